@@ -24,9 +24,9 @@ RUNS = (2, 3, 5, 10, 16)
 
 def shown(rate: Rate) -> str:
     """Coverage of the intervals that were told, and how many were not, in percent."""
-    if not rate.told:
+    if not rate.distinguished:
         return "none"
-    missing = 100.0 * (1.0 - rate.told / rate.trials)
+    missing = 100.0 * (1.0 - rate.distinguished / rate.trials)
     return f"{100.0 * rate.share:.1f}" + (f" ({missing:.0f} none)" if missing >= 0.5 else "")
 
 

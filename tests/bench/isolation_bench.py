@@ -61,11 +61,11 @@ def main() -> None:
     )
     print("seconds a run, in the mean:")
     for phase in PHASES:
-        told = "  ".join(
+        line = "  ".join(
             f"{name} {sum(getattr(one.timing, phase) for one in records[rule]) / n:7.2f}"
             for name, rule in (("rule", "related"), ("off", "off"))
         )
-        print(f"  {phase:<11}{told}")
+        print(f"  {phase:<11}{line}")
     retries = {
         rule: sum(int(one.outcome.auxiliary.get("infrastructure_retries", 0)) for one in found)
         for rule, found in records.items()
@@ -87,8 +87,8 @@ def sweep(root: Path, text: str, rule: str, slots: int) -> tuple[float, list[Run
             check=False,
         ).returncode
     if code:
-        told = [line for line in (root / "events.jsonl").read_text().splitlines() if '"error":"' in line]
-        raise SystemExit(f"the sweep ended with exit code {code}: " + "\n".join(told[:5]))
+        lines = [line for line in (root / "events.jsonl").read_text().splitlines() if '"error":"' in line]
+        raise SystemExit(f"the sweep ended with exit code {code}: " + "\n".join(lines[:5]))
     wall = time.monotonic() - started
     files = sorted((root / "runs").glob("*/*/*/run.json"))
     found = [decode_run_record(file.read_bytes()) for file in files]

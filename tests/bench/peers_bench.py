@@ -33,7 +33,7 @@ sys.path.insert(0, os.environ["BENCH"])
 gymnasium_id, n, cores = sys.argv[1], int(sys.argv[2]), len(os.sched_getaffinity(0))
 import bare_loop
 
-def told(package, seconds, steps):
+def report(package, seconds, steps):
     print(json.dumps({"version": f"{package} {importlib.metadata.version(package)}", "seconds": seconds, "steps": steps}))
 """
 BARE = """
@@ -41,7 +41,7 @@ env = bare_loop.make(gymnasium_id)
 bare_loop.play(env, 1)
 started = time.perf_counter()
 steps = sum(bare_loop.play(env, seed) for seed in bare_loop.seeds(n))
-told("gymnasium", time.perf_counter() - started, steps)
+report("gymnasium", time.perf_counter() - started, steps)
 """
 VECTOR = """
 import gymnasium, numpy as np
@@ -69,7 +69,7 @@ def main():
             done |= ended
             if ended.any() and not done.all():
                 envs.reset(options={"reset_mask": ended})
-    told("gymnasium", time.perf_counter() - started, steps)
+    report("gymnasium", time.perf_counter() - started, steps)
     envs.close()
 
 if __name__ == "__main__":
@@ -103,7 +103,7 @@ pool = ActorPool([Player.remote() for _ in range(cores)])
 list(pool.map(lambda player, seed: player.play.remote(seed), [1] * cores))
 started = time.perf_counter()
 steps = sum(pool.map_unordered(lambda player, seed: player.play.remote(seed), bare_loop.seeds(n)))
-told("ray", time.perf_counter() - started, steps)
+report("ray", time.perf_counter() - started, steps)
 ray.shutdown()
 """
 DASK = """
@@ -115,7 +115,7 @@ if __name__ == "__main__":
         started = time.perf_counter()
         tasks = [client.submit(episode, gymnasium_id, seed, pure=False) for seed in bare_loop.seeds(n)]
         steps = sum(client.gather(tasks))
-        told("distributed", time.perf_counter() - started, steps)
+        report("distributed", time.perf_counter() - started, steps)
 """
 PEERS = {
     "Gymnasium AsyncVectorEnv": ("gymnasium", BEGIN + VECTOR),

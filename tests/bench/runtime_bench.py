@@ -180,18 +180,18 @@ def write_splits(env: str, n: int, folder: Path) -> None:
 def submit_time(env: str, n: int, *, accelerations: bool) -> tuple[float, list[float]]:
     """Seconds of one warm submit of `n` episodes on two slots up to committed feedback, and of one-episode submits."""
     hidden = ("--validation", "1", "--heldout", "1")
-    measured = agent_told(env, n, n + 14, *hidden, **{ACCELERATIONS: "on" if accelerations else "off"})
+    measured = agent_measured(env, n, n + 14, *hidden, **{ACCELERATIONS: "on" if accelerations else "off"})
     return measured["submit_s"], measured["single_s"]
 
 
 def small_submit(env: str, n: int) -> dict[str, Any]:
     """Seconds of the second and the next submits of `n` episodes on two slots, and of the bare loop on one core."""
     bare = json.loads(quietly([sys.executable, str(HERE / "bare_loop.py"), env, "inf", str(n)]))
-    told = agent_told(env, n, SMALL * n, how="--small")
-    return {"env": env, "episodes": n, "bare_s": bare["seconds"], "small_s": told["small_s"]}
+    measured = agent_measured(env, n, SMALL * n, how="--small")
+    return {"env": env, "episodes": n, "bare_s": bare["seconds"], "small_s": measured["small_s"]}
 
 
-def agent_told(env: str, n: int, budget: int, *options: str, how: str = "", **environment: str) -> Any:
+def agent_measured(env: str, n: int, budget: int, *options: str, how: str = "", **environment: str) -> Any:
     """What `submit_agent.py` wrote at the end of a run on this machine."""
     with tempfile.TemporaryDirectory(prefix="evopolicy-bench-") as folder:
         result = Path(folder) / "result.json"
@@ -404,8 +404,8 @@ def main() -> None:
     submits = [small_submit(env, SMALL_SUBMITS[env][0]) for env in small]
     tell_small(submits, console)
     if options.json:
-        told = {"rows": rows, "summary": summary, "small": submits}
-        options.json.write_text(json.dumps(told, indent=2))
+        document = {"rows": rows, "summary": summary, "small": submits}
+        options.json.write_text(json.dumps(document, indent=2))
     if failed:
         raise SystemExit(f"not measured: {', '.join(failed)}")
 

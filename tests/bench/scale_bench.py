@@ -128,9 +128,9 @@ class AnsweringSlot:
     ) -> tuple[EpisodeOutcome, ...]:
         outcomes = []
         for spec in job.episodes:
-            said = slot_messages.answers.decode(self._outcomes.by_seed[spec.case.seed])
-            assert isinstance(said, slot_messages.Finished)
-            outcomes.append(msgspec.structs.replace(said.outcome, index=spec.index))
+            reply = slot_messages.replies.decode(self._outcomes.by_seed[spec.case.seed])
+            assert isinstance(reply, slot_messages.Finished)
+            outcomes.append(msgspec.structs.replace(reply.outcome, index=spec.index))
         await asyncio.sleep(self._outcomes.pace_s * len(outcomes))
         return tuple(outcomes)
 
@@ -321,12 +321,12 @@ def play_really(coordinator: Coordinator, env: str, folder: Path, n: int) -> Pla
         ref = outcome.trajectory
         assert ref is not None
         whole = ref if ref.inline is not None else msgspec.structs.replace(ref, inline=blobs.read(ref.digest))
-        said = slot_messages.Finished(outcome=msgspec.structs.replace(outcome, trajectory=whole))
-        by_seed[stored.train[ids[row.index]].seed] = slot_messages.encoder.encode(said)
+        reply = slot_messages.Finished(outcome=msgspec.structs.replace(outcome, trajectory=whole))
+        by_seed[stored.train[ids[row.index]].seed] = slot_messages.encoder.encode(reply)
     # The hidden cases of the runs to come are answered like a case that was played.
     some = next(iter(by_seed.values()))
     by_seed |= {case.seed: some for case in (*stored.validation, *stored.heldout)}
-    first = slot_messages.answers.decode(by_seed[stored.train[ids[0]].seed])
+    first = slot_messages.replies.decode(by_seed[stored.train[ids[0]].seed])
     bare_s = bare(env, stored.train[ids[0]], rendered.decode(first.outcome.trajectory.inline).actions)
     outcomes = Outcomes(env=environments.describe(env), by_seed=by_seed)
     (folder / "outcomes").write_bytes(msgspec.msgpack.encode(outcomes))
@@ -464,8 +464,8 @@ def bench(env: str, options: Any) -> list[dict[str, Any]]:
             rows = []
             for n_runs in map(int, options.runs.split(",")):
                 rows.append(answered(coordinator, env, folder / f"n{n_runs}", n_runs, played, options))
-                told = {name: value for name, value in rows[-1].items() if name != "threads_ms"}
-                print("  ".join(f"{name} {value}" for name, value in told.items()), flush=True)
+                values = {name: value for name, value in rows[-1].items() if name != "threads_ms"}
+                print("  ".join(f"{name} {value}" for name, value in values.items()), flush=True)
             return rows
         finally:
             coordinator.stop()
@@ -503,8 +503,8 @@ def tell(rows: list[dict[str, Any]], console: Console) -> None:
     console.print(table)
     for row in rows:
         for what, parts in row["threads_ms"].items():
-            told = "  ".join(f"{name} {value}" for name, value in parts.items() if value)
-            print(f"{row['env']}, {row['runs']} runs, {what} by thread, ms: {told}")
+            line = "  ".join(f"{name} {value}" for name, value in parts.items() if value)
+            print(f"{row['env']}, {row['runs']} runs, {what} by thread, ms: {line}")
 
 
 def main() -> None:

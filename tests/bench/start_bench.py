@@ -100,13 +100,13 @@ def floor(programs: Sequence[str], times: int) -> Cost:
 
 def first_minute(folder: Path, state: Path) -> tuple[float, float, float]:
     """Seconds from the call to the first submit's answer, and what the first and the second submit took."""
-    policy, agent, told = folder / "policy.py", folder / "agent.py", folder / "times.json"
+    policy, agent, times = folder / "policy.py", folder / "agent.py", folder / "times.json"
     policy.write_text(POLICY)
     agent.write_text(AGENT)
     called = time.time()
     run(
         *("-m", "evopolicy_gateway.cli", "local", "--env", ENV, "--budget", "2", "--state", state),
-        *("--agent", f"command:{sys.executable} {agent} {policy} {told}", "--jail", "none"),
+        *("--agent", f"command:{sys.executable} {agent} {policy} {times}", "--jail", "none"),
         *(
             "--runs",
             folder / "runs",
@@ -119,7 +119,7 @@ def first_minute(folder: Path, state: Path) -> tuple[float, float, float]:
             "1",
         ),
     )
-    begun, first, second = json.loads(told.read_text())
+    begun, first, second = json.loads(times.read_text())
     return first - called, first - begun, second - first
 
 

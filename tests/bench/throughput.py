@@ -220,9 +220,9 @@ def dask_row(n: int, folder: Path) -> dict[str, Any]:
             [str(python), str(script), str(n)], check=True, capture_output=True, text=True, timeout=300
         )
     except (subprocess.SubprocessError, OSError) as error:
-        said = (getattr(error, "stderr", None) or str(error)).strip().splitlines()
+        lines = (getattr(error, "stderr", None) or str(error)).strip().splitlines()
         return {
-            "left_out": f"dask.distributed cannot be installed or run here: {said[-1] if said else error}"
+            "left_out": f"dask.distributed cannot be installed or run here: {lines[-1] if lines else error}"
         }
     return {"episodes": n, "episodes_per_s": round(float(ran.stdout.strip().splitlines()[-1]), 1)}
 
@@ -272,8 +272,8 @@ def main() -> None:
     rows: dict[str, dict[str, Any]] = {}
     for name in options.rows.split(","):
         rows[name] = makers[name]()
-        told = "  ".join(f"{key} {value}" for key, value in rows[name].items())
-        print(f"{name:<12}{told}  {verdict(name, rows[name])}", flush=True)
+        line = "  ".join(f"{key} {value}" for key, value in rows[name].items())
+        print(f"{name:<12}{line}  {verdict(name, rows[name])}", flush=True)
     if options.json is not None:
         options.json.write_text(json.dumps(rows, indent=2) + "\n")
 

@@ -148,6 +148,6 @@ def test_evolve_plays_a_whole_run_with_a_worker_from_it(tmp_path: Path, made: Ma
     for each in episodes:
         assert (each / "video.mp4").read_bytes()[4:8] == b"ftyp"
         (row, *_) = (each / "trajectory.jsonl").read_text().splitlines()
-        told = json.loads(row)["info"]
-        assert set(told["rewards"]) == {"treasure", "time"}
-        assert told["reward_vector"] == list(told["rewards"].values())
+        info = json.loads(row)["info"]
+        assert set(info["rewards"]) == {"treasure", "time"}
+        assert info["reward_vector"] == list(info["rewards"].values())

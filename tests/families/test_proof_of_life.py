@@ -71,13 +71,13 @@ def test_a_policy_beats_random_on_the_cases_that_were_fixed_beforehand(slots: Sl
 
     ours, random = returns(proof.policy), returns(None)
     better = over_cases(ours - random, (ours, random))
-    told = (
+    command = (
         f"{proof.env}: {ours.mean():.4g} beside {random.mean():.4g}, better by {better.low} to {better.high}"
     )
-    print(told)
+    print(command)
     # Without any spread there is no interval: the difference is the same on every case.
     least = better.value if better.low is None else better.low
-    assert least > 0, told
+    assert least > 0, command
 
 
 @pytest.mark.slow

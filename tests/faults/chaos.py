@@ -247,8 +247,8 @@ class _Twins:
                     if faults is not None and command.pid in faults.killed:
                         start(what)
                     else:
-                        said = (cluster.root / f"{name}-{what}.err").read_text(errors="replace")
-                        wrong.append(f"{what}: exit status {code}: {' | '.join(said.splitlines()[-4:])}")
+                        output = (cluster.root / f"{name}-{what}.err").read_text(errors="replace")
+                        wrong.append(f"{what}: exit status {code}: {' | '.join(output.splitlines()[-4:])}")
                 now = time.monotonic()
                 timeout_s, looked = timeout_s - (now - looked) / slowness(), now
                 if timeout_s < 0.0:

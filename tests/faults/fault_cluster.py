@@ -204,7 +204,7 @@ class FaultCluster:
         return f"command:{sys.executable} {self._agent}"
 
     def operator_command(
-        self, arguments: list[str], said: int | IO[str] = subprocess.PIPE
+        self, arguments: list[str], stderr: int | IO[str] = subprocess.PIPE
     ) -> subprocess.Popen[str]:
         """`evopolicy` with these arguments and the operator's credentials."""
         return subprocess.Popen(
@@ -213,20 +213,20 @@ class FaultCluster:
                 *("--credentials", self.files["operator"]),
             ],
             stdout=subprocess.DEVNULL,
-            stderr=said,
+            stderr=stderr,
             text=True,
             cwd=self.root,
             env={**os.environ, **self._environment},
         )
 
     async def tell_afterwards(self) -> None:
-        told, self.afterwards = self.afterwards, []
-        if told:
+        actions, self.afterwards = self.afterwards, []
+        if actions:
             async with connect(self.operators) as link:
                 ask = Requester(
                     link, partial(keys.operator_key, link.credentials.cluster), codec.operator_replies
                 )
-                for message in told:
+                for message in actions:
                     await ask.until_answered("cancel", message, operator.Done)
 
     def folder(self, name: str) -> Path:

@@ -303,13 +303,13 @@ def play(cluster: FaultCluster, name: str, case: Case | None = None) -> Row:
             time.sleep(case.delay_s)
             row.struck = command.poll() is None and strike(cluster, case, row)
             asyncio.run(cluster.tell_afterwards())
-        said = command.communicate(timeout=TIMEOUT_S)[1]
+        output = command.communicate(timeout=TIMEOUT_S)[1]
         if command.returncode and case is not None and case.target in ("run", "everything"):
             row.again = True
             command = cluster.command(name)
-            said = command.communicate(timeout=TIMEOUT_S)[1]
+            output = command.communicate(timeout=TIMEOUT_S)[1]
         if command.returncode:
-            row.wrong.append(f"exit status {command.returncode}: {' | '.join(said.splitlines()[-3:])}")
+            row.wrong.append(f"exit status {command.returncode}: {' | '.join(output.splitlines()[-3:])}")
     except subprocess.TimeoutExpired:
         row.wrong.append(f"did not end within {TIMEOUT_S:g} s")
         command.kill()
@@ -327,9 +327,9 @@ def check(cluster: FaultCluster, row: Row, folder: Path, undisturbed: Path) -> N
     used = record(folder)["outcome"]["budget_used"]
     if used != SUBMITS * EPISODES:
         row.wrong.append(f"budget used: {used} of {SUBMITS * EPISODES}")
-    told_s = record(folder)["timing"]["wall_time_seconds"]
-    if not 0.0 <= told_s <= row.took_s + 1.0:
-        row.wrong.append(f"wall time told: {told_s:g} s of {row.took_s:g} s")
+    reported_s = record(folder)["timing"]["wall_time_seconds"]
+    if not 0.0 <= reported_s <= row.took_s + 1.0:
+        row.wrong.append(f"wall time reported: {reported_s:g} s of {row.took_s:g} s")
     deadline = time.monotonic() + 5.0
     while (strays := cluster.strays()) and time.monotonic() < deadline:
         time.sleep(0.05)

@@ -33,11 +33,11 @@ for line in sys.stdin:
     module, *words = json.loads(line)
     reader, writer = os.pipe()
     os.close(reader)
-    said = os.memfd_create("stderr")
+    stderr = os.memfd_create("stderr")
     child = os.fork()
     if not child:
         os.dup2(writer, 1)
-        os.dup2(said, 2)
+        os.dup2(stderr, 2)
         sys.argv = [module, *words]
         if not hasattr(sys.modules[module], "__path__"):
             del sys.modules[module]  # it is not imported but run
@@ -45,9 +45,9 @@ for line in sys.stdin:
         break
     os.close(writer)
     status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
-    os.lseek(said, 0, 0)
-    print(json.dumps([status, os.read(said, 1 << 16).decode()]), flush=True)
-    os.close(said)
+    os.lseek(stderr, 0, 0)
+    print(json.dumps([status, os.read(stderr, 1 << 16).decode()]), flush=True)
+    os.close(stderr)
 """
 """Plays each command as a process of its own, forked when all that commands import is imported; its stdout has no reader."""
 
@@ -64,9 +64,9 @@ def closed(*words: str, lines: int = 0, cwd: Path | None = None) -> tuple[int, s
         with os.fdopen(reader) as output:
             for _ in range(lines):
                 assert output.readline()
-    _, said = process.communicate(timeout=TIMEOUT_S)
-    told = [line for line in said.splitlines(keepends=True) if not line.startswith("waiting for ")]
-    return process.returncode, "".join(told)
+    _, errors = process.communicate(timeout=TIMEOUT_S)
+    lines_shown = [line for line in errors.splitlines(keepends=True) if not line.startswith("waiting for ")]
+    return process.returncode, "".join(lines_shown)
 
 
 @pytest.fixture(scope="module")
@@ -86,8 +86,8 @@ def forked() -> Iterator[Callable[..., tuple[int, str]]]:
             assert process.stdout is not None
             process.stdin.write(json.dumps([MODULES[words[0]], *words[1:]]) + "\n")
             process.stdin.flush()
-            status, said = json.loads(process.stdout.readline())
-            return status, said
+            status, errors = json.loads(process.stdout.readline())
+            return status, errors
 
         yield play
 

@@ -183,7 +183,7 @@ class Checkers:
 
     def asking(self, event: events.Event) -> None:
         """Note a request that reached the core."""
-        message = event.message if isinstance(event, events.Asked) else None
+        message = event.message if isinstance(event, events.Requested) else None
         if isinstance(message, wire.Heartbeat | wire.Register):
             now = self._simulation.world.now
             last, since = self._heard.get(message.worker, (-1e9, now))
@@ -221,8 +221,8 @@ class Checkers:
             for held in request.held:
                 group, _, first = held.job_id.rpartition("/")
                 row = disk.outcome(group, int(first))
-                told = row is None or held.lease_id in self._handed_in or held.lease_id in message.cancelled
-                want(told, "who plays what is done already is told to stop", held, row)
+                notified = row is None or held.lease_id in self._handed_in or held.lease_id in message.cancelled
+                want(notified, "who plays what is done already is told to stop", held, row)
         elif isinstance(message, wire.Leases) and isinstance(request, wire.LeaseRequest):
             for lease in message.leases:
                 self._leased(request.worker, lease)
@@ -289,13 +289,13 @@ class Checkers:
             if worker.name in self.named:
                 continue
             last, since = self._heard.get(worker.name, (-1e9, now))
-            told = [each for each in worker.outbox if each.job_id == job.job_id and each.begun is not None]
+            reported = [each for each in worker.outbox if each.job_id == job.job_id and each.begun is not None]
             played = [
                 each.lease_id
                 for each in worker.running.values()
                 if each.job.job_id == job.job_id and begun_of(each) not in (None, job.begun)
             ]
-            for lease_id in [*(each.lease_id for each in told if each.begun != job.begun), *played]:
+            for lease_id in [*(each.lease_id for each in reported if each.begun != job.begun), *played]:
                 known = self._granted[lease_id][1] == self._disk.incarnation
                 heard = now - last <= HEARD_S and since < self._granted_at[lease_id]
                 want(
@@ -353,12 +353,12 @@ class Checkers:
         used = sum(len(each.episodes) for each in expected.submits)
         want(result.budget_used == used, "each episode is charged once", plan.name, result.budget_used, used)
         for index, each in enumerate(expected.submits):
-            told = result.submits[index]
+            reported = result.submits[index]
             want(
-                (told.mean_return, told.val_mean) == (each.mean, each.val_mean),
+                (reported.mean_return, reported.val_mean) == (each.mean, each.val_mean),
                 "means",
                 plan.name,
-                told,
+                reported,
                 each,
             )
         self._audited(plan, result)

@@ -157,11 +157,11 @@ class SimGateway(Asker):
         if not self.asks_permit:
             self._permitted(gateway.Permit(granted=True))
             return
-        told = self.tells_kernel
+        known = self.tells_kernel
         fields = {
             "run": self.plan.name,
-            "boot_id": self.boot_id if told else "",
-            "machine_id": self.machine.name if told else "",
+            "boot_id": self.boot_id if known else "",
+            "machine_id": self.machine.name if known else "",
             "wait_s": 5.0,
         }
         self.ask(gateway.RequestPermit, fields, self._permitted, 5.0)

@@ -110,13 +110,13 @@ def failure_of(bundle: str | None, index: int) -> FailureCategory | None:
 
 
 def return_of(
-    case_seed: int, bundle: str | None, policy_seed: bytes, episode_index: int, told: dict[str, Any]
+    case_seed: int, bundle: str | None, policy_seed: bytes, episode_index: int, meta: dict[str, Any]
 ) -> float:
     """An episode's return: depends on everything that an episode may depend on, and on nothing else."""
-    meta = sorted(
-        (name, value) for name, value in told.items() if name not in ("obs_storage", "max_episode_steps")
+    known = sorted(
+        (name, value) for name, value in meta.items() if name not in ("obs_storage", "max_episode_steps")
     )
-    text = repr((case_seed, bundle, policy_seed, episode_index, meta))
+    text = repr((case_seed, bundle, policy_seed, episode_index, known))
     return zlib.crc32(text.encode()) % 16 / 4.0
 
 
@@ -138,7 +138,7 @@ def _played(
     bundle: str | None,
     submit_index: int,
     modulo: int,
-    told: dict[str, Any],
+    meta: dict[str, Any],
 ) -> tuple[Expected, ...]:
     seeds = run.cases("heldout" if bundle is None else split)
     played = []
@@ -147,7 +147,7 @@ def _played(
             seed = _reference_seed(seeds[case_id])
         else:
             seed = _seed(run, submit_index, split, case_id, ids[:index].count(case_id))
-        value = return_of(seeds[case_id], bundle, seed, index % modulo, told)
+        value = return_of(seeds[case_id], bundle, seed, index % modulo, meta)
         played.append(Expected(value, failure_of(bundle, index)))
     return tuple(played)
 
@@ -164,18 +164,18 @@ def expect(run: PlannedRun) -> ExpectedRun:
     for index, submit in enumerate(run.admitted()):
         n = len(submit.ids)
         left -= n
-        told = {
+        meta = {
             "env": run.env,
             "submit_index": index,
             "n_episodes_this_submit": n,
             "remaining_budget_after": left,
         }
-        episodes = _played(run, "train", list(submit.ids), submit.bundle, index, n, told)
+        episodes = _played(run, "train", list(submit.ids), submit.bundle, index, n, meta)
         if failure_of(submit.bundle, 0) == "init_error":
             submits.append(ExpectedSubmit("init_error", episodes, None, None))
             continue
-        hidden = _played(run, "validation", list(range(run.n_validation)), submit.bundle, index, n, told)
-        heldout = _played(run, "heldout", list(range(run.n_heldout)), submit.bundle, index, n, told)
+        hidden = _played(run, "validation", list(range(run.n_validation)), submit.bundle, index, n, meta)
+        heldout = _played(run, "heldout", list(range(run.n_heldout)), submit.bundle, index, n, meta)
         heldout_of[index] = tuple(each.episode_return for each in heldout)
         submits.append(ExpectedSubmit("ok", episodes, _mean(episodes), _mean(hidden)))
     ok = {index: each.val_mean for index, each in enumerate(submits) if each.val_mean is not None}

@@ -136,8 +136,8 @@ class Simulation:
         if plan.name not in self._of_run:
             apart = not self.near or (not self.crowd and self.places.random() < 0.25)
             machine = Machine(f"m-of-{plan.name}") if apart else self.places.choice(self.machines)
-            told = not self.near or self.crowd or self.places.random() < 0.85
-            self._of_run[plan.name] = machine, told
+            is_known = not self.near or self.crowd or self.places.random() < 0.85
+            self._of_run[plan.name] = machine, is_known
         return self._of_run[plan.name]
 
     def asks_permit(self, plan: PlannedRun) -> bool:

@@ -52,7 +52,7 @@ def test_a_planted_bug_is_caught(bug: Bug) -> None:
     raise AssertionError(f"no seed of {SEEDS_PER_BUG} notices: {bug.title}")
 
 
-def test_the_same_seed_is_the_same_story() -> None:
+def test_the_same_seed_gives_the_same_trace() -> None:
     def trace(seed: int) -> list[str]:
         simulation = Simulation(seed, trace=True)
         simulation.run()

@@ -29,7 +29,7 @@ def blocks_of_commands(path: Path) -> list[list[list[str]]]:
     blocks = re.findall(r"^```(\w*)\n(.*?)^```$", path.read_text(), re.DOTALL | re.MULTILINE)
     plain = [text for language, text in blocks if not language and "─" not in text]
     found = [[_command(line) for line in text.splitlines()] for text in plain]
-    return [told for block in found if (told := [words for words in block if words])]
+    return [rows for block in found if (rows := [words for words in block if words])]
 
 
 def commands() -> Iterator[tuple[str, Any]]:

@@ -13,7 +13,7 @@ from typing import Any
 import httpx
 import msgspec
 import numpy as np
-from rigs.service_world import IDENTITY, Asked, World
+from rigs.service_world import IDENTITY, Requested, World
 
 from evopolicy_common.messages import operator, worker
 from evopolicy_common.messages.environment import EnvironmentDescription
@@ -314,7 +314,7 @@ class Double:
     async def _ask(self, key: str, message: Message) -> Any:
         """Asks until there is an answer: while the core is loaded anew there is none."""
         while True:
-            asked = Asked(key, message)
+            asked = Requested(key, message)
             self.world.service.on_queries([asked])  # type: ignore[list-item]
             answer = await asked.message()
             if answer is not None:
@@ -347,7 +347,7 @@ class Double:
         """Ends the poll that waits, so that it brings no lease."""
         if self._session:
             message = worker.LeaseRequest(worker=WORKER, session=self._session, n=0, wait_s=0.0)
-            self.world.service.on_queries([Asked(keys.worker_key(CLUSTER, "lease"), message)])  # type: ignore[list-item]
+            self.world.service.on_queries([Requested(keys.worker_key(CLUSTER, "lease"), message)])  # type: ignore[list-item]
 
     async def _beat(self) -> None:
         while True:

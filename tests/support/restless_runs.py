@@ -44,9 +44,9 @@ def assert_same(root: Path, restless: str, calm: str) -> None:
     assert first.val_scores == second.val_scores
     for index in range(N_SUBMITS):
         path = f"workspace/feedback/submit_{index:03d}/summary.json"
-        told, other = (decode_summary((folder / path).read_bytes()) for folder in (one, two))
-        assert told.returns == other.returns
-        assert told.errors == other.errors == ()
+        document, other = (decode_summary((folder / path).read_bytes()) for folder in (one, two))
+        assert document.returns == other.returns
+        assert document.errors == other.errors == ()
 
 
 def folder_of(root: Path, name: str) -> Path:

@@ -15,11 +15,11 @@ TIMEOUT_S = 150.0
 _PAUSE_S = 0.05
 
 
-def wait_until(what: Callable[[], T], told: Callable[[], str] = lambda: "it did not come true") -> T:
+def wait_until(what: Callable[[], T], message: Callable[[], str] = lambda: "it did not come true") -> T:
     """The first value that counts as true; AssertionError with what is `told` when none comes."""
     deadline = time.monotonic() + TIMEOUT_S
     while not (value := what()):
-        assert time.monotonic() < deadline, told()
+        assert time.monotonic() < deadline, message()
         time.sleep(_PAUSE_S)
     return value
 

@@ -109,15 +109,15 @@ def test_every_command_knows_h_and_shows_no_python_types() -> None:
     for name, command in commands():
         context = command.make_context(name, [], resilient_parsing=True)
         assert "-h" in context.help_option_names, name
-        told = command.get_help(context)
+        output = command.get_help(context)
         for kind in ("<str>", "<int", "<float", "<path>", "list["):
-            assert kind not in told, (name, kind)
+            assert kind not in output, (name, kind)
 
 
 def test_choices_are_shown_and_a_wrong_one_is_told_with_those_that_are() -> None:
-    told = started(["evopolicy", "local", "--help"]).stdout
+    output = started(["evopolicy", "local", "--help"]).stdout
     for choices in ("<bwrap|landlock|none>", "<bwrap|open-network|none>", "<off|first|all>"):
-        assert choices in told
+        assert choices in output
     done = started(["evopolicy", "run", "--env", "toy", "--agent", "evolve", "--tier", "x"])
     assert done.returncode == 2
     assert done.stderr == (
@@ -126,12 +126,12 @@ def test_choices_are_shown_and_a_wrong_one_is_told_with_those_that_are() -> None
 
 
 def test_the_help_of_local_is_in_groups_and_fits_a_narrow_terminal() -> None:
-    told = started(["evopolicy", "local", "--help"], COLUMNS="60").stdout
-    headings = [line[:-1] for line in told.splitlines() if line.endswith(":") and not line.startswith(" ")]
+    output = started(["evopolicy", "local", "--help"], COLUMNS="60").stdout
+    headings = [line[:-1] for line in output.splitlines() if line.endswith(":") and not line.startswith(" ")]
     assert headings[0] == "Run"
     assert headings[-1] == "Other options"
     assert len(headings) >= 6
-    assert max(map(len, told.splitlines())) <= 60
+    assert max(map(len, output.splitlines())) <= 60
 
 
 def test_a_mistyped_command_is_answered_with_the_nearest() -> None:

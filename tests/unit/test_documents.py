@@ -116,9 +116,9 @@ def test_make_has_the_targets_that_documents_name() -> None:
 
 
 def test_every_command_is_in_a_document_and_its_help_has_an_example() -> None:
-    told = "\n".join(map(text_of, DOCUMENTS))
+    text = "\n".join(map(text_of, DOCUMENTS))
     names = {name: f"`{name.partition(' ')[2]}" for name, _ in commands()}
-    assert [name for name, short in names.items() if name not in told and short not in told] == []
+    assert [name for name, short in names.items() if name not in text and short not in text] == []
     assert [name for name, each in commands() if "Example: " not in f"{each.epilog} {each.help}"] == []
 
 

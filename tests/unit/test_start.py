@@ -73,7 +73,7 @@ def test_commands_are_found_by_the_table_alone() -> None:
 
 
 @pytest.mark.parametrize("name", PLACES)
-def test_the_front_door_says_of_a_command_what_its_own_help_says(name: str) -> None:
+def test_the_help_of_evopolicy_describes_a_command_as_its_own_help_does(name: str) -> None:
     front = typer.main.get_command(app)
     command = front.commands[name]  # type: ignore[attr-defined]
     assert command.name == name

@@ -140,12 +140,12 @@ async def in_a_slot(env_id: str, definitions: tuple[Entry, ...]) -> InASlot:
         bundle.mkdir()
         try:
             await slot.start()
-            (told,) = await slot.describe([env_id])
-            neutral = compile_actions(told.action_space).neutral()
+            (description,) = await slot.describe([env_id])
+            neutral = compile_actions(description.action_space).neutral()
             (bundle / "policy.py").write_text(_POLICY + repr(_literal(neutral)))
             timed: list[tuple[int, float]] = []
             for steps in (1, 1 + _SLOT_STEPS):
-                job = _job(told, tier, steps)
+                job = _job(description, tier, steps)
                 (outcome,) = await slot.play(job, bundle, lambda episodes, steps: None)
                 if outcome.failure is not None:
                     return InASlot(fault=f"in a slot: {outcome.failure.message[:200]}")
@@ -159,18 +159,18 @@ async def in_a_slot(env_id: str, definitions: tuple[Entry, ...]) -> InASlot:
             await slot.close()
 
 
-def _job(told: EnvironmentDescription, tier: Tier, steps: int) -> Job:
+def _job(description: EnvironmentDescription, tier: Tier, steps: int) -> Job:
     meta = {
-        "env": told.env,
+        "env": description.env,
         "submit_index": 0,
         "n_episodes_this_submit": 1,
         "remaining_budget_after": 0,
-        "max_episode_steps": told.max_episode_steps,
+        "max_episode_steps": description.max_episode_steps,
     }
     spec = EpisodeSpec(index=0, episode_index=0, case=Case(seed=SEEDS[0]), policy_seed=bytes(16))
     return Job(
         job_id="check",
-        env=told.env,
+        env=description.env,
         bundle="check",
         episodes=(spec,),
         env_meta=meta,

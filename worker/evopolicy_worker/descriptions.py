@@ -80,8 +80,8 @@ class Cache:
         if packages is None:
             return ""
         entry = msgspec.json.encode(catalogue.entry(env_id), order="sorted").decode()
-        told = f"{self._code}\n{platform.python_version()}\n{entry}\n{sorted(packages.items())}"
-        return hashlib.sha256(told.encode()).hexdigest()
+        definition = f"{self._code}\n{platform.python_version()}\n{entry}\n{sorted(packages.items())}"
+        return hashlib.sha256(definition.encode()).hexdigest()
 
 
 class _Kept(msgspec.Struct, frozen=True):

@@ -181,21 +181,21 @@ def _mark(folder: Path, made: Made) -> None:
 
 def _check_python(wanted: Mapping[str, Install], python: str) -> None:
     try:
-        asked = [python, "-c", "import sys, venv, ensurepip; print(*sys.version_info[:2], sep='.')"]
-        said = subprocess.run(asked, capture_output=True, text=True, check=False)
+        command = [python, "-c", "import sys, venv, ensurepip; print(*sys.version_info[:2], sep='.')"]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
     except OSError as error:
         raise ConfigError(f"--python {python} cannot be started: {error.strerror}") from error
-    if said.returncode:
+    if done.returncode:
         raise ConfigError(
-            f"{python} makes no virtual environments: {last_line(said.stderr)}; install its venv module (Debian: python3-venv)"
+            f"{python} makes no virtual environments: {last_line(done.stderr)}; install its venv module (Debian: python3-venv)"
             " or name another with --python"
         )
-    found = _numbers(said.stdout)
+    found = _numbers(done.stdout)
     for name, each in wanted.items():
         if not _numbers(each.python[0]) <= found < _numbers(each.python[1]):
             raise ConfigError(
                 f"{name} is tested with Python {each.python[0]} up to, but not including, {each.python[1]}, and {python} is"
-                f" {said.stdout.strip()}: name another with --python"
+                f" {done.stdout.strip()}: name another with --python"
             )
 
 
@@ -269,24 +269,24 @@ def _run(program: Sequence[str], what: str) -> None:
         raise failure(what, done.stderr + done.stdout)
 
 
-def failure(what: str, said: str) -> ConfigError:
+def failure(what: str, output: str) -> ConfigError:
     """The error for a failed step of the installation, from the program's output."""
-    if _NO_NETWORK.search(said):
+    if _NO_NETWORK.search(output):
         return MachineError(
             f"{what}: no package index with it can be reached: check the network, and pip's index-url and proxy (`pip config list`)"
         )
-    if "No space left" in said or "Errno 28" in said:
+    if "No space left" in output or "Errno 28" in output:
         return MachineError(f"{what}: no space is left; make room, or name another folder with --into")
-    if found := _NO_VERSION.search(said):
+    if found := _NO_VERSION.search(output):
         return ConfigError(
             f"{what}: the package index has no {found[1]} for this Python and platform; name another interpreter with --python"
         )
-    return ConfigError(f"{what} cannot be installed: {last_line(said)}")
+    return ConfigError(f"{what} cannot be installed: {last_line(output)}")
 
 
-def last_line(said: str) -> str:
+def last_line(output: str) -> str:
     """The last line of a program's output that says something, errors first."""
-    lines = [line for line in said.splitlines() if line.strip()]
+    lines = [line for line in output.splitlines() if line.strip()]
     errors = [line for line in lines if "error" in line.lower()]
     return one_line((errors or lines or ["no output"])[-1])[:300]
 

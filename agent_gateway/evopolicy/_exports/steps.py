@@ -119,8 +119,8 @@ class _Log:
         elif kind == "stderr" and isinstance(text, str):
             self.step("system", "stderr", at).texts.append(text)
         elif kind in _NOTES:
-            told = {name: value for name, value in event.items() if name not in ("type", "timestamp")}
-            self.step("system", at=at).texts.append(f"{kind}: {_json(told)}")
+            fields = {name: value for name, value in event.items() if name not in ("type", "timestamp")}
+            self.step("system", at=at).texts.append(f"{kind}: {_json(fields)}")
         elif isinstance(event.get("turn"), int) and isinstance(text, str):
             self.step("agent", at=at).texts.append(text)
 

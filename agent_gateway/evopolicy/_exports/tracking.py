@@ -60,16 +60,16 @@ class Curve(NamedTuple):
     def settings(self) -> dict[str, str]:
         """Known from the start: entry, environment, and once it is finished the experiment's settings."""
         entry, env, experiment = self.folder.parts[-3:]
-        told = {"entry": entry, "env": env.replace("_", "/", 1), "experiment": experiment}
+        settings = {"entry": entry, "env": env.replace("_", "/", 1), "experiment": experiment}
         if self.record is not None:
-            told |= {"entry": self.record.agent.entry, "env": self.record.env, "model": self.record.model}
-            told |= {"repeat": str(self.record.repeat), "status": self.record.outcome.status}
-            told |= {
+            settings |= {"entry": self.record.agent.entry, "env": self.record.env, "model": self.record.model}
+            settings |= {"repeat": str(self.record.repeat), "status": self.record.outcome.status}
+            settings |= {
                 name: str(value)
                 for name, value in msgspec.to_builtins(self.record.experiment_dimensions).items()
                 if isinstance(value, str | int)
             }
-        return told
+        return settings
 
 
 class Point(NamedTuple):

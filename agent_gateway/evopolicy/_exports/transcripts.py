@@ -45,8 +45,8 @@ def _name(run: Run) -> str:
 
 def _id(run: Run) -> str:
     """22 hexadecimal digits; equal in every export of this run."""
-    told = f"{run.folder.absolute()} {run._record.timing.start_time}"
-    return hashlib.sha256(told.encode("utf-8", "surrogateescape")).hexdigest()[:22]
+    identity = f"{run.folder.absolute()} {run._record.timing.start_time}"
+    return hashlib.sha256(identity.encode("utf-8", "surrogateescape")).hexdigest()[:22]
 
 
 def _about(run: Run) -> dict[str, Any]:
@@ -96,10 +96,10 @@ def _atif_step(number: int, step: Step) -> dict[str, Any]:
         {"tool_call_id": call.id, "function_name": call.name, "arguments": call.arguments}
         for call in step.calls
     ]
-    told = _without_none(
+    optional = _without_none(
         timestamp=step.at,
         reasoning_content="\n".join(step.reasoning),
         tool_calls=calls,
         observation={"results": results} if results else None,
     )
-    return {"step_id": number, "source": step.source, "message": step.text, **told}
+    return {"step_id": number, "source": step.source, "message": step.text, **optional}

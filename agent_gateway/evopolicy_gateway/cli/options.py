@@ -266,22 +266,22 @@ def cases_of(text: str) -> tuple[int, ...]:
     return ids
 
 
-def check_packages(asked: list[str] | None, *, local: bool) -> tuple[str, ...]:
+def check_packages(requested: list[str] | None, *, local: bool) -> tuple[str, ...]:
     """The packages of `--policy-package`. ConfigError for a cluster that is not brought up here."""
-    if asked and not local:
+    if requested and not local:
         raise ConfigError(
             "--policy-package is for a cluster that this command brings up; give it to evopolicy-coordinator and to each"
             " evopolicy-worker"
         )
-    return tuple(sorted(set(asked or ())))
+    return tuple(sorted(set(requested or ())))
 
 
-def packages_for(policy: Path, asked: Sequence[str] | None) -> tuple[str, ...]:
+def packages_for(policy: Path, requested: Sequence[str] | None) -> tuple[str, ...]:
     """The packages of `--policy-package`; where it is not given, those of the run to whose directory the policy belongs.
 
     Raises ConfigError when policies cannot have one of those."""
-    if asked:
-        return tuple(sorted(set(asked)))
+    if requested:
+        return tuple(sorted(set(requested)))
     folder = policy.absolute()
     for run in (folder, *list(folder.parents)[:2]):
         with contextlib.suppress(OSError, ProtocolError):
@@ -296,18 +296,18 @@ def packages_for(policy: Path, asked: Sequence[str] | None) -> tuple[str, ...]:
     return ()
 
 
-def check_browser(asked: Path | None, *, local: bool) -> Path | None:
+def check_browser(requested: Path | None, *, local: bool) -> Path | None:
     """The browser of `--browser`. ConfigError for a cluster that is not brought up here."""
-    if asked is not None and not local:
+    if requested is not None and not local:
         raise ConfigError(
             "--browser is for a cluster that this command brings up; give it to each evopolicy-worker"
         )
-    return None if asked is None else asked.absolute()
+    return None if requested is None else requested.absolute()
 
 
-def check_isolation(asked: HiddenIsolation | None, *, local: bool) -> None:
+def check_isolation(requested: HiddenIsolation | None, *, local: bool) -> None:
     """ConfigError where `--hidden-isolation` is given for a cluster that is not brought up here."""
-    if asked is not None and not local:
+    if requested is not None and not local:
         raise ConfigError(
             "--hidden-isolation applies only to a cluster started by this command; otherwise set it at the coordinator:"
             " evopolicy-coordinator --hidden-isolation"

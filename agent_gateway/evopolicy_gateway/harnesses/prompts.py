@@ -117,5 +117,5 @@ def check_text(where: str, text: str, known: tuple[str, ...]) -> None:
 
 
 def _filled(text: str, standard: str, left: int | None) -> str:
-    told = "unknown" if left is None else str(left)
-    return Template(text).substitute(standard=Template(standard).substitute(left=told), left=told)
+    episodes_left = "unknown" if left is None else str(left)
+    return Template(text).substitute(standard=Template(standard).substitute(left=episodes_left), left=episodes_left)

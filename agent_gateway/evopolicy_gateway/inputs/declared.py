@@ -72,26 +72,26 @@ def read(skills: Sequence[str], servers: Mapping[str, McpServer], started_in: Pa
 
 
 def _skill(path: str, started_in: Path) -> Content:
-    said = f"skills: {path}"
-    folder = _below(said, path, started_in)
+    field = f"skills: {path}"
+    folder = _below(field, path, started_in)
     _check_name("skills", folder.name)
-    files = dict(_files(said, folder, ""))
+    files = dict(_files(field, folder, ""))
     if SKILL not in files:
-        raise ConfigError(f"{said}: the folder has no {SKILL}, so it is no skill")
+        raise ConfigError(f"{field}: the folder has no {SKILL}, so it is no skill")
     return Content(AgentInput(kind="skill", name=folder.name, digest=_digest(files)), files)
 
 
 def _server(name: str, server: McpServer, started_in: Path) -> Content:
-    said = f"mcp.{name}"
+    field = f"mcp.{name}"
     _check_name("mcp", name)
     for text in server.hosts:
-        host(text, f"{said}.hosts")
-    roots = {path: _below(f"{said}.files", path, started_in) for path in server.files}
+        host(text, f"{field}.hosts")
+    roots = {path: _below(f"{field}.files", path, started_in) for path in server.files}
     words: list[str] = []
     for word in server.args:
         # Absolute paths are those of the jail.
         if word and not os.path.isabs(word) and os.path.lexists(started_in / word):
-            place = _below(f"{said}.args", word, started_in)
+            place = _below(f"{field}.args", word, started_in)
             root = next((one for one in roots.values() if place.is_relative_to(one)), None)
             if root is None:
                 root = roots[word] = place
@@ -100,9 +100,9 @@ def _server(name: str, server: McpServer, started_in: Path) -> Content:
     files: dict[str, File] = {}
     for path, root in roots.items():
         if any(other.name == root.name and other != root for other in roots.values()):
-            raise ConfigError(f"{said}: two of its files or folders are named {root.name!r}; rename one")
-        files |= _files(f"{said}: {path}", root, root.name)
-    program = _program(said, server.command, started_in)
+            raise ConfigError(f"{field}: two of its files or folders are named {root.name!r}; rename one")
+        files |= _files(f"{field}: {path}", root, root.name)
+    program = _program(field, server.command, started_in)
     about = [
         os.path.basename(program),
         _executable_digest(program),
@@ -113,12 +113,12 @@ def _server(name: str, server: McpServer, started_in: Path) -> Content:
     return Content(recorded, files, (program, *words), server.environment)
 
 
-def _program(said: str, command: str, started_in: Path) -> str:
+def _program(field: str, command: str, started_in: Path) -> str:
     own = started_in / command
     found = os.path.abspath(own) if "/" in command and own.is_file() else shutil.which(command)
     if found is None:
         raise ConfigError(
-            f"{said}.command: there is no program {command!r}, neither as a file nor on the PATH"
+            f"{field}.command: there is no program {command!r}, neither as a file nor on the PATH"
         )
     return found
 
@@ -131,31 +131,31 @@ def _executable_digest(program: str) -> str:
         raise ConfigError(f"{program} cannot be read: {error.strerror}") from error
 
 
-def _check_name(said: str, name: str) -> None:
+def _check_name(field: str, name: str) -> None:
     if not _NAME.fullmatch(name):
         raise ConfigError(
-            f"{said}: the name {name!r} is not made of letters, digits, '_' and '-' (at most 64)"
+            f"{field}: the name {name!r} is not made of letters, digits, '_' and '-' (at most 64)"
         )
 
 
-def _below(said: str, path: str, started_in: Path) -> Path:
+def _below(field: str, path: str, started_in: Path) -> Path:
     """The path as absolute one. ConfigError where it leads out of the folder, or over a link."""
     whole = Path(os.path.normpath(started_in / path))
     if not whole.is_relative_to(started_in) or whole == started_in:
         raise ConfigError(
-            f"{said}: {whole} is not below {started_in}; copy it there, so that nothing else is shown"
+            f"{field}: {whole} is not below {started_in}; copy it there, so that nothing else is shown"
         )
     for part in (whole, *whole.parents):
         if part == started_in:
             break
         if part.is_symlink():
-            raise ConfigError(f"{said}: {part} is a symbolic link; put a copy in its place")
+            raise ConfigError(f"{field}: {part} is a symbolic link; put a copy in its place")
     if not whole.exists():
-        raise ConfigError(f"{said}: {whole} does not exist")
+        raise ConfigError(f"{field}: {whole} does not exist")
     return whole
 
 
-def _files(said: str, root: Path, prefix: str) -> Iterator[tuple[str, File]]:
+def _files(field: str, root: Path, prefix: str) -> Iterator[tuple[str, File]]:
     """A file, or all files of a folder, by path from `prefix` on. ConfigError for links, devices, and too many or too large ones."""
     left, n, pending = MAX_BYTES, 0, [(root, prefix)]
     while pending:
@@ -171,17 +171,17 @@ def _files(said: str, root: Path, prefix: str) -> Iterator[tuple[str, File]]:
                 continue
             if not stat.S_ISREG(mode):
                 kind = "a symbolic link; put a copy in its place" if stat.S_ISLNK(mode) else "no regular file"
-                raise ConfigError(f"{said}: {path} is {kind}")
+                raise ConfigError(f"{field}: {path} is {kind}")
             with open(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC), "rb") as file:
                 data = file.read(left + 1)
         except OSError as error:
-            raise ConfigError(f"{said}: {path}: {error.strerror}") from error
+            raise ConfigError(f"{field}: {path}: {error.strerror}") from error
         if any("\ud800" <= character <= "\udfff" for character in name):
-            raise ConfigError(f"{said}: the name {str(path)!r} is not UTF-8; rename the file")
+            raise ConfigError(f"{field}: the name {str(path)!r} is not UTF-8; rename the file")
         left, n = left - len(data), n + 1
         if left < 0 or n > MAX_FILES:
             raise ConfigError(
-                f"{said}: more than {MAX_BYTES >> 20} MiB or {MAX_FILES} files; leave out what the agent does not need"
+                f"{field}: more than {MAX_BYTES >> 20} MiB or {MAX_FILES} files; leave out what the agent does not need"
             )
         yield name, File(data, bool(mode & 0o100))
 

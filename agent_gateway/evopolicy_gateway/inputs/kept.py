@@ -84,18 +84,18 @@ def changed(now: Sequence[AgentInput], then: Sequence[AgentInput]) -> str:
     """Which inputs differ, for an error; empty for none."""
     known = {(each.kind, each.name): each for each in then}
     here = {(each.kind, each.name): each for each in now}
-    told = [
+    differing = [
         f"{kind} {name}"
         for kind, name in sorted(known.keys() | here.keys())
         if known.get((kind, name)) != here.get((kind, name))
     ]
-    return ", ".join(told)
+    return ", ".join(differing)
 
 
 def _compare(now: Sequence[AgentInput], then: Sequence[AgentInput], where: str) -> None:
-    if told := changed(now, then):
+    if differing := changed(now, then):
         raise ConfigError(
-            f"{told} {where} changed after the run was opened: restore what was there, or start the run anew with --overwrite"
+            f"{differing} {where} changed after the run was opened: restore what was there, or start the run anew with --overwrite"
         )
 
 

@@ -143,11 +143,11 @@ class Gateway:
         """True when the permit is granted or the run is to be closed; False when ordered to leave the run open."""
         if self._alone:
             self._folder.unwatched.touch(mode=0o600)
-        asked = time.monotonic()
+        requested_at = time.monotonic()
         permit = asyncio.ensure_future(session.permit(self._agent_place, self._on_wait))
         waited: list[asyncio.Future[Any]] = [permit, self._orders]
         await asyncio.wait(waited, return_when=asyncio.FIRST_COMPLETED)
-        self.permit_s = time.monotonic() - asked
+        self.permit_s = time.monotonic() - requested_at
         self._on_wait("")
         if permit.done():
             return permit.result()

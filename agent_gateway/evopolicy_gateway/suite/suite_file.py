@@ -244,7 +244,7 @@ def _plan(
     harness = agent.agent or agent.config.harness if agent.config else agent.agent
     model = agent.config.model if agent.config is not None else None
     known = agent.config or harnesses.config_of(agent.agent, started_in)
-    told = texts.read(table.agents_md, table.prompts, known, started_in)
+    agent_texts = texts.read(table.agents_md, table.prompts, known, started_in)
     settings = run_settings(
         table,
         limits_from(table.limits or {}, "limits."),
@@ -254,7 +254,7 @@ def _plan(
         exp_id=f"{suite.name}-{repeat}",
         repeat=repeat,
         notes={"suite": suite.name},
-        **told.digests,
+        **agent_texts.digests,
     )
     return Plan(
         name=f"{agent.name}/{env}/{repeat}",
@@ -265,7 +265,7 @@ def _plan(
         wall_limit_s=table.agent_wall_s or WALL_S,
         silence_s=table.agent_silence_s or SILENCE_S,
         config=agent.config,
-        texts=told,
+        texts=agent_texts,
         parallel=agent.parallel,
         jail=agent.jail,
     )

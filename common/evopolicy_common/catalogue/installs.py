@@ -163,11 +163,11 @@ def divided(env_ids: Iterable[str]) -> dict[str, list[str]]:
         _check_version(family, playing[0])
         found.setdefault(playing[0].python, []).append(env_id)
     if lacking:
-        told = "; ".join(
+        remedies = "; ".join(
             f"{env_ids[0]}{f' and {len(env_ids) - 1} more' * (len(env_ids) > 1)}: {setup_line(family)}"
             for family, env_ids in lacking.items()
         )
-        raise ConfigError(f"not installed on this machine: {told}")
+        raise ConfigError(f"not installed on this machine: {remedies}")
     return found
 
 

@@ -25,10 +25,10 @@ def boot_id() -> str:
         pass
     if platform.system() != "Darwin":
         return ""
-    asked = subprocess.run(
+    done = subprocess.run(
         ["sysctl", "-n", "kern.bootsessionuuid"], capture_output=True, text=True, check=False
     )
-    return asked.stdout.strip().lower() if asked.returncode == 0 else ""
+    return done.stdout.strip().lower() if done.returncode == 0 else ""
 
 
 def machine_id() -> str:

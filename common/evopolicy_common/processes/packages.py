@@ -35,17 +35,17 @@ def files_of(names: Iterable[str], *, metadata_too: bool = False) -> dict[str, s
     distributions: set[str] = set()
     pending = [(name, name) for name in wanted]
     while pending:
-        name, asked = pending.pop()
+        name, requested = pending.pop()
         if name in distributions:
             continue
         distributions.add(name)
         tops, needs = (
             _numpy()
             if name == "numpy"
-            else _one(name, asked, required=name in wanted, metadata_too=metadata_too)
+            else _one(name, requested, required=name in wanted, metadata_too=metadata_too)
         )
         found.update(tops)
-        pending += [(need, asked) for need in needs]
+        pending += [(need, requested) for need in needs]
     return found
 
 
@@ -77,12 +77,12 @@ def policy_versions(names: Iterable[str]) -> dict[str, str]:
 
     Empty without packages. Raises as `files_of`.
     """
-    asked = sorted(set(names))
-    if not asked:
+    requested = sorted(set(names))
+    if not requested:
         return {}
-    files_of(asked)
-    found = {f"{POLICY}:{name}": version for name, version in versions_of(asked).items() if name != "numpy"}
-    return {POLICY: ",".join(asked), **found}
+    files_of(requested)
+    found = {f"{POLICY}:{name}": version for name, version in versions_of(requested).items() if name != "numpy"}
+    return {POLICY: ",".join(requested), **found}
 
 
 def packages_in(fingerprint: Mapping[str, str]) -> tuple[str, ...]:
@@ -115,7 +115,7 @@ def _numpy() -> tuple[dict[str, str], list[str]]:
     return {path.name: str(path) for path in both if path.is_dir()}, []
 
 
-def _one(name: str, asked: str, *, required: bool, metadata_too: bool) -> tuple[dict[str, str], list[str]]:
+def _one(name: str, requested: str, *, required: bool, metadata_too: bool) -> tuple[dict[str, str], list[str]]:
     """Folders and modules of one distribution, and what it requires."""
     # A run.json of somebody else may name anything, which would stand in a command to be copied.
     if required and not _NAME.fullmatch(name):
@@ -138,9 +138,9 @@ def _one(name: str, asked: str, *, required: bool, metadata_too: bool) -> tuple[
     simulators |= {point.name for point in distribution.entry_points if point.group in _ENVIRONMENTS}
     simulators |= {"evopolicy"} if _canonical(distribution.metadata["Name"]) == "evopolicy" else set()
     if simulators:
-        which = "is" if name == asked else f"requires {name}, which is"
+        which = "is" if name == requested else f"requires {name}, which is"
         raise ConfigError(
-            f"package {asked!r} {which} a simulator ({min(simulators)}); no policy or agent may see one"
+            f"package {requested!r} {which} a simulator ({min(simulators)}); no policy or agent may see one"
         )
     return entries, _requires(distribution)
 

@@ -92,11 +92,11 @@ class OperatorClient:
     async def describe(self, message: DescribeEnvironment) -> EnvironmentState:
         """What the cluster has for replaying a finished run's episodes. Waits for a worker that describes the environment
         now."""
-        asked = replace(message, token=self._token)
+        request = replace(message, token=self._token)
         until = time.monotonic() + DESCRIPTION_S
         while True:
             found = await self._requests.until_answered(
-                "describe", asked, EnvironmentState, timeout_s=TIMEOUT_S
+                "describe", request, EnvironmentState, timeout_s=TIMEOUT_S
             )
             if not found.awaited or time.monotonic() > until:
                 return found
@@ -179,9 +179,9 @@ class OperatorClient:
         Yields `(outcome, total, "")` or `(None, total, waits_for)`; `total` is the number of episodes. Cancels the
         evaluation when the caller stops before its end. Raises RefusedError when somebody else cancels it.
         """
-        asked = replace(message, token=self._token)
+        request = replace(message, token=self._token)
         started = await self._requests.until_answered(
-            "evaluate", asked, EvaluationStarted, timeout_s=TIMEOUT_S
+            "evaluate", request, EvaluationStarted, timeout_s=TIMEOUT_S
         )
         cursor, finished = 0, False
         try:

@@ -152,7 +152,7 @@ async def _serve(address: Address, order: _Order) -> None:
 
     end_on_sigterm()
     found = order.found
-    if found is not None and not order.named and not await _answers(found):
+    if found is not None and not order.named and not await _is_reachable(found):
         say("this machine's coordinator does not answer: the folders alone are shown", err=True)
         found = None
     with listen(address) as sock:
@@ -193,7 +193,7 @@ def site_roots(roots: list[Path]) -> list[Path]:
     return [root.resolve() for root in roots] or [Path.cwd()]
 
 
-async def _answers(found: Credentials) -> bool:
+async def _is_reachable(found: Credentials) -> bool:
     """Whether this machine's coordinator is there."""
     try:
         async with asyncio.timeout(_REACH_S), transport.connect(found) as link:

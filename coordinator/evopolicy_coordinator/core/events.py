@@ -31,7 +31,7 @@ class Event(msgspec.Struct, frozen=True, kw_only=True):
     stimulus_id: str = ""
 
 
-class Asked(Event, Generic[M_co], frozen=True, kw_only=True):
+class Requested(Event, Generic[M_co], frozen=True, kw_only=True):
     """A request arrived: the message itself, with waits and cursors made finite."""
 
     request: RequestId
@@ -40,7 +40,7 @@ class Asked(Event, Generic[M_co], frozen=True, kw_only=True):
     """Seconds for which the request lay unread because the loop was blocked."""
 
 
-class RunCreated(Asked[CreateRun], frozen=True, kw_only=True):
+class RunCreated(Requested[CreateRun], frozen=True, kw_only=True):
     """An operator requested a run; a known `key` returns the existing run."""
 
     row: RunRow
@@ -48,21 +48,21 @@ class RunCreated(Asked[CreateRun], frozen=True, kw_only=True):
     (`keys.valid_name`)."""
 
 
-class EvaluationRequested(Asked[Evaluate | Rescore], frozen=True, kw_only=True):
+class EvaluationRequested(Requested[Evaluate | Rescore], frozen=True, kw_only=True):
     """An operator requested cases to be played outside any run; a known `key` returns the existing evaluation."""
 
     row: EvaluationRow
     """Complete except for creation time and stimulus id."""
 
 
-class DisclosureAsked(Asked[Disclose], frozen=True, kw_only=True):
+class DisclosureRequested(Requested[Disclose], frozen=True, kw_only=True):
     """An operator requested that the cases of finished runs be declared public."""
 
     epochs: tuple[str, ...]
     """Epochs of the runs, each once."""
 
 
-class WorkerRegistered(Asked[Register], frozen=True, kw_only=True):
+class WorkerRegistered(Requested[Register], frozen=True, kw_only=True):
     """A worker started, or found its session unknown."""
 
     session: str
@@ -118,4 +118,4 @@ class AuditCompared(Event, frozen=True, kw_only=True):
 
 AuditEvent = AuditPrepared | AuditCompared
 
-AnyEvent = Asked[Any] | LivenessLost | DescriptionAwaited | AuditEvent
+AnyEvent = Requested[Any] | LivenessLost | DescriptionAwaited | AuditEvent

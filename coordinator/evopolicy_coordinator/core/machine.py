@@ -66,7 +66,7 @@ class Core:
         """Process an event; the shell carries out the returned effects in order."""
         self._watch(now)
         this = Step(now, event.stimulus_id)
-        EVENTS[type(event.message if isinstance(event, events.Asked) else event)](self.state, event, this)
+        EVENTS[type(event.message if isinstance(event, events.Requested) else event)](self.state, event, this)
         return self._end(this)
 
     def next_deadline(self) -> float | None:

@@ -210,8 +210,8 @@ async def _play(ask: OperatorClient, files: Files, part: Chosen, bundle: Bundle,
         ),
     )
     seen: set[int] = set()
-    async with contextlib.aclosing(ask.evaluate(message)) as told:
-        async for outcome, _, _ in told:
+    async with contextlib.aclosing(ask.evaluate(message)) as outcomes:
+        async for outcome, _, _ in outcomes:
             if outcome is None:
                 continue
             index = part.indexes[outcome.index]

@@ -73,13 +73,13 @@ class Definitions:
             return "a worker of an earlier version cannot tell its definition: install the same version of evopolicy on both"
         return ""
 
-    def pin(self, env: str, asked: str, workers: Iterable[Worker]) -> str:
+    def pin(self, env: str, requested: str, workers: Iterable[Worker]) -> str:
         """Returns the definition that a run or an evaluation of `env` is played in; empty: any accepted one.
 
         `asked`: the first digits of the digest that the operator named. Raises RefusedError, with similar names and
         the remedy, when no worker offers it or the operator has not approved it.
         """
-        if self._trusting and not asked:
+        if self._trusting and not requested:
             return ""
         offering = [each.profile for each in workers]
         offers = {
@@ -87,8 +87,8 @@ class Definitions:
             for each in offering
             if env in each.descriptions
         }
-        if asked:
-            return self._named(env, asked, list(offers))
+        if requested:
+            return self._named(env, requested, list(offers))
         if catalogue.is_shipped(env) and env in self._shipped:
             return ""
         if not offers:
@@ -109,30 +109,30 @@ class Definitions:
             f" {env}@{next(iter(offers))}`",
         )
 
-    def _named(self, env: str, asked: str, offers: list[str]) -> str:
-        if len(asked) < LEAST_DIGITS or not all(each in "0123456789abcdef" for each in asked):
+    def _named(self, env: str, requested: str, offers: list[str]) -> str:
+        if len(requested) < LEAST_DIGITS or not all(each in "0123456789abcdef" for each in requested):
             raise RefusedError(
                 Refusal.INVALID_SETTINGS,
-                f"{env}@{asked[:80]}: a definition's digest has {LEAST_DIGITS} hex digits or more, as `evopolicy envs` shows it",
+                f"{env}@{requested[:80]}: a definition's digest has {LEAST_DIGITS} hex digits or more, as `evopolicy envs` shows it",
             )
-        found = [each for each in offers if each.startswith(asked) or asked.startswith(each)]
+        found = [each for each in offers if each.startswith(requested) or requested.startswith(each)]
         if len(found) == 1:
             return found[0]
         if self._trusting and not offers:  # its worker is about to register
-            return asked[:DEFINITION_DIGITS]
+            return requested[:DEFINITION_DIGITS]
         offered = ", ".join(offers) or "none"
         raise RefusedError(
-            Refusal.INVALID_SETTINGS, f"no worker offers {env} in definition {asked}; offered are: {offered}"
+            Refusal.INVALID_SETTINGS, f"no worker offers {env} in definition {requested}; offered are: {offered}"
         )
 
-    def approve(self, env: str, asked: str, workers: Iterable[Worker]) -> None:
+    def approve(self, env: str, requested: str, workers: Iterable[Worker]) -> None:
         """Approves a definition and stores the approval. Raises RefusedError when no worker offers it."""
         offers = {
             each.profile.fingerprints[env].definition: None
             for each in workers
             if env in each.profile.descriptions
         }
-        digest = self._named(env, asked, list(offers))
+        digest = self._named(env, requested, list(offers))
         kept = [each for each in self.approved.get(env, []) if each != digest]
         self.approved[env] = [*kept, digest]
         if self._file is not None:

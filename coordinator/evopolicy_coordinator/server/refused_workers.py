@@ -26,15 +26,15 @@ class RefusedWorkers:
         if not key.endswith("/work/register"):
             return
         try:
-            asked = codec.decode(codec.worker_requests, payload)
+            request = codec.decode(codec.worker_requests, payload)
         except ProtocolError:
             return
-        if not isinstance(asked, Register):
+        if not isinstance(request, Register):
             return
-        name = asked.worker[:64]
+        name = request.worker[:64]
         self._last.pop(name, None)
         if isinstance(answer, Refused):
-            self._last[name] = (asked.host[:64], answer.message[:_MAX_TEXT], now)
+            self._last[name] = (request.host[:64], answer.message[:_MAX_TEXT], now)
             while len(self._last) > KEPT:
                 self._last.popitem(last=False)
 

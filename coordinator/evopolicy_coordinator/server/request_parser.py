@@ -202,7 +202,7 @@ class RequestParser:
         if make is not None:
             return make(self, message, request, stimulus_id)
         checked = _CHECKS[type(message)](self, message)
-        return events.Asked(stimulus_id=stimulus_id, request=request, message=checked)
+        return events.Requested(stimulus_id=stimulus_id, request=request, message=checked)
 
     def _as_it_is(self, m: Message) -> Message:
         return m
@@ -509,15 +509,15 @@ class RequestParser:
         """Number of cases of each split for a run; files supply all of theirs unless the run requests fewer."""
         if min(_or(n_validation, 1), _or(n_heldout, 1)) < 1:
             raise ConfigError("a run needs at least one validation and one held-out case")
-        asked: dict[Split, int | None] = {"train": None, "validation": n_validation, "heldout": n_heldout}
+        requested: dict[Split, int | None] = {"train": None, "validation": n_validation, "heldout": n_heldout}
         usual: dict[Split, int] = {
             "train": suite.n_train,
             "validation": suite.n_validation,
             "heldout": suite.n_heldout,
         }
         if self._source.from_files:
-            return {split: n for split, n in asked.items() if n is not None}
-        return {split: _or(asked[split], n) for split, n in usual.items()}
+            return {split: n for split, n in requested.items() if n is not None}
+        return {split: _or(requested[split], n) for split, n in usual.items()}
 
     def _check_again(self, m: operator.Evaluate, n: int) -> None:
         """Checks that a request to replay episodes is consistent, and that its recordings are stored."""

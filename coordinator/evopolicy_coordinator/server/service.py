@@ -48,7 +48,7 @@ from evopolicy_coordinator.core.events import (
     AnyEvent,
     AuditEvent,
     DescriptionAwaited,
-    DisclosureAsked,
+    DisclosureRequested,
     LivenessLost,
 )
 from evopolicy_coordinator.core.machine import Core
@@ -330,7 +330,7 @@ class Service:
             return self._parser.rescore_requested(message, request, stimulus, of, result)
         if isinstance(message, operator.Disclose):
             epochs = self._reader.epochs(message.runs)
-            return DisclosureAsked(stimulus_id=stimulus, request=request, message=message, epochs=epochs)
+            return DisclosureRequested(stimulus_id=stimulus, request=request, message=message, epochs=epochs)
         return self._parser.event(parsed, request, stimulus)
 
     async def _serve_description(

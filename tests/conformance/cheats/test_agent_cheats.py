@@ -74,8 +74,8 @@ def test_nothing_of_the_jail_reaches_a_port_of_this_machine(
 def test_a_cheating_run_is_scored_by_its_honest_submit_alone(jailed: CheatingRun) -> None:
     feedback = jailed.folder / "workspace" / "feedback"
     assert [path.name for path in feedback.iterdir()] == ["submit_000"]
-    told = json.loads((feedback / "submit_000" / "summary.json").read_text())
-    assert told == jailed.report["submit"]["summary"]
+    document = json.loads((feedback / "submit_000" / "summary.json").read_text())
+    assert document == jailed.report["submit"]["summary"]
     assert jailed.record.outcome.status == "completed"
     assert jailed.record.outcome.budget_used == 2
 
@@ -108,8 +108,8 @@ def test_what_was_used_is_recorded(jailed: CheatingRun, unjailed: CheatingRun) -
 
 @pytest.mark.parametrize("agent", ["evolve", "random"])
 def test_an_honest_agent_plays_its_run_in_the_jail(cheated: Cheated, agent: str) -> None:
-    code, said, folder = cheated.play(agent, f"honest-{agent}")
-    assert code == 0, said
+    code, output, folder = cheated.play(agent, f"honest-{agent}")
+    assert code == 0, output
     record = decode_run_record((folder / "run.json").read_bytes())
     assert (record.outcome.status, record.outcome.budget_used, record.jail) == ("completed", 4, "bwrap")
 
@@ -125,22 +125,22 @@ with socket.create_connection(("127.0.0.1", port), 5) as sock:
 host, _, proxy = os.environ["HTTPS_PROXY"].rpartition("/")[2].partition(":")
 with socket.create_connection((host, int(proxy)), 5) as sock:
     sock.sendall(f"CONNECT localhost:{port} HTTP/1.1\\r\\n\\r\\n".encode())
-    said = b""
-    while not said.endswith(b"hello"):
-        said += sock.recv(100)
+    received = b""
+    while not received.endswith(b"hello"):
+        received += sock.recv(100)
 home = os.path.expanduser("~")
 notes = open(os.path.join(home, "notes")).read()
 open(os.path.join(home, "mine"), "w").close()
 body = json.dumps({"env_instances": [0]}).encode()
 urllib.request.urlopen(urllib.request.Request(os.environ["EVOPOLICYGYM_SUBMIT_URL"], data=body)).read()
-open("report.json", "w").write(json.dumps([direct, said.decode(), notes, os.environ["OPERATORS_SECRET"]]))
+open("report.json", "w").write(json.dumps([direct, received.decode(), notes, os.environ["OPERATORS_SECRET"]]))
 """
     program = tmp_path / "agent.py"
     program.write_text(code.replace("PORT", str(cheated.listener.port)))
     options = ["--allow-host", f"localhost:{cheated.listener.port}", "--jail-env", "OPERATORS_SECRET"]
     options += ["--jail-bind", str(cheated.home / "notes")]
-    exit_code, said, folder = cheated.play(f"command:{sys.executable} {program}", "named", *options)
-    assert exit_code == 0, said
+    exit_code, output, folder = cheated.play(f"command:{sys.executable} {program}", "named", *options)
+    assert exit_code == 0, output
     direct, proxied, notes, variable = json.loads((folder / "workspace" / "report.json").read_text())
     assert (direct, proxied[:12]) == ("hello", "HTTP/1.1 200")
     assert notes == variable
@@ -155,11 +155,11 @@ def test_without_bubblewrap_there_is_no_run_unless_the_jail_is_given_up(
     path = cheated.environment["PATH"]
     cheated.environment["PATH"] = str(tmp_path)
     try:
-        code, said, folder = cheated.play("evolve", "no-bubblewrap")
+        code, output, folder = cheated.play("evolve", "no-bubblewrap")
     finally:
         cheated.environment["PATH"] = path
     assert code == 2
-    assert "--jail none" in said
+    assert "--jail none" in output
     assert not folder.exists()
 
 
@@ -177,7 +177,7 @@ def test_an_agent_whose_time_is_over_is_asked_before_its_jail_is_torn_down(
         "time.sleep(1000)\n"
     )
     options = ["--agent-wall-s", "3"]
-    code, said, folder = cheated.play(f"command:{sys.executable} {program}", "asked", *options)
-    assert code == 3, said
+    code, output, folder = cheated.play(f"command:{sys.executable} {program}", "asked", *options)
+    assert code == 3, output
     assert (folder / "workspace" / "ready").exists()
     assert (folder / "workspace" / "bye").exists()

@@ -134,8 +134,8 @@ def test_hidden_returns_are_written_only_when_gateway_and_agent_are_gone(golden:
     assert {f"return of held-out {index}" for index in range(2)} <= hidden.found_in(record)
     files = golden.read_files()
     # Both are the operator's, written at the end.
-    for told in (record, files.pop("logs/env.log", b"")):
-        assert not any(name.startswith(("seed", "mark")) for name in hidden.found_in(told))
+    for content in (record, files.pop("logs/env.log", b"")):
+        assert not any(name.startswith(("seed", "mark")) for name in hidden.found_in(content))
     for path, data in files.items():
         assert hidden.found_in(data) == set(), path
     assert decode_run_record(record).outcome.budget_used == N_SUBMITS * len(EPISODES)
@@ -151,8 +151,8 @@ def test_the_search_finds_the_seeds_and_returns_where_they_do_cross(golden: Gold
 
 def test_a_planted_leak_is_found_in_traffic_memory_and_workspace(leaky: GoldenRun) -> None:
     hidden = hidden_of(leaky)
-    told = {"return of validation of submit 0 0", "return of validation of submit 0 1"}
-    wanted = seeds_of(leaky) | told
+    expected = {"return of validation of submit 0 0", "return of validation of submit 0 1"}
+    wanted = seeds_of(leaky) | expected
     assert wanted <= hidden.found_in(bytes(leaky.wiretap.heard))
     tapped = [hidden.found_in(payload) for _, _, payload in leaky.cluster.crossed(f"/gw/{leaky.run}/")]
     assert wanted <= set().union(*tapped)

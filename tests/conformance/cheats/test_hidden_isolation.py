@@ -48,23 +48,23 @@ class Listening:
         self.cluster = cluster
         self.root = cluster.root / "runs" / "e" / "toy_line" / name
         self.folder = RunFolder(self.root)
-        self.said = cluster.root / f"{name}-said"
+        self.log = cluster.root / f"{name}-log"
         words = ["run", "--env", "toy/line", "--agent", agent, "--entry", "e", "--exp-id", name, *options]
         words += ["--credentials", cluster.files["operator"], "--runs", str(cluster.root / "runs")]
-        with self.said.open("wb") as said:
+        with self.log.open("wb") as log:
             self.process = subprocess.Popen(
                 [sys.executable, "-m", "evopolicy_gateway.cli", *words, "--budget", "8"],
                 env=cluster.environment,
                 cwd=cluster.root,
-                stdout=said,
-                stderr=said,
+                stdout=log,
+                stderr=log,
             )
 
     def wait_for(self, condition: Callable[[], object]) -> None:
         deadline = time.monotonic() + 2 * TIMEOUT_S
         while not condition():
-            assert self.process.poll() is None, self.said.read_text()
-            assert time.monotonic() < deadline, self.said.read_text()
+            assert self.process.poll() is None, self.log.read_text()
+            assert time.monotonic() < deadline, self.log.read_text()
             time.sleep(0.05)
 
     @property
@@ -85,7 +85,7 @@ class Listening:
         return self.record()
 
     def record(self) -> RunRecord:
-        assert self.process.wait(timeout=2 * TIMEOUT_S) == 0, self.said.read_text()
+        assert self.process.wait(timeout=2 * TIMEOUT_S) == 0, self.log.read_text()
         return decode_run_record(self.folder.run_json.read_bytes())
 
 
@@ -207,14 +207,14 @@ def test_sibling_hears_nothing_of_a_run_that_is_scored_only_when_it_is_gone(isol
             time.sleep(QUIET_S)
             assert recognised(sibling.heard()[n_before:], pulses(isolated, "heldout")) == 0
             assert scored.process.poll() is None
-            assert "waiting for" in scored.said.read_text()
+            assert "waiting for" in scored.log.read_text()
             sibling.stop()
             scored.record()
     assert met(isolated, moments(isolated)) == []
 
 
 def run_of(run: Listening) -> str:
-    return run.said.read_text().partition("run ")[2].split()[0]
+    return run.log.read_text().partition("run ")[2].split()[0]
 
 
 def test_hidden_episodes_are_not_played_beside_train_episodes_whose_agent_is_elsewhere(
@@ -225,7 +225,7 @@ def test_hidden_episodes_are_not_played_beside_train_episodes_whose_agent_is_els
     words = ("--http", "127.0.0.1:0", "--agent-host", kernel)
     far = Listening(isolated, "far", "remote", "--tier", "none", *words)
     try:
-        far.wait_for(lambda: far.folder.bearer.exists() and "served at" in far.said.read_text())
+        far.wait_for(lambda: far.folder.bearer.exists() and "served at" in far.log.read_text())
         elsewhere = run_of(far)
         (far.folder.system / "policy.py").write_bytes(POLICY.read_bytes())
         with listening(isolated, "near", 1) as near:
@@ -246,7 +246,7 @@ def test_hidden_episodes_are_not_played_beside_train_episodes_whose_agent_is_els
 
 
 def submitted(run: Listening, episodes: list[int]) -> str:
-    url = next(line.split()[-1] for line in run.said.read_text().splitlines() if "served at" in line)
+    url = next(line.split()[-1] for line in run.log.read_text().splitlines() if "served at" in line)
     request = urllib.request.Request(
         url,
         data=json.dumps({"env_instances": episodes}).encode(),

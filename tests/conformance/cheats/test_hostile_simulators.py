@@ -116,9 +116,9 @@ def attempts(slots: Slots, tier: Tier) -> dict[str, str]:
         slot = slots.new(tier)
         try:
             await slot.start()
-            with pytest.raises(WorkerError) as told:
+            with pytest.raises(WorkerError) as caught:
                 await slot.play(make_job(env=ENV, bundle=None, tier=tier), None, lambda episodes, steps: None)
-            return str(told.value)
+            return str(caught.value)
         finally:
             await slot.close()
 
@@ -180,9 +180,9 @@ def test_graphics_devices_are_there_for_videos_only(
 
     async def play(slot: Slot, video: bool) -> str:
         job = make_job(env=ENV, bundle=None, video=video)
-        with pytest.raises(WorkerError) as told:
+        with pytest.raises(WorkerError) as caught:
             await slot.play(job, None, lambda episodes, steps: None)
-        return str(told.value)
+        return str(caught.value)
 
     slot = slots.new()
     slots.run(slot.start())

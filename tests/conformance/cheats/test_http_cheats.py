@@ -178,7 +178,7 @@ def test_a_request_inside_another_ones_body_is_never_served_or_has_to_know_the_t
         chunk = b"%x\r\n%s\r\n0\r\n\r\n" % (len(BODY), BODY)
         lengths = f"Content-Length: {len(BODY)}\r\n"
         # Told twice, and differently, how long the body is: refused, or cut off.
-        for told in (
+        for answer_text in (
             f"{lengths}Content-Length: 5\r\n",
             f"Content-Length: +{len(BODY)}\r\n",
             f"Content-Length: {len(BODY):#x}\r\n",
@@ -191,9 +191,9 @@ def test_a_request_inside_another_ones_body_is_never_served_or_has_to_know_the_t
             "Transfer-Encoding: chunked\r\nTransfer-Encoding: chunked\r\n",
             f"X: y\0z\r\n{lengths}",
         ):
-            answer = await w.send((head + told + "\r\n").encode() + BODY + inner)
-            assert status(answer) in (0, 400, 501), told
-            assert answer.count(b"HTTP/1.1") <= 1, told
+            answer = await w.send((head + answer_text + "\r\n").encode() + BODY + inner)
+            assert status(answer) in (0, 400, 501), answer_text
+            assert answer.count(b"HTTP/1.1") <= 1, answer_text
         assert w.served.double.submits == []
         # Chunks go before a length, here as for every server that a front would hand this on to: the rest is no request.
         both = f"{head}Transfer-Encoding: chunked\r\nContent-Length: {len(chunk) + 10}\r\nConnection: close\r\n\r\n"
@@ -296,8 +296,8 @@ def test_feedback_that_cannot_be_written_is_told_without_the_machines_paths(
             assert status(await w.ask(f"{w.path}/submit?wait=false", "POST", length, BODY)) == 202
             waits_for = ""
             while not waits_for:
-                told = json.loads((await w.ask(f"{w.path}/info")).partition(b"\r\n\r\n")[2])
-                waits_for = told["submit_in_flight"]["waits_for"]
+                document = json.loads((await w.ask(f"{w.path}/info")).partition(b"\r\n\r\n")[2])
+                waits_for = document["submit_in_flight"]["waits_for"]
         assert waits_for == "the gateway cannot write feedback: No space left on device"
         await w.served.pipeline.idle()
         await w.submit_honestly(1)

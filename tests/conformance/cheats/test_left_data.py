@@ -24,8 +24,8 @@ class Left:
         policy = PROGRAMS / "leaving_policy.py"
         words = f"command:{sys.executable} {PROGRAMS / 'listening_agent.py'} {policy}"
         # Without a jail the agent and what plays its policy share the machine's folders, ports and names.
-        code, said, self.folder = cheated.play(words, "left", "--jail", "none")
-        assert code == 0, said
+        code, output, self.folder = cheated.play(words, "left", "--jail", "none")
+        assert code == 0, output
         self.report: dict[str, Any] = json.loads((self.folder / "workspace" / "report.json").read_text())
 
 
@@ -35,27 +35,27 @@ def left(cheated: Cheated) -> Left:
 
 
 def test_the_policy_left_something_in_every_train_episode(left: Left) -> None:
-    assert len(left.report["said"]) == N_TRAIN
-    assert all(said["left"] for said in left.report["said"])
+    assert len(left.report["reports"]) == N_TRAIN
+    assert all(report["left"] for report in left.report["reports"])
 
 
 def test_its_next_episode_finds_nothing(left: Left) -> None:
-    assert [said["before"] for said in left.report["said"]] == [[]] * N_TRAIN
+    assert [report["before"] for report in left.report["reports"]] == [[]] * N_TRAIN
 
 
 def test_its_agent_finds_nothing_and_is_not_called(left: Left) -> None:
     assert left.report["files"] == []
     assert left.report["called"] == []
-    assert [said["reached"] for said in left.report["said"]] == [[]] * N_TRAIN
+    assert [report["reached"] for report in left.report["reports"]] == [[]] * N_TRAIN
 
 
 def test_what_it_says_in_hidden_episodes_is_kept_nowhere_in_the_run(left: Left) -> None:
-    marks = {said["mark"].encode() for said in left.report["said"]}
+    marks = {report["mark"].encode() for report in left.report["reports"]}
     assert len(marks) == N_TRAIN
     for path in left.folder.rglob("*"):
         if path.is_file():
-            told = [part.partition(b"-of-an-episode")[0] for part in path.read_bytes().split(b"mark-")[1:]]
-            hexadecimal = [b"mark-" + word + b"-of-an-episode" for word in told if word.isalnum()]
+            found = [part.partition(b"-of-an-episode")[0] for part in path.read_bytes().split(b"mark-")[1:]]
+            hexadecimal = [b"mark-" + word + b"-of-an-episode" for word in found if word.isalnum()]
             assert set(hexadecimal) <= marks, path
     outcome = decode_run_record((left.folder / "run.json").read_bytes()).outcome
     assert (outcome.status, outcome.budget_used, len(outcome.heldout_returns)) == ("completed", N_TRAIN, 2)

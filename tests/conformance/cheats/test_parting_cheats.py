@@ -27,9 +27,9 @@ def test_traps_that_an_agent_leaves_catch_nobody(
     (outside / "plot.png").write_bytes(b"not the agent's")
     words = f"command:{sys.executable} {AGENT} '{how}' '{outside}'"
     # The link is of use to an agent that does not see where it leads, too.
-    code, said, folder = cheated.play(words, f"parting {how}".replace(" ", "-"))
+    code, output, folder = cheated.play(words, f"parting {how}".replace(" ", "-"))
     request.addfinalizer(lambda: remove_tree(folder / "workspace"))
-    assert code == 0, said
+    assert code == 0, output
     outcome = decode_run_record((folder / "run.json").read_bytes()).outcome
     assert (outcome.status, outcome.budget_used) == ("completed", 1)
     assert not (folder / ".gateway").exists()
@@ -46,8 +46,8 @@ def test_traps_that_an_agent_leaves_catch_nobody(
     if how == "as it is":  # the rest of the workspace is the same in all of them
         check_readers(folder, tmp_path / "report")
     if how == "deep":
-        code, said, again = cheated.play("random", folder.name, "--overwrite")
-        assert (code, again) == (0, folder), said
+        code, output, again = cheated.play("random", folder.name, "--overwrite")
+        assert (code, again) == (0, folder), output
         assert not (workspace / "d").exists()
 
 
@@ -64,6 +64,6 @@ def check_readers(folder: Path, report: Path) -> None:
     page = "".join(path.read_text() for path in report.rglob("*.html"))
     assert page
     assert "root:x:0" not in page
-    (told,) = differences(folder, folder)
-    assert told.startswith("workspace/huge.png: ")
-    assert told.endswith("too many to compare")
+    (difference,) = differences(folder, folder)
+    assert difference.startswith("workspace/huge.png: ")
+    assert difference.endswith("too many to compare")

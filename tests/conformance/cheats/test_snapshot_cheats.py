@@ -28,12 +28,12 @@ REFUSED = (
 class Swapped:
     def __init__(self, cheated: Cheated, *options: str) -> None:
         name = "swapped" + "".join(options)
-        self.code, self.said, self.folder = cheated.play(
+        self.code, self.output, self.folder = cheated.play(
             f"command:{sys.executable} {AGENT}", name, "--budget", "20", *options
         )
-        assert self.code == 0, self.said
+        assert self.code == 0, self.output
         report = (self.folder / "workspace" / "report.json").read_text()
-        self.told: list[tuple[str, str]] = [tuple(each) for each in json.loads(report)]
+        self.verdicts: list[tuple[str, str]] = [tuple(each) for each in json.loads(report)]
 
 
 @pytest.fixture(scope="module", params=[(), ("--jail", "none")], ids=["jailed", "unjailed"])
@@ -56,12 +56,12 @@ def test_no_submit_holds_what_its_agent_has_not_written(swapped: Swapped) -> Non
 
 
 def test_what_is_a_link_a_pipe_or_too_much_is_charged_and_named(swapped: Swapped) -> None:
-    honest, raced, spoiled = swapped.told[0], swapped.told[1 : 1 + N_RACES], swapped.told[1 + N_RACES : -1]
-    assert honest[0] == swapped.told[-1][0] == "ok"
+    honest, raced, spoiled = swapped.verdicts[0], swapped.verdicts[1 : 1 + N_RACES], swapped.verdicts[1 + N_RACES : -1]
+    assert honest[0] == swapped.verdicts[-1][0] == "ok"
     assert {status for status, _ in raced} <= {"ok", "missing_policy", "import_error"}
     assert [status for status, _ in spoiled] == [status for status, _ in REFUSED]
-    for (_, told), (_, named) in zip(spoiled, REFUSED, strict=True):
-        assert named in told
-        assert str(swapped.folder) not in told
+    for (_, verdict), (_, named) in zip(spoiled, REFUSED, strict=True):
+        assert named in verdict
+        assert str(swapped.folder) not in verdict
     record = decode_run_record((swapped.folder / "run.json").read_bytes())
-    assert (record.outcome.status, record.outcome.budget_used) == ("completed", len(swapped.told))
+    assert (record.outcome.status, record.outcome.budget_used) == ("completed", len(swapped.verdicts))

@@ -45,8 +45,8 @@ class Probed:
         policy = root / "policy.py"
         policy.write_text(POLICY.read_text())
         options = ["--jail-bind", str(policy), "--validation", str(N_CASES), "--heldout", str(N_CASES)]
-        code, said, folder = cheated.play(f"command:{sys.executable} {agent} {policy}", "probed", *options)
-        assert code == 0, said
+        code, output, folder = cheated.play(f"command:{sys.executable} {agent} {policy}", "probed", *options)
+        assert code == 0, output
         self.record: RunRecord = decode_run_record((folder / "run.json").read_bytes())
         feedback = folder / "workspace" / "feedback" / "submit_000" / "episodes" / "ep_000"
         self.names = (feedback / "stdout.txt").read_text().splitlines()
@@ -96,11 +96,11 @@ def test_the_probing_policy_sees_much_and_tells_all_of_it(probed: Probed) -> Non
 def test_what_a_policy_sees_is_the_same_in_train_validation_and_held_out(probed: Probed) -> None:
     fixed = [name for name in probed.names if name not in DIFFER]
     differences = {
-        (split, index, name): (facts[name], told[name])
+        (split, index, name): (facts[name], train_facts[name])
         for split in ("validation", "heldout")
-        for index, (facts, told) in enumerate(zip(probed.seen[split], probed.seen["train"], strict=True))
+        for index, (facts, train_facts) in enumerate(zip(probed.seen[split], probed.seen["train"], strict=True))
         for name in fixed
-        if facts[name] != told[name]
+        if facts[name] != train_facts[name]
     }
     assert differences == {}
 

@@ -48,12 +48,12 @@ class Eavesdropped:
         try:
             wait_until(lambda: (workspace / "listening").exists() or played)
             assert not played, played
-            self.code, self.said, self.honest = cheated.play("evolve", "overheard")
+            self.code, self.output, self.honest = cheated.play("evolve", "overheard")
             (workspace / "enough").touch()
         finally:
             thread.join(TIMEOUT_S)
-        ((code, said, self.folder),) = played
-        assert code == 0, said
+        ((code, output, self.folder),) = played
+        assert code == 0, output
         self.report: dict[str, Any] = json.loads((workspace / "report.json").read_text())
 
 
@@ -84,7 +84,7 @@ def test_its_session_is_answered_on_its_own_runs_keys_alone(eavesdropped: Eavesd
 
 
 def test_the_honest_run_beside_it_is_played_as_if_nobody_listened(eavesdropped: Eavesdropped) -> None:
-    assert eavesdropped.code == 0, eavesdropped.said
+    assert eavesdropped.code == 0, eavesdropped.output
     record = decode_run_record((eavesdropped.honest / "run.json").read_bytes())
     assert (record.outcome.status, record.outcome.budget_used) == ("completed", 4)
     assert decode_run_record((eavesdropped.folder / "run.json").read_bytes()).outcome.budget_used == 1

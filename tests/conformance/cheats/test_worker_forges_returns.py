@@ -60,7 +60,7 @@ class Workers:
                 [sys.executable, str(script), how, *options], stdout=log, stderr=log
             )
 
-    def said(self, name: str) -> str:
+    def log_of(self, name: str) -> str:
         return (self._root / f"{name}.log").read_text()
 
     async def ended(self, name: str) -> int:
@@ -128,10 +128,10 @@ def test_forger_among_three_workers_is_caught_named_and_gets_no_more_work(tmp_pa
                 assert list((await client.status()).quarantined) == ["forger"]
                 assert "forger is quarantined: forged results" in await shown(coordinator)
                 assert await workers.ended("forger") != 0
-                assert "gets no more work here" in workers.said("forger")
+                assert "gets no more work here" in workers.log_of("forger")
                 workers.start("forger", "honest")
                 await workers.ended("forger")
-                assert "gets no more work here" in workers.said("forger").splitlines()[-1]
+                assert "gets no more work here" in workers.log_of("forger").splitlines()[-1]
                 await gateway.close()
                 again, _ = await gateway.results(0)
                 assert [one.episode_return for one in again] == [one.episode_return for one in forged]
@@ -255,17 +255,17 @@ def test_audits_of_a_local_run_are_in_its_run_json(tmp_path: Path) -> None:
     assert found.share == 1.0
     # The second worker may come up when all is over.
     assert found.agreed + found.not_audited.get("one worker only", 0) == found.sampled >= 4
-    told = [
+    warnings = [
         path for path in (folder / "workspace").rglob("*") if path.is_file() and b"audit" in path.read_bytes()
     ]
-    assert told == [], "an agent is told nothing of audits"
+    assert warnings == [], "an agent is told nothing of audits"
 
 
 def test_worker_of_an_old_protocol_is_refused_with_the_reason(tmp_path: Path) -> None:
     async def scenario(coordinator: Coordinator, workers: Workers) -> None:
         workers.start("ancient", "old-protocol")
         assert await workers.ended("ancient") == 1
-        assert "speaks wire version 0, the coordinator" in workers.said("ancient").splitlines()[-1]
+        assert "speaks wire version 0, the coordinator" in workers.log_of("ancient").splitlines()[-1]
         async with operator_of(coordinator) as client:
             (turned_away,) = (await client.status()).turned_away
             assert turned_away.worker == "ancient"
@@ -288,7 +288,7 @@ def test_worker_of_old_code_gets_no_work_of_a_run_and_is_told_why(tmp_path: Path
                 await gateway.results(0)
                 workers.start("old", "old-code")
                 why = "1.1+old here"
-                await eventually(lambda: why in workers.said("old"), "it is told why")
+                await eventually(lambda: why in workers.log_of("old"), "it is told why")
                 await gateway.submit(bundle_of(CLOCK_POLICY), (0, 1, 2), "second")
                 await gateway.results(1)
                 workers_shown = {one.worker: one for one in (await client.status()).workers}

@@ -126,8 +126,8 @@ def test_info_is_plain_names_no_seed_and_holds_the_reward_components(env_id: str
         assert msgspec.msgpack.decode(msgspec.msgpack.encode(step.info)) == step.info
         assert json.loads(json.dumps(step.info)) == step.info
         assert not [key for key in step.info if "seed" in key]
-        told = step.info.get("rewards", step.info)
-        components = [told[name] for name in environment.description.reward_components]
+        rewards = step.info.get("rewards", step.info)
+        components = [rewards[name] for name in environment.description.reward_components]
         assert set(environment.description.reward_texts) == set(environment.description.reward_components)
         assert all(environment.description.reward_texts.values())
         assert all(type(value) is float for value in components)

@@ -69,14 +69,14 @@ def test_a_slot_plays_what_the_environment_plays(
     outcome = slots.play(POLICY, env=env_id, seed=SEED, limits=ResourceLimits())
     assert outcome.failure is None
     played = rows(outcome)
-    told = outcome.stdout.decode().split()
+    words = outcome.stdout.decode().split()
     assert len(played) == outcome.length
-    assert len(told) == min(60, outcome.length)
+    assert len(words) == min(60, outcome.length)
     assert (played[-1].terminated, played[-1].truncated) == (outcome.terminated, outcome.truncated)
     environment = warm(env_id)
     obs = environment.reset(make_case())
     total = 0.0
-    for row, digest in zip(played[:COMPARED_STEPS], told, strict=True):
+    for row, digest in zip(played[:COMPARED_STEPS], words, strict=True):
         for seen in (obs, row.obs):
             expected = hashlib.sha256()
             mark(seen, expected)

@@ -95,7 +95,7 @@ def test_text_describes_dynamics_and_reward_in_words(env_id: str, warm: Warm) ->
 
 
 @pytest.mark.parametrize(
-    "told",
+    "text",
     [
         "One step: `v ← v + 0.0015 a − 0.0025 cos(3x)`, held within ±0.07.",
         "Each step `Δx / 0.05 − 0.1 Σ aᵢ²`, Δx being the way forward.",
@@ -111,9 +111,9 @@ def test_text_describes_dynamics_and_reward_in_words(env_id: str, warm: Warm) ->
         "Each joint has damping 1 N m s/rad and armature inertia 1 kg m².",
     ],
 )
-def test_equation_or_constant_in_a_text_is_found(told: str) -> None:
-    assert flags(f"# Title\n\n## Observation\n\n{told}\n\n## Action\n")
-    assert flags(f"# Title\n\n## Observation\n\n## Action\n\n## Reward\n\n{told}\n")
+def test_equation_or_constant_in_a_text_is_found(text: str) -> None:
+    assert flags(f"# Title\n\n## Observation\n\n{text}\n\n## Action\n")
+    assert flags(f"# Title\n\n## Observation\n\n## Action\n\n## Reward\n\n{text}\n")
 
 
 def test_no_text_is_left_without_an_environment() -> None:

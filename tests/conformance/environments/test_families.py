@@ -118,15 +118,15 @@ def test_a_text_made_by_the_template_has_all_sections_and_no_equations(env_id: s
 
 
 def test_documentation_is_told_in_words() -> None:
-    told = template.in_words(
+    text = template.in_words(
         "The pole stands on a cart. The velocity is `v = v + 0.1 * a` each step (default is `2`). Links: see [a page](x.md).\n\n"
         "```python\nenv.step(0)\n```\n\n| Num | Meaning |\n|---|---|\n| 0 | position |\n| 1 | `a * sin(b)` |"
     )
-    assert "The pole stands on a cart." in told
-    assert "see a page." in told
-    assert "| 0 | position |" in told
+    assert "The pole stands on a cart." in text
+    assert "see a page." in text
+    assert "| 0 | position |" in text
     for gone in ("0.1", "default", "env.step", "sin"):
-        assert gone not in told
+        assert gone not in text
 
 
 def test_one_environment_under_two_ids_has_the_text_that_is_written_for_it(warm: Warm) -> None:

@@ -112,9 +112,9 @@ def test_few_are_described_at_the_start_and_many_on_first_use(tmp_path: Path) ->
 
 def test_a_description_holds_for_one_fingerprint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     cache = descriptions.Cache("code", tmp_path)
-    told = describe("toy/line")
-    cache.put(told)
-    assert cache.get("toy/line") == told
+    description = describe("toy/line")
+    cache.put(description)
+    assert cache.get("toy/line") == description
     assert descriptions.Cache("other code", tmp_path).get("toy/line") is None
     monkeypatch.setattr(registry, "versions", lambda names: {"numpy": "0"})
     assert cache.get("toy/line") is None

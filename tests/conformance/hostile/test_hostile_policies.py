@@ -82,13 +82,13 @@ def serve(listener: socket.socket) -> None:
             connection.sendall(b"hello")
 
 
-def probe(slots: Slots, name: str, told: dict[str, Any], **options: Any) -> EpisodeOutcome:
+def probe(slots: Slots, name: str, parameters: dict[str, Any], **options: Any) -> EpisodeOutcome:
     attack = (POLICIES / f"{name}.py").read_text()
     options = {"limits": PATIENT} | options
-    return slots.play({"policy.py": PROBE, "attack.py": attack, "target.json": json.dumps(told)}, **options)
+    return slots.play({"policy.py": PROBE, "attack.py": attack, "target.json": json.dumps(parameters)}, **options)
 
 
-def doors(outcome: EpisodeOutcome) -> dict[str, list[str]]:
+def attempts(outcome: EpisodeOutcome) -> dict[str, list[str]]:
     """What the probe printed, by `held` and `THROUGH`."""
     found: dict[str, list[str]] = {"held": [], "THROUGH": []}
     for line in outcome.stdout.decode().splitlines():
@@ -123,8 +123,8 @@ def test_nothing_gets_through(
 ) -> None:
     outcome = probe(slots, attack.name, target, packages=packages)
     assert outcome.failure is None, outcome.failure
-    assert doors(outcome)["THROUGH"] == [], outcome.stdout.decode()
-    assert len(doors(outcome)["held"]) > 0
+    assert attempts(outcome)["THROUGH"] == [], outcome.stdout.decode()
+    assert len(attempts(outcome)["held"]) > 0
     assert serves_honestly(slots, packages=packages)
 
 
@@ -139,16 +139,16 @@ OPEN_WITHOUT_NAMESPACES = {
 def test_little_gets_through_in_the_weaker_tier(slots: Slots, target: dict[str, Any], attack: Probe) -> None:
     outcome = probe(slots, attack.name, target, tier="landlock", packages=attack.packages)
     assert outcome.failure is None, outcome.failure
-    assert set(doors(outcome)["THROUGH"]) <= OPEN_WITHOUT_NAMESPACES, outcome.stdout.decode()
+    assert set(attempts(outcome)["THROUGH"]) <= OPEN_WITHOUT_NAMESPACES, outcome.stdout.decode()
     assert serves_honestly(slots, "landlock", attack.packages)
 
 
 @pytest.mark.parametrize(
     "attack", [attack for attack in PROBES if attack.off], ids=lambda attack: attack.name
 )
-def test_without_its_defence_each_door_is_open(slots: Slots, target: dict[str, Any], attack: Probe) -> None:
+def test_without_its_defence_each_attack_succeeds(slots: Slots, target: dict[str, Any], attack: Probe) -> None:
     assert attack.off is not None
-    found = doors(probe(slots, attack.name, target, packages=attack.packages, **attack.off))
+    found = attempts(probe(slots, attack.name, target, packages=attack.packages, **attack.off))
     shut = attack.stays_shut if os.geteuid() == 0 else attack.stays_shut | attack.opens_for_root
     assert set(found["held"]) <= shut
     assert found["THROUGH"] or os.geteuid() != 0
@@ -218,25 +218,25 @@ def test_an_honest_policy_plays_in_the_environments_own_process_too() -> None:
 
 def test_nothing_of_an_episode_is_left_for_the_next(slots: Slots) -> None:
     probe(slots, "leave_traces", {})
-    assert doors(probe(slots, "find_traces", {}))["THROUGH"] == []
+    assert attempts(probe(slots, "find_traces", {}))["THROUGH"] == []
     # Undefended, files and shared memory of the first are there for the second.
     probe(slots, "leave_traces", {}, **NO_SANDBOX)
-    found = doors(probe(slots, "find_traces", {}, **NO_SANDBOX))["THROUGH"]
+    found = attempts(probe(slots, "find_traces", {}, **NO_SANDBOX))["THROUGH"]
     assert {"in /tmp", "in shared memory", "in System V memory"} <= set(found)
 
 
 def test_the_cases_seed_is_nowhere_in_the_policys_process(slots: Slots) -> None:
-    told = {"masked_seed": SEED ^ 0x5A5A5A5A}
-    found = doors(probe(slots, "find_seed", told, seed=SEED))
+    parameters = {"masked_seed": SEED ^ 0x5A5A5A5A}
+    found = attempts(probe(slots, "find_seed", parameters, seed=SEED))
     assert found == {"held": ["in an object", "in random's state", "in numpy's state"], "THROUGH": []}
     # The search does find what is there: the same policy, given the number.
     source = PROBE.replace("import attack", f"import attack\nGIVEN = [{SEED}]")
     files: dict[str, str | bytes] = {
         "policy.py": source,
         "attack.py": (POLICIES / "find_seed.py").read_text(),
-        "target.json": json.dumps(told),
+        "target.json": json.dumps(parameters),
     }
-    assert doors(slots.play(files, seed=SEED))["THROUGH"] == ["in an object"]
+    assert attempts(slots.play(files, seed=SEED))["THROUGH"] == ["in an object"]
 
 
 def test_train_and_hidden_episodes_look_the_same_to_a_policy(slots: Slots) -> None:
@@ -252,8 +252,8 @@ def test_names_that_a_policy_looked_for_tell_a_later_one_nothing(slots: Slots, t
     bits, tag = [random.getrandbits(1) for _ in range(400)], f"{random.getrandbits(64):x}"
     source = (POLICIES / "names.py").read_text()
 
-    def play(slot: Any, **told: Any) -> EpisodeOutcome:
-        files: dict[str, str | bytes] = {"policy.py": source, "target.json": json.dumps({"tag": tag, **told})}
+    def play(slot: Any, **parameters: Any) -> EpisodeOutcome:
+        files: dict[str, str | bytes] = {"policy.py": source, "target.json": json.dumps({"tag": tag, **parameters})}
         outcome = slots.play(files, slot=slot, tier=tier, limits=PATIENT)
         assert outcome.failure is None, outcome.failure
         return outcome
@@ -261,8 +261,8 @@ def test_names_that_a_policy_looked_for_tell_a_later_one_nothing(slots: Slots, t
     play(slots.slot(tier), role="tell", bits=bits)  # type: ignore[arg-type]
     # Undefended one folder is enough: there are many.
     walk = "/" if tier == "bwrap" else os.path.dirname(os.__file__)
-    told = play(second_slot(slots, tier), role="listen", n=len(bits), walk=walk).stdout
-    heard, machines_folders = json.loads(told)
+    output = play(second_slot(slots, tier), role="listen", n=len(bits), walk=walk).stdout
+    heard, machines_folders = json.loads(output)
     agreeing = sum(one == bool(other) for one, other in zip(heard, bits, strict=True))
     # Guessing gets half of them, give or take ten.
     assert (agreeing > 300) == (tier == "none"), agreeing
@@ -361,11 +361,11 @@ def test_policies_in_parallel_slots_cannot_talk(slots: Slots, way: str) -> None:
         attack = (POLICIES / "talk.py").read_text()
         plays = []
         for slot, role in zip(pair, ("tell", "listen"), strict=True):
-            told = json.dumps({"role": role, "way": way})
-            folder = slots.bundle({"policy.py": PROBE, "attack.py": attack, "target.json": told})
+            parameters = json.dumps({"role": role, "way": way})
+            folder = slots.bundle({"policy.py": PROBE, "attack.py": attack, "target.json": parameters})
             plays.append(slot.play(make_job(tier=tier, limits=PATIENT), folder, lambda episodes, steps: None))
         (_,), (listener,) = slots.run(both(plays[0], plays[1]))
-        heard[tier] = doors(listener)["THROUGH"] != []
+        heard[tier] = attempts(listener)["THROUGH"] != []
     assert heard == {"bwrap": False, "none": True}
 
 

@@ -72,7 +72,7 @@ def harmed(source: str, timeout_s: float = _TIMEOUT_S) -> str | None:
             os.close(commands)
             os.close(going)
         try:
-            status = process.wait(_patience(results, timeout_s, process))
+            status = process.wait(_timeout_left(results, timeout_s, process))
         except subprocess.TimeoutExpired:
             return "it never came to its end"
         finally:
@@ -112,7 +112,7 @@ def _arrange(commands: int, replies: int) -> None:
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 
 
-def _patience(results: Path, timeout_s: float, process: subprocess.Popen[bytes]) -> float:
+def _timeout_left(results: Path, timeout_s: float, process: subprocess.Popen[bytes]) -> float:
     """Counted from the first result: how long the start takes is the machine's affair."""
     end = time.monotonic() + 60.0
     while process.poll() is None and results.stat().st_size == 0 and time.monotonic() < end:

@@ -98,8 +98,8 @@ def artifacts(run: Path) -> dict[str, str]:
 
 
 def _json(path: Path, more: Callable[[Any], Any] | None) -> str:
-    told = _plain("", json.loads(path.read_bytes()))
-    return json.dumps(told if more is None else more(told), indent=2, ensure_ascii=False) + "\n"
+    document = _plain("", json.loads(path.read_bytes()))
+    return json.dumps(document if more is None else more(document), indent=2, ensure_ascii=False) + "\n"
 
 
 def _lines(path: Path, most: int | None = 4) -> str:
@@ -107,29 +107,29 @@ def _lines(path: Path, most: int | None = 4) -> str:
     return "".join(json.dumps(row, ensure_ascii=False) + "\n" for row in rows)
 
 
-def _row(told: Any) -> Any:
+def _row(value: Any) -> Any:
     """Once a policy has failed its episode's actions are the run's own random ones, and so is what comes of them."""
-    if isinstance(told, dict) and (told.get("info") or {}).get("policy_failed"):
-        return _without_numbers(told)
-    if isinstance(told, dict) and told.get("submit_index") == 2:
-        return _without_numbers(told)
-    return told
+    if isinstance(value, dict) and (value.get("info") or {}).get("policy_failed"):
+        return _without_numbers(value)
+    if isinstance(value, dict) and value.get("submit_index") == 2:
+        return _without_numbers(value)
+    return value
 
 
-def _record(told: Any) -> Any:
+def _record(record: Any) -> Any:
     """Of submit 2, whose episodes are random, every score is taken out."""
-    told["outcome"]["val_scores"]["2"] = "<random>"
-    told["versions"]["harness"] = told["versions"]["env"] = "<version>"
-    told["timing"] = dict.fromkeys(told["timing"], "<time>")
-    return told
+    record["outcome"]["val_scores"]["2"] = "<random>"
+    record["versions"]["harness"] = record["versions"]["env"] = "<version>"
+    record["timing"] = dict.fromkeys(record["timing"], "<time>")
+    return record
 
 
-def _without_numbers(told: Any) -> Any:
-    if isinstance(told, dict):
-        return {name: _without_numbers(value) for name, value in told.items()}
-    if isinstance(told, list):
-        return [_without_numbers(value) for value in told]
-    return "<random>" if isinstance(told, float) else told
+def _without_numbers(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {name: _without_numbers(each) for name, each in value.items()}
+    if isinstance(value, list):
+        return [_without_numbers(each) for each in value]
+    return "<random>" if isinstance(value, float) else value
 
 
 def _plain(name: str, value: Any) -> Any:

@@ -58,9 +58,9 @@ def test_an_earlier_run_is_verified(tmp_path: Path) -> None:
     command += [str(run), "--json", "--local", "--data", str(DATA)]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=600, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
-    told = json.loads(done.stdout)
-    assert told["identical"]
-    assert (told["episodes"], told["policy_episodes"], told["policy_differences"]) == (7, 7, [])
+    document = json.loads(done.stdout)
+    assert document["identical"]
+    assert (document["episodes"], document["policy_episodes"], document["policy_differences"]) == (7, 7, [])
 
 
 def test_an_earlier_run_is_the_same_run_as_one_of_today(now: Path) -> None:
@@ -73,9 +73,9 @@ def test_an_earlier_run_is_the_same_run_as_one_of_today(now: Path) -> None:
 def test_an_earlier_run_differs_where_its_outcome_does(now: Path, tmp_path: Path) -> None:
     changed = tmp_path / "run"
     shutil.copytree(EARLIER / "run", changed)
-    told = json.loads((changed / "run.json").read_bytes())
-    told["outcome"]["final_score"] = 1.0
-    (changed / "run.json").write_text(json.dumps(told))
+    document = json.loads((changed / "run.json").read_bytes())
+    document["outcome"]["final_score"] = 1.0
+    (changed / "run.json").write_text(json.dumps(document))
     (changed / "checkpoints/submit_001/system/table.json").write_text("[9]")
     found = differences(changed, now)
     assert any("outcome.final_score" in line for line in found)

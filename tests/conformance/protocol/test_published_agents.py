@@ -163,8 +163,8 @@ def test_runs_of_the_profile_are_stamped_with_every_choice_and_marked_as_public(
 def test_one_policy_plays_a_submit_on_lists_and_what_cannot_be_read_is_zero(published: Played) -> None:
     folder, _ = published["variables"]
     episodes = sorted((folder / "workspace/feedback/submit_000/episodes").iterdir())
-    said = [(episode / "stdout.txt").read_text() for episode in episodes]
-    assert said == [f"episode {n} of this Policy\n" for n in (1, 2, 3)]
+    outputs = [(episode / "stdout.txt").read_text() for episode in episodes]
+    assert outputs == [f"episode {n} of this Policy\n" for n in (1, 2, 3)]
     rows = [json.loads(line) for line in (episodes[1] / "trajectory.jsonl").read_text().splitlines()]
     unread = [row for row in rows if row["action"] is None]
     assert all(row["info"]["action_invalid"] and row["info"]["reward_effort"] == 0.0 for row in unread)

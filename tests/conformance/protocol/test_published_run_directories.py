@@ -52,9 +52,9 @@ def test_a_published_run_is_read_with_what_it_tells(tmp_path: Path, env: str) ->
 
 def test_the_selected_submit_is_found_by_its_code_where_it_is_not_told(tmp_path: Path) -> None:
     folder = write_published_run(tmp_path)
-    told = json.loads((folder / "run.json").read_bytes())
-    del told["outcome"]["best_submit_index"]
-    (folder / "run.json").write_text(json.dumps(told))
+    document = json.loads((folder / "run.json").read_bytes())
+    del document["outcome"]["best_submit_index"]
+    (folder / "run.json").write_text(json.dumps(document))
     assert read_run(folder).record.outcome.best_submit_index == 3
 
 
@@ -128,8 +128,8 @@ def test_only_reports_read_published_runs(tmp_path: Path) -> None:
 )
 def test_a_damaged_published_run_is_left_out_with_its_reason(tmp_path: Path, damage: dict[str, Any]) -> None:
     folder = write_published_run(tmp_path)
-    told = json.loads((folder / "run.json").read_bytes())
-    (folder / "run.json").write_text(json.dumps(told | damage))
+    document = json.loads((folder / "run.json").read_bytes())
+    (folder / "run.json").write_text(json.dumps(document | damage))
     found = read_or_explain(folder)
     assert isinstance(found, LeftOut)
     assert found.reason

@@ -213,9 +213,9 @@ def test_disk_tells_what_runs_take_and_whether_a_sweep_fits(coordinator: Coordin
     assert estimate.fits
     cli = CliRunner()
     arguments = ["--state", str(coordinator.state), "--env", "toy/line", "--budget", "80"]
-    told = cli.invoke(gc_cli.disk_app, arguments)
-    assert (told.exit_code, "planned: about" in told.stdout) == (0, True)
-    assert "run directories, in addition: at most" in told.stdout
+    invoked = cli.invoke(gc_cli.disk_app, arguments)
+    assert (invoked.exit_code, "planned: about" in invoked.stdout) == (0, True)
+    assert "run directories, in addition: at most" in invoked.stdout
     too_much = cli.invoke(gc_cli.disk_app, [*arguments, "--runs", "1000000000", "--json"])
     assert too_much.exit_code == 1
     assert json.loads(too_much.stdout)["planned"]["guessed"] == []

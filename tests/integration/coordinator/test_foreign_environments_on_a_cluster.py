@@ -97,10 +97,10 @@ def test_an_environment_of_the_workers_alone_goes_from_announcement_to_report(
     while len(found) < 2 and time.monotonic() < deadline:
         assert worker.poll() is None, (tmp_path / "worker" / "log").read_text()
         found = json.loads(operator.says("envs", "--json").stdout or "[]")
-    told = {str(each["description"]["env"]): each for each in found}  # type: ignore[index]
-    assert told["toy/line"]["accepted"] == "ships"
-    assert told["acme/glider"]["accepted"] == "by digest only"
-    digest = str(told["acme/glider"]["digest"])
+    listed = {str(each["description"]["env"]): each for each in found}  # type: ignore[index]
+    assert listed["toy/line"]["accepted"] == "ships"
+    assert listed["acme/glider"]["accepted"] == "by digest only"
+    digest = str(listed["acme/glider"]["digest"])
 
     refused = operator.says("random", "--env", "acme/glider", "--cases", "0,1")
     assert refused.returncode == 2

@@ -35,8 +35,8 @@ def command(*args: str) -> subprocess.CompletedProcess[str]:
 
 
 def listed(state: Path) -> dict[str, object]:
-    told: dict[str, object] = json.loads(command("epoch", "list", "--state", str(state), "--json").stdout)
-    return told
+    document: dict[str, object] = json.loads(command("epoch", "list", "--state", str(state), "--json").stdout)
+    return document
 
 
 async def play(coordinator: Coordinator, operator: HarnessOperator, key: str) -> RunFinished:
@@ -72,8 +72,8 @@ def test_runs_are_committed_to_disclosed_and_followed_by_another_epoch(tmp_path:
                 await client.disclose((finished.run,))
                 entries = await client.journal()
                 heads = journal.heads(entries)
-                told = [type(journal.read_entry(entry)).__name__ for entry in entries]
-                assert told == ["Opened", "Ended", "Opened", "Ended", "Revealed"]
+                kinds = [type(journal.read_entry(entry)).__name__ for entry in entries]
+                assert kinds == ["Opened", "Ended", "Opened", "Ended", "Revealed"]
                 assert (heads[place.opened], place.ended) == (place.opened_head, 1)
                 opening = await client.opening(finished.run)
                 assert journal.commitment(opening.salt, opening.opening) == place.commitment

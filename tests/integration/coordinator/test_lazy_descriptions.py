@@ -83,9 +83,9 @@ class Cluster:
 
     def offered(self) -> tuple[set[str], set[str]]:
         """Ids that are described, and those that are not yet."""
-        told = self.says("envs")
-        described = {each["description"]["env"] for each in told if "description" in each}
-        return described, {each["env"] for each in told if each.get("described") is False}
+        listed = self.says("envs")
+        described = {each["description"]["env"] for each in listed if "description" in each}
+        return described, {each["env"] for each in listed if each.get("described") is False}
 
 
 @pytest.fixture
@@ -122,6 +122,6 @@ def test_what_a_run_waits_for_is_described_then_and_kept_for_the_next_start(clus
     cluster.start()
     described, later = wait_until(lambda: found if env in (found := cluster.offered())[0] else None)
     assert (described, later) == (known, ids - known)
-    told = next(each for each in cluster.says("envs", "--filter", env))
-    assert told["accepted"] == "ships"
-    assert told["description"]["step_us"] > 0
+    listed = next(each for each in cluster.says("envs", "--filter", env))
+    assert listed["accepted"] == "ships"
+    assert listed["description"]["step_us"] > 0

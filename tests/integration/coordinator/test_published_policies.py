@@ -46,8 +46,8 @@ submit(text + "#", [2, 3])
 def findings(cwd: Path, *options: str, kind: str = "policies") -> tuple[int, list[dict[str, Any]]]:
     done = evopolicy(cwd, "check", "results.evp", "--json", *options)
     assert done.stdout, done.stderr
-    told = [each for each in json.loads(done.stdout)["findings"] if each["kind"] == kind]
-    return done.returncode, told
+    found = [each for each in json.loads(done.stdout)["findings"] if each["kind"] == kind]
+    return done.returncode, found
 
 
 @pytest.mark.timeout(900)
@@ -71,12 +71,12 @@ def test_deterministic_policies_give_the_recorded_actions_and_a_false_declaratio
         for path in tmp_path.glob("runs/*/*/*/run.json")
     }
 
-    code, told = findings(tmp_path)
-    assert (code, {each["state"] for each in told}) == (0, {"open"})
-    code, told = findings(tmp_path, "--policies", "all")
+    code, found = findings(tmp_path)
+    assert (code, {each["state"] for each in found}) == (0, {"open"})
+    code, found = findings(tmp_path, "--policies", "all")
     assert code == 1
     by_entry: dict[str, list[dict[str, Any]]] = {}
-    for each in told:
+    for each in found:
         by_entry.setdefault(runs[each["run"]], []).append(each)
     # 5 train episodes, 3 validation cases of both checkpoints, 4 held-out ones.
     (honest,) = by_entry["honest"]
@@ -115,6 +115,6 @@ def test_an_environment_that_does_not_repeat_episodes_is_not_played(
     done = evopolicy(tmp_path, "publish", "runs", "--out", "results.evp", "--local", "--state", "st")
     assert done.returncode == 0, done.stderr
     for option, kind, left in (("--replay", "replay", 3), ("--policies", "policies", 0)):
-        code, told = findings(tmp_path, option, "all", kind=kind)
-        assert (code, [each["state"] for each in told]) == (left, ["open"]), told
-        assert "acme/moody is marked as not deterministic" in told[0]["text"]
+        code, found = findings(tmp_path, option, "all", kind=kind)
+        assert (code, [each["state"] for each in found]) == (left, ["open"]), found
+        assert "acme/moody is marked as not deterministic" in found[0]["text"]

@@ -87,14 +87,14 @@ class Results:
                 ),
             )
             assert done.returncode == 0, done.stdout + done.stderr
-        self.told = self.publish("all.evp", "runs")
+        self.summary = self.publish("all.evp", "runs")
         self.files = self.read("all.evp")
 
     def publish(self, out: str, *runs: str) -> dict[str, Any]:
         done = evopolicy(self.root, "publish", *runs, "--out", out, "--local", "--state", "st", "--json")
         assert done.returncode == 0, done.stdout + done.stderr
-        told: dict[str, Any] = json.loads(done.stdout)
-        return told
+        document: dict[str, Any] = json.loads(done.stdout)
+        return document
 
     def read(self, name: str) -> dict[str, bytes]:
         with Archive(self.root / name) as archive:
@@ -133,9 +133,9 @@ class Forger:
 
     def json(self, name: str, change: Callable[[Any], Any]) -> None:
         """Changes a document in place, or into what `change` returns."""
-        told = json.loads(self.files[name])
-        new = change(told)
-        self.files[name] = json.dumps(told if new is None else new).encode()
+        document = json.loads(self.files[name])
+        new = change(document)
+        self.files[name] = json.dumps(document if new is None else new).encode()
 
     def text(self, name: str, before: bytes, after: bytes) -> None:
         assert before in self.files[name]
@@ -182,11 +182,11 @@ RUN, RESULT, OPENING, EPISODES, SALT = (
 def put(*path: str | int, value: Any) -> Callable[[Any], None]:
     """Sets a part of a document."""
 
-    def change(told: Any) -> None:
+    def change(document: Any) -> None:
         for step in path[:-1]:
-            told = told[step]
-        assert told[path[-1]] != value
-        told[path[-1]] = value
+            document = document[step]
+        assert document[path[-1]] != value
+        document[path[-1]] = value
 
     return change
 
@@ -230,13 +230,13 @@ def entry_edited(lines: list[bytes]) -> list[bytes]:
 def better_result(forger: Forger) -> None:
     """All that the forger can raise consistently."""
     for name, path in ((RESULT, ("heldout_returns",)), (RUN, ("outcome", "heldout_returns"))):
-        told = json.loads(forger.files[name])
-        part = told
+        document = json.loads(forger.files[name])
+        part = document
         for step in path[:-1]:
             part = part[step]
         part[path[-1]] = [0.0, 0.0, 0.0]
-        (told if name == RESULT else told["outcome"])["final_score"] = 0.0
-        forger.files[name] = json.dumps(told).encode()
+        (document if name == RESULT else document["outcome"])["final_score"] = 0.0
+        forger.files[name] = json.dumps(document).encode()
 
 
 Edit = Callable[[Forger], None]
@@ -244,16 +244,16 @@ SIGNED_ANEW: dict[str, tuple[Edit, str, str]] = {
     "a changed held-out return": (lambda f: f.json(EPISODES, put(4, "episodes", 0, "episode_return", value=99.0)), "scores", "not those of the result"),
     "a changed train return": (lambda f: f.json(EPISODES, put(0, "episodes", 0, "episode_return", value=99.0)), "scores", "have the mean"),
     "a changed validation return": (lambda f: f.json(EPISODES, put(2, "episodes", 1, "episode_return", value=99.0)), "scores", "have the mean"),
-    "a dropped episode": (lambda f: f.json(EPISODES, lambda told: told[4]["episodes"].pop() and None), "scores", "instead of"),
-    "a dropped list of episodes": (lambda f: f.json(EPISODES, lambda told: told[:-1]), "scores", "are not there"),
-    "a doubled list of episodes": (lambda f: f.json(EPISODES, lambda told: [*told, told[0]]), "scores", "twice"),
+    "a dropped episode": (lambda f: f.json(EPISODES, lambda summary: summary[4]["episodes"].pop() and None), "scores", "instead of"),
+    "a dropped list of episodes": (lambda f: f.json(EPISODES, lambda summary: summary[:-1]), "scores", "are not there"),
+    "a doubled list of episodes": (lambda f: f.json(EPISODES, lambda summary: [*summary, summary[0]]), "scores", "twice"),
     "a swapped checkpoint": (swap_policy, "checkpoints", "another policy"),
     "a swapped checkpoint and its digest": (swap_policy_and_result, "result", "not the result"),
     "an edited setting": (lambda f: f.json(RUN, put("experiment_dimensions", "policy_scope", value="submit")), "record", "policy_scope"),
     "an edited setting in the opening too": (lambda f: f.json(OPENING, put("settings", "policy_scope", value="submit")), "commitment", "not those that were committed to"),
     "an edited budget": (lambda f: f.json(OPENING, put("budget", value=500)), "commitment", "not those that were committed to"),
     "splits that do not match the commitment": (lambda f: f.json(OPENING, put("heldout", 0, "seed", value=7)), "commitment", "not those that were committed to"),
-    "a held-out case that is a train case": (lambda f: f.json(OPENING, lambda told: told["heldout"].__setitem__(0, told["train"][0])), "commitment", "not disjoint"),
+    "a held-out case that is a train case": (lambda f: f.json(OPENING, lambda summary: summary["heldout"].__setitem__(0, summary["train"][0])), "commitment", "not disjoint"),
     "another salt": (lambda f: f.files.__setitem__(SALT, b"00" * 32), "commitment", "not those that were committed to"),
     "a salt of no length": (lambda f: f.files.__setitem__(SALT, b""), "commitment", "0 bytes instead of 32"),
     "another hash of the splits": (lambda f: f.json(RUN, put("versions", "cases_hashes", "heldout", value="sha256:00")), "record", "heldout cases"),
@@ -263,10 +263,10 @@ SIGNED_ANEW: dict[str, tuple[Edit, str, str]] = {
     "a smaller spread": (lambda f: f.json(RUN, put("outcome", "heldout_std_return", value=0.001)), "record", "heldout_std_return"),
     "a weaker random reference": (lambda f: f.json(RUN, put("outcome", "random_reference", "mean_return", value=-1e6)), "record", "random actions"),
     "a validation mean edited": (lambda f: f.json(RUN, put("outcome", "val_scores", "0", value=1e6)), "record", "val_scores"),
-    "another selected checkpoint": (lambda f: f.json(RESULT, lambda told: put("best_submit_index", value=1 - told["best_submit_index"])(told)), "selection", "has the best validation mean"),
-    "reordered submits": (lambda f: f.json(RESULT, lambda told: told["submits"].reverse()), "budget", "not in order"),
-    "a submit left out": (lambda f: f.json(RESULT, lambda told: told["submits"].pop() and None), "budget", "episodes"),
-    "a submit of more episodes than granted": (lambda f: f.json(RESULT, lambda told: told["submits"][0]["env_instances"].extend([0] * 9)), "budget", "were granted"),
+    "another selected checkpoint": (lambda f: f.json(RESULT, lambda summary: put("best_submit_index", value=1 - summary["best_submit_index"])(summary)), "selection", "has the best validation mean"),
+    "reordered submits": (lambda f: f.json(RESULT, lambda summary: summary["submits"].reverse()), "budget", "not in order"),
+    "a submit left out": (lambda f: f.json(RESULT, lambda summary: summary["submits"].pop() and None), "budget", "episodes"),
+    "a submit of more episodes than granted": (lambda f: f.json(RESULT, lambda summary: summary["submits"][0]["env_instances"].extend([0] * 9)), "budget", "were granted"),
     "a submit on a case that is not one of train": (lambda f: f.json(RESULT, put("submits", 0, "env_instances", 0, value=10**6)), "budget", "not one of train"),
     "a failed run called completed": (lambda f: f.json(RUN, put("outcome", "status", value="no_ok_submit")), "record", "status"),
     "another agent's name": (lambda f: f.json(RUN, put("agent", "entry", value="theirs")), "record", "agent.entry"),
@@ -318,7 +318,7 @@ def named(findings: list[Finding], kind: str, text: str) -> bool:
 
 
 def test_untouched_results_hold(results: Results) -> None:
-    checked = rules.check(Held(results.files), results.told["signer"])
+    checked = rules.check(Held(results.files), results.summary["signer"])
     assert [each for each in checked.findings if each.state == "failed"] == []
     assert {each.kind for each in checked.findings if each.state == "open"} == {"order", "policies"}
     assert {each.kind for each in checked.findings} == KINDS.keys() - {"replay", "signals", "logs"}
@@ -333,7 +333,7 @@ def test_tampering_is_named_though_all_is_signed_anew(results: Results, kind: st
     forger.sign()
     findings = found(forger.files)
     assert named(findings, finding, text), findings
-    assert named(found(forger.files, results.told["signer"]), "identity", "another signer")
+    assert named(found(forger.files, results.summary["signer"]), "identity", "another signer")
 
 
 @pytest.mark.parametrize("kind", NOT_SIGNED_ANEW)
@@ -348,12 +348,12 @@ def test_signing_anew_alone_is_another_signer(results: Results) -> None:
     forger = Forger(results.files)
     forger.sign()
     assert found(forger.files) == []
-    assert [each.kind for each in found(forger.files, results.told["signer"])] == ["identity"]
+    assert [each.kind for each in found(forger.files, results.summary["signer"])] == ["identity"]
 
 
 def test_selected_runs_show_what_they_were_selected_from(results: Results) -> None:
-    told = results.publish("one.evp", results.run_folder("second"))
-    assert [(each["exp_id"], each["state"]) for each in told["left_out"]] == [("first", "completed")]
+    summary = results.publish("one.evp", results.run_folder("second"))
+    assert [(each["exp_id"], each["state"]) for each in summary["left_out"]] == [("first", "completed")]
     checked = rules.check(Held(results.read("one.evp")))
     assert not checked.failed
     assert [each.text for each in checked.findings if each.kind == "completeness"] == [
@@ -436,8 +436,8 @@ def test_a_policy_that_tells_of_the_machine_is_withheld(results: Results) -> Non
     )
     assert done.returncode == 0, done.stdout + done.stderr
     args = ("publish", "leaky", "--out", "leaky.evp", "--local", "--state", "leaky-st", "--json")
-    told = json.loads(evopolicy(results.root, *args).stdout)
-    assert any("checkpoints/000" in each["what"] for each in told["removed"])
+    document = json.loads(evopolicy(results.root, *args).stdout)
+    assert any("checkpoints/000" in each["what"] for each in document["removed"])
     files = results.read("leaky.evp")
     assert not any("checkpoints" in name for name in files)
     checked = rules.check(Held(files))
@@ -459,14 +459,14 @@ def _policy(root: Path) -> Path:
 
 
 def test_the_command_checks_and_replays(results: Results) -> None:
-    identity = results.told["signer"]
+    identity = results.summary["signer"]
     done = evopolicy(results.root, "check", "all.evp", "--replay", "all", "--identity", identity)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "ok     replay" in done.stdout
     assert "the signer is the one that you named" in done.stdout
     plain = evopolicy(results.root, "check", "all.evp", "--json")
-    told = json.loads(plain.stdout)
-    assert (plain.returncode, told["ok"], told["signer"]) == (0, True, identity)
+    document = json.loads(plain.stdout)
+    assert (plain.returncode, document["ok"], document["signer"]) == (0, True, identity)
 
 
 def test_rewards_that_the_environment_does_not_give_are_found_by_replay_alone(results: Results) -> None:
@@ -485,7 +485,7 @@ def test_rewards_that_the_environment_does_not_give_are_found_by_replay_alone(re
     forger.files[RESULT] = json.dumps(result).encode()
     forger.json(EPISODES, put(4, "episodes", 0, "episode_return", value=value))
 
-    def told(record: Any) -> None:
+    def altered(record: Any) -> None:
         returns = result["heldout_returns"]
         mean = result["final_score"]
         std = math.sqrt(math.fsum((each - mean) * (each - mean) for each in returns) / 3)
@@ -506,7 +506,7 @@ def test_rewards_that_the_environment_does_not_give_are_found_by_replay_alone(re
                 each["result"] = contents.digest(forger.files[RESULT])
         return [json.dumps(each).encode() for each in kept]
 
-    forger.json(RUN, told)
+    forger.json(RUN, altered)
     forger.entries(rewritten)
     heads = journal.heads(contents.journal_entries(forger.files[contents.JOURNAL]))
     places = {"opened": 0, "opened_head": heads[0], "ended": 1, "ended_head": heads[1]}
@@ -534,8 +534,8 @@ def test_no_module_that_a_file_names_is_imported(
     opening = msgspec.structs.replace(run.opening, settings=settings)
     checked.runs = [msgspec.structs.replace(run, opening=opening)]
     asyncio.run(replays.replay(Held(results.files), checked, 1.0, 0, 1, lambda n, total: None))
-    told = {each.text for each in checked.findings if each.kind == "replay"}
-    assert told == {"evil_env:Glider-v0 is not installed here"}
+    texts = {each.text for each in checked.findings if each.kind == "replay"}
+    assert texts == {"evil_env:Glider-v0 is not installed here"}
     assert not (tmp_path / "imported").exists()
 
 
@@ -573,7 +573,7 @@ def test_logs_are_published_only_on_request_and_without_what_the_search_finds(re
     log.write_bytes(before + json.dumps(call).encode() + b"\n")
     try:
         plain = results.publish("no-logs.evp", str(folder))
-        told = results.publish("logs.evp", str(folder), "--with-logs")
+        summary = results.publish("logs.evp", str(folder), "--with-logs")
     finally:
         log.write_bytes(before)
     assert "runs/0000/logs/agent.jsonl" not in results.read("no-logs.evp")
@@ -581,7 +581,7 @@ def test_logs_are_published_only_on_request_and_without_what_the_search_finds(re
     assert b"https://example.org/x" in data
     assert secret.encode() not in data
     assert str(results.root).encode() not in data
-    held = [each["why"] for each in told["removed"] if "logs/agent.jsonl" in each["what"]]
+    held = [each["why"] for each in summary["removed"] if "logs/agent.jsonl" in each["what"]]
     assert any("an API key" in why for why in held)
     assert any(each["what"] == "logs/" for each in plain["removed"])
     done = evopolicy(results.root, "check", "logs.evp", "--json")

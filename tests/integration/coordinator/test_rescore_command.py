@@ -111,11 +111,11 @@ def test_checkpoints_play_further_cases_and_the_report_uses_them(played: Played)
     assert before == {entry: (played.run(entry) / "run.json").read_bytes() for entry in before}
     for record, entry in ((mine, "mine"), (slow, "slow")):
         (checkpoint,) = record.checkpoints
-        told = json.loads(before[entry])
-        assert checkpoint.submit_index == record.selected == told["outcome"]["best_submit_index"]
+        document = json.loads(before[entry])
+        assert checkpoint.submit_index == record.selected == document["outcome"]["best_submit_index"]
         assert (len(checkpoint.returns), len(record.random_returns), record.n_cases) == (8, 8, 8)
-        assert record.cases_hash != told["versions"]["cases_hashes"]["heldout"]
-        assert set(checkpoint.returns).isdisjoint(told["outcome"]["heldout_returns"])
+        assert record.cases_hash != document["versions"]["cases_hashes"]["heldout"]
+        assert set(checkpoint.returns).isdisjoint(document["outcome"]["heldout_returns"])
     # Runs of one environment are paired by case, the reference's actions too.
     assert (mine.cases_hash, mine.random_returns) == (slow.cases_hash, slow.random_returns)
 
@@ -130,11 +130,11 @@ def test_checkpoints_play_further_cases_and_the_report_uses_them(played: Played)
 
     done = evopolicy(played.root, "report", "runs", "--scores", "cases-8", "--out", "report", "--jobs", "1")
     assert done.returncode == 0, done.stderr
-    told = json.loads((played.root / "report" / "report.json").read_text())
-    assert "cases-8: 8 further hidden cases, played post hoc" in told["post_hoc"]
-    assert "post hoc" in told["tables"]["heldout_toy"]["caption"]
+    document = json.loads((played.root / "report" / "report.json").read_text())
+    assert "cases-8: 8 further hidden cases, played post hoc" in document["post_hoc"]
+    assert "post hoc" in document["tables"]["heldout_toy"]["caption"]
     assert "post hoc" in (played.root / "report" / "index.html").read_text()
-    shown = {run["entry"]: run["score"] for run in told["runs"]}
+    shown = {run["entry"]: run["score"] for run in document["runs"]}
     assert shown["mine"] == math.fsum(mine.checkpoints[0].returns) / 8
     plain = evopolicy(played.root, "report", "runs", "--out", "plain", "--jobs", "1")
     assert plain.returncode == 0, plain.stderr
@@ -185,8 +185,8 @@ def test_a_cancelled_re_score_ends_with_the_reason(played: Played) -> None:
         ((name,),) = db.execute("SELECT evaluation FROM evaluations WHERE finished = 0").fetchall()
     done = evopolicy(played.root, "runs", "cancel", name, "--credentials", "cancelled/credentials")
     assert done.returncode == 0, done.stderr
-    _, told = began.communicate(timeout=60)
-    assert (began.returncode, "an operator cancelled evaluation" in told) == (1, True), told
+    _, output = began.communicate(timeout=60)
+    assert (began.returncode, "an operator cancelled evaluation" in output) == (1, True), output
 
 
 def n_outcomes(database: Path) -> int:
@@ -247,9 +247,9 @@ def test_runs_that_cannot_be_rescored_are_refused_with_the_reason(played: Played
     def changed(name: str, change: dict[str, Any]) -> str:
         copy = tmp_path / name
         shutil.copytree(run, copy)
-        told = json.loads((copy / "run.json").read_text())
+        document = json.loads((copy / "run.json").read_text())
         (copy / "run.json").chmod(0o644)
-        (copy / "run.json").write_text(json.dumps(told | change))
+        (copy / "run.json").write_text(json.dumps(document | change))
         return str(copy)
 
     assert "no finished run r-other" in refused(changed("other", {"run": "r-other"}), "--cases", "2")

@@ -35,7 +35,7 @@ def ask(what, body=None):
     request = urllib.request.Request(os.environ[f"EVOPOLICYGYM_{{what}}_URL"], data=body)
     return urllib.request.urlopen(request).read()
 
-with open("system/told.json", "w") as file:
+with open("system/documents.json", "w") as file:
     json.dump({{"task": ask("TASK").decode(), "info": json.loads(ask("INFO"))}}, file)
 with open("system/policy.py", "w") as file:
     file.write({POLICY!r})
@@ -69,9 +69,9 @@ class Played:
             assert done.returncode == 0, done.stdout + done.stderr
             self.runs[scope] = next((root / scope).glob("*/*/*/run.json")).parent
 
-    def told(self, scope: str) -> dict[str, Any]:
+    def documents(self, scope: str) -> dict[str, Any]:
         found: dict[str, Any] = json.loads(
-            (self.runs[scope] / "checkpoints/submit_000/told.json").read_text()
+            (self.runs[scope] / "checkpoints/submit_000/documents.json").read_text()
         )
         return found
 
@@ -95,13 +95,13 @@ def played(tmp_path_factory: pytest.TempPathFactory) -> Played:
 
 def test_the_agent_is_told_the_scope(played: Played) -> None:
     for scope in ("submit", "episode"):
-        told = played.told(scope)
-        assert told["info"]["policy_scope"] == scope
-        assert f"Policy scope `{scope}`" in told["task"]
+        documents = played.documents(scope)
+        assert documents["info"]["policy_scope"] == scope
+        assert f"Policy scope `{scope}`" in documents["task"]
 
 
 def test_the_agent_is_told_every_limit(played: Played) -> None:
-    limits = played.told("submit")["info"]["resource_limits"]
+    limits = played.documents("submit")["info"]["resource_limits"]
     assert {
         "rollout_wall_s",
         "act_wall_s",

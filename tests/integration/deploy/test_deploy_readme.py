@@ -18,7 +18,7 @@ DEPLOY = Path(__file__).parents[3] / "deploy"
 
 def run_blocks(wanted: str, places: dict[str, Path]) -> str:
     """Runs the blocks whose certificates are asked for by a command that holds `wanted`, and says what they printed."""
-    said = ""
+    output = ""
     for block in blocks_of_commands(DEPLOY / "README.md"):
         text = [" ".join(words) for words in block]
         if not any(wanted in line for line in text):
@@ -30,8 +30,8 @@ def run_blocks(wanted: str, places: dict[str, Path]) -> str:
                 words = [word.replace(place, str(here)) for word in words]
             done = CliRunner().invoke(app, words[1:])
             assert done.exit_code == 0, (words, done.output)
-            said += done.output
-    return said
+            output += done.output
+    return output
 
 
 @pytest.fixture
@@ -65,8 +65,8 @@ def test_the_docker_steps_make_the_folders_that_the_compose_file_mounts(state: P
 
 def test_the_steps_for_a_site_make_a_router_that_lets_its_worker_in(state: Path, tmp_path: Path) -> None:
     run_blocks("--host FIRST", {"/var/lib/evopolicy": state, "FIRST": Path("first.lab")})
-    said = run_blocks("berlin", {"ROUTER": Path("router.berlin.lab")})
-    assert "zenohd --config /etc/evopolicy/router/zenohd.json" in said
+    output = run_blocks("berlin", {"ROUTER": Path("router.berlin.lab")})
+    assert "zenohd --config /etc/evopolicy/router/zenohd.json" in output
     router = json.loads((tmp_path / "router-berlin" / "zenohd.json").read_text())
     assert router["connect"]["endpoints"] == ["tls/first.lab:7447"]
     assert {subject["id"] for subject in router["access_control"]["subjects"]} == {"worker/gpu-8", "uplink"}

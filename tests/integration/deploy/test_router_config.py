@@ -216,19 +216,19 @@ def test_a_restarted_router_carries_on(site: Site) -> None:
 
 
 def test_the_file_holds_the_coordinators_own_rules(site: Site) -> None:
-    told = json.loads((site.folder / "zenohd.json").read_text())
+    document = json.loads((site.folder / "zenohd.json").read_text())
     admitted = [
         (machine.role, machine.identity)
         for machine in Machines(site.certs.state).admitted()
         if machine.name in ("here", "desk")
     ]
     own = transport.machine_access_control(CLUSTER, admitted)
-    rights = told["access_control"]
+    rights = document["access_control"]
     for part in ("rules", "subjects", "policies"):
         assert rights[part][: len(own[part])] == own[part]
     assert rights["default_permission"] == "deny"
-    assert told["adminspace"] == {"enabled": False}
-    assert told["scouting"] == {"multicast": {"enabled": False}, "gossip": {"enabled": False}}
+    assert document["adminspace"] == {"enabled": False}
+    assert document["scouting"] == {"multicast": {"enabled": False}, "gossip": {"enabled": False}}
     # What is added: towards the coordinator the same, the other way round, and no one else has it.
     added = rights["rules"][len(own["rules"]) :]
     for rule, above in zip(own["rules"], added, strict=True):
@@ -252,11 +252,11 @@ def test_the_command_writes_a_file_for_the_folders_place_on_the_routers_host(sit
     assert done.exit_code == 0, done.output
     assert "zenohd --config /etc/evopolicy/router/zenohd.json" in done.output
     assert "worker/elsewhere" in done.output
-    told = json.loads((site.folder / "zenohd.json").read_text())
-    assert told["transport"]["auth"]["usrpwd"]["dictionary_file"] == "/etc/evopolicy/router/passwords"
-    assert told["transport"]["link"]["tls"]["listen_private_key"] == "/etc/evopolicy/router/key.pem"
-    assert told["listen"] == {"endpoints": ["tls/0.0.0.0:7447"]}
-    assert str(site.certs.state) not in msgspec.json.encode(told).decode()
+    document = json.loads((site.folder / "zenohd.json").read_text())
+    assert document["transport"]["auth"]["usrpwd"]["dictionary_file"] == "/etc/evopolicy/router/passwords"
+    assert document["transport"]["link"]["tls"]["listen_private_key"] == "/etc/evopolicy/router/key.pem"
+    assert document["listen"] == {"endpoints": ["tls/0.0.0.0:7447"]}
+    assert str(site.certs.state) not in msgspec.json.encode(document).decode()
 
 
 def test_a_revoked_router_gets_no_file(site: Site) -> None:

@@ -72,7 +72,7 @@ PartitionName=high Nodes={name} PriorityTier=10 PreemptMode=OFF MaxTime=INFINITE
         wait_until(munge.exists)
         self._start("slurmctld", "-D")
         self._start("slurmd", "-D", "-N", name)
-        wait_until(lambda: "idle" in self.says("sinfo", "--noheader", "--format=%T"), self.told)
+        wait_until(lambda: "idle" in self.says("sinfo", "--noheader", "--format=%T"), self.diagnostics)
 
     def _start(self, *words: str) -> None:
         with (self.root / f"{words[0]}.out").open("wb") as out:
@@ -89,15 +89,15 @@ PartitionName=high Nodes={name} PriorityTier=10 PreemptMode=OFF MaxTime=INFINITE
         )
         return done.stdout + done.stderr
 
-    def told(self) -> str:
+    def diagnostics(self) -> str:
         logs = [*self.root.glob("*.log"), *self.root.glob("*.out")]
         return "\n".join(f"{path.name}: {path.read_text()[-3000:]}" for path in logs)
 
     def submit(self, *words: str, **more: str) -> str:
         """The id of the job."""
-        said = self.says("sbatch", *words, **more)
-        found = re.search(r"Submitted batch job (\d+)", said)
-        assert found is not None, said
+        output = self.says("sbatch", *words, **more)
+        found = re.search(r"Submitted batch job (\d+)", output)
+        assert found is not None, output
         return found[1]
 
     def running(self, job: str) -> list[str]:
@@ -145,13 +145,13 @@ def test_workers_of_an_array_are_preempted_and_the_run_comes_to_the_same(
             feedback = f"*/*/{name}/workspace/feedback/"
             wait_until(lambda: [*(tmp_path / "runs").glob(f"{feedback}submit_001*/episodes/ep_*")])
             disturb()
-            assert running.wait() == 0, running.text + slurm.told()
+            assert running.wait() == 0, running.text + slurm.diagnostics()
 
     def take_nodes() -> None:
         """A job of higher priority takes both CPUs for a while, a task is cancelled, another killed outright."""
         slurm.submit("--partition=high", "--ntasks=2", "--output=high.log", "--wrap=sleep 3")
-        wait_until(lambda: not slurm.running(workers), slurm.told)
-        first, second = wait_until(lambda: pair(slurm.running(workers)), slurm.told)
+        wait_until(lambda: not slurm.running(workers), slurm.diagnostics)
+        first, second = wait_until(lambda: pair(slurm.running(workers)), slurm.diagnostics)
         slurm.says("scancel", first)
         slurm.says("scancel", "--signal=KILL", "--full", second)
 

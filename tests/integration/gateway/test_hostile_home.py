@@ -85,21 +85,21 @@ def refused(where: str, command: str, folder: Path, *namespaces: str, code: int 
         capture_output=True,
         timeout=TIMEOUT_S,
     )
-    said = done.stderr.decode("utf-8", "replace")
-    assert done.returncode == code, (done.returncode, said, done.stdout)
-    assert len(said.splitlines()) == 1, said
+    output = done.stderr.decode("utf-8", "replace")
+    assert done.returncode == code, (done.returncode, output, done.stdout)
+    assert len(output.splitlines()) == 1, output
     assert done.stdout == b""
-    return said
+    return output
 
 
 @pytest.mark.parametrize("name", [name for name in COMMANDS if name not in ("random", "worker")])
 def test_a_read_only_home_is_told_before_anything_is_begun(home: Path, name: str) -> None:
     StateFolder.open(home / "old").close()
     where = f"mount --bind {home} {home}; mount -o remount,ro,bind {home}; cd {home}"
-    said = refused(where, COMMANDS[name], home, code=1)
-    assert str(home) in said
-    assert "read-only" in said
-    assert any(option in said for option in ("--out", "--runs", "--state")), said
+    output = refused(where, COMMANDS[name], home, code=1)
+    assert str(home) in output
+    assert "read-only" in output
+    assert any(option in output for option in ("--out", "--runs", "--state")), output
 
 
 @pytest.mark.parametrize("name", ["try", "local", "suite", "random", "worker"])
@@ -108,9 +108,9 @@ def test_a_full_temporary_folder_is_told_before_anything_is_begun(home: Path, na
     full = home / "tmp"
     full.mkdir()
     where = f"mount -t tmpfs -o {limit} none {full}; export TMPDIR={full}"
-    said = refused(where, COMMANDS[name], home, code=1)
-    assert str(full) in said
-    assert "TMPDIR" in said
+    output = refused(where, COMMANDS[name], home, code=1)
+    assert str(full) in output
+    assert "TMPDIR" in output
 
 
 @pytest.mark.parametrize("name", ["run", "local", "suite"])
@@ -120,9 +120,9 @@ def test_a_full_temporary_folder_is_told_before_anything_is_begun(home: Path, na
 def test_a_machine_without_ipv4_loopback_is_told_before_anything_is_begun(
     home: Path, name: str, how: str
 ) -> None:
-    said = refused(how, COMMANDS[name], home, "--net")
-    assert "127.0.0.1" in said
-    assert "ip link set lo up" in said
+    output = refused(how, COMMANDS[name], home, "--net")
+    assert "127.0.0.1" in output
+    assert "ip link set lo up" in output
     assert list((home / "runs").iterdir()) == []
 
 
@@ -138,7 +138,7 @@ def test_a_machine_without_ipv4_loopback_is_told_before_anything_is_begun(
     ],
 )
 def test_a_path_that_is_not_utf_8_is_told_before_anything_is_begun(home: Path, command: str) -> None:
-    said = refused("export ODD=$(printf 'odd-\\377')", command.replace("{home}", str(home)), home)
-    assert r"odd-\xff" in said
-    assert "not UTF-8" in said
+    output = refused("export ODD=$(printf 'odd-\\377')", command.replace("{home}", str(home)), home)
+    assert r"odd-\xff" in output
+    assert "not UTF-8" in output
     assert list((home / "runs").iterdir()) == []

@@ -30,16 +30,16 @@ def asked(double: Double, kind: type[Message]) -> list[Message]:
 
 def quiet(folder: RunFolder, *, alone: bool = False, **more: object) -> tuple[Gateway, list[object]]:
     """A gateway, and what it has said: URLs once it serves, texts of what it waits for."""
-    said: list[object] = []
+    events: list[object] = []
     gateway = Gateway(
         folder,
-        on_ready=lambda urls, pipeline: said.append(urls),
+        on_ready=lambda urls, pipeline: events.append(urls),
         on_change=lambda pipeline: None,
-        on_wait=said.append,
+        on_wait=events.append,
         alone=alone,
         **more,  # type: ignore[arg-type]
     )
-    return gateway, said
+    return gateway, events
 
 
 async def until(what: Callable[[], object]) -> None:
@@ -60,13 +60,13 @@ def test_nothing_is_served_before_the_permit_and_the_operator_hears_why(tmp_path
         async with answering(tmp_path, double) as found:
             await double.score_another_run(host.boot_id())
             folder = prepare(tmp_path / "run", found, double)
-            gateway, said = quiet(folder)
+            gateway, events = quiet(folder)
             task = asyncio.create_task(gateway.run())
-            await until(lambda: said)
-            assert set(said) == {"hidden cases on this machine to be postponed"}
+            await until(lambda: events)
+            assert set(events) == {"hidden cases on this machine to be postponed"}
             assert not folder.workspace.exists()
             double.scoring.clear()
-            await until(lambda: len(said) > 1 and said[-2] == "")
+            await until(lambda: len(events) > 1 and events[-2] == "")
             assert gateway.permit_s > 0.0
             gateway.tell(None)
             assert not await task
@@ -121,12 +121,12 @@ def test_run_that_is_cancelled_while_it_waits_is_over(tmp_path: Path) -> None:
         double = Double(opened())
         async with answering(tmp_path, double) as found:
             await double.score_another_run(host.boot_id())
-            gateway, said = quiet(prepare(tmp_path / "run", found, double))
+            gateway, events = quiet(prepare(tmp_path / "run", found, double))
             task = asyncio.create_task(gateway.run())
-            await until(lambda: said)
+            await until(lambda: events)
             await double.cancel()
             assert await task
-        assert said[-1] == ""
+        assert events[-1] == ""
 
     asyncio.run(main())
 
@@ -150,10 +150,10 @@ def test_coordinator_of_an_older_version_is_an_error_with_the_remedy(tmp_path: P
         older = Refused(status=Refusal.BAD_MESSAGE, message="not a message")
         double.intercept = lambda message: older if isinstance(message, RequestPermit) else None
         async with answering(tmp_path, double) as found:
-            gateway, said = quiet(prepare(tmp_path / "run", found, double))
+            gateway, events = quiet(prepare(tmp_path / "run", found, double))
             with pytest.raises(ConfigError, match=r"older version.*update it"):
                 await gateway.run()
-        assert said == [""]
+        assert events == [""]
 
     asyncio.run(main())
 

@@ -120,15 +120,15 @@ def test_published_policies_import_what_the_checker_allows_them_by_name(root: Pa
     )
     assert code == 0, out + err
 
-    def told(*options: str) -> list[str]:
+    def printed(*options: str) -> list[str]:
         asked = ("check", "results.evp", "--policies", "all", "--json", "--slots", "1", *options)
         code, out, err = finished(root, *asked)
         assert code == 0, out + err
         return [each["text"] for each in json.loads(out)["findings"] if each["kind"] == "policies"]
 
-    (refused,) = told()
+    (refused,) = printed()
     assert "allow them with --policy-package scipy" in refused
-    assert any("the same actions" in text for text in told("--policy-package", "scipy"))
+    assert any("the same actions" in text for text in printed("--policy-package", "scipy"))
 
 
 def test_the_python_package_takes_them_too(root: Path) -> None:

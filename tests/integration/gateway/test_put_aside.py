@@ -26,7 +26,7 @@ def files_of(folder: Path, submit: str = "submit_000") -> dict[str, set[str]]:
     return {path.name: {file.name for file in path.iterdir()} for path in sorted(episodes.iterdir())}
 
 
-def told(folder: Path, episode: str, submit: str = "submit_000") -> list[dict[str, Any]]:
+def rows(folder: Path, episode: str, submit: str = "submit_000") -> list[dict[str, Any]]:
     text = (folder / submit / "episodes" / episode / "error.txt").read_text()
     return [json.loads(line) for line in text.splitlines()]
 
@@ -50,7 +50,7 @@ def test_an_episode_whose_trajectory_cannot_be_written_is_put_aside(
                 "ep_001": WHOLE,
                 "ep_002": {"error.txt", "stdout.txt", "stderr.txt"},
             }
-            (line,) = told(s.folder.feedback, "ep_002")
+            (line,) = rows(s.folder.feedback, "ep_002")
             assert line["category"] == "feedback_error"
             assert "cannot be written; the episode's return counts" in line["message"]
 
@@ -63,7 +63,7 @@ def test_an_episode_whose_recording_is_gone_is_put_aside(tmp_path: Path) -> None
         double.lost = {2}
         async with served(tmp_path, double) as s:
             assert (await s.http.post(s.urls.submit, json=BODY)).json()["status"] == "ok"
-            assert [line["message"] for line in told(s.folder.feedback, "ep_001")] == [
+            assert [line["message"] for line in rows(s.folder.feedback, "ep_001")] == [
                 "this episode's trajectory or video is not stored any more; the episode's return counts"
             ]
             assert files_of(s.folder.feedback)["ep_000"] == WHOLE
@@ -126,7 +126,7 @@ def test_an_episode_that_kills_two_gateways_is_put_aside_and_blames_no_other(tmp
             assert {frozenset(files) for name, files in found_files.items() if name != "ep_002"} == {
                 frozenset(WHOLE)
             }
-            assert "ended 2 times" in told(folder.feedback, "ep_002")[0]["message"]
+            assert "ended 2 times" in rows(folder.feedback, "ep_002")[0]["message"]
             async with gateway_on(folder, double) as s:
                 assert (await s.http.get(f"{s.urls.submit}/submit_000")).json()["status"] == "ok"
 

@@ -75,9 +75,9 @@ def test_the_wheel_holds_what_messages_and_pages_name(built: Built) -> None:
         for room in ("common", "coordinator", "worker", "agent_gateway")
         for path in (ROOT / room).rglob("*.py")
     ]
-    told = {name for path in texts for name in NAMED.findall(path.read_text()) if (ROOT / name).exists()}
-    assert {"constraints.txt", "examples/policies", "examples/agents/qwen.toml"} <= told
-    for name in sorted(told):
+    named = {name for path in texts for name in NAMED.findall(path.read_text()) if (ROOT / name).exists()}
+    assert {"constraints.txt", "examples/policies", "examples/agents/qwen.toml"} <= named
+    for name in sorted(named):
         if name in ("pyproject.toml",) or name.startswith(REPOSITORY_ONLY):
             continue
         inside = f"evopolicy_gateway/{name}"
@@ -89,8 +89,8 @@ def test_the_wheel_holds_what_messages_and_pages_name(built: Built) -> None:
 def test_the_extra_local_asks_for_what_this_environment_has(built: Built) -> None:
     with zipfile.ZipFile(built.wheel) as archive:
         (metadata,) = (name for name in archive.namelist() if name.endswith(".dist-info/METADATA"))
-        told = HeaderParser().parsestr(archive.read(metadata).decode())
-    asked = [Requirement(text) for text in told.get_all("Requires-Dist", [])]
+        headers = HeaderParser().parsestr(archive.read(metadata).decode())
+    asked = [Requirement(text) for text in headers.get_all("Requires-Dist", [])]
 
     def of(extra: str) -> dict[str, Requirement]:
         return {str(one): one for one in asked if one.marker is None or one.marker.evaluate({"extra": extra})}
@@ -181,10 +181,10 @@ def test_the_installation_finds_its_own_files_and_not_the_repository(place: Plac
 
 
 def test_doctor_says_that_this_machine_plays_runs(place: Place) -> None:
-    told = json.loads(place.run(["evopolicy", "doctor", "--json"]))
-    assert told["plays"]
-    assert told["tier"] == "bwrap"
-    found = {check["name"]: check for check in told["checks"]}
+    document = json.loads(place.run(["evopolicy", "doctor", "--json"]))
+    assert document["plays"]
+    assert document["tier"] == "bwrap"
+    found = {check["name"]: check for check in document["checks"]}
     for name in (
         "Python",
         "extra gateway",
@@ -196,7 +196,7 @@ def test_doctor_says_that_this_machine_plays_runs(place: Place) -> None:
         "open files",
     ):
         assert name in found
-    for check in told["checks"]:
+    for check in document["checks"]:
         assert check["verdict"] != "missing" or (check["advice"] and check["found"]), check
 
 
@@ -208,9 +208,9 @@ def test_commands_complete_and_the_agents_of_the_extras_start(place: Place) -> N
         assert (
             place.run([program, "--version"]).split()[-1] == place.run(["evopolicy", "--version"]).split()[-1]
         )
-    told = place.run([str(place.bin / "python"), "-P", "-m", "evopolicy_gateway.agents.llm", "--version"])
-    assert told.startswith("openai ")
-    assert ", anthropic " in told
+    output = place.run([str(place.bin / "python"), "-P", "-m", "evopolicy_gateway.agents.llm", "--version"])
+    assert output.startswith("openai ")
+    assert ", anthropic " in output
     agent = (
         "from pathlib import Path; from evopolicy_gateway.harnesses import make;"
         " print(make('acp:gemini --acp', Path.cwd()).name, make('llm:openai/m', Path.cwd()).name)"
@@ -222,8 +222,8 @@ def test_commands_complete_and_the_agents_of_the_extras_start(place: Place) -> N
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_an_ordinary_user_plays_the_demo(place: Place) -> None:
-    told = place.run(["evopolicy", "demo"])
-    assert "next: evopolicy report runs --out report" in told
+    output = place.run(["evopolicy", "demo"])
+    assert "next: evopolicy report runs --out report" in output
     record = json.loads((place.root / "runs/evolve/gym_continuouscar/demo/run.json").read_text())
     assert record["outcome"]["status"] == "completed"
     assert record["outcome"]["budget_used"] == 32

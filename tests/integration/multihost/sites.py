@@ -187,8 +187,8 @@ class Sites:
 
     def _is_ours(self, pid: int) -> bool:
         with contextlib.suppress(OSError):
-            told = Path(f"/proc/{pid}/environ").read_bytes() + Path(f"/proc/{pid}/cmdline").read_bytes()
-            return pid != os.getpid() and os.fsencode(self.root) in told
+            readable = Path(f"/proc/{pid}/environ").read_bytes() + Path(f"/proc/{pid}/cmdline").read_bytes()
+            return pid != os.getpid() and os.fsencode(self.root) in readable
         return False
 
     def status_until(
@@ -208,9 +208,9 @@ class Sites:
                 message = operator.StatusRequest(token=link.credentials.token)
                 while time.monotonic() < deadline:
                     with contextlib.suppress(TransportError):
-                        told = await requester.once("status", message, operator.StatusReply)
-                        if fits(told):
-                            return told
+                        reply = await requester.once("status", message, operator.StatusReply)
+                        if fits(reply):
+                            return reply
                     assert process is None or process.poll() is None, "it ended before"
                     await asyncio.sleep(0.02)
             raise AssertionError(f"not within {TIMEOUT_S:g} s")

@@ -50,8 +50,8 @@ def cluster() -> Iterator[Sites]:
         yield made
 
 
-def is_active(name: str, told: StatusReply) -> bool:
-    return any(each.worker == name and each.state == "active" for each in told.workers)
+def is_active(name: str, reply: StatusReply) -> bool:
+    return any(each.worker == name and each.state == "active" for each in reply.workers)
 
 
 def ended_well(cluster: Sites, command: subprocess.Popen[bytes], host: str, name: str) -> None:
@@ -67,10 +67,10 @@ def play(
     cluster: Sites, name: str, env: str = TOY, meanwhile: Callable[[Command], object] | None = None
 ) -> None:
     """A run from the desk; `meanwhile` happens when a third of its episodes are done. It must be that of one machine."""
-    before = cluster.status_until(lambda told: True).episodes_done
+    before = cluster.status_until(lambda reply: True).episodes_done
     command = cluster.begin("desk", name, env, cluster.root / "desk" / "keys")
     if meanwhile is not None:
-        cluster.status_until(lambda told: told.episodes_done - before >= TOTAL // 3, command)
+        cluster.status_until(lambda reply: reply.episodes_done - before >= TOTAL // 3, command)
         meanwhile(command)
     ended_well(cluster, command, "desk", name)
     folder = cluster.folder("desk", name, env)
@@ -85,8 +85,8 @@ def test_a_run_over_several_hosts_is_that_of_one_machine(cluster: Sites) -> None
 def test_both_workers_are_given_work_and_see_nothing_of_the_coordinators_disk(cluster: Sites) -> None:
     busy: set[str] = set()
 
-    def both(told: StatusReply) -> bool:
-        busy.update(each.worker for each in told.workers if each.held)
+    def both(reply: StatusReply) -> bool:
+        busy.update(each.worker for each in reply.workers if each.held)
         return busy >= {"one", "two"}
 
     for name in ("one", "two", "desk", "router"):

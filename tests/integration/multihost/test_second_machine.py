@@ -78,8 +78,8 @@ def wait(first: Machine, worker: str, running: subprocess.Popen[bytes], log: Pat
     """Until the coordinator knows the worker."""
     deadline = time.monotonic() + TIMEOUT_S
     while True:
-        told = json.loads(first.says("evopolicy status --json"))
-        if any(one["worker"].startswith(worker) and one["state"] == "active" for one in told["workers"]):
+        document = json.loads(first.says("evopolicy status --json"))
+        if any(one["worker"].startswith(worker) and one["state"] == "active" for one in document["workers"]):
             return
         assert running.poll() is None, log.read_text()
         assert time.monotonic() < deadline, log.read_text()
@@ -126,7 +126,7 @@ def test_a_worker_that_is_there_before_its_coordinator_waits_and_joins(
     assert worker.poll() is None, log.read_text()
     first.leave_running(listen, "coordinator.log")
     deadline = time.monotonic() + TIMEOUT_S
-    while "ready: " not in (said := (first.home / "coordinator.log").read_text()):
-        assert time.monotonic() < deadline, said
+    while "ready: " not in (output := (first.home / "coordinator.log").read_text()):
+        assert time.monotonic() < deadline, output
         time.sleep(0.1)
     wait(first, "second", worker, log)

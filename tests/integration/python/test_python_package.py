@@ -169,8 +169,8 @@ evp.run(env="toy/line", agent=agent, budget=4, validation=1, heldout=1, exp_id="
         if "submit_000 ok" in line:
             break
     process.send_signal(signal.SIGINT)
-    _, told = process.communicate(timeout=120)
-    assert told.strip().endswith("KeyboardInterrupt")
+    _, output = process.communicate(timeout=120)
+    assert output.strip().endswith("KeyboardInterrupt")
     record = json.loads((tmp_path / "runs/agent/toy_line/stopped/run.json").read_text())
     assert record["outcome"]["status"] == "cancelled"
     assert not list(tmp_path.glob("evopolicy-function-*"))
@@ -182,8 +182,8 @@ def test_the_page_does_what_it_says(tmp_path: Path) -> None:
     blocks = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)
     assert len(blocks) == 4
     (tmp_path / "page.py").write_text("\n".join(blocks))
-    told = run_here([sys.executable, "page.py"], tmp_path)
-    assert "my_function gym/continuouscar completed" in told
+    output = run_here([sys.executable, "page.py"], tmp_path)
+    assert "my_function gym/continuouscar completed" in output
 
 
 @pytest.mark.slow
@@ -191,9 +191,9 @@ def test_the_page_does_what_it_says(tmp_path: Path) -> None:
 def test_the_notebook_runs_from_its_first_cell_to_its_last(tmp_path: Path) -> None:
     notebook = json.loads(NOTEBOOK.read_text())
     assert (notebook["nbformat"], notebook["nbformat_minor"]) == (4, 4)
-    told = run_here([sys.executable, "-c", CELLS, str(NOTEBOOK)], tmp_path)
-    assert told.count("<svg") == 2
-    assert "((60, 3), " in told
+    output = run_here([sys.executable, "-c", CELLS, str(NOTEBOOK)], tmp_path)
+    assert output.count("<svg") == 2
+    assert "((60, 3), " in output
     assert (tmp_path / "runs/climb/toy_line/notebook/run.json").is_file()
 
 

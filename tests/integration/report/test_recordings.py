@@ -91,9 +91,9 @@ class Policy:
         return [(-1.0) ** (self.t // 5) * 0.9] * self.space["shape"][0]
 """
 VIDEOS = """Promise.all([...document.querySelectorAll('video')].map((video) => new Promise((done) => {
-  const told = () => done([video.readyState, video.videoWidth, video.videoHeight, video.duration, video.error && video.error.message]);
-  if (video.readyState >= 2 || video.error) { told(); return; }
-  video.addEventListener('loadeddata', told); video.addEventListener('error', told);
+  const report = () => done([video.readyState, video.videoWidth, video.videoHeight, video.duration, video.error && video.error.message]);
+  if (video.readyState >= 2 || video.error) { report(); return; }
+  video.addEventListener('loadeddata', report); video.addEventListener('error', report);
   video.preload = 'auto'; video.load();
 })))"""
 
@@ -115,11 +115,11 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
         start_new_session=True,
     )
     try:
-        said, _ = running.communicate(timeout=TIMEOUT_S)
+        output, _ = running.communicate(timeout=TIMEOUT_S)
     except subprocess.TimeoutExpired:
         os.killpg(running.pid, signal.SIGTERM)
         raise
-    assert running.returncode == 0, said
+    assert running.returncode == 0, output
     return folder / "runs/t"
 
 
@@ -188,8 +188,8 @@ def test_recorded_videos_play_in_a_browser_with_the_agents_side_by_side(runs: Pa
     arguments = [str(runs), "--out", str(tmp_path / "report"), "--jobs", "1", "--json"]
     refused = CliRunner().invoke(app, arguments)
     assert "videos in feedback on toy/line" in refused.output
-    told = CliRunner().invoke(app, [*arguments, "--allow-mixed"])
-    assert told.exit_code == 0, told.output
+    invoked = CliRunner().invoke(app, [*arguments, "--allow-mixed"])
+    assert invoked.exit_code == 0, invoked.output
     pages = sorted((tmp_path / "report/replays").glob("*.html"))
     assert [page.stem for page in pages] == ["gymnasium-FetchPickAndPlace-v4", "toy-line"]
     with Page() as page:
@@ -235,9 +235,9 @@ def test_a_harnesss_log_tells_what_was_read_and_said_before_each_submit(runs: Pa
         assert evidence is not None
         name = f"submit_{row.submit.index:03d}"
         assert evidence.read == (f"feedback/{name}/summary.json",)
-        said = f"{name} came to a mean return of {row.submit.mean_return:.4g}. I {plan} next."
-        assert evidence.attribution == said
-        assert evidence.messages == ("submitted", said)
+        quote = f"{name} came to a mean return of {row.submit.mean_return:.4g}. I {plan} next."
+        assert evidence.attribution == quote
+        assert evidence.messages == ("submitted", quote)
     assert found.unplaced == ("submitted",)
     assert [row.transition.edit for row in found.rows if row.transition] == [
         "first",

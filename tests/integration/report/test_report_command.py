@@ -159,7 +159,7 @@ def test_index_is_self_contained(report: Path) -> None:
     assert text.count('<svg role="img"') == len(list((report / "figures").glob("*.svg")))
 
 
-def test_front_door_has_report_as_a_plain_command(tmp_path: Path) -> None:
+def test_evopolicy_has_report_as_a_plain_command(tmp_path: Path) -> None:
     write_run(tmp_path / "runs", [Version(policy(), (1.0,), 1.0)])
     command = [sys.executable, "-c", "from evopolicy_gateway.cli.main import main; main()", "report"]
     arguments = [str(tmp_path / "runs"), "--out", str(tmp_path / "report"), "--no-pages"]
@@ -211,8 +211,8 @@ def test_mixed_runs_are_refused_unless_told_and_then_marked(tmp_path: Path) -> N
     assert refused.exit_code == 3
     assert "policy scope on core16: episode (1 run), submit (1 run)" in refused.output
     assert not (tmp_path / "report").exists()
-    told = CliRunner().invoke(app, [*arguments, "--allow-mixed"])
-    assert told.exit_code == 0
+    invoked = CliRunner().invoke(app, [*arguments, "--allow-mixed"])
+    assert invoked.exit_code == 0
     assert "policy scope on core16" in (tmp_path / "report/index.html").read_text()
 
 

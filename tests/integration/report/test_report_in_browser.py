@@ -201,18 +201,18 @@ def test_screen_reader_is_told_the_name_of_every_table_figure_and_control(page: 
     for path in [report / "index.html", sorted((report / "traces").glob("*.html"))[0]]:
         page.look()
         page.open(path)
-        told = page.accessible()
-        assert [(role, name) for role, name in told if role in named and not name.strip()] == []
-        assert [role for role, _ in told].count("main") == 1
-        regions = [name for role, name in told if role in ("region", "navigation")]
+        tree = page.accessible()
+        assert [(role, name) for role, name in tree if role in named and not name.strip()] == []
+        assert [role for role, _ in tree].count("main") == 1
+        regions = [name for role, name in tree if role in ("region", "navigation")]
         assert len(regions) == len(set(regions)), "two places of one name"
     page.open(report / "index.html")
-    told = page.accessible()
+    tree = page.accessible()
     figures = len(
         page.run("[...document.querySelectorAll('figure:not([hidden]) svg[role=img]')].map((e) => e.id)")
     )
-    assert sum(role == "image" for role, _ in told) == figures
-    assert sum(role == "table" for role, _ in told) >= 10
+    assert sum(role == "image" for role, _ in tree) == figures
+    assert sum(role == "table" for role, _ in tree) >= 10
 
 
 def test_run_pages_lead_to_the_other_agents_on_the_same_environment(page: Page, report: Path) -> None:

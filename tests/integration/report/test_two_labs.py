@@ -117,9 +117,9 @@ def test_a_clean_installation_checks_both_files(labs: Path, tmp_path: Path) -> N
             "25%",
         ]
         done = run(tmp_path, *command, "--identity", key(labs, lab))
-        told = json.loads(done.stdout)
-        assert told["ok"]
-        states = {each["kind"]: each["state"] for each in told["findings"]}
+        document = json.loads(done.stdout)
+        assert document["ok"]
+        states = {each["kind"]: each["state"] for each in document["findings"]}
         assert (states["identity"], states["replay"]) == ("ok", "ok")
 
 
@@ -136,10 +136,10 @@ def test_what_cannot_be_compared_or_does_not_stand_is_apart_with_the_reason(
 ) -> None:
     with Archive(labs / "lab-b.evp") as archive:
         record = decode_run_record(archive.read("runs/0000/run.json", 1 << 20))
-        told = json.loads(archive.read("runs/0000/run.json", 1 << 20))
+        document = json.loads(archive.read("runs/0000/run.json", 1 << 20))
     assert record.agent.entry == "evolve"
-    told["agent"]["entry"] = "<script>alert(1)</script>"
-    changed(labs / "lab-b.evp", tmp_path / "<b>forged.evp", "runs/0000/run.json", json.dumps(told).encode())
+    document["agent"]["entry"] = "<script>alert(1)</script>"
+    changed(labs / "lab-b.evp", tmp_path / "<b>forged.evp", "runs/0000/run.json", json.dumps(document).encode())
     (tmp_path / "torn.evp").write_bytes((labs / "lab-a.evp").read_bytes()[:5000])
     # Another budget: no comparison with the first two.
     sweep = (

@@ -67,7 +67,7 @@ def test_a_question_that_is_not_answered_fails(tmp_path: Path, monkeypatch: pyte
     run(tmp_path, "operator", scenario)
 
 
-def test_who_asks_again_says_why_he_waits_and_gives_up_when_his_patience_ends(
+def test_a_client_that_retries_reports_why_and_gives_up_at_its_timeout(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(requests, "ANSWER_S", SOON_S)
@@ -80,9 +80,9 @@ def test_who_asks_again_says_why_he_waits_and_gives_up_when_his_patience_ends(
     with capture_logs() as logs:
         monkeypatch.setattr(requests, "log", structlog.get_logger())
         run(tmp_path, "operator", scenario)
-    told = [entry["why"] for entry in logs if entry["event"] == "still waiting for the coordinator"]
-    assert told
-    assert all("no answer" in text for text in told)
+    reasons = [entry["why"] for entry in logs if entry["event"] == "still waiting for the coordinator"]
+    assert reasons
+    assert all("no answer" in text for text in reasons)
 
 
 def test_an_operators_command_gives_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

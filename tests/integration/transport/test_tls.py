@@ -32,7 +32,7 @@ KEYS: dict[Role, str] = {
 
 @contextlib.asynccontextmanager
 async def coordinator(certs: OwnCerts) -> AsyncIterator[list[str]]:
-    """The coordinator's door for other machines, which answers every key; yields the keys it was asked."""
+    """The coordinator's listener for other machines, which answers every key; yields the keys it was asked."""
     asked: list[str] = []
 
     def answer(queries: list[IncomingQuery]) -> None:
@@ -40,8 +40,8 @@ async def coordinator(certs: OwnCerts) -> AsyncIterator[list[str]]:
             asked.append(query.key)
             query.reply(b"coordinator")
 
-    door = remote_listener(CLUSTER, (certs.endpoint,), Machines(certs.state), answer, lambda key, alive: None)
-    async with door:
+    listener = remote_listener(CLUSTER, (certs.endpoint,), Machines(certs.state), answer, lambda key, alive: None)
+    async with listener:
         yield asked
 
 
@@ -106,7 +106,7 @@ def test_a_machine_is_answered_on_the_keys_of_its_role_only(certs: OwnCerts, nam
     asyncio.run(scenario())
 
 
-def refused_at_the_door(certs: OwnCerts, tmp_path: Path) -> dict[str, Credentials]:
+def refused_clients(certs: OwnCerts, tmp_path: Path) -> dict[str, Credentials]:
     """Cheats that do not get a session."""
     honest = of(folder(certs, "worker-honest"))
     foreign = OwnCerts(tmp_path / "foreign")
@@ -133,7 +133,7 @@ def test_who_has_no_good_certificate_and_password_gets_no_session(certs: OwnCert
             coordinator(certs) as asked,
             transport.connect(of(folder(certs, "worker-honest"))) as honest,
         ):
-            for cheat, credentials in refused_at_the_door(certs, tmp_path).items():
+            for cheat, credentials in refused_clients(certs, tmp_path).items():
                 assert not await gets_in(credentials), cheat
             assert asked == []
             assert await answered(honest, KEYS["worker"])
@@ -315,11 +315,11 @@ def test_an_open_link_ends_with_its_certificate(tmp_path: Path) -> None:
 
 def test_listening_for_other_machines_needs_certificates(tmp_path: Path) -> None:
     async def scenario() -> None:
-        door = remote_listener(
+        listener = remote_listener(
             CLUSTER, ("tls/127.0.0.1:1",), Machines(tmp_path), lambda queries: None, lambda key, alive: None
         )
         with pytest.raises(ConfigError, match="certs init"):
-            async with door:
+            async with listener:
                 pass
 
     asyncio.run(scenario())

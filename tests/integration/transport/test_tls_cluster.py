@@ -198,10 +198,10 @@ def refused(*args: object) -> str:
 
 
 def test_plain_tcp_beyond_this_machine_is_refused_with_the_remedy(tmp_path: Path) -> None:
-    said = refused("--state", tmp_path / "state", "--listen", "tcp/0.0.0.0:7447")
-    assert "certs init" in said
-    assert "tls/0.0.0.0:7447" in said
-    assert "--insecure-tcp" in said
+    output = refused("--state", tmp_path / "state", "--listen", "tcp/0.0.0.0:7447")
+    assert "certs init" in output
+    assert "tls/0.0.0.0:7447" in output
+    assert "--insecure-tcp" in output
 
 
 def test_tls_without_certificates_is_refused_with_the_remedy(tmp_path: Path) -> None:

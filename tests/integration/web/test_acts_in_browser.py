@@ -166,7 +166,7 @@ def test_runs_workers_and_sweeps_are_acted_on_from_the_page(tmp_path: Path) -> N
             assert reader.problems == []
     finally:
         coordinator.stop()
-    told = [json.loads(line) for line in acts.read_text().splitlines()]
+    entries = [json.loads(line) for line in acts.read_text().splitlines()]
     names = [
         "sweep pause",
         "worker pause",
@@ -176,12 +176,12 @@ def test_runs_workers_and_sweeps_are_acted_on_from_the_page(tmp_path: Path) -> N
         "run cancel",
         "worker drain",
     ]
-    assert [(one["act"], one["outcome"]) for one in told] == [
+    assert [(one["act"], one["outcome"]) for one in entries] == [
         (name, outcome) for name in names for outcome in ("asked", "done")
     ]
-    assert [one["name"] for one in told[::2]][:3] == ["acted", "w-first", "w-first"]
-    assert told[6]["reason"] == told[7]["reason"] == "the first machine has died"
-    assert {one["by"] for one in told} == {"browser at 127.0.0.1"}
+    assert [one["name"] for one in entries[::2]][:3] == ["acted", "w-first", "w-first"]
+    assert entries[6]["reason"] == entries[7]["reason"] == "the first machine has died"
+    assert {one["by"] for one in entries} == {"browser at 127.0.0.1"}
     text = acts.read_text()
     assert tokens.act not in text
     assert tokens.read not in text

@@ -58,8 +58,8 @@ def test_a_worker_is_paused_and_resumed_and_a_refusal_is_told(tmp_path: Path) ->
                 assert refused.status_code == 409
                 assert "Not done" in refused.text
                 assert client.post("/act/run/r-1/repin", content="class=x").status_code == 400
-                told = [json.loads(line) for line in log.read_text().splitlines()]
-                assert [(one["act"], one["outcome"].partition(":")[0]) for one in told] == [
+                entries = [json.loads(line) for line in log.read_text().splitlines()]
+                assert [(one["act"], one["outcome"].partition(":")[0]) for one in entries] == [
                     ("worker pause", "asked"),
                     ("worker pause", "done"),
                     ("worker resume", "asked"),

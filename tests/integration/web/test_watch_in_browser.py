@@ -183,7 +183,7 @@ def test_a_sweep_is_watched_from_start_to_end(tmp_path: Path) -> None:
                             assert page.run("document.documentElement.scrollWidth <= innerWidth")
                         assert page.problems == []
             with urllib.request.urlopen(f"http://127.0.0.1:{metrics}/metrics", timeout=TIMEOUT_S) as answer:
-                told = answer.read().decode()
+                output = answer.read().decode()
             for line in (
                 'evopolicy_submits_total{verdict="ok"}',
                 'evopolicy_episodes_total{split="heldout",verdict="ok"} 2.0',
@@ -192,7 +192,7 @@ def test_a_sweep_is_watched_from_start_to_end(tmp_path: Path) -> None:
                 "evopolicy_up 1.0",
                 "evopolicy_store_database_bytes",
             ):
-                assert line in told, told
+                assert line in output, output
             with urllib.request.urlopen(f"http://127.0.0.1:{metrics}/healthz", timeout=TIMEOUT_S) as answer:
                 assert answer.read() == b"ok\n"
     finally:

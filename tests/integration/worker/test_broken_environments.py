@@ -31,7 +31,7 @@ how = "{how}"
 seeds_from = 100
 """
 """It keeps its word while it is tried out and measured, with small seeds, and breaks it in episodes that count."""
-TOLD = {
+PROBLEMS = {
     "hang": "environment acme/bad, step 0: it has not returned for 4 s, the limit of one call",
     "hang in reset": "environment acme/bad, reset: it has not returned for 4 s",
     "exit": "environment acme/bad: its process ended while it played",
@@ -67,7 +67,7 @@ def worker(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("worker", "how"), [(how, how) for how in TOLD], indirect=["worker"])
+@pytest.mark.parametrize(("worker", "how"), [(how, how) for how in PROBLEMS], indirect=["worker"])
 def test_a_broken_environment_is_told_and_charges_nothing(
     tmp_path: Path, coordinator: Coordinator, worker: subprocess.Popen[bytes], how: str
 ) -> None:
@@ -102,6 +102,6 @@ def test_a_broken_environment_is_told_and_charges_nothing(
                 assert (await sound.state()).remaining_budget == 1
 
     asyncio.run(play())
-    assert TOLD[how] in log.read_text()
-    wait_until(lambda: TOLD[how] in coordinator.log.read_text())
+    assert PROBLEMS[how] in log.read_text()
+    wait_until(lambda: PROBLEMS[how] in coordinator.log.read_text())
     assert worker.poll() is None

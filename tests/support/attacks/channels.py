@@ -48,7 +48,7 @@ WAYS = {
 
 WRITER = """
 import ctypes, json, os, sys, threading, time
-TOLD = json.load(open("told.json"))
+GIVEN = json.load(open("given.json"))
 LIBRARY = os.path.realpath(sys.executable)
 
 def send(way, bit, end):
@@ -76,10 +76,10 @@ class Policy:
     def act(self, obs):
         self.n += 1
         if self.n == 1:
-            for k, bit in enumerate(TOLD["bits"]):
-                start = TOLD["start"] + k * TOLD["period"]
+            for k, bit in enumerate(GIVEN["bits"]):
+                start = GIVEN["start"] + k * GIVEN["period"]
                 time.sleep(max(0.0, start - time.monotonic()))
-                send(TOLD["way"], bit, start + 0.7 * TOLD["period"])
+                send(GIVEN["way"], bit, start + 0.7 * GIVEN["period"])
         return [0.0]
 """
 
@@ -152,17 +152,17 @@ READER = (
     READINGS
     + """
 import json
-told = json.loads(sys.argv[1])
+given = json.loads(sys.argv[1])
 watch_library()
-found = {name: [] for name in told["names"]}
+found = {name: [] for name in given["names"]}
 print("ready", flush=True)
-told["start"] = float(sys.stdin.readline())
-for k in range(told["n"]):
-    start = told["start"] + k * told["period"]
-    time.sleep(max(0.0, start + 0.1 * told["period"] - time.monotonic()))
-    speed = own_speed(start + 0.6 * told["period"]) if "own_speed" in told["names"] else 0
-    time.sleep(max(0.0, start + 0.6 * told["period"] - time.monotonic()))
-    for name, value in {**readings(set(told["names"]) - {"own_speed"}), "own_speed": speed}.items():
+given["start"] = float(sys.stdin.readline())
+for k in range(given["n"]):
+    start = given["start"] + k * given["period"]
+    time.sleep(max(0.0, start + 0.1 * given["period"] - time.monotonic()))
+    speed = own_speed(start + 0.6 * given["period"]) if "own_speed" in given["names"] else 0
+    time.sleep(max(0.0, start + 0.6 * given["period"] - time.monotonic()))
+    for name, value in {**readings(set(given["names"]) - {"own_speed"}), "own_speed": speed}.items():
         if name in found:
             found[name].append(value)
 print(json.dumps(found))
@@ -173,7 +173,7 @@ LISTENER = (
     READINGS
     + """
 import json
-TOLD = json.load(open("told.json"))
+GIVEN = json.load(open("given.json"))
 
 class Policy:
     def __init__(self, *spaces): self.n = 0
@@ -182,10 +182,10 @@ class Policy:
         self.n += 1
         if self.n == 1:
             found = []
-            for k in range(len(TOLD["bits"])):
-                start = TOLD["start"] + k * TOLD["period"]
-                time.sleep(max(0.0, start + 0.1 * TOLD["period"] - time.monotonic()))
-                found.append(own_speed(start + 0.6 * TOLD["period"]))
+            for k in range(len(GIVEN["bits"])):
+                start = GIVEN["start"] + k * GIVEN["period"]
+                time.sleep(max(0.0, start + 0.1 * GIVEN["period"] - time.monotonic()))
+                found.append(own_speed(start + 0.6 * GIVEN["period"]))
             print(json.dumps(found))
         return [0.0]
 """
@@ -227,8 +227,8 @@ class JailedReader:
 
     def look(self) -> dict[str, float | None]:
         """All readings, once."""
-        said, _ = self.start(LOOKER).communicate(timeout=60)
-        found: dict[str, float | None] = json.loads(said)
+        output, _ = self.start(LOOKER).communicate(timeout=60)
+        found: dict[str, float | None] = json.loads(output)
         return found
 
 
@@ -243,12 +243,12 @@ def live(
     assert listening.stdout is not None
     assert listening.stdout.readline() == "ready\n"
     start = time.monotonic() + 1.5
-    told = {"way": way, "bits": bits, "start": start, "period": period_s}
+    parameters = {"way": way, "bits": bits, "start": start, "period": period_s}
     listening.stdin.write(f"{start}\n")
     listening.stdin.flush()
-    play(slots, told)
-    said, _ = listening.communicate(timeout=120)
-    values = json.loads(said)
+    play(slots, parameters)
+    output, _ = listening.communicate(timeout=120)
+    values = json.loads(output)
     return {name: arrived(bits, values[name]) / period_s for name in names}
 
 
@@ -259,10 +259,10 @@ def between_policies(slots: Slots, cores: tuple[int, int], n: int = 80) -> float
     try:
         for slot in pair:
             slots.run(slot.start())
-        told = {"way": "computes", "bits": bits, "start": time.monotonic() + 3.0, "period": PERIOD_S}
+        parameters = {"way": "computes", "bits": bits, "start": time.monotonic() + 3.0, "period": PERIOD_S}
         plays = []
         for slot, source in zip(pair, (WRITER, LISTENER), strict=True):
-            folder = slots.bundle({"policy.py": source, "told.json": json.dumps(told)})
+            folder = slots.bundle({"policy.py": source, "given.json": json.dumps(parameters)})
             plays.append(slot.play(make_job(limits=LIMITS), folder, lambda episodes, steps: None))
 
         async def both() -> Any:
@@ -282,16 +282,16 @@ def afterwards(slots: Slots, reader: JailedReader, wait_s: float, n: int) -> dic
     moved: dict[str, list[float | None]] = {}
     for kind in kinds:
         before = reader.look()
-        told = {"way": "all that lasts", "bits": [kind] * 4, "start": time.monotonic() + 0.5, "period": 0.7}
-        play(slots, told)
+        parameters = {"way": "all that lasts", "bits": [kind] * 4, "start": time.monotonic() + 0.5, "period": 0.7}
+        play(slots, parameters)
         time.sleep(wait_s)
         for name, value in reader.look().items():
             old = before[name]
             moved.setdefault(name, []).append(None if value is None or old is None else value - old)
-    return {name: _told_apart(kinds, values) for name, values in moved.items() if None not in values}
+    return {name: _separated(kinds, values) for name, values in moved.items() if None not in values}
 
 
-def _told_apart(kinds: list[int], values: list[Any]) -> float:
+def _separated(kinds: list[int], values: list[Any]) -> float:
     """Share of the episodes that lie nearer to the mean of the others of their kind."""
     right = 0
     for k, (kind, value) in enumerate(zip(kinds, values, strict=True)):
@@ -303,9 +303,9 @@ def _told_apart(kinds: list[int], values: list[Any]) -> float:
     return right / len(kinds)
 
 
-def play(slots: Slots, told: dict[str, Any]) -> None:
+def play(slots: Slots, parameters: dict[str, Any]) -> None:
     """One episode of the writer."""
-    folder = slots.bundle({"policy.py": WRITER, "told.json": json.dumps(told)})
+    folder = slots.bundle({"policy.py": WRITER, "given.json": json.dumps(parameters)})
     (outcome,) = slots.run(
         slots.slot().play(make_job(limits=LIMITS), folder, lambda episodes, steps: None), timeout_s=300.0
     )
@@ -318,10 +318,10 @@ def arrived(bits: list[int], values: list[float | None]) -> float:
         return 0.0
     plain = [float(value) for value in values if value is not None]
     changes = [0.0, *(after - before for before, after in itertools.pairwise(plain))]
-    return max(_told(bits, plain), _told(bits, changes))
+    return max(_share_read(bits, plain), _share_read(bits, changes))
 
 
-def _told(bits: list[int], values: list[float]) -> float:
+def _share_read(bits: list[int], values: list[float]) -> float:
     half = len(bits) // 2
     wrong, cut, upwards = half, 0.0, True
     for threshold in sorted(set(values[:half])):

@@ -162,8 +162,8 @@ class CheatingRun:
     def __init__(self, cheated: Cheated, name: str, *options: str) -> None:
         before = len(cheated.listener.heard)
         words = f"command:{sys.executable} {AGENT} '{json.dumps(cheated.targets())}'"
-        code, said, self.folder = cheated.play(words, name, *options)
-        assert code == 0, said
+        code, output, self.folder = cheated.play(words, name, *options)
+        assert code == 0, output
         self.report: dict[str, Any] = json.loads((self.folder / "workspace" / "report.json").read_text())
         self.record: RunRecord = decode_run_record((self.folder / "run.json").read_bytes())
         self.heard = cheated.listener.heard[before:]

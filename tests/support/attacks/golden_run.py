@@ -85,9 +85,9 @@ class GoldenCluster:
             *options,
         )
         self.wait_for(ready.exists)
-        told = json.loads(ready.read_text())
-        self.files: dict[str, str] = told["credentials"]
-        (endpoint,) = [one for one in told["endpoints"] if one.startswith("tcp/")]
+        document = json.loads(ready.read_text())
+        self.files: dict[str, str] = document["credentials"]
+        (endpoint,) = [one for one in document["endpoints"] if one.startswith("tcp/")]
         host, _, port = endpoint.removeprefix("tcp/").rpartition(":")
         self.address = (host, int(port))
         self.worker_tap = Wiretap(*self.address)
@@ -194,14 +194,14 @@ class GoldenRun:
         words = ["run", "--env", "toy/line", "--agent", f"command:{sys.executable} {agent}", "--entry", "e"]
         words += ["--exp-id", name, "--credentials", str(operator), "--budget", str(budget)]
         words += ["--runs", str(cluster.root / "runs")]
-        self.said = cluster.root / f"{name}-said"
-        with self.said.open("wb") as said:
+        self.log = cluster.root / f"{name}-log"
+        with self.log.open("wb") as log:
             process = subprocess.Popen(
                 [sys.executable, "-m", "evopolicy_gateway.cli", *words],
                 env=cluster.environment,
                 cwd=cluster.root,
-                stdout=said,
-                stderr=said,
+                stdout=log,
+                stderr=log,
             )
         try:
             self._follow(process)
@@ -232,7 +232,7 @@ class GoldenRun:
         self.memory["gateway, after the scoring"] = list(memory_of(self.gateway))
         self.found_early = self.read_files()
         self._go_on()
-        assert process.wait(timeout=2 * TIMEOUT_S) == 0, self.said.read_text()
+        assert process.wait(timeout=2 * TIMEOUT_S) == 0, self.log.read_text()
         self.gateway_is_gone = not Path(f"/proc/{self.gateway}").exists()
         self.outcomes = {
             name: cluster.ask(lambda client, split=split, index=index: self._outcomes(client, split, index))
@@ -261,7 +261,7 @@ class GoldenRun:
         return self._run
 
     def _at_work(self, process: subprocess.Popen[bytes], file: str) -> bool:
-        assert process.poll() is None, self.said.read_text()
+        assert process.poll() is None, self.log.read_text()
         return (self.workspace / file).exists()
 
     def _bundles(self) -> set[str]:

@@ -35,7 +35,7 @@ def carry(near: int, far: int, weather: int) -> None:
     draw = random.Random(0)
     under_way: deque[tuple[float, int, bytes]] = deque()
     other = {near: far, far: near}
-    said = b""
+    received = b""
     while True:
         wait_s = max(0.0, under_way[0][0] - time.monotonic()) if under_way else None
         readable, _, _ = select.select([near, far, weather], [], [], wait_s)
@@ -43,7 +43,7 @@ def carry(near: int, far: int, weather: int) -> None:
             heard = os.read(weather, 4096)
             if not heard:
                 return
-            *lines, said = (said + heard).split(b"\n")
+            *lines, received = (received + heard).split(b"\n")
             for line in lines:
                 delay_s, loss = (float(word) for word in line.split())
         now = time.monotonic()

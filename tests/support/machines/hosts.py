@@ -46,8 +46,8 @@ def refusal() -> str | None:
             hosts.cable(near, "10.92.0.1/30", far, "10.92.0.2/30")
             hosts.wire(near, "10.92.0.5/30", far, "10.92.0.6/30")
     except (AssertionError, OSError, subprocess.CalledProcessError) as error:
-        said = getattr(error, "stderr", None) or error
-        return f"needs network namespaces, which cannot be made here ({said}): run the tests as root, a container privileged"
+        output = getattr(error, "stderr", None) or error
+        return f"needs network namespaces, which cannot be made here ({output}): run the tests as root, a container privileged"
     return None
 
 
@@ -85,12 +85,12 @@ class Host:
 
         It is sent SIGTERM with the end of the network, or of the thread that started it.
         """
-        with log.open("ab") as said:
+        with log.open("ab") as stream:
             process = subprocess.Popen(
                 [*self.enter, "setpriv", "--pdeathsig", "TERM", *command],
                 stdin=subprocess.DEVNULL,
-                stdout=said,
-                stderr=said,
+                stdout=stream,
+                stderr=stream,
                 start_new_session=True,
                 env={**os.environ, **(environment or {})},
             )
@@ -213,8 +213,8 @@ class Network:
         assert process.stderr is not None
         with process.stdout, process.stderr:
             if process.stdout.readline() != b"ready\n":
-                said = process.stderr.read().decode(errors="replace").strip().splitlines()
-                raise AssertionError(f"no TUN device: {said[-1] if said else 'nothing said'}")
+                lines = process.stderr.read().decode(errors="replace").strip().splitlines()
+                raise AssertionError(f"no TUN device: {lines[-1] if lines else 'no output'}")
         near.run("ip", "link", "set", ends[1][1], "netns", str(far.pid))
         for (host, device), address in zip(ends, (near_address, far_address), strict=True):
             _bring_up(host, device, address)

@@ -13,13 +13,13 @@ _USUAL: dict[str, Any] = {"token": "", "protocol": 0, "cases": None}
 _RENAMED = {"sandbox_tier": "tier"}
 
 
-def asked(kind: type[Message], *, request: events.RequestId, **fields: Any) -> events.Asked[Any]:
+def asked(kind: type[Message], *, request: events.RequestId, **fields: Any) -> events.Requested[Any]:
     """Somebody sent a message of this kind: `fields` are the message's and those that the shell adds to it."""
     if kind is operator.CreateRun:
         return _with_row(kind, RunRow, events.RunCreated, request, fields)
     if kind is operator.Evaluate:
         return _with_row(kind, EvaluationRow, events.EvaluationRequested, request, fields)
-    made = events.WorkerRegistered if kind is worker.Register else events.Asked
+    made = events.WorkerRegistered if kind is worker.Register else events.Requested
     own = {name: fields.pop(name) for name in made.__struct_fields__ if name in fields}
     return made(request=request, message=_message(kind, fields), **own)
 
@@ -33,10 +33,10 @@ def _with_row(
 ) -> Any:
     stimulus = fields.pop("stimulus_id", "")
     kept = {_RENAMED.get(name, name): value for name, value in fields.items()}
-    told = {
+    meta = {
         name: value for name, value in fields.items() if name in kind.__struct_fields__ and name != "cases"
     }
-    return made(request=request, stimulus_id=stimulus, message=_message(kind, told), row=row(**kept))
+    return made(request=request, stimulus_id=stimulus, message=_message(kind, meta), row=row(**kept))
 
 
 def _message(kind: type[Message], fields: dict[str, Any]) -> Message:

@@ -147,6 +147,6 @@ def _difference(one: float, other: float) -> str | None:
     return None if one == other else f"step 0: reward {one!r} and {other!r}"
 
 
-def told(finished: operator.RunFinished) -> Any:
+def audit_state(finished: operator.RunFinished) -> Any:
     assert finished.audit is not None
     return finished.audit

@@ -59,8 +59,8 @@ T = TypeVar("T")
 
 
 def describe(env: str = ENV, **more: Any) -> EnvironmentDescription:
-    told = {"env_version": "1", "max_episode_steps": 10, "task_text": ""} | more
-    return EnvironmentDescription(env=env, obs_space={}, action_space={}, **told)
+    fields = {"env_version": "1", "max_episode_steps": 10, "task_text": ""} | more
+    return EnvironmentDescription(env=env, obs_space={}, action_space={}, **fields)
 
 
 def fingerprint(version: str = "1", packages: dict[str, str] | None = None) -> wire.Fingerprint:

@@ -32,7 +32,7 @@ SETTINGS = CoreSettings()
 FAILURE = PolicyFailure(category="missing_policy", step_index=None, message="no policy.py")
 
 
-class Asked:
+class Requested:
     """A query as the transport hands it over, with its answer to be awaited."""
 
     def __init__(self, key: str, message: Message) -> None:
@@ -102,13 +102,13 @@ class World:
 
         self.store.write = counted  # type: ignore[method-assign]
 
-    def ask(self, *asked: Asked) -> None:
+    def ask(self, *asked: Requested) -> None:
         """One tick."""
         self.service.on_queries(list(asked))  # type: ignore[arg-type]
 
     async def create(self, key: str = "run") -> operator.RunCreated:
         settings = RunSettings(env="toy/line", entry="e", model="m", exp_id="x", budget=100)
-        asked = Asked(
+        asked = Requested(
             keys.operator_key("c", "create"), operator.CreateRun(token="operate", key=key, settings=settings)
         )
         self.ask(asked)
@@ -116,7 +116,7 @@ class World:
         assert isinstance(created, operator.RunCreated), created
         return created
 
-    def submit(self, created: operator.RunCreated, key: str) -> Asked:
+    def submit(self, created: operator.RunCreated, key: str) -> Requested:
         message = gateway.Submit(
             run=created.run,
             token=created.capability,
@@ -125,14 +125,14 @@ class World:
             bundle=None,
             bundle_error=FAILURE,
         )
-        return Asked(keys.gateway_key("c", created.run, "submit"), message)
+        return Requested(keys.gateway_key("c", created.run, "submit"), message)
 
-    def state(self, created: operator.RunCreated) -> Asked:
+    def state(self, created: operator.RunCreated) -> Requested:
         message = gateway.StateRequest(run=created.run, token=created.capability)
-        return Asked(keys.gateway_key("c", created.run, "state"), message)
+        return Requested(keys.gateway_key("c", created.run, "state"), message)
 
 
-def register(world: World) -> Asked:
+def register(world: World) -> Requested:
     """A worker of one slot registers."""
     description = EnvironmentDescription(
         env="toy/line", env_version="1", obs_space={}, action_space={}, max_episode_steps=1, task_text=""
@@ -146,7 +146,7 @@ def register(world: World) -> Asked:
         environments=(description,),
         fingerprint=worker.Fingerprint(code_version="", python="", packages={}, cpu=""),
     )
-    asked = Asked(keys.worker_key("c", "register"), message)
+    asked = Requested(keys.worker_key("c", "register"), message)
     world.ask(asked)
     return asked
 

@@ -39,7 +39,7 @@ class Cluster:
     """The part of `Operations` that a sweep uses itself. `answer`: what a claim is answered; granted as it stands."""
 
     def __init__(self) -> None:
-        self.told: list[tuple[str, str, dict[str, Any] | None]] = []
+        self.reports: list[tuple[str, str, dict[str, Any] | None]] = []
         """Run's name, the cluster's id of it, and its result, as claims told them."""
         self.cancelled: list[str] = []
         self.answer: Callable[[str], ClaimState | None] = lambda name: None
@@ -48,7 +48,7 @@ class Cluster:
         self, suite: str, name: str, holder: str, ttl_s: float, run: str, result: dict[str, Any] | None
     ) -> ClaimState:
         plain = name.partition("@")[0]
-        self.told.append((plain, run, result))
+        self.reports.append((plain, run, result))
         return self.answer(plain) or ClaimState(granted=True, holder=holder, run="")
 
     async def cancel(self, run: str) -> None:
@@ -118,8 +118,8 @@ class Stage:
         self.index = index or Index(suite="s")
         self.cluster = Cluster()
         self.view = SuiteView([run.name for run in self.runs], 2)
-        self.said: list[str] = []
-        self.view.event = lambda kind, run, **more: self.said.append(f"{kind} {run} {more}")  # type: ignore[method-assign]
+        self.events: list[str] = []
+        self.view.event = lambda kind, run, **more: self.events.append(f"{kind} {run} {more}")  # type: ignore[method-assign]
         self.begun: list[str] = []
         self.going: set[str] = set()
         self.most: set[frozenset[str]] = set()
@@ -181,7 +181,7 @@ class Direct:
 
     def __init__(self, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         self.act: Callable[[str], Awaitable[None]] = lambda name: asyncio.sleep(0.01)
-        self.said = io.StringIO()
+        self.output = io.StringIO()
         self.ended: list[str] = []
         self.kinds: list[str] = []
         stage = self
@@ -221,7 +221,7 @@ class Direct:
         async def main() -> runs.Played:
             async with asyncio.timeout(TIMEOUT_S):
                 return await runs.play(
-                    self.plans, LocalCluster(), parallel, Terminal(file=self.said, width=200)
+                    self.plans, LocalCluster(), parallel, Terminal(file=self.output, width=200)
                 )
 
         return asyncio.run(main())

@@ -41,9 +41,9 @@ def test_nothing_printed_steers_the_terminal(text: str, capsys: pytest.CaptureFi
     say_lines([text])
     with pytest.raises(SystemExit):
         fail(text)
-    told = capsys.readouterr()
-    assert is_plain(told.out + told.err)
-    assert "error: " in told.err
+    captured = capsys.readouterr()
+    assert is_plain(captured.out + captured.err)
+    assert "error: " in captured.err
     console, out = on_terminal()
     table = Table(title=text, box=None)
     table.add_column(text)
@@ -83,9 +83,9 @@ def test_json_escapes_what_is_not_printable_and_stays_the_same_value(
     text: str, indent: bool, capsys: pytest.CaptureFixture[str]
 ) -> None:
     say_json({"text": [text]}, indent=indent)
-    told = capsys.readouterr().out
-    assert is_plain(told)
-    assert json.loads(told) == {"text": [text]}
+    printed = capsys.readouterr().out
+    assert is_plain(printed)
+    assert json.loads(printed) == {"text": [text]}
 
 
 @pytest.mark.parametrize("text", STEERING)
@@ -100,9 +100,9 @@ def test_log_lines_on_a_terminal_are_harmless(text: str, monkeypatch: pytest.Mon
         structlog.get_logger().info("said", text=text, other=[text])
     finally:
         structlog.reset_defaults()
-    told = stderr.getvalue()
-    assert "said" in told
-    assert not any(piece in told for piece in ("\x1b[2J", "\x1b]", "\x9b", "\x9d", "\u202e", "\udcff"))
+    output = stderr.getvalue()
+    assert "said" in output
+    assert not any(piece in output for piece in ("\x1b[2J", "\x1b]", "\x9b", "\x9d", "\u202e", "\udcff"))
 
 
 def test_printable_text_stays_as_it_is() -> None:

@@ -65,9 +65,9 @@ def test_a_log_keeps_everything_but_what_the_search_finds() -> None:
     assert len(scrub.search(data, needles())) == 5
     clean, counts = scrub.redact(data, needles())
     assert scrub.search(clean, needles()) == []
-    told = [json.loads(line)["text"] for line in clean.splitlines()]
-    assert told[0] == "hello\n[removed] is at [removed]/x\n[removed]/runs"
-    assert told[1] == "summaries\n[removed]\t[removed]"
+    texts = [json.loads(line)["text"] for line in clean.splitlines()]
+    assert texts[0] == "hello\n[removed] is at [removed]/x\n[removed]/runs"
+    assert texts[1] == "summaries\n[removed]\t[removed]"
     assert sum(counts.values()) == 5
     assert scrub.redact(clean, needles()) == (clean, {})
 

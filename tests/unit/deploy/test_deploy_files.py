@@ -104,8 +104,8 @@ def test_a_unit_is_taken_by_systemd(name: str, tmp_path: Path) -> None:
     text = (DEPLOY / name).read_text()
     path.write_text(re.sub(r"^ExecStart=\S+", f"ExecStart={program}", text, flags=re.MULTILINE))
     done = subprocess.run([analyze, "verify", str(path)], capture_output=True, text=True, timeout=100)
-    said = [line for line in done.stderr.splitlines() if line.startswith("evopolicy")]
-    assert (done.returncode, said) == (0, [])
+    lines = [line for line in done.stderr.splitlines() if line.startswith("evopolicy")]
+    assert (done.returncode, lines) == (0, [])
 
 
 def test_the_worker_unit_leaves_bubblewrap_what_it_needs() -> None:
@@ -264,14 +264,14 @@ def test_the_commands_of_the_readme_are_taken() -> None:
 
 
 def test_the_readme_names_every_file_and_no_other() -> None:
-    told = set(
+    documented = set(
         re.findall(
             r"`(?:\w+/)?([\w@.-]+\.(?:service|env|conf|yaml|sbatch|sh|txt)|grafana-dashboard\.json|Dockerfile)`",
             (DEPLOY / "README.md").read_text(),
         )
     )
     there = {path.name for path in DEPLOY.rglob("*") if path.is_file()}
-    assert there - {"README.md", "Dockerfile.dockerignore"} == told
+    assert there - {"README.md", "Dockerfile.dockerignore"} == documented
 
 
 def _any() -> dict[str, str]:

@@ -78,9 +78,9 @@ def test_a_python_that_is_too_old_or_missing_is_named(tmp_path: Path) -> None:
     old = tmp_path / "python3.9"
     old.write_text("#!/bin/sh\necho 3.9\n")
     old.chmod(0o755)
-    said = refused("minigrid", "--into", str(tmp_path / "new"), "--python", str(old))
-    assert "is 3.9" in said
-    assert "--python" in said
+    output = refused("minigrid", "--into", str(tmp_path / "new"), "--python", str(old))
+    assert "is 3.9" in output
+    assert "--python" in output
     assert not (tmp_path / "new").exists()
     assert "cannot be started" in refused("minigrid", "--python", str(tmp_path / "nowhere"))
 
@@ -135,9 +135,9 @@ def test_a_browser_that_setup_may_not_or_cannot_install_is_told(
     into = ("miniwob", "--into", str(tmp_path / "new"))
     assert "cannot be installed: E: Held packages" in refused(*into)
     monkeypatch.setattr(os, "geteuid", lambda: 1000)
-    said = refused(*into)
-    assert "install chromium" in said
-    assert "--browser PATH" in said
+    output = refused(*into)
+    assert "install chromium" in output
+    assert "--browser PATH" in output
     assert "does not exist" in refused(*into, "--browser", "/nowhere")
     assert not (tmp_path / "new").exists()
 
@@ -163,7 +163,7 @@ def test_a_package_index_that_cannot_be_reached_is_told(
 
 
 @pytest.mark.parametrize(
-    ("said", "kind", "told"),
+    ("output", "kind", "problem"),
     [
         ("ERROR: Could not install packages: [Errno 28] No space left on device", MachineError, "make room"),
         (
@@ -174,10 +174,10 @@ def test_a_package_index_that_cannot_be_reached_is_told(
         ("note: x\nERROR: ResolutionImpossible\nfor help visit y", ConfigError, "ResolutionImpossible"),
     ],
 )
-def test_pips_words_become_a_problem_and_its_remedy(said: str, kind: type, told: str) -> None:
-    error = setup.failure("minigrid", said)
+def test_pips_words_become_a_problem_and_its_remedy(output: str, kind: type, problem: str) -> None:
+    error = setup.failure("minigrid", output)
     assert type(error) is kind
-    assert told in str(error)
+    assert problem in str(error)
 
 
 def test_a_wheel_of_an_installed_distribution_can_be_installed(tmp_path: Path) -> None:
@@ -212,8 +212,8 @@ def made(root: Path, name: str, **fields: object) -> Path:
     folder = root / name
     (folder / "bin").mkdir(parents=True)
     (folder / "bin" / "python").symlink_to(sys.executable)
-    told = {"families": [name], "version": metadata.version("evopolicy"), "ready": True, **fields}
-    (folder / installs.MARK).write_bytes(msgspec.json.encode(told))
+    document = {"families": [name], "version": metadata.version("evopolicy"), "ready": True, **fields}
+    (folder / installs.MARK).write_bytes(msgspec.json.encode(document))
     return folder
 
 

@@ -316,8 +316,8 @@ class GymnasiumEnvironment(Environment):
 def _definition(entry: Entry) -> dict[str, Any]:
     """How Gymnasium makes it, for the digest of its definition."""
     wrappers = [{"wrapper": each.wrapper, "kwargs": each.kwargs} for each in entry.wrappers]
-    told = {"gymnasium_id": entry.gymnasium_id, "kwargs": entry.kwargs, "wrappers": wrappers}
-    return {name: value for name, value in told.items() if value}
+    definition = {"gymnasium_id": entry.gymnasium_id, "kwargs": entry.kwargs, "wrappers": wrappers}
+    return {name: value for name, value in definition.items() if value}
 
 
 @contextlib.contextmanager

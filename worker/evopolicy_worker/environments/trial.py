@@ -36,7 +36,7 @@ class Promises:
         self._schema_of = schema_of
         self.strict = False
         """Whether values beyond bounds are refused, too."""
-        self._told = False
+        self._reported = False
         self._spaces = {"observation_space": obs_space, "action_space": action_space}
         self._outside = spaces.compile_checker(obs_space)
 
@@ -63,8 +63,8 @@ class Promises:
         text = f"{call}, observation: {fault}; correct the environment, or its observation_space"
         if self.strict or _OF_FORM in fault:
             raise WorkerError(text)
-        if not self._told:
-            self._told = True
+        if not self._reported:
+            self._reported = True
             note(text)
 
 

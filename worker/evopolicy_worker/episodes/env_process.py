@@ -36,9 +36,9 @@ ALIVE_S = 5.0
 class Channel:
     """Commands in, answers out."""
 
-    def __init__(self, commands: int, answers: int) -> None:
+    def __init__(self, commands: int, replies: int) -> None:
         self._commands = commands
-        self._answers = answers
+        self._replies = replies
         self._received = bytearray()
         self._lock = threading.Lock()
 
@@ -65,7 +65,7 @@ class Channel:
         data = memoryview(frame)
         with self._lock:
             while data:
-                data = data[os.write(self._answers, data) :]
+                data = data[os.write(self._replies, data) :]
 
 
 class EnvProcess:
@@ -78,7 +78,7 @@ class EnvProcess:
         )
         self._bundle: tuple[str, BundleFiles] | None = None
         self._progress: Progress | None = None
-        self._told = (0.0, 0)
+        self._last_report = (0.0, 0)
         self._limits = calls.Limits()
         self._guard = calls.Guard(self._limits)
         self._monitor = Monitor(commands, self._hear, self._tell)
@@ -118,7 +118,7 @@ class EnvProcess:
             with contextlib.suppress(SandboxError, SlotDiedError):
                 player.prepare()
 
-    def _play(self, player: Player, command: messages.Play, progress: Progress) -> messages.Answer:
+    def _play(self, player: Player, command: messages.Play, progress: Progress) -> messages.Reply:
         self._monitor.ticking = True
         self._monitor.wake()
         try:
@@ -141,7 +141,7 @@ class EnvProcess:
             self._progress = None
             self._monitor.ticking = False
 
-    def _described(self, player: Player, env_ids: tuple[str, ...]) -> messages.Answer:
+    def _described(self, player: Player, env_ids: tuple[str, ...]) -> messages.Reply:
         self._monitor.ticking = True
         self._monitor.wake()
         try:
@@ -177,7 +177,7 @@ class EnvProcess:
             self._jobs.put(command)
         elif isinstance(command, messages.Play):
             # From now on it can be cancelled, also before it is taken up.
-            self._told = 0.0, 0
+            self._last_report = 0.0, 0
             self._progress = Progress()
             self._jobs.put((command, self._progress))
         elif isinstance(command, messages.Cancel):
@@ -197,16 +197,16 @@ class EnvProcess:
             os._exit(1)
         if progress is None:
             return
-        at, steps = self._told
+        at, steps = self._last_report
         if now - at >= (_PROGRESS_S if progress.steps != steps else ALIVE_S):
-            self._told = now, progress.steps
-            self._channel.send(messages.Told(episodes_done=progress.episodes_done, steps=progress.steps))
+            self._last_report = now, progress.steps
+            self._channel.send(messages.Progress(episodes_done=progress.episodes_done, steps=progress.steps))
 
 
 def main() -> None:
     """The process's entry."""
-    commands, answers = take_pipes()
-    channel = Channel(commands, answers)
+    commands, replies = take_pipes()
+    channel = Channel(commands, replies)
     received: list[messages.Command] = []
     while not received:
         received = channel.receive()

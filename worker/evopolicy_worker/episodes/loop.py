@@ -489,11 +489,11 @@ class _Episode:
                 self._tell(_ACTING)
             next_obs, reward, terminated, truncated, info = step(action)
             truncated = truncated or t >= last
-            told = info.get("rewards", info)
+            components = info.get("rewards", info)
             for name in names:
-                sums[name] += _number(told.get(name))
-            if solves and (told_success := info.get(solves)) is not None:
-                success = bool(told_success) or (ever and bool(success))
+                sums[name] += _number(components.get(name))
+            if solves and (reported_success := info.get(solves)) is not None:
+                success = bool(reported_success) or (ever and bool(success))
             if invalid:
                 info = {**info, "action_invalid": True}
             if failed:

@@ -205,7 +205,7 @@ class PolicyProcess:
                 return frames.action(tag, payload, self._action_bytes // frames.VALUE_BYTES)
             except frames.BadReplyError as error:
                 raise self._broken(str(error)) from None
-        raise self._told(tag, payload, "act")
+        raise self._reported_failure(tag, payload, "act")
 
     def _count_surplus(self, n_bytes: int) -> None:
         """Actions are kept as they came: what they take beyond the usual is bounded for the whole episode too."""
@@ -272,7 +272,7 @@ class PolicyProcess:
         self._watch.answer_limit_s = limit_s
         tag, payload = self._exchange(parts, sum(map(len, parts)))
         if tag != frames.OK:
-            raise self._told(tag, payload, what)
+            raise self._reported_failure(tag, payload, what)
 
     def _exchange(self, parts: list[Any], total: int) -> tuple[int, bytes]:
         watch = self._watch
@@ -322,7 +322,7 @@ class PolicyProcess:
 
     # How it failed.
 
-    def _told(self, tag: int, payload: bytes, what: str) -> PolicyFailedError:
+    def _reported_failure(self, tag: int, payload: bytes, what: str) -> PolicyFailedError:
         """The failure that the policy's process reports of itself."""
         if what == "seal":
             # None of the bundle's code has run: this is ours.

@@ -117,7 +117,7 @@ def replay(environment: Environment, case: Case, actions: bytes) -> bytes:
     return encoder.finish()
 
 
-def serve(env_id: str, orders: BinaryIO, answers: BinaryIO) -> None:
+def serve(env_id: str, orders: BinaryIO, replies: BinaryIO) -> None:
     """Record one episode after another until there are no more orders."""
     environment: Environment | None = None
     decoder = msgspec.msgpack.Decoder(Order)
@@ -132,14 +132,14 @@ def serve(env_id: str, orders: BinaryIO, answers: BinaryIO) -> None:
             what = str(error) if isinstance(error, WorkerError) else f"{type(error).__name__}: {error}"
             made = Made(mp4=None, error=what)
         data = msgspec.msgpack.encode(made)
-        answers.write(LENGTH.pack(len(data)) + data)
-        answers.flush()
+        replies.write(LENGTH.pack(len(data)) + data)
+        replies.flush()
 
 
 def main() -> None:
     """The process's entry."""
-    orders, answers = take_pipes()
-    with os.fdopen(orders, "rb") as reader, os.fdopen(answers, "wb") as writer:
+    orders, replies = take_pipes()
+    with os.fdopen(orders, "rb") as reader, os.fdopen(replies, "wb") as writer:
         env_id, *definitions = sys.argv[1:]
         environments.define(msgspec.json.decode(each, type=Entry) for each in definitions)
         serve(env_id, reader, writer)

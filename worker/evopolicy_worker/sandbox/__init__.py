@@ -76,8 +76,8 @@ def _why_not_started(
             return f"a slot did not start within {2 * START_TIMEOUT_S:g} s"
         head = process.stdout.read(messages.LENGTH.size)
         if len(head) == messages.LENGTH.size:
-            answer = messages.answers.decode(process.stdout.read(messages.LENGTH.unpack(head)[0]))
-            return answer.message if isinstance(answer, messages.Fault) else None
+            reply = messages.replies.decode(process.stdout.read(messages.LENGTH.unpack(head)[0]))
+            return reply.message if isinstance(reply, messages.Fault) else None
     except (BrokenPipeError, msgspec.DecodeError):
         pass
     finally:

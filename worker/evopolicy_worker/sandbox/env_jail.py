@@ -255,8 +255,8 @@ def _below(path: str, folder: str) -> bool:
 @cache
 def _python_path() -> tuple[str, ...]:
     """Module search path of a fresh interpreter, the only way to learn what .pth files add."""
-    asked = "import sys; print('\\0'.join(sys.path), end='')"
+    program = "import sys; print('\\0'.join(sys.path), end='')"
     output = subprocess.run(
-        [sys.executable, "-P", "-c", asked], capture_output=True, text=True, check=True, timeout=_CHECK_S
+        [sys.executable, "-P", "-c", program], capture_output=True, text=True, check=True, timeout=_CHECK_S
     )
     return tuple(filter(None, output.stdout.split("\0")))

@@ -98,7 +98,7 @@ class Slot:
         self._cancelled = False
         self._sent = ""
         self._begun: dict[int, PackedBegun] = {}
-        self._answers = 0
+        self._n_replies = 0
         self._hung = ""
         """Why the processes were killed while they played."""
         self._process: asyncio.subprocess.Process | None = None
@@ -133,16 +133,16 @@ class Slot:
         try:
             async with asyncio.timeout(START_TIMEOUT_S):
                 await self._send(self._start)
-                answer = await self._answer()
+                reply = await self._reply()
         except TimeoutError:
             await self.close()
             raise WorkerError(f"a slot did not start within {START_TIMEOUT_S:g} s") from None
         except SlotDiedError as error:
             await self.close()
             raise WorkerError(str(error)) from error
-        if not isinstance(answer, messages.Ready):
+        if not isinstance(reply, messages.Ready):
             await self.close()
-            raise _error(answer)
+            raise _error(reply)
 
     async def prepare(self, env_ids: Sequence[str]) -> None:
         """Starts the processes if necessary and makes these environments, so that later jobs find them ready. Raises as
@@ -195,21 +195,21 @@ class Slot:
                         messages.Play(job=job, bundle=files, first=len(outcomes), failure=failure)
                     )
                     self._sent = files.key if files is not None else self._sent
-                    while not isinstance(answer := await self._answer(), messages.Played):
-                        if isinstance(answer, messages.Told):
-                            on_progress(answer.episodes_done, answer.steps)
-                        elif isinstance(answer, messages.Acting):
+                    while not isinstance(reply := await self._reply(), messages.Played):
+                        if isinstance(reply, messages.Progress):
+                            on_progress(reply.episodes_done, reply.steps)
+                        elif isinstance(reply, messages.Acting):
                             acted = True
-                        elif isinstance(answer, messages.Finished):
+                        elif isinstance(reply, messages.Finished):
                             acted = False
-                            if answer.begun is not None:
-                                self._begun[len(outcomes)] = answer.begun
-                            outcomes.append(answer.outcome)
-                        elif isinstance(answer, messages.Begun):
-                            self._begun[answer.place] = answer.begun
+                            if reply.begun is not None:
+                                self._begun[len(outcomes)] = reply.begun
+                            outcomes.append(reply.outcome)
+                        elif isinstance(reply, messages.Begun):
+                            self._begun[reply.place] = reply.begun
                         else:
-                            raise _error(answer)
-                    return () if answer.cancelled else tuple(outcomes)
+                            raise _error(reply)
+                    return () if reply.cancelled else tuple(outcomes)
                 except SlotDiedError as error:
                     failure = endings.broken_down(Ending("environment", self._how_it_ended(), began=acted))
                     if failure is None or self._cancelled or bundle is None:
@@ -244,7 +244,7 @@ class Slot:
             try:
                 async with asyncio.timeout(DESCRIBED_CALLS * limits.call_s + SILENT_S):
                     await self._send(messages.Describe(environments=(env_id,)))
-                    answer = await self._answer()
+                    reply = await self._reply()
             except TimeoutError:
                 self._end_process()
                 raise BrokenEnvironmentError(
@@ -254,9 +254,9 @@ class Slot:
                 raise self._broken(
                     f"environment {env_id}: its process ended while it was tried out; {error}"
                 ) from error
-            if not isinstance(answer, messages.Described):
-                raise _error(answer)
-            found += answer.environments
+            if not isinstance(reply, messages.Described):
+                raise _error(reply)
+            found += reply.environments
         return tuple(found)
 
     def memory_bytes(self) -> int:
@@ -310,7 +310,7 @@ class Slot:
         except (ConnectionError, OSError) as error:
             raise SlotDiedError(await self._last_words()) from error
 
-    async def _answer(self) -> messages.Answer:
+    async def _reply(self) -> messages.Reply:
         process = self._process
         assert process is not None
         assert process.stdout is not None
@@ -319,8 +319,8 @@ class Slot:
             if length > MAX_ANSWER_BYTES:
                 raise SlotDiedError(f"the slot's process announced an answer of {length} bytes")
             data = await process.stdout.readexactly(length)
-            self._answers += 1
-            return messages.answers.decode(data)
+            self._n_replies += 1
+            return messages.replies.decode(data)
         except DECODE_ERRORS as error:
             raise WorkerError(f"an answer of the slot's process cannot be read: {error}") from error
         except (asyncio.IncompleteReadError, ConnectionError) as error:
@@ -330,15 +330,15 @@ class Slot:
         """Kills the slot's processes when one of them has been stopped from outside for `STOPPED_S`, or when they say nothing
         although they tell twelve times a minute that they are alive."""
         stood_s = silent_s = 0.0
-        answers = -1
+        n_replies = -1
         longest_s = self._start.limits.call_s + SILENT_S
         while True:
             await asyncio.sleep(_LOOK_S)
             process = self._process
             pids = [] if process is None else [process.pid, *_children(process.pid, self._start.tier)]
             stood_s = stood_s + _LOOK_S if any(map(is_stopped, pids)) else 0.0
-            silent_s = silent_s + _LOOK_S if answers == self._answers and not stood_s else 0.0
-            answers = self._answers
+            silent_s = silent_s + _LOOK_S if n_replies == self._n_replies and not stood_s else 0.0
+            n_replies = self._n_replies
             if silent_s >= longest_s:
                 self._hung = hung(f"environment {env_id}, reset or step", self._start.limits)
                 self._end_process()
@@ -441,10 +441,10 @@ def bundle_files(folder: Path) -> messages.Files:
 _FAULTS = {"sandbox": SandboxError, "environment": BrokenEnvironmentError}
 
 
-def _error(answer: messages.Answer) -> EvopolicyError:
-    if not isinstance(answer, messages.Fault):
-        return WorkerError(f"the slot's process answered {type(answer).__name__} out of turn")
-    return _FAULTS.get(answer.kind, WorkerError)(answer.message)
+def _error(reply: messages.Reply) -> EvopolicyError:
+    if not isinstance(reply, messages.Fault):
+        return WorkerError(f"the slot's process answered {type(reply).__name__} out of turn")
+    return _FAULTS.get(reply.kind, WorkerError)(reply.message)
 
 
 def _kill(process: asyncio.subprocess.Process) -> None:

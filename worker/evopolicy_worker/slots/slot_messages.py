@@ -48,7 +48,7 @@ class Files(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Play(Message, frozen=True, kw_only=True, tag="play"):
-    """Play this job. Answered by any number of Told; for each episode by Acting, when a policy's first action is due,
+    """Play this job. Answered by any number of Progress; for each episode by Acting, when a policy's first action is due,
     and Finished; by Begun when an episode is given up; and last by Played or Fault."""
 
     job: Job
@@ -73,7 +73,7 @@ class Ready(Message, frozen=True, kw_only=True, tag="ready"):
     """The process and its sandbox have started."""
 
 
-class Told(Message, frozen=True, kw_only=True, tag="progress"):
+class Progress(Message, frozen=True, kw_only=True, tag="progress"):
     """Progress of the running job."""
 
     episodes_done: int
@@ -121,11 +121,11 @@ class Fault(Message, frozen=True, kw_only=True, tag="fault"):
 
 
 Command = Start | Play | Describe | Cancel
-Answer = Ready | Told | Acting | Finished | Begun | Played | Described | Fault
+Reply = Ready | Progress | Acting | Finished | Begun | Played | Described | Fault
 
 encoder = msgspec.msgpack.Encoder()
 commands: msgspec.msgpack.Decoder[Command] = msgspec.msgpack.Decoder(Command)
-answers: msgspec.msgpack.Decoder[Answer] = msgspec.msgpack.Decoder(Answer)
+replies: msgspec.msgpack.Decoder[Reply] = msgspec.msgpack.Decoder(Reply)
 
 
 def framed(message: Message) -> bytes:

@@ -69,8 +69,8 @@ class Events:
     def failed(self, failure: ApiError) -> None:
         """The request that ended the turn."""
         wait = "" if failure.retry_after_s is None else f"; try again in {failure.retry_after_s:g} s"
-        told = {"is_error": True, "api_error_status": failure.status, "result": f"{failure}{wait}"}
-        self._emit({"type": "result", **told})
+        result = {"is_error": True, "api_error_status": failure.status, "result": f"{failure}{wait}"}
+        self._emit({"type": "result", **result})
 
     def _emit(self, event: dict[str, Any]) -> None:
         print(json.dumps(event), file=self._out, flush=True)

@@ -275,7 +275,7 @@ def open_api(settings: dict[str, Any], key: str, messages: list[Message]) -> Api
 
 def _skills(paths: Sequence[str]) -> str:
     """What the system prompt says of skills: each file with the header that describes it, not the whole text."""
-    told = []
+    listed = []
     for path in paths:
         text = Path(path).expanduser().read_text(errors="replace")
         header = (
@@ -283,8 +283,8 @@ def _skills(paths: Sequence[str]) -> str:
             if text.startswith("---\n")
             else text.partition("\n")[0]
         )
-        told.append(f"\n\n{path}\n{header.strip()[:_MAX_HEADER]}")
-    return _SKILLS + "".join(told) if told else ""
+        listed.append(f"\n\n{path}\n{header.strip()[:_MAX_HEADER]}")
+    return _SKILLS + "".join(listed) if listed else ""
 
 
 def _call(identity: str, name: str, arguments: Any) -> Call:

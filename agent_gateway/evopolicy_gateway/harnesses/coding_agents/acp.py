@@ -172,13 +172,13 @@ class AcpAgent(CliAgent):
         """Sends the prompt and reads updates until its answer."""
         link.clear()
         content = [{"type": "text", "text": prompt}]
-        asked = asyncio.ensure_future(
+        prompt_reply = asyncio.ensure_future(
             link.request("session_prompt", {"sessionId": link.session, "prompt": content})
         )
         try:
-            while not asked.done():
+            while not prompt_reply.done():
                 update = asyncio.ensure_future(link.updates.get())
-                waited: list[asyncio.Future[Any]] = [asked, update]
+                waited: list[asyncio.Future[Any]] = [prompt_reply, update]
                 done, _ = await asyncio.wait(
                     waited, timeout=self._config.silence_s, return_when=asyncio.FIRST_COMPLETED
                 )
@@ -191,7 +191,7 @@ class AcpAgent(CliAgent):
                 if (why := capped(reader)) is not None:
                     reader.failure = TurnFailure(kind="cap", message=why)
                     return
-            answer = asked.result()
+            answer = prompt_reply.result()
             while not link.updates.empty():
                 self._read(stage, reader, link.updates.get_nowait())
             reader.ended(answer)
@@ -201,8 +201,8 @@ class AcpAgent(CliAgent):
             elif (why := capped(reader)) is not None:
                 reader.done, reader.failure = False, TurnFailure(kind="cap", message=why)
         finally:
-            asked.cancel()
-            await asyncio.gather(asked, return_exceptions=True)
+            prompt_reply.cancel()
+            await asyncio.gather(prompt_reply, return_exceptions=True)
 
     def _read(self, stage: Stage, reader: AcpReader, event: dict[str, Any]) -> None:
         before = reader.action
@@ -249,7 +249,7 @@ class _Link:
         self.version: str | None = None
         self.updates: asyncio.Queue[dict[str, Any]] = asyncio.Queue()
         self._stage = stage
-        self._connection = Connection(self._asked, _Pipe(process))
+        self._connection = Connection(self._handle, _Pipe(process))
 
     @classmethod
     async def start(cls, stage: Stage, program: list[str]) -> _Link:
@@ -292,22 +292,22 @@ class _Link:
         await self._connection.close()
         await self.process.close()
 
-    async def _asked(self, method: str, params: Any, is_notification: bool) -> Any:
+    async def _handle(self, method: str, params: Any, is_notification: bool) -> Any:
         """A request or notification of the agent."""
         from acp.exceptions import RequestError
         from acp.meta import CLIENT_METHODS
 
-        told = params if isinstance(params, dict) else {}
+        fields = params if isinstance(params, dict) else {}
         if method == CLIENT_METHODS["session_update"]:
-            if told.get("sessionId") == self.session or self.session is None:
-                self.updates.put_nowait(dict(mapping(told.get("update"))))
+            if fields.get("sessionId") == self.session or self.session is None:
+                self.updates.put_nowait(dict(mapping(fields.get("update"))))
             return None
         if method == CLIENT_METHODS["session_request_permission"]:
-            answer = permission(told, PurePosixPath(self._stage.workspace))
-            title = string(mapping(told.get("toolCall")).get("title"))
+            answer = permission(fields, PurePosixPath(self._stage.workspace))
+            title = string(mapping(fields.get("toolCall")).get("title"))
             self._stage.log.note({"type": "permission", "title": title, **answer["outcome"]})
             # Some agents tell what they do only here.
-            call = mapping(told.get("toolCall"))
+            call = mapping(fields.get("toolCall"))
             self.updates.put_nowait({**call, "sessionUpdate": "tool_call_update", "status": "pending"})
             return answer
         if is_notification:

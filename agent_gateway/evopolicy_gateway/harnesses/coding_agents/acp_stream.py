@@ -81,8 +81,8 @@ class AcpReader(TurnReader):
             return
         given = known["input"] or {"title": known["title"]}
         self._entry("assistant", {"type": "tool_use", "id": identity, "name": known["title"], "input": given})
-        told = event.get("rawOutput") or event.get("content")
-        result = {"type": "tool_result", "tool_use_id": identity, "content": told}
+        output = event.get("rawOutput") or event.get("content")
+        result = {"type": "tool_result", "tool_use_id": identity, "content": output}
         self._entry("user", result | {"is_error": status == "failed"})
         del self._calls[identity]
 
@@ -90,9 +90,9 @@ class AcpReader(TurnReader):
         """The answer to `session/prompt`."""
         self._whole()
         self.done = answer.get("stopReason") in _ENDED
-        told = mapping(answer.get("usage"))
-        if told:
-            self.usage = usage_of(told)
+        usage = mapping(answer.get("usage"))
+        if usage:
+            self.usage = usage_of(usage)
         else:
             # Gemini CLI's own field.
             counts = mapping(mapping(mapping(answer.get("_meta")).get("quota")).get("token_count"))
@@ -119,11 +119,11 @@ class AcpReader(TurnReader):
         self._entries.append({"type": kind, "message": {"role": kind, "content": [block]}})
 
 
-def usage_of(told: Mapping[str, Any]) -> Usage:
+def usage_of(usage: Mapping[str, Any]) -> Usage:
     """The paper's token counts from the protocol's `usage`. Its total tells what an agent counts into what."""
-    given, output, thought = (count(told.get(f"{name}Tokens")) for name in ("input", "output", "thought"))
-    read, written = count(told.get("cachedReadTokens")), count(told.get("cachedWriteTokens"))
-    total = count(told.get("totalTokens"))
+    given, output, thought = (count(usage.get(f"{name}Tokens")) for name in ("input", "output", "thought"))
+    read, written = count(usage.get("cachedReadTokens")), count(usage.get("cachedWriteTokens"))
+    total = count(usage.get("totalTokens"))
     apart = total >= given + output + read + written
     own = given if apart else max(0, given - read - written)
     known = own + read + written + output

@@ -45,8 +45,8 @@ class Codex(Dialect):
             words += ["--config", f'model_reasoning_effort="{self.config.effort}"']
         for name, server in self.kept.servers.items():
             env = ", ".join(f"{_toml(variable)} = {_toml(value)}" for variable, value in server.env.items())
-            told = {"command": _toml(server.command), "args": _toml(server.args), "env": f"{{{env}}}"}
-            for key, value in told.items():
+            settings = {"command": _toml(server.command), "args": _toml(server.args), "env": f"{{{env}}}"}
+            for key, value in settings.items():
                 words += ["--config", f"mcp_servers.{name}.{key}={value}"]
         words += self.config.extra_args
         if resume and session is not None:

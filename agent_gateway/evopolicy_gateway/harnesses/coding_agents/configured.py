@@ -61,8 +61,8 @@ class ConfiguredCli(Dialect):
                 continue
             # In one pass, so that `{model}` inside a prompt is not replaced.
             words.append(_filled(word, {name: value or "" for name, value in known.items()}))
-        told = [_filled(word, _MCP) for word in self._cli.mcp] if self.kept.servers else []
-        return words + told + list(self.config.extra_args)
+        mcp_options = [_filled(word, _MCP) for word in self._cli.mcp] if self.kept.servers else []
+        return words + mcp_options + list(self.config.extra_args)
 
     def environment(self) -> dict[str, str]:
         if not self.kept.servers:

@@ -56,7 +56,7 @@ class LogEvent(msgspec.Struct, frozen=True, kw_only=True):
     """Paths under `feedback/` that a tool call names."""
     images: tuple[str, ...] = ()
     """Image files that a tool call names."""
-    answers: tuple[int, ...] = ()
+    answered: tuple[int, ...] = ()
     """Indices of the submits that a tool's output answers."""
     at: float | None = None
     """Unix time, seconds; None when the line has no timestamp."""
@@ -97,7 +97,7 @@ def read_agent_log(path: Path, submits: Sequence[Submit]) -> LogReading:
 def place(events: Sequence[LogEvent], submits: Sequence[Submit]) -> LogReading:
     """Assigns each event to the submit that it precedes."""
     expected = [submit.index for submit in submits]
-    groups = _by_answers(events, expected)
+    groups = _by_results(events, expected)
     if groups is None:
         groups = _by_times(events, submits)
     if groups is None:
@@ -107,7 +107,7 @@ def place(events: Sequence[LogEvent], submits: Sequence[Submit]) -> LogReading:
     return LogReading(by_submit=by_submit, unplaced=tuple(event.message for event in rest if event.message))
 
 
-def _by_answers(
+def _by_results(
     events: Sequence[LogEvent], expected: list[int]
 ) -> tuple[dict[int, list[LogEvent]], list[LogEvent]] | None:
     placed: dict[int, list[LogEvent]] = {}
@@ -115,7 +115,7 @@ def _by_answers(
     places = {index: place for place, index in enumerate(expected)}
     first_waiting = 0
     for event in events:
-        answered = next((index for index in event.answers if places.get(index, -1) >= first_waiting), None)
+        answered = next((index for index in event.answered if places.get(index, -1) >= first_waiting), None)
         if answered is not None:
             placed[answered] = pending
             pending = []
@@ -208,7 +208,7 @@ def _events_of(value: dict[str, Any]) -> Iterator[LogEvent]:
         yield from _codex_item(value["item"], at)
     elif kind == "stdout" and isinstance(value.get("text"), str):
         named = _NAMED.match(value["text"])
-        yield LogEvent(message=_clip(value["text"]), answers=(int(named.group(1)),) if named else (), at=at)
+        yield LogEvent(message=_clip(value["text"]), answered=(int(named.group(1)),) if named else (), at=at)
     elif isinstance(value.get("turn"), int) and isinstance(value.get("text"), str):
         yield LogEvent(message=_clip(value["text"]), at=at)
 
@@ -220,7 +220,7 @@ def _claude_block(block: dict[str, Any], by_agent: bool, at: float | None) -> It
     elif kind == "tool_use":
         yield _call(_strings(block.get("input")), at)
     elif kind == "tool_result":
-        yield LogEvent(answers=_answers(_strings(block.get("content"))), at=at)
+        yield LogEvent(answered=_answered_submits(_strings(block.get("content"))), at=at)
 
 
 def _codex_item(item: dict[str, Any], at: float | None) -> Iterator[LogEvent]:
@@ -229,7 +229,7 @@ def _codex_item(item: dict[str, Any], at: float | None) -> Iterator[LogEvent]:
         yield LogEvent(message=_clip(item["text"]), at=at)
     elif kind == "command_execution":
         yield _call(_strings(item.get("command")), at)
-        yield LogEvent(answers=_answers(_strings(item.get("aggregated_output"))), at=at)
+        yield LogEvent(answered=_answered_submits(_strings(item.get("aggregated_output"))), at=at)
     elif kind in ("mcp_tool_call", "file_change"):
         yield _call(_strings(item.get("arguments") or item.get("changes")), at)
 
@@ -255,7 +255,7 @@ def _is_short(path: str) -> bool:
     return len(path) <= _MAX_PATH_CHARS
 
 
-def _answers(texts: Sequence[str]) -> tuple[int, ...]:
+def _answered_submits(texts: Sequence[str]) -> tuple[int, ...]:
     found: dict[int, None] = {}
     for text in texts:
         for match in _ANSWER.finditer(text):

@@ -38,12 +38,12 @@ def copied_actions(checkpoints: Sequence[tuple[int, Files]], trajectories: Traje
     new = list(_fresh(checkpoints))
     last = max((place for place, (_, fresh) in enumerate(new) if fresh), default=0)
     recorded: dict[Window, int] = {}
-    told: set[str] = set()
+    reported: set[str] = set()
     for place, (index, fresh) in enumerate(new[: last + 1]):
         for path, windows in fresh.items():
             copied = next((window for window in windows if window in recorded), None)
-            if copied is not None and path not in told:
-                told.add(path)
+            if copied is not None and path not in reported:
+                reported.add(path)
                 quote = ", ".join(f"{value:g}" for value in copied)
                 reason = (
                     f"{_WINDOW} consecutive numbers or more are recorded actions of submit {recorded[copied]}"

@@ -80,12 +80,12 @@ def _calls(value: dict[str, Any]) -> Iterator[str]:
         content = message.get("content") if isinstance(message, dict) else None
         for block in content if isinstance(content, list) else ():
             if isinstance(block, dict) and block.get("type") == "tool_use":
-                told = block.get("input")
-                if isinstance(told, dict):
+                arguments = block.get("input")
+                if isinstance(arguments, dict):
                     yield from (
                         text
                         for name in ("command", "url", "file_path", "path")
-                        if isinstance(text := told.get(name), str)
+                        if isinstance(text := arguments.get(name), str)
                     )
     elif kind in ("item.completed", "item.started") and isinstance(item, dict):
         command = item.get("command")

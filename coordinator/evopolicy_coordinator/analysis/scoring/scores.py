@@ -89,7 +89,7 @@ def ordered_environments(envs: Iterable[str]) -> list[str]:
     return sorted(set(envs), key=lambda env: (order.get(env, len(order)), env))
 
 
-_told: dict[str, set[tuple[str, str]]] = {}
+_names_in_runs: dict[str, set[tuple[str, str]]] = {}
 """Titles and families that runs tell of environments which do not ship, by id."""
 _MAX_TITLE = 60
 _FAMILY = re.compile(r"[a-z0-9_]{1,40}")
@@ -102,9 +102,9 @@ def learn_names(records: Iterable[RunRecord]) -> None:
     """
     for record in records:
         if record.env not in catalogue.entries() and (record.env_title or record.env_family):
-            told = _told.setdefault(record.env, set())
-            if len(told) < 2:
-                told.add((record.env_title, record.env_family))
+            names = _names_in_runs.setdefault(record.env, set())
+            if len(names) < 2:
+                names.add((record.env_title, record.env_family))
 
 
 def _name(env: str) -> tuple[str, str]:
@@ -112,8 +112,8 @@ def _name(env: str) -> tuple[str, str]:
     found = catalogue.entries().get(env)
     if found is not None:
         return found.title, found.family
-    told = _told.get(env, set())
-    return next(iter(told)) if len(told) == 1 else ("", "")
+    names = _names_in_runs.get(env, set())
+    return next(iter(names)) if len(names) == 1 else ("", "")
 
 
 @cache

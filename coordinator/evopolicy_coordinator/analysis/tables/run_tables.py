@@ -45,7 +45,7 @@ def tables_of_runs(study: Study, link_of: LinkOf) -> list[Table]:
         _simulators(study, link_of),
         _agents(study),
         _environments(study),
-        _not_told(study),
+        _missing(study),
         _left_out(study),
     ]
 
@@ -434,7 +434,7 @@ def _no_validation(run: Run) -> bool:
     return not run.record.outcome.val_scores
 
 
-_NOT_TOLD: tuple[tuple[str, str, Callable[[Run], bool]], ...] = (
+_MISSING: tuple[tuple[str, str, Callable[[Run], bool]], ...] = (
     ("Normalised performance", "the random reference on the held-out cases", _no_reference),
     (
         "Score evolution",
@@ -456,10 +456,10 @@ _NOT_TOLD: tuple[tuple[str, str, Callable[[Run], bool]], ...] = (
 """Table, the information that it lacks for runs of the published software, and a test for affected runs."""
 
 
-def _not_told(study: Study) -> Table:
+def _missing(study: Study) -> Table:
     """The information missing from the published software's run directories, by table."""
     runs = [run for run in study.runs if run.is_published]
-    counts = [(table, what, sum(map(lacks, runs))) for table, what, lacks in _NOT_TOLD]
+    counts = [(table, what, sum(map(lacks, runs))) for table, what, lacks in _MISSING]
     return Table(
         name="not_told",
         title="Not told",

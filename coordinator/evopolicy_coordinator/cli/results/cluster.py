@@ -113,7 +113,7 @@ class Playing:
     def __init__(self, progress: Progress, title: str) -> None:
         self._progress = progress
         self._task = progress.add_task(title, total=None)
-        self._told: set[str] = set()
+        self._shown_reasons: set[str] = set()
 
     def update(self, *, total: int | None = None, title: str | None = None) -> None:
         """Sets the number of episodes to come, or the bar's title."""
@@ -122,8 +122,8 @@ class Playing:
     def played(self, count: int, waits_for: str) -> None:
         """Shows the number of episodes played, and each reason for waiting once."""
         self._progress.update(self._task, completed=count)
-        if waits_for and waits_for not in self._told:
-            self._told.add(waits_for)
+        if waits_for and waits_for not in self._shown_reasons:
+            self._shown_reasons.add(waits_for)
             self._progress.console.print(f"waits for {waits_for}")
 
 

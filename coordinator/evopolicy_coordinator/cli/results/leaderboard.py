@@ -103,7 +103,7 @@ def leaderboard(
             raise ConfigError(f"{error.filename}: {error.strerror}") from error
         shown = [bundle for bundle in bundles if not bundle.refused]
         index = write_site(bundles, out, title=title, tell=lambda text: say(one_line(text), err=True))
-        told = {
+        summary = {
             "index": str(index),
             "files": [
                 {
@@ -117,7 +117,7 @@ def leaderboard(
             ],
         }
     if as_json:
-        say_json(told)
+        say_json(summary)
     else:
         for one in bundles:
             if one.refused:

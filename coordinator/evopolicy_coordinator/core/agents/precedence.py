@@ -74,18 +74,18 @@ def _hidden(
             del lane.done_looks[family]
             lane.kept_s.pop(family, None)
             if reversal is not None:
-                turn_back(state, reversal, step, "no hidden case of closed runs is left")
+                release_kernel(state, reversal, step, "no hidden case of closed runs is left")
         return
     if reversal is not None:
         if reversal.kernel not in there:
-            turn_back(state, reversal, step, "its workers are gone")
+            release_kernel(state, reversal, step, "its workers are gone")
         return
     known = [kernel for kernel in there if kernel.boot_id != EVERYWHERE]
     if played or not known or not all(conflicts.hidden_conflict(state, family, kernel) for kernel in known):
         return
     kept_s = lane.kept_s[family] = lane.kept_s.get(family, 0.0) + passed_s
     if kept_s >= state.settings.hidden_wait_s:
-        _turn_over(state, lane, family, known, step)
+        _reserve_kernel(state, lane, family, known, step)
 
 
 def _played(state: State, lane: Lane, family: Family) -> bool:
@@ -100,7 +100,7 @@ def _played(state: State, lane: Lane, family: Family) -> bool:
     )
 
 
-def _turn_over(state: State, lane: Lane, family: Family, known: list[Kernel], step: Step) -> None:
+def _reserve_kernel(state: State, lane: Lane, family: Family, known: list[Kernel], step: Step) -> None:
     def in_the_way(kernel: Kernel) -> tuple[int, int]:
         return len(all_related(kernel.permits, family)), len(all_related(kernel.train, family))
 
@@ -116,7 +116,7 @@ def _turn_over(state: State, lane: Lane, family: Family, known: list[Kernel], st
     step.log("info", "hidden_first", env=lane.key[0], boot_id=kernel.boot_id, agents=in_the_way(kernel)[0])
 
 
-def turn_back(state: State, reversal: Reversal, step: Step, why: str) -> None:
+def release_kernel(state: State, reversal: Reversal, step: Step, why: str) -> None:
     """Release a reserved kernel: agents have precedence again."""
     kernel, family = reversal.kernel, reversal.family
     del reversal.lane.reversals[family]

@@ -21,7 +21,7 @@ ASK_AGAIN_S = 10.0
 """A declined permit request is kept for this long, until the gateway repeats it."""
 
 
-def requested(state: State, event: events.Asked[gateway.RequestPermit], step: Step) -> None:
+def requested(state: State, event: events.Requested[gateway.RequestPermit], step: Step) -> None:
     """A gateway requests that its agent may be alive on a kernel."""
     message = event.message
     run = state.runs.get(message.run)
@@ -78,7 +78,7 @@ def _implied(state: State, run: Run, step: Step) -> Reason | None:
     return waits_for
 
 
-def agent_gone(state: State, event: events.Asked[operator.AgentGone], step: Step) -> None:
+def agent_gone(state: State, event: events.Requested[operator.AgentGone], step: Step) -> None:
     """An operator confirms that a run's agent is no longer alive."""
     message = event.message
     if message.run not in state.capabilities:

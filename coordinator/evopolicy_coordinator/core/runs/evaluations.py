@@ -117,7 +117,7 @@ def _answer_polls(state: State, group: JobGroup, step: Step, *, finished: bool) 
         step.add(_page(state, poll, group, step, finished=finished))
 
 
-def polled(state: State, event: events.Asked[operator.EvaluationPoll], step: Step) -> None:
+def polled(state: State, event: events.Requested[operator.EvaluationPoll], step: Step) -> None:
     """An operator polls for outcomes: answered at once, or when there are more than it has."""
     message = event.message
     poll = Poll(event.request, "evaluation", evaluation_group(message.evaluation), message.cursor)

@@ -86,7 +86,7 @@ def look_at_audits(state: State, name: str, step: Step) -> None:
 # ---- stages ----
 
 
-def close(state: State, event: events.Asked[gateway.CloseRun], step: Step) -> None:
+def close(state: State, event: events.Requested[gateway.CloseRun], step: Step) -> None:
     """The agent is gone: the run takes no more submits, and its hidden cases are played. A second
     close changes nothing."""
     message = event.message
@@ -132,7 +132,7 @@ def advance(state: State, run: Run, step: Step) -> None:
         _finish(state, run, best, step)
 
 
-def cancel(state: State, event: events.Asked[operator.CancelRun], step: Step) -> None:
+def cancel(state: State, event: events.Requested[operator.CancelRun], step: Step) -> None:
     """End a run at once on an operator's command; it is not scored. Also ends an evaluation of that name."""
     message = event.message
     run = state.runs.get(message.run)

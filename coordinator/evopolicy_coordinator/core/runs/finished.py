@@ -149,7 +149,7 @@ def _submit_record(row: SubmitRow) -> operator.SubmitRecord:
 # ---- waiting for the end ----
 
 
-def waited(state: State, event: events.Asked[operator.WaitRun], step: Step) -> None:
+def waited(state: State, event: events.Requested[operator.WaitRun], step: Step) -> None:
     """An operator waits for the end of a run."""
     message = event.message
     run = state.runs.get(message.run)

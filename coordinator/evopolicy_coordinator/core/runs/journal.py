@@ -91,7 +91,7 @@ def ended(state: State, finished: RunFinished, step: Step) -> RunFinished:
     return msgspec.structs.replace(finished, committed=place)
 
 
-def disclose(state: State, event: events.DisclosureAsked, step: Step) -> None:
+def disclose(state: State, event: events.DisclosureRequested, step: Step) -> None:
     """Reveal the epochs of runs that are to be published. Refuses (BUSY) while a run of them is unfinished.
     Revealed epochs stay so."""
     for run in state.runs.values():

@@ -18,7 +18,7 @@ from . import waits
 from .runs import held_s
 
 
-def results(state: State, event: events.Asked[gateway.ResultsRequest], step: Step) -> None:
+def results(state: State, event: events.Requested[gateway.ResultsRequest], step: Step) -> None:
     """A gateway polls for outcomes: answered at once, or when there are more than it has."""
     message = event.message
     run = state.runs.get(message.run)

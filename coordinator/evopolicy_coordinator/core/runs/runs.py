@@ -99,7 +99,7 @@ def _fault(row: RunRow) -> Reason | None:
 # ---- requests of gateways ----
 
 
-def opened(state: State, event: events.Asked[gateway.OpenRun], step: Step) -> None:
+def opened(state: State, event: events.Requested[gateway.OpenRun], step: Step) -> None:
     """Send a gateway the fixed parameters of its run; refused until a worker has offered the environment."""
     run = live(state, event.request, event.message.run, step)
     if run is None:
@@ -140,7 +140,7 @@ def opened(state: State, event: events.Asked[gateway.OpenRun], step: Step) -> No
     )
 
 
-def state_requested(state: State, event: events.Asked[gateway.StateRequest], step: Step) -> None:
+def state_requested(state: State, event: events.Requested[gateway.StateRequest], step: Step) -> None:
     """Send a gateway the state of its run, also after it is finished."""
     last = state.finished.get(event.message.run)
     if last is not None:

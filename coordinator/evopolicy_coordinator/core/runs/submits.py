@@ -32,7 +32,7 @@ from evopolicy_coordinator.core.structures.ledger import refusal
 from . import result_polls, templates
 
 
-def submit(state: State, event: events.Asked[gateway.Submit], step: Step) -> None:
+def submit(state: State, event: events.Requested[gateway.Submit], step: Step) -> None:
     """Accept a submit, or refuse it for the first cause in the protocol's order; a known key
     gets the earlier answer."""
     message = event.message
@@ -67,7 +67,7 @@ def submit(state: State, event: events.Asked[gateway.Submit], step: Step) -> Non
     _accept(state, run, event, step)
 
 
-def _again(event: events.Asked[gateway.Submit], row: SubmitRow, step: Step) -> None:
+def _again(event: events.Requested[gateway.Submit], row: SubmitRow, step: Step) -> None:
     """Answer a known key as the first time if the request is the same; otherwise refuse it (KEY_CONFLICT)."""
     message = event.message
     if (message.env_instances, message.bundle) != (row.env_instances, row.bundle):
@@ -85,7 +85,7 @@ def _accepted(row: SubmitRow) -> gateway.SubmitAccepted:
     )
 
 
-def _accept(state: State, run: Run, event: events.Asked[gateway.Submit], step: Step) -> None:
+def _accept(state: State, run: Run, event: events.Requested[gateway.Submit], step: Step) -> None:
     message = event.message
     index, n = len(run.submits), len(message.env_instances)
     first_global_episode = run.ledger.spent

@@ -74,7 +74,7 @@ def _refused_as_forger(state: State, name: str, machine: str, request: events.Re
 
 
 def worker_of(
-    state: State, event: events.Asked[wire.LeaseRequest | wire.Heartbeat | wire.ReportResults], step: Step
+    state: State, event: events.Requested[wire.LeaseRequest | wire.Heartbeat | wire.ReportResults], step: Step
 ) -> Worker | None:
     """Returns the worker that sent the request; None, and the request is refused, when its session is unknown
     or it is quarantined."""
@@ -93,14 +93,14 @@ def worker_of(
     return worker
 
 
-def lease_requested(state: State, event: events.Asked[wire.LeaseRequest], step: Step) -> None:
+def lease_requested(state: State, event: events.Requested[wire.LeaseRequest], step: Step) -> None:
     """A worker polls for leases."""
     worker = worker_of(state, event, step)
     if worker is not None:
         scheduler.poll(state, worker, event, step)
 
 
-def heartbeat(state: State, event: events.Asked[wire.Heartbeat], step: Step) -> None:
+def heartbeat(state: State, event: events.Requested[wire.Heartbeat], step: Step) -> None:
     """Renew the leases that a worker names, and reply with those to stop."""
     message = event.message
     worker = worker_of(state, event, step)
@@ -116,7 +116,7 @@ def heartbeat(state: State, event: events.Asked[wire.Heartbeat], step: Step) -> 
         state.timers.arm(("beat", worker.name), step.now + min(message.wait_s, state.settings.max_wait_s))
 
 
-def results_reported(state: State, event: events.Asked[wire.ReportResults], step: Step) -> None:
+def results_reported(state: State, event: events.Requested[wire.ReportResults], step: Step) -> None:
     """Take results, and answer once they are durable."""
     worker = worker_of(state, event, step)
     if worker is None:
@@ -134,7 +134,7 @@ def liveness_lost(state: State, event: events.LivenessLost, step: Step) -> None:
         state.timers.arm(("worker", worker.name), step.now + state.settings.liveness_grace_s)
 
 
-def worker_state(state: State, event: events.Asked[operator.SetWorker], step: Step) -> None:
+def worker_state(state: State, event: events.Requested[operator.SetWorker], step: Step) -> None:
     """Drain, pause or reactivate a worker; durable, also for one that is not connected."""
     message = event.message
     if message.state != "active" and message.worker in state.quarantined:
@@ -156,7 +156,7 @@ def worker_state(state: State, event: events.Asked[operator.SetWorker], step: St
     step.reply(event.request, operator.Done())
 
 
-def repinned(state: State, event: events.Asked[operator.RepinRun], step: Step) -> None:
+def repinned(state: State, event: events.Requested[operator.RepinRun], step: Step) -> None:
     """Pin an unfinished run to another class of workers on an operator's command."""
     message = event.message
     run = state.runs.get(message.run)

@@ -19,7 +19,7 @@ from itertools import islice
 
 from evopolicy_common.messages import worker as wire
 from evopolicy_coordinator.core.agents import permits, precedence
-from evopolicy_coordinator.core.events import Asked
+from evopolicy_coordinator.core.events import Requested
 from evopolicy_coordinator.core.leasing import fleet, leases, queue
 from evopolicy_coordinator.core.model import TRAIN, Lane, LeasePoll, Worker
 from evopolicy_coordinator.core.state import State
@@ -46,7 +46,7 @@ HELD_MAX = 16_384
 """Most leases that a worker may hold: its heartbeats name them all."""
 
 
-def poll(state: State, worker: Worker, event: Asked[wire.LeaseRequest], step: Step) -> None:
+def poll(state: State, worker: Worker, event: Requested[wire.LeaseRequest], step: Step) -> None:
     """A worker polls for leases; an older poll of it is answered with none."""
     message = event.message
     fleet.drop_poll(state, worker, step)

@@ -237,10 +237,10 @@ def _():
     host, _, port = address.partition(":")
     with socket.create_connection((host, int(port)), 5) as sock:
         sock.sendall(f"CONNECT 127.0.0.1:{targets['port']} HTTP/1.1\r\n\r\n".encode())
-        said = sock.recv(100).decode()
-    if "hello" not in said:
-        raise OSError(said.splitlines()[0])
-    return said
+        output = sock.recv(100).decode()
+    if "hello" not in output:
+        raise OSError(output.splitlines()[0])
+    return output
 
 
 @attempt("import a simulator")

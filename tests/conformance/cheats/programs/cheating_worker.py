@@ -81,8 +81,8 @@ class OldSlot(Slot):
 
 if __name__ == "__main__":
     HOW = sys.argv.pop(1)
-    told = msgspec.structs.replace(fingerprint(), code_version="old" if HOW == "old-code" else "cheats")
-    cli.fingerprint = lambda: told  # type: ignore[attr-defined]
+    forged = msgspec.structs.replace(fingerprint(), code_version="old" if HOW == "old-code" else "cheats")
+    cli.fingerprint = lambda: forged  # type: ignore[attr-defined]
     if HOW in FORGERIES:
         cli.Slot = CheatingSlot  # type: ignore[attr-defined]
     if HOW == "old-code":

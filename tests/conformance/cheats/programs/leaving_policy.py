@@ -64,8 +64,8 @@ def found():
 class Policy:
     def __init__(self, obs_space, action_space, env_meta):
         before = found()
-        said = {"mark": MARK, "before": before, "left": leave(), "reached": call_the_agent()}
-        print("SAID " + json.dumps(said), flush=True)
+        report = {"mark": MARK, "before": before, "left": leave(), "reached": call_the_agent()}
+        print("REPORT " + json.dumps(report), flush=True)
 
     def reset(self, episode_index):
         pass

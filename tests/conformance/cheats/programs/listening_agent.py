@@ -34,9 +34,9 @@ for sock in (tcp, unix):
     except TimeoutError:
         pass
 files = [path for folder in folders for path in glob.glob(os.path.join(folder, "left-behind*"))]
-said = []
+reports = []
 for path in sorted(glob.glob("feedback/submit_*/episodes/*/stdout.txt")):
     with open(path) as file:
-        said += [json.loads(line.removeprefix("SAID ")) for line in file if line.startswith("SAID ")]
+        reports += [json.loads(line.removeprefix("REPORT ")) for line in file if line.startswith("REPORT ")]
 with open("report.json", "w") as file:
-    json.dump({"called": called, "files": files, "said": said}, file)
+    json.dump({"called": called, "files": files, "reports": reports}, file)

@@ -1,7 +1,7 @@
 """An agent that has its gateway read other files for it: `system/` and what is in it change places with links, pipes and
 hard links while a submit is taken. In a jail a link may point to what only the gateway sees: relative to the workspace.
 
-Its report: `report.json`, the status of each submit and what was told.
+Its report: `report.json`, the status of each submit and what it was told.
 """
 
 import contextlib
@@ -24,12 +24,12 @@ def submit(ids):
         os.environ["EVOPOLICYGYM_SUBMIT_URL"], data=json.dumps({"env_instances": ids}).encode()
     )
     with urllib.request.urlopen(request) as reply:
-        told = json.load(reply)
+        document = json.load(reply)
     try:
-        with open(os.path.join(told["feedback"], "errors.txt")) as errors:
-            return told["status"], errors.read()
+        with open(os.path.join(document["feedback"], "errors.txt")) as errors:
+            return document["status"], errors.read()
     except FileNotFoundError:
-        return told["status"], ""
+        return document["status"], ""
 
 
 def write(path, text):
@@ -86,11 +86,11 @@ def restore():
 
 
 restore()
-told = [submit([0])]
+verdicts = [submit([0])]
 threads = [threading.Thread(target=swap) for swap in (swap_files, swap_folders)]
 for thread in threads:
     thread.start()
-told += [submit([0]) for _ in range(8)]
+verdicts += [submit([0]) for _ in range(8)]
 over.set()
 for thread in threads:
     thread.join()
@@ -105,8 +105,8 @@ for spoil in (
 ):
     restore()
     spoil()
-    told.append(submit([0]))
+    verdicts.append(submit([0]))
 restore()
-told.append(submit([0]))
+verdicts.append(submit([0]))
 with open("report.json", "w") as file:
-    json.dump(told, file)
+    json.dump(verdicts, file)

@@ -357,10 +357,10 @@ def test_a_browser_s_memory_is_limited_and_it_is_replaced_when_it_has_grown(
 def test_texts_that_no_observation_can_have_are_told_in_others(browser: Page, tmp_path: Path) -> None:
     browser.open(address(tmp_path, ""), "")
     pair, half = r"\ud83d\ude00", r"\ud83d"
-    told = browser.tell(
+    texts = browser.tell(
         f'["{pair}", "{pair}".slice(0, 1), "{half}{half}a", "{pair}".slice(1), "\\{half}", "\\\\{half}"]'
     )
-    assert told == ["😀", "�", "��a", "�", "\\ud83d", "\\�"]
+    assert texts == ["😀", "�", "��a", "�", "\\ud83d", "\\�"]
     with pytest.raises(BrowserLostError, match="no JSON"):
         browser.tell("undefined")
 

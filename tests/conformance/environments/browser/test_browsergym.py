@@ -132,8 +132,8 @@ def test_every_call_can_be_made(warm: Warm) -> None:
         if name not in skipped:
             given = {
                 each: values.get(each, 50)
-                for each, told in arguments.items()
-                if each in values or not isinstance(told[0], str)
+                for each, parameter in arguments.items()
+                if each in values or not isinstance(parameter[0], str)
             }
             given = {each: value for each, value in given.items() if each not in ("button", "modifiers")}
             step = environment.step(

@@ -113,14 +113,14 @@ def test_a_cli_of_the_example_files_edits_submits_and_is_resumed(
     (tmp_path / ".gemini/settings.json").write_text(
         '{"security": {"auth": {"selectedType": "gemini-api-key"}}}'
     )
-    told = read_agent(AGENTS / f"{name}.toml")
+    agent = read_agent(AGENTS / f"{name}.toml")
     with ModelApi([*SCRIPT[:2], Step(status=503, text="overloaded"), *SCRIPT[2:]]) as api:
         variables = {
             "GOOGLE_GEMINI_BASE_URL": api.base_url,
             "OPENAI_BASE_URL": f"{api.base_url}/v1",
             "PATH": f"{CLIS}:{os.environ['PATH']}",
         }
-        config = msgspec.structs.replace(told, environment=variables, backoff_s=0.001)
+        config = msgspec.structs.replace(agent, environment=variables, backoff_s=0.001)
         played = play(
             tmp_path, config, "", budget=4, GEMINI_API_KEY="stub-0123456789", OPENAI_API_KEY="stub-0123456789"
         )
@@ -142,10 +142,10 @@ def test_the_real_cli_plays_a_whole_run_in_its_jail_and_is_resumed_there(
     with ModelApi([*SCRIPT[:2], Step(status=503, text="overloaded"), *SCRIPT[2:]]) as api:
         config = config_for(harness, api)
         variables = {name: value for name, value in config.environment.items() if name != "PATH"}
-        told = ", ".join(f"{name} = {json.dumps(value)}" for name, value in variables.items())
+        line = ", ".join(f"{name} = {json.dumps(value)}" for name, value in variables.items())
         (tmp_path / "agent.toml").write_text(
             f'harness = "{harness}"\nmodel = "{config.model}"\nprogram = ["{program}"]\nbackoff_s = 0.01\n'
-            f"extra_args = {json.dumps(config.extra_args)}\nenvironment = {{ {told} }}\n"
+            f"extra_args = {json.dumps(config.extra_args)}\nenvironment = {{ {line} }}\n"
         )
         arguments = ("--env", "toy/line", "--agent", "file:agent.toml", "--exp-id", "t", "--budget", "4")
         reaches = api.base_url.removeprefix("http://")
@@ -205,10 +205,10 @@ def test_a_real_agent_behind_the_protocol_edits_submits_and_goes_on(tmp_path: Pa
     assert (tmp_path / "workspace/system/policy.py").read_text() == "# better\n# better\n"
     assert "first" in str(api.requests[-1])
     # Qwen Code tells no tokens, OpenCode those of a turn's last request.
-    told = {"gemini": 4 * INPUT, "opencode": 2 * INPUT, "claude": 4 * (INPUT + CREATED), "qwen": 0}
+    usage = {"gemini": 4 * INPUT, "opencode": 2 * INPUT, "claude": 4 * (INPUT + CREATED), "qwen": 0}
     tokens = played.ending.facts.get("tokens", {})
     assert (
-        sum(tokens.get(kind, 0) for kind in ("input_noncached", "cache_read", "cache_creation")) == told[name]
+        sum(tokens.get(kind, 0) for kind in ("input_noncached", "cache_read", "cache_creation")) == usage[name]
     )
     assert KEY not in played.text
 
@@ -221,10 +221,10 @@ def test_a_real_agent_behind_the_protocol_plays_a_whole_run_in_its_jail(
     with ModelApi(SCRIPT) as api:
         monkeypatch.setenv("HOME", str(home))
         variables = acp_settings(name, api, home)
-        told = ", ".join(f"{key} = {json.dumps(value)}" for key, value in variables.items())
+        line = ", ".join(f"{key} = {json.dumps(value)}" for key, value in variables.items())
         program = json.dumps([f"{CLIS}/{ACP[name][0]}", *ACP[name][1:]])
         (tmp_path / "agent.toml").write_text(
-            f'harness = "{name}"\nprogram = {program}\nenvironment = {{ {told} }}\nbackoff_s = 0.01\n[acp]\n'
+            f'harness = "{name}"\nprogram = {program}\nenvironment = {{ {line} }}\nbackoff_s = 0.01\n[acp]\n'
         )
         arguments = ("--env", "toy/line", "--agent", "file:agent.toml", "--exp-id", "t", "--budget", "4")
         reaches = api.base_url.removeprefix("http://")
@@ -263,10 +263,10 @@ def test_a_real_agent_has_the_runs_skills_and_mcp_servers_in_its_jail(
         more = ["--allow-host", api.base_url.removeprefix("http://")]
         config = inputs_config(name, api, home)
         config = msgspec.structs.replace(config, skills=skills, mcp=servers, backoff_s=0.01)
-        told = {
+        document = {
             name: each for name, each in msgspec.to_builtins(config).items() if each not in (None, (), {})
         }
-        lines = [f"{name} = {as_toml(each)}\n" for name, each in told.items()]
+        lines = [f"{name} = {as_toml(each)}\n" for name, each in document.items()]
         (tmp_path / "agent.toml").write_text("".join(lines))
         for path in home.iterdir():
             more += ["--jail-bind-rw", str(path)]
@@ -295,11 +295,11 @@ def inputs_config(name: str, api: ModelApi, home: Path) -> AgentConfig:
             harness="acp", program=program, acp=AcpTable(), environment=acp_settings(name, api, home)
         )
     if name in ("gemini", "qwen"):
-        told = read_agent(AGENTS / f"{name}.toml")
+        agent = read_agent(AGENTS / f"{name}.toml")
         variables = {"GOOGLE_GEMINI_BASE_URL": api.base_url, "OPENAI_BASE_URL": f"{api.base_url}/v1"}
         if name == "gemini":
             acp_settings(name, api, home)
-        return msgspec.structs.replace(told, environment=variables, program=(f"{CLIS}/{name}",))
+        return msgspec.structs.replace(agent, environment=variables, program=(f"{CLIS}/{name}",))
     config = config_for(name, api)
     variables = {key: value for key, value in config.environment.items() if key != "PATH"}
     program = f"{CLIS}/{'codex' if name == 'codex' else 'claude'}"

@@ -146,7 +146,7 @@ def test_every_command_in_a_remote_agents_rules_runs_as_it_stands(tmp_path: Path
         surroundings = {**os.environ, "EVOPOLICYGYM_TOKEN": token_of(s.folder)}
         shell = [block.split("```")[0] for block in text.split("```bash\n")[1:]]
         python = text.split("```python\n")[1].split("```")[0]
-        said = []
+        lines = []
         for command in [*(["bash", "-euc", one] for one in shell), [sys.executable, "-c", python]]:
             process = await asyncio.create_subprocess_exec(
                 *command,
@@ -156,10 +156,10 @@ def test_every_command_in_a_remote_agents_rules_runs_as_it_stands(tmp_path: Path
             )
             out, _ = await process.communicate()
             assert process.returncode == 0, command
-            said.append(out.decode())
-        assert said[0].startswith("# A line")
-        assert json.loads(said[2])["status"] == "ok"
-        assert said[-1].startswith("feedback/submit_001 ok")
+            lines.append(out.decode())
+        assert lines[0].startswith("# A line")
+        assert json.loads(lines[2])["status"] == "ok"
+        assert lines[-1].startswith("feedback/submit_001 ok")
 
     play(tmp_path, script)
 
@@ -173,7 +173,7 @@ def test_the_rules_tell_the_url_by_which_the_agent_reaches_the_service(tmp_path:
 
 
 @pytest.mark.parametrize(
-    ("http", "url", "told"),
+    ("http", "url", "problem"),
     [
         ("10.0.0.5", None, "HOST:PORT"),
         (":80", None, "HOST:PORT"),
@@ -185,12 +185,12 @@ def test_the_rules_tell_the_url_by_which_the_agent_reaches_the_service(tmp_path:
         ("10.0.0.5:80", "https://gym.example/'; rm -rf x", "without quotes"),
     ],
 )
-def test_a_door_that_cannot_be_is_refused_by_name(http: str, url: str | None, told: str) -> None:
-    with pytest.raises(ConfigError, match=told):
+def test_an_address_that_cannot_be_served_is_refused_by_name(http: str, url: str | None, problem: str) -> None:
+    with pytest.raises(ConfigError, match=problem):
         listener_of(http, url)
 
 
-def test_a_door_is_what_the_operator_named() -> None:
+def test_a_listener_has_the_address_that_the_operator_named() -> None:
     assert listener_of("[fd00::5]:8080", None) == Listener(host="fd00::5", port=8080)
     assert listener_of("0.0.0.0:80", "https://gym.example/") == Listener(
         host="0.0.0.0", port=80, url="https://gym.example"
@@ -198,7 +198,7 @@ def test_a_door_is_what_the_operator_named() -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "told"),
+    ("options", "problem"),
     [
         (["--agent", "remote"], "needs --http"),
         (
@@ -217,10 +217,10 @@ def test_a_door_is_what_the_operator_named() -> None:
         (["--agent", "evolve", "--hidden-cases", "mine"], "'shared', 'per-run'"),
     ],
 )
-def test_options_that_do_not_go_together_are_refused(tmp_path: Path, options: list[str], told: str) -> None:
+def test_options_that_do_not_go_together_are_refused(tmp_path: Path, options: list[str], problem: str) -> None:
     done = CliRunner().invoke(evopolicy, ["run", "--env", "toy/line", "--runs", str(tmp_path), *options])
     assert done.exit_code == 2, done.stderr
-    assert told in done.stderr
+    assert problem in done.stderr
     assert list(tmp_path.iterdir()) == []
 
 
@@ -232,26 +232,26 @@ class RemoteRun:
         words = ["run", "--credentials", str(operator_file), "--env", "toy/line", "--agent", "remote"]
         words += ["--http", f"{HOST}:0", "--entry", "theirs", "--exp-id", "r", "--runs", str(root / "runs")]
         words += ["--budget", "4", "--validation", "1", "--heldout", "1", *options]
-        self.said = root / "said"
-        with self.said.open("wb") as said:
+        self.log = root / "log"
+        with self.log.open("wb") as log:
             self.process = subprocess.Popen(
                 [sys.executable, "-m", "evopolicy_gateway.cli", *words],
                 cwd=root,
                 env={**os.environ, "XDG_STATE_HOME": str(root / "xdg")},
-                stdout=said,
-                stderr=said,
+                stdout=log,
+                stderr=log,
             )
 
     def wait_until_served(self) -> None:
         deadline = time.monotonic() + TIMEOUT_S
-        while "when it is done before its budget" not in self.said.read_text():
-            assert self.process.poll() is None, self.said.read_text()
-            assert time.monotonic() < deadline, self.said.read_text()
+        while "when it is done before its budget" not in self.log.read_text():
+            assert self.process.poll() is None, self.log.read_text()
+            assert time.monotonic() < deadline, self.log.read_text()
             time.sleep(0.1)
 
     def submit(self, episodes: list[int], token: str) -> tuple[int, str]:
         """Status of the answer, and of the submit."""
-        url = next(line.split()[-1] for line in self.said.read_text().splitlines() if "served at" in line)
+        url = next(line.split()[-1] for line in self.log.read_text().splitlines() if "served at" in line)
         request = urllib.request.Request(
             url,
             data=json.dumps({"env_instances": episodes}).encode(),
@@ -280,8 +280,8 @@ def test_a_remote_run_waits_for_its_agent_and_ends_when_the_operator_says_so(
     try:
         run.wait_until_served()
         token = token_of(run.folder)
-        assert str(run.folder.bearer) in run.said.read_text()
-        assert token not in run.said.read_text()
+        assert str(run.folder.bearer) in run.log.read_text()
+        assert token not in run.log.read_text()
         assert run.submit([0, 1], "guess") == (401, "")
         assert run.submit([0, 1], token) == (200, "ok")
         assert (run.folder.feedback / "submit_000" / "summary.json").exists()
@@ -290,11 +290,11 @@ def test_a_remote_run_waits_for_its_agent_and_ends_when_the_operator_says_so(
         assert ended.value.code == 0
     finally:
         code = run.end()
-    assert code == 0, run.said.read_text()
+    assert code == 0, run.log.read_text()
     record = decode_run_record(run.folder.run_json.read_bytes())
     assert (record.agent.harness, record.jail, record.outcome.budget_used) == ("remote", "none", 2)
     assert record.outcome.closed_reason == "agent_stopped"
-    assert token not in run.said.read_text() + run.folder.harness_log.read_text()
+    assert token not in run.log.read_text() + run.folder.harness_log.read_text()
     assert not run.folder.state.exists()
 
 
@@ -304,15 +304,15 @@ def test_a_remote_run_that_has_spent_its_budget_is_scored_when_its_agent_has_end
     run = RemoteRun(operator_file, tmp_path)
     try:
         run.wait_until_served()
-        assert "it may be any: no hidden case" in run.said.read_text()
+        assert "it may be any: no hidden case" in run.log.read_text()
         assert run.submit([0, 1, 2, 3], token_of(run.folder)) == (200, "ok")
-        wait_until(lambda: "waiting for the agent's end" in run.said.read_text())
+        wait_until(lambda: "waiting for the agent's end" in run.log.read_text())
         assert run.submit([0], token_of(run.folder))[0] == 409
         assert run.process.poll() is None
         finish(run.folder)
     finally:
         code = run.end()
-    assert code == 0, run.said.read_text()
+    assert code == 0, run.log.read_text()
     record = decode_run_record(run.folder.run_json.read_bytes())
     assert (record.outcome.closed_reason, record.hidden_isolation) == ("budget_spent", "exclusive")
 
@@ -326,14 +326,14 @@ def test_a_remote_run_whose_operator_vouches_for_its_agent_ends_by_itself(
         assert run.submit([0, 1, 2, 3], token_of(run.folder)) == (200, "ok")
     finally:
         code = run.end()
-    assert code == 0, run.said.read_text()
+    assert code == 0, run.log.read_text()
     record = decode_run_record(run.folder.run_json.read_bytes())
     assert (record.outcome.closed_reason, record.hidden_isolation) == ("budget_spent", "waived")
 
 
 def test_a_remote_run_ends_when_its_agents_time_is_over(operator_file: Path, tmp_path: Path) -> None:
     run = RemoteRun(operator_file, tmp_path, "--agent-wall-s", "1", "--agent-host", "elsewhere")
-    assert run.end() == 3, run.said.read_text()
+    assert run.end() == 3, run.log.read_text()
     assert decode_run_record(run.folder.run_json.read_bytes()).outcome.closed_reason == "wall_limit"
 
 

@@ -141,16 +141,16 @@ def test_bad_input_gets_its_verdict_and_a_message_that_helps(operator_file: Path
         "never returns": ("ok", 10, None),
         "act raises": ("ok", 9, None),
     }
-    for name, (status, left, said) in expected.items():
+    for name, (status, left, text) in expected.items():
         assert log[name][:2] == (status, left), (name, log[name])
-        if said is not None:
-            assert said in log[name][2], (name, log[name])
+        if text is not None:
+            assert text in log[name][2], (name, log[name])
     feedback = folder / "workspace" / "feedback"
-    told = {}
+    found = {}
     for index, name in ((8, "nonsense action"), (9, "never returns"), (10, "act raises")):
         errors = (feedback / f"submit_{index:03d}").glob("episodes/*/error.txt")
-        told[name] = [json.loads(error.read_text())["category"] for error in errors]
-    assert told == {"nonsense action": [], "never returns": ["act_timeout"], "act raises": ["act_error"]}
+        found[name] = [json.loads(error.read_text())["category"] for error in errors]
+    assert found == {"nonsense action": [], "never returns": ["act_timeout"], "act raises": ["act_error"]}
     rows = (feedback / "submit_008/episodes").glob("*/trajectory.jsonl")
     assert all(
         json.loads(line)["info"]["action_invalid"] for path in rows for line in path.read_text().splitlines()
@@ -266,8 +266,8 @@ for line in sys.stdin:
 """
     (tmp_path / "rules.md").write_text("House rules for $env.\n$standard")
     (tmp_path / "prompts.toml").write_text('first = "Begin, please."\n')
-    told = ("--feedback", "scores", "--agents-md", "rules.md", "--prompts", "prompts.toml")
-    exit_code, _, err = run_on(operator_file, tmp_path, agent(tmp_path, code), *told)
+    text_options = ("--feedback", "scores", "--agents-md", "rules.md", "--prompts", "prompts.toml")
+    exit_code, _, err = run_on(operator_file, tmp_path, agent(tmp_path, code), *text_options)
     assert exit_code == 0, err
     folder = run_dir(tmp_path)
     record = record_in(folder)

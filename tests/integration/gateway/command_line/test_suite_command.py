@@ -219,8 +219,8 @@ def test_a_dead_hosts_runs_are_taken_over_and_it_takes_their_results_when_it_is_
     assert (entry["state"], entry["attempt"]) == ("completed", 2)
     with sweep(hosts[0], *arguments) as back:
         assert back.wait() == 0, back.text
-    (told,) = index_in(hosts[0] / "runs" / "t").values()
-    assert (told["state"], told["score"], told["directory"]) == ("completed", entry["score"], "")
+    (indexed,) = index_in(hosts[0] / "runs" / "t").values()
+    assert (indexed["state"], indexed["score"], indexed["directory"]) == ("completed", entry["score"], "")
     assert [*hosts[0].glob("runs/t/*/*/*/run.json")] == []
 
 
@@ -261,9 +261,9 @@ def test_a_host_whose_run_is_taken_over_during_a_submit_takes_the_others_result(
     assert "Traceback" not in (workspace.parent / "logs/harness.log").read_text()
     assert "starting it again" not in one.text
     (entry,) = index_in(hosts[1] / "runs" / "t").values()
-    (told,) = index_in(hosts[0] / "runs" / "t").values()
+    (indexed,) = index_in(hosts[0] / "runs" / "t").values()
     assert (entry["state"], entry["attempt"]) == ("completed", 2)
-    assert (told["state"], told["score"], told["directory"]) == ("completed", entry["score"], "")
+    assert (indexed["state"], indexed["score"], indexed["directory"]) == ("completed", entry["score"], "")
 
 
 def test_a_wrong_key_is_no_result_and_is_played_again_once_it_is_right(

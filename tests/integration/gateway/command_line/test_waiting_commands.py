@@ -86,8 +86,8 @@ def paused(operator_file: Path) -> Path:
     words = ("--credentials", str(operator_file))
 
     def workers() -> list[str]:
-        told = subprocess.run([*status, *words], capture_output=True, check=True).stdout
-        return [worker["worker"] for worker in json.loads(told)["workers"]]
+        output = subprocess.run([*status, *words], capture_output=True, check=True).stdout
+        return [worker["worker"] for worker in json.loads(output)["workers"]]
 
     wait_until(workers)
     (name,) = workers()

@@ -10,7 +10,7 @@ from evopolicy_common.processes.distribution import install, permit_namespaces
 
 
 @pytest.mark.parametrize(
-    ("told", "bubblewrap", "egl"),
+    ("release", "bubblewrap", "egl"),
     [
         ('ID=debian\nVERSION_ID="12"\n', "sudo apt-get install bubblewrap", "libegl1"),
         ('ID=linuxmint\nID_LIKE="ubuntu debian"\n', "sudo apt-get install bubblewrap", "libegl1"),
@@ -21,9 +21,9 @@ from evopolicy_common.processes.distribution import install, permit_namespaces
     ],
 )
 def test_the_package_is_named_for_the_distribution(
-    told: str, bubblewrap: str, egl: str, tmp_path: Path
+    release: str, bubblewrap: str, egl: str, tmp_path: Path
 ) -> None:
-    (tmp_path / "os-release").write_text(told)
+    (tmp_path / "os-release").write_text(release)
     assert install("bubblewrap", tmp_path / "os-release") == bubblewrap
     assert egl in install("egl", tmp_path / "os-release")
 
@@ -49,9 +49,9 @@ def test_the_setting_that_forbids_namespaces_is_named_alone(name: str, value: st
         (tmp_path / other).parent.mkdir(exist_ok=True)
         (tmp_path / other).write_text("1\n")
     (tmp_path / name).write_text(f"{value}\n")
-    told = permit_namespaces(tmp_path)
-    assert f"sysctl -w {name.replace('/', '.')}=" in told
-    assert told.count("sysctl -w") == 1
+    steps = permit_namespaces(tmp_path)
+    assert f"sysctl -w {name.replace('/', '.')}=" in steps
+    assert steps.count("sysctl -w") == 1
 
 
 def test_where_no_setting_forbids_namespaces_a_container_is_named(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from machines.own_processes import alive
 from evopolicy_common.processes import parent_death
 
 
-def test_a_leashed_program_ends_with_its_parent() -> None:
+def test_a_program_with_a_parent_death_signal_ends_with_its_parent() -> None:
     parent = """
 import subprocess, sys, time
 from evopolicy_common.processes.parent_death import ending_with_parent
@@ -22,9 +22,9 @@ time.sleep(1000)
 """
     process = subprocess.Popen([sys.executable, "-c", parent], stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
-    said = sorted(process.stdout.readline().strip() for _ in range(2))
-    child = int(said[0])
-    assert said[1] == "up"
+    lines = sorted(process.stdout.readline().strip() for _ in range(2))
+    child = int(lines[0])
+    assert lines[1] == "up"
     assert alive(child)
     process.send_signal(signal.SIGKILL)
     process.wait()
@@ -35,7 +35,7 @@ time.sleep(1000)
     assert not alive(child)
 
 
-def test_a_leash_whose_holder_is_gone_starts_nothing() -> None:
+def test_a_program_whose_parent_is_gone_does_not_start() -> None:
     done = subprocess.run(
         [sys.executable, parent_death.__file__, "1", "9", "/bin/echo", "started"],
         capture_output=True,

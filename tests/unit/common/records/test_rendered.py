@@ -175,9 +175,9 @@ def row(t: int, reward: str = "0.5") -> bytes:
     ],
 )
 def test_rows_that_are_not_the_declared_steps_are_refused(rows: bytes) -> None:
-    told = {"name": ROWS, "size": len(rows), "packed": "zstd"}
+    file = {"name": ROWS, "size": len(rows), "packed": "zstd"}
     with pytest.raises(ProtocolError):
-        checked_files(container([(told, zstandard.ZstdCompressor().compress(rows))]), 3, 1.5)
+        checked_files(container([(file, zstandard.ZstdCompressor().compress(rows))]), 3, 1.5)
 
 
 @given(st.integers(0, 400), st.binary(min_size=1, max_size=3))
@@ -195,23 +195,23 @@ def test_damaged_bytes_are_an_error_of_the_protocol(at: int, wrong: bytes) -> No
 
 
 def container(files: list[tuple[dict[str, Any], bytes]], n: int = 3) -> bytes:
-    header = {"observations": "arrays", "n": n, "files": [told for told, _ in files]}
+    header = {"observations": "arrays", "n": n, "files": [header_entry for header_entry, _ in files]}
     parts = [msgspec.msgpack.encode(header), recorded(Recorder("actions"), [(None, 0, 0.5)] * n)]
     parts += [data for _, data in files]
     return rendered.MAGIC + b"".join(len(part).to_bytes(4, "little") + part for part in parts)
 
 
-@pytest.mark.parametrize("told", [10, 1 << 40, -1, 1 << 27])
-def test_a_bomb_is_refused_before_it_is_unpacked(told: int) -> None:
+@pytest.mark.parametrize("size", [10, 1 << 40, -1, 1 << 27])
+def test_a_bomb_is_refused_before_it_is_unpacked(size: int) -> None:
     bomb = zstandard.ZstdCompressor().compress(bytes(64 << 20))
     with pytest.raises(ProtocolError):
-        checked_files(container([({"name": ROWS, "size": told, "packed": "zstd"}, bomb)]), 3, 1.5)
+        checked_files(container([({"name": ROWS, "size": size, "packed": "zstd"}, bomb)]), 3, 1.5)
 
 
 def test_only_feedback_files_come_out_of_a_container() -> None:
-    told = {"name": "../policy.py", "size": 1, "packed": "as it is"}
+    file = {"name": "../policy.py", "size": 1, "packed": "as it is"}
     with pytest.raises(ProtocolError):
-        checked_files(container([(told, b"x")]), 3, 1.5)
+        checked_files(container([(file, b"x")]), 3, 1.5)
     twice = ({"name": ROWS, "size": 1, "packed": "as it is"}, b"x")
     with pytest.raises(ProtocolError):
         checked_files(container([twice, twice]), 3, 1.5)

@@ -93,22 +93,22 @@ def test_file_names_neither_steer_the_terminal_nor_forge_lines(tmp_path: Path) -
     for name in (b"x\nno difference (times and logs aside)", b"\x1b]8;;evil\x1b\\", b"\xff[x]"):
         with open(bytes(left) + b"/" + name, "wb"):
             pass
-    told = CliRunner().invoke(app, ["diff", str(left), str(right)])
-    assert told.exit_code == 1
-    assert len(told.output.splitlines()) == 3
-    assert "\x1b" not in told.output
-    told = CliRunner().invoke(app, ["diff", "--json", str(left), str(right)])
-    assert told.exit_code == 1
-    assert len(json.loads(told.output)) == 3
+    invoked = CliRunner().invoke(app, ["diff", str(left), str(right)])
+    assert invoked.exit_code == 1
+    assert len(invoked.output.splitlines()) == 3
+    assert "\x1b" not in invoked.output
+    invoked = CliRunner().invoke(app, ["diff", "--json", str(left), str(right)])
+    assert invoked.exit_code == 1
+    assert len(json.loads(invoked.output)) == 3
 
 
 def test_the_list_of_what_is_left_out_is_told_with_reasons_and_covers_what_differs(tmp_path: Path) -> None:
     done = CliRunner().invoke(app, ["diff", "--left-out"])
     assert done.exit_code == 0, done.output
-    told = done.output.splitlines()
-    assert "run.json, timing: times" in told
-    assert "summary.json, submit_started_at: a time" in told
-    assert all(": " in line for line in told)
+    lines = done.output.splitlines()
+    assert "run.json, timing: times" in lines
+    assert "summary.json, submit_started_at: a time" in lines
+    assert all(": " in line for line in lines)
     left, right = make_run(tmp_path, "a"), make_run(tmp_path, "b")
     assert CliRunner().invoke(app, ["diff", str(left), str(right)]).exit_code == 0
     (right / "extra").touch()
@@ -127,12 +127,12 @@ def test_people_see_scores_first_and_folders_in_place_of_the_files_in_them(tmp_p
     (right / "extra").touch()
     found = differences(left, right)
     assert len(found) > 30
-    told = shortened(found, left, right)
-    assert told[:2] == [
+    shown = shortened(found, left, right)
+    assert shown[:2] == [
         "run.json: outcome.final_score: 1.0 and 7.0",
         "run.json: outcome.best_submit_index: nothing and 3",
     ]
-    assert told[-2:] == [
+    assert shown[-2:] == [
         f"workspace/feedback/submit_001: only in {left} (30 files)",
         f"extra: only in {right}",
     ]

@@ -176,17 +176,17 @@ def test_tokens_are_in_millions_and_missing_ones_are_none(tmp_path: Path) -> Non
     write_run(tmp_path, VERSIONS[:1], tokens=one)
     write_run(tmp_path, VERSIONS[:1], tokens=two, repeat=1)
     write_run(tmp_path, VERSIONS[:1], entry="Silent")
-    told, silent = token_use(load_runs([tmp_path]).runs)
-    assert (told.input_noncached, told.cache, told.output, told.cost) == (2.0, 1.5, 0.2, None)
-    assert (told.n_runs, silent.n_runs, silent.output) == (2, 0, None)
+    reported, silent = token_use(load_runs([tmp_path]).runs)
+    assert (reported.input_noncached, reported.cache, reported.output, reported.cost) == (2.0, 1.5, 0.2, None)
+    assert (reported.n_runs, silent.n_runs, silent.output) == (2, 0, None)
 
 
 def test_cost_is_the_mean_of_runs_that_all_have_a_price(tmp_path: Path) -> None:
     for repeat, cost in enumerate((2.0, 5.0)):
         tokens = Tokens(input_noncached=0, cache_read=0, cache_creation=0, output=1, cost=cost)
         write_run(tmp_path, VERSIONS[:1], tokens=tokens, repeat=repeat)
-    (told,) = token_use(load_runs([tmp_path]).runs)
-    assert told.cost == 3.5
+    (reported,) = token_use(load_runs([tmp_path]).runs)
+    assert reported.cost == 3.5
 
 
 def test_random_reference_of_one_split_counts_once(tmp_path: Path) -> None:

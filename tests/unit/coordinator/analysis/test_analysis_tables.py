@@ -140,7 +140,7 @@ def test_inline_svg_is_themed_named_and_has_ids_of_its_own() -> None:
     assert not ids[0] & ids[1]
 
 
-SAID = [
+VERSIONS = [
     Version(policy(gain=1.0), (0.0,) * 4, 1.0, says="I start simple."),
     Version(policy(gain=2.0), (0.0,) * 4, 2.0, says="It is too slow.", images={"probe.png": png()}),
     Version({"policy.py": "import nope\n"}, (0.0,), None, "import_error"),
@@ -150,7 +150,7 @@ SAID = [
 
 @pytest.mark.parametrize("form", ["claude", "codex"])
 def test_log_gives_each_submit_what_was_read_and_said_before_it(tmp_path: Path, form: str) -> None:
-    run = read_run(write_run(tmp_path, SAID, log=form))
+    run = read_run(write_run(tmp_path, VERSIONS, log=form))
     found = trace(run)
     evidence = [row.evidence for row in found.rows]
     assert all(one is not None for one in evidence)
@@ -167,14 +167,14 @@ def test_log_gives_each_submit_what_was_read_and_said_before_it(tmp_path: Path, 
 
 
 def test_log_without_answers_or_times_is_not_guessed_into_place(tmp_path: Path) -> None:
-    run = read_run(write_run(tmp_path, SAID, log="turns"))
+    run = read_run(write_run(tmp_path, VERSIONS, log="turns"))
     reading = read_agent_log(run.path / "logs/agent.jsonl", run.submits)
     assert reading.by_submit == {}
     assert reading.unplaced == ("I start simple.", "It is too slow.", "submit 2", "Back to work.")
 
 
 def test_plain_lines_that_begin_with_a_submits_name_tell_its_place(tmp_path: Path) -> None:
-    run = read_run(write_run(tmp_path, SAID[:2], log=None))
+    run = read_run(write_run(tmp_path, VERSIONS[:2], log=None))
     log = tmp_path / "agent.jsonl"
     lines = ["gain 1.0", "submit_000: ok, mean 3.5", "gain 2.0 looks better", "submit_001: ok", "bye"]
     log.write_text("".join(json.dumps({"type": "stdout", "text": line}) + "\n" for line in lines))
@@ -184,7 +184,7 @@ def test_plain_lines_that_begin_with_a_submits_name_tell_its_place(tmp_path: Pat
 
 
 def test_stamped_lines_are_placed_by_time(tmp_path: Path) -> None:
-    run = read_run(write_run(tmp_path, SAID[:2], log=None))
+    run = read_run(write_run(tmp_path, VERSIONS[:2], log=None))
     log = tmp_path / "agent.jsonl"
     lines = [
         {"turn": 0, "text": "early", "timestamp": "2020-01-01T00:00:00Z"},
@@ -201,7 +201,7 @@ def test_stamped_lines_are_placed_by_time(tmp_path: Path) -> None:
 
 
 def test_damaged_or_strange_log_lines_are_passed_over(tmp_path: Path) -> None:
-    run = read_run(write_run(tmp_path, SAID[:1], log=None))
+    run = read_run(write_run(tmp_path, VERSIONS[:1], log=None))
     log = tmp_path / "agent.jsonl"
     strange = [
         b"\xff\xfe",
@@ -243,7 +243,7 @@ def test_many_repeats_are_drawn_as_mean_and_range(tmp_path: Path) -> None:
     assert band.get_datalim(panel.transData).ymax == 9.0
 
 
-def told(folder: Path, title: str, family: str) -> None:
+def with_names(folder: Path, title: str, family: str) -> None:
     """Puts a title and a family into the run's record, as a worker told them."""
     record = json.loads((folder / "run.json").read_text())
     (folder / "run.json").write_text(json.dumps({**record, "env_title": title, "env_family": family}))
@@ -252,16 +252,16 @@ def told(folder: Path, title: str, family: str) -> None:
 def test_environments_that_do_not_ship_have_the_title_and_family_that_their_runs_tell(tmp_path: Path) -> None:
     versions = [Version(policy(gain=1.0), (1.0,), 1.0)]
     for entry in ("A", "B"):
-        told(
+        with_names(
             write_run(tmp_path, versions, entry=entry, env="my/glider"), "Glider\x1b[2J\n" + "x" * 99, "score"
         )
-        told(
+        with_names(
             write_run(tmp_path, versions, entry=entry, env="my/kite"),
             "Kite" if entry == "A" else "Dragon",
             "air",
         )
-        told(write_run(tmp_path, versions, entry=entry, env="gym/acrobot"), "Not acrobot", "air")
-        told(write_run(tmp_path, versions, entry=entry, env="my/easy"), " ACROBOT ", "air")
+        with_names(write_run(tmp_path, versions, entry=entry, env="gym/acrobot"), "Not acrobot", "air")
+        with_names(write_run(tmp_path, versions, entry=entry, env="my/easy"), " ACROBOT ", "air")
     tables = {table.name: table for table in tables_of(study([tmp_path]))}
     rows = {row["id"]: (row["env"], row["family"]) for row in tables["environments"].rows}
     assert rows["gym/acrobot"] == ("Acrobot", "Gym / Box2D")

@@ -24,17 +24,17 @@ def state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "state"
 
 
-def said(capsys: pytest.CaptureFixture[str]) -> str:
+def printed(capsys: pytest.CaptureFixture[str]) -> str:
     return " ".join(capsys.readouterr().err.split())
 
 
 def test_init_tells_the_next_two_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     state = tmp_path / "state"
     certs_cli.init(state=state, host=["lab.example", "10.0.0.5"])
-    told = capsys.readouterr().out
-    assert f"evopolicy-coordinator --listen tls/0.0.0.0:7447 --state {state}" in told
-    assert f"certs issue worker NAME --state {state}" in told
-    assert "lab.example, 10.0.0.5, localhost, 127.0.0.1, ::1" in told
+    output = capsys.readouterr().out
+    assert f"evopolicy-coordinator --listen tls/0.0.0.0:7447 --state {state}" in output
+    assert f"certs issue worker NAME --state {state}" in output
+    assert "lab.example, 10.0.0.5, localhost, 127.0.0.1, ::1" in output
 
 
 def test_init_overwrites_nothing_and_says_what_is_there(
@@ -44,9 +44,9 @@ def test_init_overwrites_nothing_and_says_what_is_there(
     with pytest.raises(SystemExit) as ended:
         certs_cli.init(state=state)
     assert ended.value.code == 2
-    told = said(capsys)
+    text = printed(capsys)
     for part in ("lab.example", "until", "--renew", "--force"):
-        assert part in told
+        assert part in text
     assert {path.name: path.read_bytes() for path in (state / "certs").iterdir()} == before
 
 
@@ -89,14 +89,14 @@ def test_list_tells_names_roles_expiry_and_revocation_and_no_secret(
     capsys.readouterr()
     certs_cli.list_(state=state, as_json=True)
     text = capsys.readouterr().out
-    told = json.loads(text)
-    assert told["coordinator"]["hosts"][0] == "lab.example"
-    assert [(one["identity"], one["revoked"] is not None) for one in told["machines"]] == [
+    document = json.loads(text)
+    assert document["coordinator"]["hosts"][0] == "lab.example"
+    assert [(one["identity"], one["revoked"] is not None) for one in document["machines"]] == [
         ("gateway/boss", False),
         ("operator/boss", False),
         ("worker/gpu-7", True),
     ]
-    assert all(one["expires"] for one in told["machines"])
+    assert all(one["expires"] for one in document["machines"])
     for machine in Machines(state).all():
         assert machine.password not in text
         assert not machine.token or machine.token not in text
@@ -126,7 +126,7 @@ def test_what_is_wrong_is_told_in_a_line(
     with pytest.raises(SystemExit) as ended:
         call(state)
     assert ended.value.code == 2
-    assert message in said(capsys)
+    assert message in printed(capsys)
 
 
 def test_a_wrong_host_leaves_the_old_certificate(state: Path) -> None:

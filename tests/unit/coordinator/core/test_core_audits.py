@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from rigs.asking import asked
-from rigs.audit_fleet import WAIT_S, Fleet, told
+from rigs.audit_fleet import WAIT_S, Fleet, audit_state
 from rigs.core_rig import BUNDLE, outcome_of, result
 
 from evopolicy_common.messages import operator
@@ -21,7 +21,7 @@ from evopolicy_coordinator.core.runs import audit_end, audits
 
 def test_nobody_audits_himself_and_every_list_of_a_run_is_audited() -> None:
     fleet = Fleet(w1=0.0, w2=0.0)
-    found = told(fleet.whole_run(0, 1, 2, 3))
+    found = audit_state(fleet.whole_run(0, 1, 2, 3))
     assert found.agreed == found.sampled == 4 + 2 + 2 + 2
     assert not found.in_question
     assert all(auditor != player for auditor, player in fleet.audits)
@@ -47,7 +47,7 @@ def test_a_lone_worker_is_not_waited_for() -> None:
     fleet.rig.close()
     fleet.rig.pass_time(20.0)
     fleet.work_off()
-    found = told(fleet.rig.finished())
+    found = audit_state(fleet.rig.finished())
     assert found.not_audited == {audit_end.ONE_WORKER: found.sampled}
     assert not found.in_question
 
@@ -72,7 +72,7 @@ def test_a_run_waits_for_a_busy_second_worker_up_to_its_bound() -> None:
     beat_for(WAIT_S - 10.0)
     assert "r1" in rig.core.state.runs
     beat_for(20.0)
-    assert told(rig.finished()).not_audited == {audit_end.TOO_LATE: 2 + 2 + 2 + 2}
+    assert audit_state(rig.finished()).not_audited == {audit_end.TOO_LATE: 2 + 2 + 2 + 2}
 
 
 def test_a_lone_worker_after_a_restart_is_given_time_to_find_company() -> None:
@@ -88,7 +88,7 @@ def test_a_lone_worker_after_a_restart_is_given_time_to_find_company() -> None:
     fleet.rig.pass_time(5.0)
     fleet.work_off()
     fleet.rig.pass_time(20.0)
-    assert told(fleet.rig.finished()).not_audited == {}
+    assert audit_state(fleet.rig.finished()).not_audited == {}
 
 
 @pytest.mark.parametrize("other", ["versions", "processor"])
@@ -104,14 +104,14 @@ def test_workers_that_may_honestly_come_to_other_bits_do_not_audit(other: str) -
     fleet.rig.close()
     fleet.work_off()
     fleet.rig.pass_time(30.0)
-    assert list(told(fleet.rig.finished()).not_audited) == [audit_end.OTHERS_DIFFER]
+    assert list(audit_state(fleet.rig.finished()).not_audited) == [audit_end.OTHERS_DIFFER]
 
 
 def test_an_environment_that_does_not_repeat_itself_is_not_audited() -> None:
     fleet = Fleet()
     fleet.join("w1", deterministic=False)
     fleet.join("w2", deterministic=False)
-    found = told(fleet.whole_run(0, 1))
+    found = audit_state(fleet.whole_run(0, 1))
     assert found.not_audited == {audits.NOT_REPEATABLE: found.sampled}
     assert fleet.audits == []
 
@@ -121,7 +121,7 @@ def test_a_cancelled_run_plays_no_more_audits() -> None:
     fleet.train(0, 1)
     fleet.turn("w1")
     fleet.rig.tell(asked(operator.CancelRun, request="c", run="r1"))
-    assert told(fleet.rig.finished()).not_audited == {audit_end.CANCELLED: 2}
+    assert audit_state(fleet.rig.finished()).not_audited == {audit_end.CANCELLED: 2}
     assert not fleet.rig.core.state.groups
 
 
@@ -169,7 +169,7 @@ def test_a_restart_at_any_point_changes_nothing_of_the_audits() -> None:
         fleet.rig.close()
         fleet.work_off()
         fleet.rig.pass_time(WAIT_S)
-        found = told(fleet.rig.finished())
+        found = audit_state(fleet.rig.finished())
         assert list(found.forgers) == ["w2"], stop_after
         assert found.audited + sum(found.not_audited.values()) == found.sampled == 4 + 2 + 2 + 2
 

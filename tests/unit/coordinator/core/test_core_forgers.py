@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rigs.asking import asked
-from rigs.audit_fleet import WAIT_S, Fleet, told
+from rigs.audit_fleet import WAIT_S, Fleet, audit_state
 
 from evopolicy_common.errors import RefusedError
 from evopolicy_common.messages import operator
@@ -20,7 +20,7 @@ from evopolicy_coordinator.core.runs import audit_end
 def test_a_forger_among_three_is_named_and_gets_no_more_leases() -> None:
     fleet = Fleet(w1=0.0, w2=5.0, w3=0.0)
     finished = fleet.whole_run()
-    found = told(finished)
+    found = audit_state(finished)
     assert list(found.forgers) == ["w2"]
     assert found.in_question
     assert all(finding.forger == "w2" for finding in found.findings)
@@ -60,7 +60,7 @@ def test_two_workers_that_disagree_are_both_in_dispute_and_nobody_is_named() -> 
     fleet.rig.close()
     fleet.work_off()
     fleet.rig.pass_time(WAIT_S)
-    found = told(fleet.rig.finished())
+    found = audit_state(fleet.rig.finished())
     assert found.disputed == found.audited > 0
     assert found.forgers == {}
     assert not fleet.rig.core.state.quarantined
@@ -90,7 +90,7 @@ def test_a_forging_auditor_is_named_and_the_player_confirmed() -> None:
     fleet.work_off()
     fleet.rig.close()
     fleet.work_off()
-    found = told(fleet.rig.finished())
+    found = audit_state(fleet.rig.finished())
     assert found.forgers == {"w2": 0}
     assert found.disputed == 0
     assert not found.in_question
@@ -100,7 +100,7 @@ def test_a_forging_auditor_is_named_and_the_player_confirmed() -> None:
 
 def test_three_workers_with_three_results_are_in_dispute_and_nobody_is_named() -> None:
     fleet = Fleet(w1=0.0, w2=5.0, w3=9.0)
-    found = told(fleet.whole_run())
+    found = audit_state(fleet.whole_run())
     assert found.disputed == found.audited > 0
     assert found.forgers == {}
 
@@ -119,7 +119,7 @@ def test_a_recording_that_is_none_is_in_dispute() -> None:
     )
     fleet.rig.close()
     fleet.work_off()
-    assert told(fleet.rig.finished()).disputed == 1
+    assert audit_state(fleet.rig.finished()).disputed == 1
 
 
 def test_an_operator_takes_a_quarantined_worker_back() -> None:
@@ -148,7 +148,7 @@ def test_a_run_whose_episodes_a_forger_played_is_in_question_though_another_run_
     fleet.work_off()
     fleet.rig.close("r1")
     fleet.work_off()
-    found = told(fleet.rig.finished("r1"))
+    found = audit_state(fleet.rig.finished("r1"))
     assert found.share == 0.0
     assert found.sampled == 0
     assert found.forgers["w2"] > 0
@@ -160,7 +160,7 @@ def test_workers_of_one_machine_have_one_voice() -> None:
     for name, machine in (("f1", "bad"), ("f2", "bad"), ("w1", "good"), ("w2", "better")):
         fleet.join(name, machine=machine)
     fleet.adds |= {"f1": 5.0, "f2": 5.0}
-    found = told(fleet.whole_run())
+    found = audit_state(fleet.whole_run())
     assert set(found.forgers) == {"f1", "f2"}
     assert set(fleet.rig.core.state.quarantined) == {"f1", "f2"}
     assert all({player[0], auditor[0]} != {"f"} for auditor, player in fleet.audits)
@@ -176,7 +176,7 @@ def test_two_workers_of_one_machine_audit_nothing() -> None:
     fleet = Fleet()
     fleet.join("f1", machine="bad")
     fleet.join("f2", machine="bad")
-    found = told(fleet.whole_run(0, 1))
+    found = audit_state(fleet.whole_run(0, 1))
     assert found.not_audited == {audit_end.ONE_MACHINE: found.sampled}
 
 

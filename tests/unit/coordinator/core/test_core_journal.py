@@ -23,14 +23,14 @@ def entries(rig: Rig) -> list[bytes]:
     return [row.entry for row in rows]
 
 
-def told(rig: Rig) -> list[journal.Entry]:
+def entries_of(rig: Rig) -> list[journal.Entry]:
     return [journal.read_entry(entry) for entry in entries(rig)]
 
 
 def disclose(rig: Rig, *runs: str, epochs: tuple[str, ...] = ("e1",)) -> object:
     request = rig.request()
     message = operator.Disclose(token="", runs=runs)
-    return rig.tell(events.DisclosureAsked(request=request, message=message, epochs=epochs))
+    return rig.tell(events.DisclosureRequested(request=request, message=message, epochs=epochs))
 
 
 def finish(rig: Rig, session: str, run: str = "r1") -> None:
@@ -45,7 +45,7 @@ def test_a_run_is_committed_to_in_the_transaction_that_makes_it() -> None:
     rig.create(agent=None)
     row = rig.row(RunRow, "r1")
     document = rig.row(DocumentRow, "r1", "opening").data
-    (entry,) = told(rig)
+    (entry,) = entries_of(rig)
     assert isinstance(entry, Opened)
     assert row.committed is not None
     assert entry.commitment == row.committed.commitment == journal.commitment(row.salt, document)
@@ -71,7 +71,7 @@ def test_whatever_becomes_of_a_run_its_result_is_fixed(cancelled: bool) -> None:
         rig.tell(asked(operator.CancelRun, request=rig.request(), run="r1"))
     else:
         finish(rig, session)
-    opened, ended = told(rig)
+    opened, ended = entries_of(rig)
     assert isinstance(opened, Opened)
     assert isinstance(ended, Ended)
     finished = rig.finished()
@@ -95,7 +95,7 @@ def test_the_journal_goes_on_after_a_restart_where_it_was() -> None:
     rig.create(agent=None)
     rig.load()
     rig.create("r2", agent=None)
-    assert [entry.run for entry in told(rig) if isinstance(entry, Opened)] == ["r1", "r2"]
+    assert [entry.run for entry in entries_of(rig) if isinstance(entry, Opened)] == ["r1", "r2"]
 
 
 def test_runs_of_an_earlier_version_end_without_an_entry() -> None:
@@ -123,7 +123,7 @@ def test_no_cases_are_revealed_while_a_run_of_their_epoch_is_open() -> None:
     assert "run 'r2' is not finished" in answer.message
     rig.tell(asked(operator.CancelRun, request=rig.request(), run="r2"))
     assert disclose(rig, "r1") == Done()
-    assert isinstance(told(rig)[-1], Revealed)
+    assert isinstance(entries_of(rig)[-1], Revealed)
 
 
 def test_a_revealed_epoch_is_given_to_no_new_run_even_after_a_restart() -> None:
@@ -167,6 +167,6 @@ def test_epochs_are_told_with_their_runs() -> None:
     finish(rig, session)
     disclose(rig, "r1", epochs=("a",))
     rig.create("r2", epoch="b", agent=None)
-    first, second = journal.epochs(told(rig))
+    first, second = journal.epochs(entries_of(rig))
     assert (first.epoch, first.opened, first.ended, first.revealed_at is not None) == ("a", 1, 1, True)
     assert (second.epoch, second.opened, second.ended, second.revealed_at) == ("b", 1, 0, None)

@@ -126,9 +126,9 @@ def test_a_worker_whose_kernel_is_not_known_plays_nothing_hidden_and_is_told_why
     session = rig.register(slots=8, boot_id="")
     scored(rig, session)
     assert splits(rig.poll(session, 8)) == {"random"}
-    told = next(reply for reply in rig.replies.values() if isinstance(reply, wire.Registered))
-    assert "boot id" in told.hidden_bar
-    assert told.hidden_bar == rig.status().workers[0].hidden_bar
+    registered = next(reply for reply in rig.replies.values() if isinstance(reply, wire.Registered))
+    assert "boot id" in registered.hidden_bar
+    assert registered.hidden_bar == rig.status().workers[0].hidden_bar
 
 
 def test_a_permit_stops_hidden_jobs_uncharged_and_waits_until_their_worker_has_let_go() -> None:

@@ -312,8 +312,8 @@ def test_a_train_job_and_hidden_ones_of_related_runs_never_share_a_kernel() -> N
     rig.create("r1", agent="remote")
     rig.submit(0, 1, run="r1")
     assert "train" not in splits(rig.poll(second, 4))
-    told = rig.beat(first)
-    assert told is not None
+    reply = rig.beat(first)
+    assert reply is not None
     assert not [lease for lease in hidden if lease.live], "they are stopped for it"
     rig.beat(first)
     train = rig.poll(second, 4)

@@ -298,22 +298,22 @@ def test_a_worker_with_the_papers_versions_is_a_class_of_its_own_and_named_so() 
         assert f"{name} {usual[name]} there, {version} here" in workers["w2"].refused["r1"]
 
 
-def told_apart(env: str = "toy/line", **more: Any) -> EnvironmentDescription:
+def versioned(env: str = "toy/line", **more: Any) -> EnvironmentDescription:
     return describe(env, **({"adapter": "1.1+aa", "packages": {"numpy": "2.4"}} | more))
 
 
 @pytest.mark.parametrize(
     ("more", "described"),
     [
-        ({"version": "2", "packages": {"numpy": "2.4", "mujoco": "4"}}, (told_apart(),)),
-        ({}, (told_apart(), told_apart("toy/maze", adapter="1.1+bb", packages={"ale-py": "0.12"}))),
+        ({"version": "2", "packages": {"numpy": "2.4", "mujoco": "4"}}, (versioned(),)),
+        ({}, (versioned(), versioned("toy/maze", adapter="1.1+bb", packages={"ale-py": "0.12"}))),
     ],
 )
 def test_what_plays_other_environments_makes_no_other_class_of_this_one(
     more: dict[str, Any], described: tuple[EnvironmentDescription, ...]
 ) -> None:
     rig = Rig()
-    rig.register("w1", described=(told_apart(),))
+    rig.register("w1", described=(versioned(),))
     rig.create()
     rig.submit(0)
     other = rig.register("w2", described=described, **more)
@@ -333,10 +333,10 @@ def test_two_definitions_of_one_environment_are_two_classes_and_the_difference_i
     changed: dict[str, Any], named: str
 ) -> None:
     rig = Rig()
-    rig.register("w1", described=(told_apart(),))
+    rig.register("w1", described=(versioned(),))
     rig.create()
     rig.submit(0)
-    other = rig.register("w2", described=(told_apart(**changed),))
+    other = rig.register("w2", described=(versioned(**changed),))
     assert rig.poll(other) == []
     (worker,) = (each for each in rig.status().workers if each.worker == "w2")
     assert named in worker.refused["r1"]
@@ -354,9 +354,9 @@ def test_two_definitions_of_one_environment_are_two_classes_and_the_difference_i
 
 
 def test_a_definition_is_the_same_whoever_plays_it_and_whatever_its_defaults() -> None:
-    digest = told_apart().digest()
-    assert digest == told_apart(adapter="2.1+dd", packages={}, env_version="9", renders=False).digest()
-    assert digest != told_apart(title="Another").digest()
+    digest = versioned().digest()
+    assert digest == versioned(adapter="2.1+dd", packages={}, env_version="9", renders=False).digest()
+    assert digest != versioned(title="Another").digest()
 
 
 @pytest.mark.parametrize(("state", "ends"), [("draining", True), ("paused", False)])

@@ -54,11 +54,11 @@ class Transcript(Rig):
         self.lines.clear()
 
     def _noted(self, what: str, rule: machine.Rule) -> machine.Rule:
-        def noted(state: Any, told: Any, this: step.Step) -> None:
-            about = f" {told}" if isinstance(told, str) else ""  # whom a deadline is about
+        def noted(state: Any, news: Any, this: step.Step) -> None:
+            about = f" {news}" if isinstance(news, str) else ""  # whom a deadline is about
             name = f"{rule.__module__.removeprefix('evopolicy_coordinator.core.')}.{rule.__name__}"
             self.lines.append(f"{what}{about} → {name}")
-            rule(state, told, this)
+            rule(state, news, this)
 
         return noted
 
@@ -112,12 +112,12 @@ class Transcript(Rig):
 
     def _carry_out(self, effects: list[Effect]) -> None:
         for effect in effects:
-            self.lines += self._told(effect)
+            self.lines += self._shown(effect)
             if isinstance(effect, Reply) and isinstance(effect.message, wire.Leases):
                 self._leases |= {lease.job.job_id: lease for lease in effect.message.leases}
         super()._carry_out(effects)
 
-    def _told(self, effect: Effect) -> list[str]:
+    def _shown(self, effect: Effect) -> list[str]:
         match effect:
             case Persist():
                 return ["persist", *(f"    {shown(row)}" for row in effect.rows)]
@@ -136,26 +136,26 @@ class Transcript(Rig):
                 return [f"{shown(effect)}" + (f" for {asker}" if asker else "")]
 
 
-def shown(told: Any) -> str:
+def shown(value: Any) -> str:
     """A row, a message or an effect in a line."""
-    name = type(told).__name__
-    if isinstance(told, wire.Leases):
-        leases = ", ".join(f"{lease.job.job_id} attempt {lease.attempt}" for lease in told.leases) or "none"
+    name = type(value).__name__
+    if isinstance(value, wire.Leases):
+        leases = ", ".join(f"{lease.job.job_id} attempt {lease.attempt}" for lease in value.leases) or "none"
         return f"Leases({leases})"
-    fields = ((field, getattr(told, field)) for field in SHOWN.get(name, ()))
-    return f"{name}({', '.join(f'{field}={value}' for field, value in fields if value is not None)})"
+    fields = ((field, getattr(value, field)) for field in SHOWN.get(name, ()))
+    return f"{name}({', '.join(f'{field}={content}' for field, content in fields if content is not None)})"
 
 
 def replayed(text: str, transcript: Transcript) -> str:
     """The transcript as it comes out now."""
     blocks = []
     for block in text.strip().split("\n\n"):
-        said = block.partition("\n----")[0]
-        if all(line.startswith("#") for line in said.splitlines()):
-            blocks.append(said)
+        command = block.partition("\n----")[0]
+        if all(line.startswith("#") for line in command.splitlines()):
+            blocks.append(command)
             continue
-        (line,) = [line for line in said.splitlines() if not line.startswith("#")]
-        blocks.append(f"{said}\n----\n{transcript.do(line)}")
+        (line,) = [line for line in command.splitlines() if not line.startswith("#")]
+        blocks.append(f"{command}\n----\n{transcript.do(line)}")
     return "\n\n".join(blocks) + "\n"
 
 

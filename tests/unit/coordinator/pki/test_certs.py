@@ -72,10 +72,10 @@ def test_a_machines_certificate_signs_nothing() -> None:
     days=st.integers(1, 3000),
 )
 def test_a_certificate_says_what_it_was_made_for(hosts: list[str], days: int) -> None:
-    told = certs.describe(certs.issue(AUTHORITY, "router/x", NOW, days, hosts=hosts, serves=True).certificate)
-    assert told.common_name == "router/x"
-    assert told.hosts == tuple(hosts)
-    assert told.expires == NOW + dt.timedelta(days=days)
+    description = certs.describe(certs.issue(AUTHORITY, "router/x", NOW, days, hosts=hosts, serves=True).certificate)
+    assert description.common_name == "router/x"
+    assert description.hosts == tuple(hosts)
+    assert description.expires == NOW + dt.timedelta(days=days)
 
 
 def test_serials_differ() -> None:

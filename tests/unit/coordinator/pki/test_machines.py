@@ -161,9 +161,9 @@ def test_renewing_the_coordinators_certificate_keeps_every_machine(own: OwnCerts
     stamp = Machines(own.state).stamp()
     machines.init(own.state, CLUSTER, ("elsewhere",), now(), DAYS, anew=False)
     assert (own.state / "certs" / "ca.pem").read_bytes() == authority == (folder / "ca.pem").read_bytes()
-    told = machines.coordinators_certificate(own.state)
-    assert told is not None
-    assert told.hosts == ("elsewhere",)
+    certificate = machines.coordinators_certificate(own.state)
+    assert certificate is not None
+    assert certificate.hosts == ("elsewhere",)
     assert Machines(own.state).stamp() != stamp
 
 

@@ -129,23 +129,23 @@ def test_what_the_store_has_lost_is_nobodys_fault(shelf: Shelf) -> None:
 def test_whatever_differs_is_told(shelf: Shelf, forged: EpisodeOutcome, difference: str | None) -> None:
     shelf.put(GROUP, forged)
     shelf.put("replay.1", played(recording(1.0, 2.0)))
-    told = shelf.compare("replay.1")
-    assert (told.error, told.replay, told.with_first) == ("", 1, None)
+    compared = shelf.compare("replay.1")
+    assert (compared.error, compared.replay, compared.with_first) == ("", 1, None)
     if difference is None:
-        assert told.with_player is None
+        assert compared.with_player is None
     else:
-        assert told.with_player is not None
-        assert difference in told.with_player
+        assert compared.with_player is not None
+        assert difference in compared.with_player
 
 
 def test_a_third_opinion_is_held_against_both(shelf: Shelf) -> None:
     shelf.put(GROUP, played(recording(9.0, 2.0)))
     shelf.put("replay.1", played(recording(1.0, 2.0)))
     shelf.put("replay.2", played(recording(1.0, 2.0)))
-    told = shelf.compare("replay.1", "replay.2")
-    assert told.replay == 2
-    assert told.with_player is not None
-    assert told.with_first is None
+    compared = shelf.compare("replay.1", "replay.2")
+    assert compared.replay == 2
+    assert compared.with_player is not None
+    assert compared.with_first is None
 
 
 def test_audits_of_unfinished_runs_are_loaded_again_and_their_actions_are_not_collected(

@@ -6,7 +6,7 @@ import sqlite3
 from pathlib import Path
 
 import pytest
-from rigs.service_world import Asked, World, play
+from rigs.service_world import Requested, World, play
 
 from evopolicy_common.errors import StorageError
 from evopolicy_common.messages import operator
@@ -26,7 +26,7 @@ def test_a_query_that_nobody_waits_for_any_more_is_let_go(
     async def scenario(world: World) -> None:
         created = await world.create()
         wait = operator.WaitRun(token="operate", run=created.run, wait_s=60)
-        waiting = Asked(keys.operator_key("c", "wait"), wait)
+        waiting = Requested(keys.operator_key("c", "wait"), wait)
         world.ask(waiting)
         assert await waiting.message() is None
 

@@ -57,18 +57,18 @@ def test_episodes_submits_and_leases_of_a_whole_run_are_counted_once(rig: Metere
     rig.report_results(session, *(done(lease, failure="step_error") for lease in rig.poll(session)))
     rig.close()
     rig.work_off(session)
-    told = rig.read()
-    assert told["evopolicy_episodes_total train ok"] == 3
-    assert told["evopolicy_episodes_total train step_error"] == 1
-    assert told["evopolicy_episodes_total heldout ok"] == 3
-    assert told["evopolicy_episodes_total random ok"] == 3
-    assert told["evopolicy_submits_total ok"] == 2, "validation stores the rows of submits again"
-    assert told["evopolicy_submit_duration_seconds_count"] == 2
-    assert told["evopolicy_lease_wait_seconds_sum"] == 4.0
-    assert told["evopolicy_leases_total"] >= 10
-    assert told["evopolicy_events_total run_finished info"] == 1
-    assert told["evopolicy_open_runs open"] == 0
-    assert told["evopolicy_slots active"] == 2
+    metrics_text = rig.read()
+    assert metrics_text["evopolicy_episodes_total train ok"] == 3
+    assert metrics_text["evopolicy_episodes_total train step_error"] == 1
+    assert metrics_text["evopolicy_episodes_total heldout ok"] == 3
+    assert metrics_text["evopolicy_episodes_total random ok"] == 3
+    assert metrics_text["evopolicy_submits_total ok"] == 2, "validation stores the rows of submits again"
+    assert metrics_text["evopolicy_submit_duration_seconds_count"] == 2
+    assert metrics_text["evopolicy_lease_wait_seconds_sum"] == 4.0
+    assert metrics_text["evopolicy_leases_total"] >= 10
+    assert metrics_text["evopolicy_events_total run_finished info"] == 1
+    assert metrics_text["evopolicy_open_runs open"] == 0
+    assert metrics_text["evopolicy_slots active"] == 2
 
 
 def test_a_submit_that_was_open_at_a_restart_is_counted_at_its_end(rig: MeteredRig, tmp_path: Path) -> None:
@@ -78,9 +78,9 @@ def test_a_submit_that_was_open_at_a_restart_is_counted_at_its_end(rig: MeteredR
     rig.meter = Meter(tmp_path, lambda: None)
     rig.meter.loaded(rig.core)
     rig.work_off(session)
-    told = rig.read()
-    assert told["evopolicy_submits_total ok"] == 1
-    assert told["evopolicy_up"] == 0
+    metrics_text = rig.read()
+    assert metrics_text["evopolicy_submits_total ok"] == 1
+    assert metrics_text["evopolicy_up"] == 0
 
 
 def test_no_label_names_a_run_or_a_worker(rig: MeteredRig) -> None:

@@ -59,15 +59,15 @@ def test_a_reason_about_another_is_put_into_one_sentence() -> None:
 
 
 def test_a_refusal_is_answered_with_its_status_and_words() -> None:
-    told = message(Refuse(request=1, status=Refusal.BUSY, reason=because("busy", submit=3)))
-    assert told == Refused(status=Refusal.BUSY, message="submit 3 is still running; one runs at a time")
+    text = message(Refuse(request=1, status=Refusal.BUSY, reason=because("busy", submit=3)))
+    assert text == Refused(status=Refusal.BUSY, message="submit 3 is still running; one runs at a time")
 
 
 def test_what_an_open_submit_waits_for_stands_in_the_state_of_its_run() -> None:
     in_flight = gateway.SubmitInFlight(submit_index=0, n_episodes=2, n_done=0)
     state = gateway.RunState(remaining_budget=1, n_submits=1, is_finalized=False, in_flight=in_flight)
-    told = message(Reply(request=1, message=gateway.StateReply(state=state), waits_for=because("scoring")))
-    assert isinstance(told, gateway.StateReply)
-    assert told.state.in_flight is not None
-    assert told.state.in_flight.waits_for == "hidden cases of another run are being scored"
-    assert told.state.in_flight.n_episodes == 2
+    text = message(Reply(request=1, message=gateway.StateReply(state=state), waits_for=because("scoring")))
+    assert isinstance(text, gateway.StateReply)
+    assert text.state.in_flight is not None
+    assert text.state.in_flight.waits_for == "hidden cases of another run are being scored"
+    assert text.state.in_flight.n_episodes == 2

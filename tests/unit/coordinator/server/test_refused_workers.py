@@ -28,8 +28,8 @@ def register(name: str) -> bytes:
 def test_a_refused_worker_is_told_with_the_reason_until_it_is_taken() -> None:
     workers = RefusedWorkers()
     workers.answered(KEY, register("old"), REFUSED, 100.0)
-    (told,) = workers.recent(103.0)
-    assert (told.worker, told.host, told.why, told.ago_s) == ("old", "lab", "another version", 3.0)
+    (entry,) = workers.recent(103.0)
+    assert (entry.worker, entry.host, entry.why, entry.ago_s) == ("old", "lab", "another version", 3.0)
     workers.answered(KEY, register("old"), Registered(session="s", lease_ttl_s=1.0, heartbeat_s=1.0), 104.0)
     assert workers.recent(104.0) == ()
 
@@ -38,7 +38,7 @@ def test_only_so_many_are_kept_and_only_for_a_while() -> None:
     workers = RefusedWorkers()
     for index in range(2 * KEPT):
         workers.answered(KEY, register(f"w{index}"), REFUSED, float(index))
-    assert [told.worker for told in workers.recent(100.0)] == [f"w{index}" for index in range(KEPT, 2 * KEPT)]
+    assert [entry.worker for entry in workers.recent(100.0)] == [f"w{index}" for index in range(KEPT, 2 * KEPT)]
     assert workers.recent(100.0 + KEPT_S) == ()
 
 

@@ -1,4 +1,4 @@
-"""The door for other machines, where what it reads cannot be read."""
+"""The listener for other machines, where what it reads cannot be read."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ class Unreadable:
 
 def test_a_list_of_machines_that_cannot_be_read_is_told_at_once() -> None:
     async def scenario() -> None:
-        door = remote_listener("c", ("tls/h:1",), Unreadable(), print, print)  # type: ignore[arg-type]
-        async with asyncio.timeout(20), door:
+        listener = remote_listener("c", ("tls/h:1",), Unreadable(), print, print)  # type: ignore[arg-type]
+        async with asyncio.timeout(20), listener:
             pass
 
     with pytest.raises(PermissionError, match=r"machines\.json"):

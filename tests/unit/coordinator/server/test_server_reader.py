@@ -151,8 +151,8 @@ def test_a_gateway_is_not_told_whether_others_have_stored_a_blob(rig: Rig) -> No
     rig.blobs.put(data)
     # Asked about a blob that is here exactly as about one that is not.
     for guess in ({"data": b""}, {"offset": 3, "data": b""}, {"offset": size, "data": b""}):
-        told = rig.put(put(data, **guess), run="r-1")
-        assert told == rig.put(msgspec.structs.replace(unknown, **guess), run="r-1") == BlobAck(have=0)
+        reply = rig.put(put(data, **guess), run="r-1")
+        assert reply == rig.put(msgspec.structs.replace(unknown, **guess), run="r-1") == BlobAck(have=0)
     for claim in ({"size": 0, "data": b""}, {"size": 4, "data": b"fake"}):
         assert rig.put(put(data, **claim), run="r-1").status == "bad_blob"
         assert not rig.uploads.has_sent("r-1", digest)

@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 import structlog
-from rigs.service_world import Asked, World, play, register
+from rigs.service_world import Requested, World, play, register
 from structlog.testing import capture_logs
 
 from evopolicy_common.errors import DamagedStoreError, PartFailedError
@@ -64,15 +64,15 @@ def test_request_that_could_not_be_written_did_not_happen_and_can_be_asked_again
         lost = world.submit(created, "key")
         world.ask(lost)
         assert await lost.message() is None
-        waiting, told = world.state(created), world.submit(created, "key")
-        world.ask(waiting, told)
+        waiting, submitted = world.state(created), world.submit(created, "key")
+        world.ask(waiting, submitted)
         assert await waiting.message() is None
-        refused = await told.message()
+        refused = await submitted.message()
         assert refused.status == "unavailable"
         assert "cannot write its store" in refused.message
         assert "disk is full" not in refused.message
         settings = RunSettings(env="toy/line", entry="e", model="m", exp_id="x")
-        creating = Asked(
+        creating = Requested(
             keys.operator_key("c", "create"),
             operator.CreateRun(token="operate", key="other", settings=settings),
         )
@@ -125,7 +125,7 @@ def test_stopping_answers_what_was_handled_and_ends_every_wait(tmp_path: Path) -
     async def scenario(world: World) -> None:
         created = await world.create()
         wait = operator.WaitRun(token="operate", run=created.run, wait_s=60)
-        waiting = Asked(keys.operator_key("c", "wait"), wait)
+        waiting = Requested(keys.operator_key("c", "wait"), wait)
         accepted = world.submit(created, "key")
         world.ask(waiting, accepted)
         await world.service.stop()
@@ -152,11 +152,11 @@ def test_a_disk_that_does_not_come_to_an_end_is_named_in_status_and_log(
         world.store.write = hanging  # type: ignore[method-assign]
         settings = RunSettings(env="toy/line", entry="e", model="m", exp_id="x")
         create = operator.CreateRun(token="operate", key="k", settings=settings)
-        created = Asked(keys.operator_key("c", "create"), create)
+        created = Requested(keys.operator_key("c", "create"), create)
         world.ask(created)
         stalls: tuple[str, ...] = ()
         while not stalls:
-            status = Asked(keys.operator_key("c", "status"), operator.StatusRequest(token="operate"))
+            status = Requested(keys.operator_key("c", "status"), operator.StatusRequest(token="operate"))
             world.ask(status)
             stalls = (await status.message()).stalls
             await asyncio.sleep(0.01)
@@ -176,7 +176,7 @@ def test_any_number_of_watchers_costs_one_status(tmp_path: Path) -> None:
     async def scenario(world: World) -> None:
         async def shown(max_age_s: float) -> tuple[float, int]:
             message = operator.StatusRequest(token="operate", max_age_s=max_age_s)
-            asked = Asked(keys.operator_key("c", "status"), message)
+            asked = Requested(keys.operator_key("c", "status"), message)
             world.ask(asked)
             reply = await asked.message()
             return reply.uptime_s, len(reply.runs)
@@ -194,7 +194,7 @@ def test_any_number_of_watchers_costs_one_status(tmp_path: Path) -> None:
 def test_the_status_tells_of_the_disk(tmp_path: Path) -> None:
     async def scenario(world: World) -> None:
         while True:
-            asked = Asked(keys.operator_key("c", "status"), operator.StatusRequest(token="operate"))
+            asked = Requested(keys.operator_key("c", "status"), operator.StatusRequest(token="operate"))
             world.ask(asked)
             if (disk := (await asked.message()).disk) is not None:
                 break
@@ -208,7 +208,7 @@ def test_long_poll_ends_by_itself(tmp_path: Path) -> None:
     async def scenario(world: World) -> None:
         registering = register(world)
         session = (await registering.message()).session
-        polling = Asked(
+        polling = Requested(
             keys.worker_key("c", "lease"),
             worker.LeaseRequest(worker="w", session=session, n=1, wait_s=0.05),
         )
@@ -241,7 +241,7 @@ def test_a_poll_that_its_worker_gave_up_while_the_loop_stood_still_gets_no_lease
         session = (await register(world).message()).session
         created = await world.create()
         request = worker.LeaseRequest(worker="w", session=session, n=1, wait_s=10.0)
-        stale, fresh = (Asked(keys.worker_key("c", "lease"), request) for _ in range(2))
+        stale, fresh = (Requested(keys.worker_key("c", "lease"), request) for _ in range(2))
         stale.arrived -= 12.0
         bundle = world.blobs.put(b"a bundle")
         world.uploads.note(created.run, bundle)
@@ -253,7 +253,7 @@ def test_a_poll_that_its_worker_gave_up_while_the_loop_stood_still_gets_no_lease
             bundle=bundle,
             bundle_error=None,
         )
-        world.ask(Asked(keys.gateway_key("c", created.run, "submit"), submit), stale, fresh)
+        world.ask(Requested(keys.gateway_key("c", created.run, "submit"), submit), stale, fresh)
         assert await stale.message() == worker.Leases(leases=())
         assert len((await fresh.message()).leases) == 1
 
@@ -394,7 +394,7 @@ def test_who_asks_for_what_cannot_be_read_is_refused_and_others_are_served(tmp_p
         created = await world.create()
         claim = operator.Claim(token="operate", suite="s", name="n", holder="h", ttl_s=9.0)
         await world.service._writer.call(lambda store: store.write_claim("s", "n", b"\0"))
-        asked = Asked(keys.operator_key("c", "claim"), claim)
+        asked = Requested(keys.operator_key("c", "claim"), claim)
         submitted = world.submit(created, "key")
         world.ask(asked, submitted)
         refused = await asked.message()
@@ -405,7 +405,7 @@ def test_who_asks_for_what_cannot_be_read_is_refused_and_others_are_served(tmp_p
         message = gateway.ResultsRequest(
             run=created.run, token=created.capability, submit_index=0, cursor=0, wait_s=1.0
         )
-        results = Asked(keys.gateway_key("c", created.run, "results"), message)
+        results = Requested(keys.gateway_key("c", created.run, "results"), message)
         world.ask(results)
         refused = await results.message()
         assert refused.status == "damaged"

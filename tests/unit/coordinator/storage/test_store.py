@@ -300,10 +300,10 @@ def test_file_that_is_no_database_is_told(path: Path) -> None:
 def test_row_that_cannot_be_read_is_told(store: Store, path: Path) -> None:
     store.write([run_row(), state_row(), submit_row()])
     store._db.execute("UPDATE submits SET data = x'00'")
-    with pytest.raises(DamagedStoreError) as told:
+    with pytest.raises(DamagedStoreError) as caught:
         store.load()
     for named in (str(path), "table submits", "('r-1', 0)", "Restore a backup", "newer version"):
-        assert named in str(told.value)
+        assert named in str(caught.value)
 
 
 def test_an_outcome_that_cannot_be_read_is_named(store: Store, path: Path) -> None:

@@ -46,7 +46,7 @@ def write_files(folder: Path, rows: list[dict[str, Any]]) -> None:
     (folder / "trajectory.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
 
 
-def told(trajectory: Trajectory) -> list[dict[str, Any]]:
+def rows_of(trajectory: Trajectory) -> list[dict[str, Any]]:
     """Rows as feedback files have them: the shortest text of each number's own dtype."""
 
     def short(array: np.ndarray) -> list[float]:
@@ -121,7 +121,7 @@ def test_the_next_float_is_another_one(value: float) -> None:
 
 
 def test_files_that_tell_the_episode_have_no_difference(tmp_path: Path) -> None:
-    write_files(tmp_path / "ep", told(episode()))
+    write_files(tmp_path / "ep", rows_of(episode()))
     rows = read_rows(tmp_path / "ep")
     assert files_difference(tmp_path / "ep", rows, episode(), actions=True) is None
     assert actions_of(rows)[1] == [0.1]
@@ -129,7 +129,7 @@ def test_files_that_tell_the_episode_have_no_difference(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("field", ["obs", "action", "reward", "terminated", "info"])
 def test_a_tampered_field_of_a_file_is_found(tmp_path: Path, field: str) -> None:
-    rows = told(episode())
+    rows = rows_of(episode())
     rows[1][field] = {"obs": [1.0, 0.2], "action": [0.3], "reward": 7.0, "terminated": True, "info": {}}[
         field
     ]
@@ -140,7 +140,7 @@ def test_a_tampered_field_of_a_file_is_found(tmp_path: Path, field: str) -> None
 
 
 def test_a_row_that_was_taken_out_is_found(tmp_path: Path) -> None:
-    write_files(tmp_path / "ep", told(episode())[:2])
+    write_files(tmp_path / "ep", rows_of(episode())[:2])
     rows = read_rows(tmp_path / "ep")
     assert files_difference(tmp_path / "ep", rows, episode(), actions=True) == "2 and 3 steps"
 

@@ -20,8 +20,8 @@ def test_a_sweep_shows_its_runs_on_all_hosts_once(tmp_path: Path) -> None:
         "b/2": {"agent": "Agent B", "env": "gym/acrobot", "repeat": 2},
         "b/3": {"agent": "Agent B", "env": "gym/acrobot", "repeat": 3, "state": "error", "error": "no key", "host": "lab3"},
     }  # fmt: skip
-    told = {name: {"name": name, **entry} for name, entry in entries.items()}
-    (root / "suite.json").write_text(json.dumps({"suite": "s", "runs": told}))
+    documents = {name: {"name": name, **entry} for name, entry in entries.items()}
+    (root / "suite.json").write_text(json.dumps({"suite": "s", "runs": documents}))
     other = open_status(
         "r-there", exp_id="s-1", repeat=1, best_mean=-70.5, waits_for="a free slot", agent_host="lab2"
     )

@@ -20,11 +20,11 @@ def key(folder: Path) -> str:
 
 
 def worker(name: str, **more: object) -> WorkerStatus:
-    told: dict[str, object] = {
+    fields: dict[str, object] = {
         "worker": name, "host": "lab", "slots": 2, "state": "active", "tiers": ("bwrap",), "environments": ("gym/acrobot",),
         "fingerprint": "f" * 12, "versions": {"python": "3.11"}, "held": 0, "running": 0, "last_seen_s": 1.0,
     }  # fmt: skip
-    return WorkerStatus(**{**told, **more})  # type: ignore[arg-type]
+    return WorkerStatus(**{**fields, **more})  # type: ignore[arg-type]
 
 
 def test_lost_workers_and_retries_stand_among_a_runs_events(tmp_path: Path) -> None:
@@ -41,8 +41,8 @@ def test_lost_workers_and_retries_stand_among_a_runs_events(tmp_path: Path) -> N
         {"event": "run opened", "timestamp": "2026-01-01T23:00:00Z", "level": "info"},
     ]
     (folder / "logs" / "harness.log").write_text("".join(json.dumps(line) + "\n" for line in lines))
-    told = status(open_status("r-open", retries=(LOST, FAILED)))
-    with client(site_of(tmp_path, cluster=told)) as browser:
+    reply = status(open_status("r-open", retries=(LOST, FAILED)))
+    with client(site_of(tmp_path, cluster=reply)) as browser:
         page = browser.get(f"/run/{key(folder)}").text
     expected = [
         "1 job failed on worker w-cellar, through no fault of the policy. It is played again, at no charge.",
@@ -84,8 +84,8 @@ def test_the_cluster_page_has_the_queue_by_priority_and_the_disks(tmp_path: Path
         QueuedJobs(priority="heldout", env="gym/acrobot", runs=1, waiting=9, leased=0),
     )
     disk = DiskUse(database=3 << 30, free=20 << 30, total=80 << 30)
-    told = status(open_status("r-1"), workers=(worker("w"),), queue=queue, disk=disk)
-    with client(site_of(tmp_path, cluster=told)) as browser:
+    reply = status(open_status("r-1"), workers=(worker("w"),), queue=queue, disk=disk)
+    with client(site_of(tmp_path, cluster=reply)) as browser:
         page = browser.get("/cluster").text
     for text in ("1 for a free slot", "held-out, final validation", "3.0 GiB", "20.0 GiB", "75 % used"):
         assert text in page, text
@@ -100,8 +100,8 @@ def test_a_run_can_be_repinned_to_classes_that_get_no_work_of_it_and_to_no_other
         worker("w-new", classes={"gym/acrobot": "class-new"}, refused={"r-open": "other versions"}),
         worker("w-gone", classes={"gym/acrobot": "class-gone"}, refused={"r-open": "versions"}, state="lost"),
     )
-    told = status(open_status("r-open"), workers=workers)
-    with client(site_of(tmp_path, cluster=told, acting=True), "act") as operator:
+    reply = status(open_status("r-open"), workers=workers)
+    with client(site_of(tmp_path, cluster=reply, acting=True), "act") as operator:
         page = operator.get(f"/run/{key(folder)}").text
     assert "/act/run/r-open/repin?class=class-new" in page
     assert "class-own" not in page

@@ -177,7 +177,7 @@ def test_an_act_is_confirmed_first_and_written_down(tmp_path: Path) -> None:
 
 
 def test_what_agents_wrote_is_text_on_every_page(tmp_path: Path) -> None:
-    said = [
+    texts = [
         {"type": "prompt", "message": MARKUP},
         {"type": "assistant", "message": {"content": [{"type": "text", "text": MARKUP}, {"type": "tool_use", "name": MARKUP, "input": {MARKUP: MARKUP}}]}},
         {"type": "stderr", "text": MARKUP},
@@ -186,7 +186,7 @@ def test_what_agents_wrote_is_text_on_every_page(tmp_path: Path) -> None:
         tmp_path,
         entry="Agent <script>",
         files={"policy.py": MARKUP.encode(), "<img src=x>.svg": b"<svg onload=alert(3)>"},
-        log=said,
+        log=texts,
     )
     (folder / "logs" / "harness.log").write_text(
         '{"event": "<script>alert(4)</script>", "why": "<b>x</b>"}\n'
@@ -198,13 +198,13 @@ def test_what_agents_wrote_is_text_on_every_page(tmp_path: Path) -> None:
         worker=MARKUP, host=MARKUP, slots=1, state="active", tiers=("bwrap",), environments=(MARKUP,), fingerprint=MARKUP,
         versions={MARKUP: MARKUP}, held=0, running=0, last_seen_s=0.0, refused={MARKUP: MARKUP}, hidden_bar=MARKUP, playing={MARKUP: 1},
     )  # fmt: skip
-    told = status(
+    reply = status(
         open_status("r-open", entry=MARKUP, waits_for=MARKUP, exp_id=MARKUP),
         workers=(worker,),
         stalls=(MARKUP,),
         quarantined={MARKUP: MARKUP},
     )
-    with client(site_of(tmp_path, cluster=told, acting=True), "act") as operator:
+    with client(site_of(tmp_path, cluster=reply, acting=True), "act") as operator:
         for path in (*PAGES, "/cluster", "/?q=" + "%3Cscript%3E", "/act/run/%3Cscript%3E/cancel"):
             answer = operator.get(path.format(key=key(folder)))
             assert answer.status_code == 200, path

@@ -105,9 +105,9 @@ def test_agent_that_survives_is_told_and_has_not_ended_before_it_is_gone(
         agent = supervisor.agent()
         held.freeze(agent)
         supervisor.tell(StopAgent())
-        told = supervisor.until(AgentSurvives)
-        assert isinstance(told, AgentSurvives)
-        assert agent in told.pids
+        event = supervisor.until(AgentSurvives)
+        assert isinstance(event, AgentSurvives)
+        assert agent in event.pids
         assert supervisor.holds_its_lock()
         held.thaw()
         ended = supervisor.until(AgentEnded)
@@ -117,7 +117,7 @@ def test_agent_that_survives_is_told_and_has_not_ended_before_it_is_gone(
     assert not supervisor.holds_its_lock()
 
 
-def test_keeper_waits_for_one_before_it_that_still_has_an_agent(
+def test_a_supervisor_waits_for_an_earlier_one_that_still_has_an_agent(
     supervisor: SupervisorProcess, tmp_path: Path
 ) -> None:
     first = supervisor.agent()

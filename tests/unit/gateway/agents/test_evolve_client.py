@@ -103,7 +103,7 @@ def test_task_is_read_as_text(tmp_path: Path) -> None:
         assert a_client(gateway.url).task() == "# Task"
 
 
-def test_gateway_that_stays_away_is_given_up_after_the_patience() -> None:
+def test_a_gateway_that_stays_away_is_given_up_after_the_timeout() -> None:
     with socket.socket() as unused:
         unused.bind(("127.0.0.1", 0))
         client = a_client(f"http://127.0.0.1:{unused.getsockname()[1]}", timeout_s=5.0)

@@ -136,7 +136,7 @@ def test_an_option_that_is_not_offered_is_not_chosen() -> None:
 
 
 @pytest.mark.parametrize(
-    ("told", "usage"),
+    ("reported", "usage"),
     [
         (
             {"inputTokens": 30, "cachedReadTokens": 70, "outputTokens": 5, "totalTokens": 105},
@@ -158,9 +158,9 @@ def test_an_option_that_is_not_offered_is_not_chosen() -> None:
     ],
 )
 def test_tokens_are_counted_whatever_an_agent_counts_into_its_input(
-    told: dict[str, Any], usage: Usage
+    reported: dict[str, Any], usage: Usage
 ) -> None:
-    assert usage_of(told) == usage
+    assert usage_of(reported) == usage
 
 
 def test_odd_updates_are_skipped() -> None:

@@ -100,27 +100,27 @@ def test_redaction_takes_time_that_grows_with_a_lines_length(piece: str) -> None
 
 
 def test_counts_of_tokens_are_bounded() -> None:
-    told = usage_of({"input_tokens": 10**400, "cached_input_tokens": -1, "output_tokens": 1 << 70})
-    assert (told.input_noncached, told.cache_read, told.output) == (MAX_COUNT, 0, MAX_COUNT)
+    usage = usage_of({"input_tokens": 10**400, "cached_input_tokens": -1, "output_tokens": 1 << 70})
+    assert (usage.input_noncached, usage.cache_read, usage.output) == (MAX_COUNT, 0, MAX_COUNT)
 
 
 def test_messages_of_claude_are_counted_once_each_however_many_there_are() -> None:
     reader = ClaudeReader()
 
-    def told(identity: int, output: int) -> None:
+    def report_usage(identity: int, output: int) -> None:
         usage = {"output_tokens": output, "input_tokens": 1}
         reader.read({"type": "assistant", "message": {"id": f"m{identity}", "usage": usage}})
 
     for identity in range(100_000):
-        told(identity, 1)
-        told(identity, 3)
+        report_usage(identity, 1)
+        report_usage(identity, 3)
     assert (reader.usage.output, reader.usage.input_noncached) == (300_000, 100_000)
     assert len(reader._messages) <= 1000
 
 
 def test_cached_input_is_taken_off_in_codex_streams() -> None:
-    told = {"input_tokens": 10, "cached_input_tokens": 7, "output_tokens": 3, "reasoning_output_tokens": 2}
-    usage = usage_of(told)
+    counts = {"input_tokens": 10, "cached_input_tokens": 7, "output_tokens": 3, "reasoning_output_tokens": 2}
+    usage = usage_of(counts)
     assert (usage.input_noncached, usage.cache_read, usage.output, usage.reasoning) == (3, 7, 3, 2)
     assert usage_of({"input_tokens": True, "output_tokens": "x"}).total == 0
 

@@ -47,10 +47,10 @@ def test_tokens_are_counted_as_the_paper_counts_them(tmp_path: Path, harness: st
     played = play(tmp_path, settings(harness, prices=prices), "work", budget=4)
     tokens = ended(played).facts["tokens"]
     # Told while it plays, too, for a sweep's caps: never less than before, and the whole at the end.
-    told = [doing.tokens for doing in played.doings if doing.tokens is not None]
-    outputs = [one["output"] for one in told]
+    usage = [doing.tokens for doing in played.doings if doing.tokens is not None]
+    outputs = [one["output"] for one in usage]
     assert outputs == sorted(outputs)
-    assert told[-1] == tokens
+    assert usage[-1] == tokens
     assert tokens["input_noncached"] == 600
     assert tokens["cache_read"] == 1400
     assert tokens["output"] == 40

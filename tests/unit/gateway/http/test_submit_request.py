@@ -141,7 +141,7 @@ def test_the_longest_text_of_ranges_is_counted_without_being_written_out() -> No
     st.lists(st.sampled_from([" ", "7", "-", ",", "99", "x"]), max_size=6),
 )
 def test_no_refusal_repeats_a_long_request(form: str, pieces: list[str]) -> None:
-    told = ""
+    message = ""
     try:
         parse(
             (form % "".join(piece * (300_000 if piece in " x" else 1) for piece in pieces)).encode()[
@@ -150,5 +150,5 @@ def test_no_refusal_repeats_a_long_request(form: str, pieces: list[str]) -> None
             BOUNDS,
         )
     except RequestError as error:
-        told = error.message
-    assert len(told) < 600
+        message = error.message
+    assert len(message) < 600

@@ -131,9 +131,9 @@ def test_a_run_has_copies_of_its_own_which_stay_when_the_source_is_gone_from_dis
     assert sorted(shown.values()) == ["/inputs/mcp.json", "/inputs/mcp/lamp", "~/.agents/skills/lamps"]
     script = tmp_path / "run" / "skills" / "lamps" / "scripts" / "read.sh"
     assert (script.stat().st_mode & 0o777) == 0o555
-    told = json.loads((tmp_path / "run" / "mcp.json").read_text())["mcpServers"]["lamp"]
-    assert told["args"] == ["/inputs/mcp/lamp/tools/mcp_server.py"]
-    assert told["env"] == {"UNIT": "lux"}
+    server = json.loads((tmp_path / "run" / "mcp.json").read_text())["mcpServers"]["lamp"]
+    assert server["args"] == ["/inputs/mcp/lamp/tools/mcp_server.py"]
+    assert server["env"] == {"UNIT": "lux"}
 
 
 def test_what_changes_while_a_run_is_open_is_refused_by_name(tmp_path: Path) -> None:
@@ -200,8 +200,8 @@ def test_codex_is_told_in_toml_whatever_the_characters(tmp_path: Path) -> None:
     harness.take(keep((), config.mcp, tmp_path, tmp_path / "run", expected))
     assert isinstance(harness, CliAgent)
     words = harness._dialect.arguments(None, resume=False, prompt="", options="")
-    told = tomllib.loads("\n".join(word for word in words if word.startswith("mcp_servers.lamp.")))
-    lamp = told["mcp_servers"]["lamp"]
+    document = tomllib.loads("\n".join(word for word in words if word.startswith("mcp_servers.lamp.")))
+    lamp = document["mcp_servers"]["lamp"]
     assert lamp["args"] == list(odd)
     assert lamp["env"] == dict(server.environment)
 

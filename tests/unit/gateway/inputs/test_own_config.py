@@ -102,8 +102,8 @@ def test_no_key_of_a_copied_login_stays_in_the_agents_log(home: Path, tmp_path: 
     log = AgentLog(tmp_path / "agent.jsonl", Redaction(["an-api-key-of-the-environment"]).knowing(found))
     log.raw(" ".join([*expected, "an-api-key-of-the-environment"]).encode(), "stdout")
     log.close()
-    told = json.loads((tmp_path / "agent.jsonl").read_text())["text"]
-    assert told == " ".join(["[redacted]"] * 5)
+    logged = json.loads((tmp_path / "agent.jsonl").read_text())["text"]
+    assert logged == " ".join(["[redacted]"] * 5)
 
 
 def test_paths_are_named_for_a_program_that_is_not_known(home: Path, tmp_path: Path) -> None:

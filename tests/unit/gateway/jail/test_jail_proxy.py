@@ -82,7 +82,7 @@ def test_a_head_without_end_is_cut() -> None:
     assert asyncio.run(ask(b"x" * 100_000)) == b""
 
 
-def test_a_program_that_ended_before_it_handed_out_its_sockets_opens_no_door() -> None:
+def test_a_program_that_ended_before_it_passed_its_sockets_opens_no_listener() -> None:
     async def main() -> None:
         opened = JailProxy({}, frozenset())
         here, there = socket.socketpair()

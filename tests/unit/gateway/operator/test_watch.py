@@ -35,9 +35,9 @@ def test_an_agents_words_do_not_steer_the_terminal(text: str) -> None:
     sweep = SuiteView(["run"], 1, console)
     sweep.turn("run", 1, text)
     sweep.note("run", text)
-    told = out.getvalue()
-    assert "run" in told
-    assert all(letter.isprintable() or letter == "\n" for letter in told)
+    output = out.getvalue()
+    assert "run" in output
+    assert all(letter.isprintable() or letter == "\n" for letter in output)
 
 
 def test_what_can_be_shown_is_shown_as_it_is() -> None:

@@ -231,8 +231,8 @@ def test_minari_reads_episodes_with_their_observations(tmp_path: Path) -> None:
     np.testing.assert_array_equal(last.actions, [1, 2, 0])
     assert list(last.rewards) == [-np.inf, 1.5, 1.5]
     assert list(last.terminations) == [False, False, True]
-    told = next(iter(dataset.storage.get_episode_metadata([3])))
-    assert (told["submit"], told["case"], told["episode_return"]) == (1, 1, 5.0)
+    metadata = next(iter(dataset.storage.get_episode_metadata([3])))
+    assert (metadata["submit"], metadata["case"], metadata["episode_return"]) == (1, 1, 5.0)
     again = export(tmp_path / "runs", "--to", "minari", "--out", tmp_path / "sets")
     assert again.returncode == 2
     assert "is there already" in again.stderr
@@ -257,10 +257,10 @@ def test_minari_leaves_out_odd_episodes_and_keeps_each_with_its_own_facts(tmp_pa
     os.environ["MINARI_DATASETS_PATH"] = str(tmp_path / "sets")
     try:
         dataset = minari.load_dataset("evopolicy/gym-acrobot/Agent-A-v0")
-        (told,) = dataset.storage.get_episode_metadata([0])
+        (metadata,) = dataset.storage.get_episode_metadata([0])
     finally:
         del os.environ["MINARI_DATASETS_PATH"]
-    assert (dataset.total_episodes, told["case"], told["episode_return"]) == (1, 3, 4.0)
+    assert (dataset.total_episodes, metadata["case"], metadata["episode_return"]) == (1, 3, 4.0)
 
 
 def test_a_sweep_is_followed_to_its_end_and_shows_nothing_hidden_before(

@@ -53,7 +53,7 @@ def log_of(tmp_path: Path, *lines: object) -> Path:
 
 
 def test_claude_codes_blocks_of_one_message_are_one_step_with_its_results(tmp_path: Path) -> None:
-    def said(identity: str, *blocks: dict[str, Any]) -> dict[str, Any]:
+    def assistant(identity: str, *blocks: dict[str, Any]) -> dict[str, Any]:
         return {"type": "assistant", "message": {"id": identity, "content": list(blocks)}}
 
     steps = read_steps(
@@ -61,9 +61,9 @@ def test_claude_codes_blocks_of_one_message_are_one_step_with_its_results(tmp_pa
             tmp_path,
             {"type": "system", "subtype": "init"},
             {"type": "prompt", "turn": 0, "message": "Begin."},
-            said("m1", {"type": "thinking", "thinking": "Hm."}),
-            said("m1", {"type": "text", "text": "I look."}),
-            said("m1", {"type": "tool_use", "id": "t", "name": "Bash", "input": {"command": "ls"}}),
+            assistant("m1", {"type": "thinking", "thinking": "Hm."}),
+            assistant("m1", {"type": "text", "text": "I look."}),
+            assistant("m1", {"type": "tool_use", "id": "t", "name": "Bash", "input": {"command": "ls"}}),
             {
                 "type": "user",
                 "message": {
@@ -79,7 +79,7 @@ def test_claude_codes_blocks_of_one_message_are_one_step_with_its_results(tmp_pa
             },
             {"type": "turn_failed", "kind": "passing", "message": "it broke"},
             # A resumed program begins to count anew.
-            said("m1", {"type": "tool_use", "id": "t", "name": "Bash", "input": {"command": "pwd"}}),
+            assistant("m1", {"type": "tool_use", "id": "t", "name": "Bash", "input": {"command": "pwd"}}),
         )
     )
     assert [(one.source, one.text) for one in steps] == [

@@ -220,14 +220,14 @@ def test_a_body_that_does_not_come_is_refused_and_its_rest_not_waited_for(
 
 def test_a_body_of_a_stranger_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(http, "STRANGER_LINGER", (1 << 20, SOON_S))
-    told: list[dict[str, Any]] = []
+    received: list[dict[str, Any]] = []
 
     async def receive() -> dict[str, Any]:
         await asyncio.sleep(1000)
         return {}
 
     async def send(message: Any) -> None:
-        told.append(message)
+        received.append(message)
 
     async def main() -> None:
         gate = http._TokenGate(PlainTextResponse("never"), "token", "bearer")
@@ -236,8 +236,8 @@ def test_a_body_of_a_stranger_is_not_waited_for(monkeypatch: pytest.MonkeyPatch)
             await gate(scope, receive, send)  # type: ignore[arg-type]
 
     asyncio.run(main())
-    assert told[0]["status"] in (401, 403)
-    assert told[-1]["more_body"] is False
+    assert received[0]["status"] in (401, 403)
+    assert received[-1]["more_body"] is False
 
 
 def test_a_submit_that_is_not_waited_for_is_answered_before_it_is_decided(

@@ -143,8 +143,8 @@ def test_a_summary_that_is_not_ok_has_every_array_and_aggregate_null() -> None:
     document = json.loads(summary_bytes("e", 0, done(5, "quarantined", n_kept=0), []))
     assert document["n_episodes"] == 5
     assert document["remaining_budget"] == 7
-    told = {key for key, value in document.items() if value is not None}
-    assert told == {
+    stated = {key for key, value in document.items() if value is not None}
+    assert stated == {
         *("schema_version", "submit_index", "env", "status", "n_episodes", "env_instances"),
         *("remaining_budget", "submit_started_at", "submit_completed_at", "wall_time_seconds"),
     }
@@ -343,9 +343,9 @@ def test_what_does_not_fit_an_episodes_share_is_left_out_in_order(share: int, le
     files = {"trajectory.jsonl": b"r" * 100, "observations.npz": b"o" * 200, "video.mp4": b"v" * 300}
     kept = within_share(files, share)
     assert set(files) - set(kept) == set(LEFT_OUT_FIRST[:left_out])
-    told = kept.get("left_out.txt", b"").decode()
-    assert [name for name in LEFT_OUT_FIRST if name in told] == list(LEFT_OUT_FIRST[:left_out])
-    assert (f"{share:,} bytes" in told) == bool(left_out)
+    listed = kept.get("left_out.txt", b"").decode()
+    assert [name for name in LEFT_OUT_FIRST if name in listed] == list(LEFT_OUT_FIRST[:left_out])
+    assert (f"{share:,} bytes" in listed) == bool(left_out)
 
 
 def test_every_episode_of_a_run_has_the_same_share_of_its_feedback() -> None:

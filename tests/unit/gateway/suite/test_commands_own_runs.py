@@ -26,7 +26,7 @@ def test_of_a_commands_own_runs_one_that_fails_stops_no_other(
     failed, completed = runs.documents(direct.play())
     assert (failed["status"], failed["error"]) == ("error", "the gateway cannot serve")
     assert (completed["status"], completed["final_score"]) == ("completed", 1.0)
-    assert direct.said.getvalue() == "toy/line: failed: the gateway cannot serve\n"
+    assert direct.output.getvalue() == "toy/line: failed: the gateway cannot serve\n"
     assert not list(tmp_path.glob("**/suite.json"))
 
 
@@ -41,12 +41,12 @@ def test_a_wrong_option_of_each_run_is_the_commands_own(
             raise ConfigError(f"{name} has too few cases")
 
     direct.act = act
-    told = runs.documents(direct.play())
-    assert [one["wrong_option"] for one in told] == [True, False]
+    documents = runs.documents(direct.play())
+    assert [one["wrong_option"] for one in documents] == [True, False]
     wrong.add("toy/maze")
     with pytest.raises(ConfigError, match="toy/line has too few cases"):
         direct.play()
-    assert direct.said.getvalue() == ""
+    assert direct.output.getvalue() == ""
 
 
 def test_a_commands_own_runs_go_on_where_they_are_resumed_and_end_with_it(

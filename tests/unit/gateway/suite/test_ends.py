@@ -100,8 +100,8 @@ def one_run(root: Path, **fields: Any) -> tuple[Plan, RunRecord]:
 
 def test_the_index_keeps_its_bytes(tmp_path: Path) -> None:
     plan, record = one_run(tmp_path)
-    told = entry_of(plan, record, settings=msgspec.to_builtins(plan.defining), host="h", run="r")
-    index = Index(suite="s", runs={plan.name: told})
+    entry = entry_of(plan, record, settings=msgspec.to_builtins(plan.defining), host="h", run="r")
+    index = Index(suite="s", runs={plan.name: entry})
     assert msgspec.json.format(msgspec.json.encode(index), indent=2).decode() == GOLDEN_INDEX
     (tmp_path / "suite.json").write_text(GOLDEN_INDEX)
     assert suite_index.load(tmp_path, "s") == index
@@ -133,9 +133,9 @@ def test_a_script_is_told_of_a_run_by_the_same_names(tmp_path: Path) -> None:
 
 def test_a_sweep_plays_again_what_its_agent_never_played(tmp_path: Path) -> None:
     plan, record = one_run(tmp_path, **NEVER_PLAYED)
-    told = entry_of(plan, record)
-    assert (told.state, told.closed_reason, told.score) == ("error", "agent_failed", None)
-    assert "failed before its first submit" in (told.error or "")
+    entry = entry_of(plan, record)
+    assert (entry.state, entry.closed_reason, entry.score) == ("error", "agent_failed", None)
+    assert "failed before its first submit" in (entry.error or "")
 
 
 def test_exit_codes_and_the_report_tell_how_runs_ended(
@@ -150,7 +150,7 @@ def test_exit_codes_and_the_report_tell_how_runs_ended(
     ]
     plans: list[Plan] = []
     index = Index(suite="")
-    for name, (told, code) in zip("abcde", ends, strict=True):
+    for name, (status, code) in zip("abcde", ends, strict=True):
         settings = RunSettings(env=name, entry="evolve", model="none", exp_id="t")
         plan = Plan(
             name=name,
@@ -162,12 +162,12 @@ def test_exit_codes_and_the_report_tell_how_runs_ended(
         )
         plans.append(plan)
         more = {"agent": "evolve", "env": name, "repeat": 0, "digest": "", "directory": f"evolve/{name}/t"}
-        index.runs[name] = Entry(name=name, **more | told)
+        index.runs[name] = Entry(name=name, **more | status)
         assert exit_code(plans, index) == code
         # Whatever is no success is explained where nobody has to look for it.
-        said = capsys.readouterr().err.splitlines()
-        assert [line.partition(":")[0] for line in said] == [one.name for one in plans[1:]]
-    assert said == [
+        printed = capsys.readouterr().err.splitlines()
+        assert [line.partition(":")[0] for line in printed] == [one.name for one in plans[1:]]
+    assert printed == [
         f"b: no submit of it was ok; see {tmp_path}/evolve/b/t",
         f"c: its agent stopped: agent_failed; see {tmp_path}/evolve/c/t",
         f"d: it was cancelled; see {tmp_path}/evolve/d/t",

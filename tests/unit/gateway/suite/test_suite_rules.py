@@ -258,11 +258,11 @@ def test_what_has_changed_in_the_file_is_named(tmp_path: Path) -> None:
 
 def test_a_setting_that_a_later_version_adds_makes_no_other_run(tmp_path: Path) -> None:
     for run in suite_in(tmp_path, FILE.replace("budget = 16", "limits = { act_wall_s = 2.0 }")):
-        told = run.defining
-        assert set(told["settings"]) <= {"env", "entry", "model", "exp_id", "repeat", "budget", *MORE}
+        defining = run.defining
+        assert set(defining["settings"]) <= {"env", "entry", "model", "exp_id", "repeat", "budget", *MORE}
         if run.entry == "GPT":
-            assert told["config"] == {"harness": "codex", "model": "gpt-5.5"}
-            assert told["settings"]["limits"] == {"act_wall_s": 2.0}
+            assert defining["config"] == {"harness": "codex", "model": "gpt-5.5"}
+            assert defining["settings"]["limits"] == {"act_wall_s": 2.0}
 
 
 def test_what_a_jail_lets_through_makes_another_run_and_where_programs_lie_does_not(tmp_path: Path) -> None:

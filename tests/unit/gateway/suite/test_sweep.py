@@ -58,7 +58,7 @@ def test_a_paused_sweep_begins_no_further_run(tmp_path: Path, monkeypatch: pytes
             pause.touch()
 
     async def unpause() -> None:
-        await until(lambda: any("paused" in said for said in stage.said))
+        await until(lambda: any("paused" in line for line in stage.events))
         await asyncio.sleep(0.1)
         begun.append(len(stage.begun))
         pause.unlink()
@@ -68,7 +68,7 @@ def test_a_paused_sweep_begins_no_further_run(tmp_path: Path, monkeypatch: pytes
     index = stage.play()
     assert begun == [1]
     assert {entry.state for entry in index.runs.values()} == {"completed"}
-    assert len([said for said in stage.said if "paused: no further run begins" in said]) == 1
+    assert len([line for line in stage.events if "paused: no further run begins" in line]) == 1
 
 
 def test_runs_that_are_followed_without_an_agent_are_bounded(
@@ -123,7 +123,7 @@ def test_a_provider_that_is_away_holds_back_further_runs_with_it_until_it_is_bac
     index = stage.play()
     assert seen == [["a/toy/line/0", "c/toy/line/0"]]
     assert index.runs["b/toy/line/0"].state == "completed"
-    assert any("paused a/toy/line/0" in said and "'seconds': 3600" in said for said in stage.said)
+    assert any("paused a/toy/line/0" in line and "'seconds': 3600" in line for line in stage.events)
 
 
 @pytest.mark.parametrize("cap", ["max_tokens = 149", "max_cost = 0.2"])
@@ -154,8 +154,8 @@ def test_a_cap_of_the_sweep_leaves_coding_agents_open_and_begins_no_further_run(
     assert (index.runs["a/toy/line/0"].state, index.runs["a/toy/line/0"].tokens) == ("running", TOKENS)
     assert index.runs["c/toy/line/0"].state == "completed"
     assert "d/toy/line/0" not in index.runs
-    assert len([said for said in stage.said if "interrupted: " in said]) == 1
-    assert "2 runs are left as they are" in stage.said[-1]
+    assert len([line for line in stage.events if "interrupted: " in line]) == 1
+    assert "2 runs are left as they are" in stage.events[-1]
 
 
 def test_what_an_earlier_attempt_used_counts_towards_the_cap(
@@ -213,7 +213,7 @@ def test_a_paused_sweep_begins_nothing_and_goes_on_later(
     paused.touch()
 
     async def resume() -> None:
-        await until(lambda: any("paused: no further run begins" in line for line in stage.said))
+        await until(lambda: any("paused: no further run begins" in line for line in stage.events))
         assert stage.begun == []
         paused.unlink()
 
@@ -221,4 +221,4 @@ def test_a_paused_sweep_begins_nothing_and_goes_on_later(
     index = stage.play()
     assert sorted(stage.begun) == sorted(index.runs)
     assert len(index.runs) == 2
-    assert sum("paused" in line for line in stage.said) == 1
+    assert sum("paused" in line for line in stage.events) == 1

@@ -26,11 +26,11 @@ def test_a_run_is_told_to_the_cluster_as_soon_as_it_is_open(
 
     async def act(_: str) -> None:
         # A host that dies before it has told cannot have its run ended by those that take over.
-        await until(lambda: (name, f"run of {name}", None) in stage.cluster.told)
+        await until(lambda: (name, f"run of {name}", None) in stage.cluster.reports)
 
     stage.act = act
     index = stage.play()
-    result = stage.cluster.told[-1][2]
+    result = stage.cluster.reports[-1][2]
     assert result is not None
     assert (result["run"], result["state"]) == (f"run of {name}", "completed")
     assert index.runs[name].settings["settings"]["env"] == "toy/line"
@@ -50,7 +50,7 @@ def test_a_dead_hosts_run_is_taken_over_as_a_new_attempt_and_ended_at_the_cluste
     assert stage.attempts == {run.name: 2}
     assert index.runs[run.name].attempt == 2
     assert (stage.root / ".attempts" / "a" / "toy_line" / "s-0.1" / "workspace").is_dir()
-    assert any("taken over from other" in said for said in stage.said)
+    assert any("taken over from other" in line for line in stage.events)
 
 
 def test_a_claim_that_another_host_has_meanwhile_ends_the_run_here_and_its_result_is_taken(
@@ -107,7 +107,7 @@ def test_our_own_failure_gives_the_claim_back_and_is_told(
     index = stage.play()
     (entry,) = index.runs.values()
     assert (entry.state, entry.error, entry.tokens) == ("error", "the gateway cannot serve", TOKENS)
-    assert stage.cluster.told[-1][2] is None
+    assert stage.cluster.reports[-1][2] is None
 
 
 def test_a_sweep_that_renews_no_claims_ends_with_the_reason(

@@ -28,7 +28,7 @@ def names(environment: Any) -> tuple[str, ...]:
 def test_an_unproved_version_switches_the_acceleration_off_and_says_so_once(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(table, "_told", set())
+    monkeypatch.setattr(table, "_reported", set())
     monkeypatch.setattr(table, "version", lambda name: "99.0")
     with structlog.testing.capture_logs() as logs:
         assert names(make(MAZE, accelerations=True)) == ()
@@ -43,7 +43,7 @@ def test_an_acceleration_that_does_not_hold_on_this_machine_is_off(monkeypatch: 
     from evopolicy_worker.environments.accelerations import car_racing_frame
 
     assert car_racing_frame.holds()
-    monkeypatch.setattr(table, "_told", set())
+    monkeypatch.setattr(table, "_reported", set())
     monkeypatch.setattr(car_racing_frame, "holds", lambda: False)
     with structlog.testing.capture_logs() as logs:
         assert names(make("gym/racing", accelerations=True)) == ("car_racing_road",)

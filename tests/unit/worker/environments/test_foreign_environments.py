@@ -41,14 +41,14 @@ def defined(name: str, **more: Any) -> str:
 
 
 def test_what_gymnasium_makes_by_module_is_described_from_its_documentation_and_spaces() -> None:
-    told = describe("acme_envs:Glider-v0")
-    assert told.max_episode_steps == 20
-    assert "A point is steered to the origin." in told.task_text
-    assert "an array of shape (2,) of float32, from -10 to 10" in told.task_text
-    assert "after 20 steps at the latest" in told.task_text
-    assert told.definition == {"gymnasium_id": "acme_envs:Glider-v0"}
-    assert "+src." in told.packages["acme_envs"]
-    assert told.renders
+    description = describe("acme_envs:Glider-v0")
+    assert description.max_episode_steps == 20
+    assert "A point is steered to the origin." in description.task_text
+    assert "an array of shape (2,) of float32, from -10 to 10" in description.task_text
+    assert "after 20 steps at the latest" in description.task_text
+    assert description.definition == {"gymnasium_id": "acme_envs:Glider-v0"}
+    assert "+src." in description.packages["acme_envs"]
+    assert description.renders
 
 
 def test_an_environment_without_a_limit_gets_the_usual_one() -> None:
@@ -64,10 +64,10 @@ def test_a_definition_sets_arguments_wrappers_limit_text_and_success() -> None:
         "success": "near",
         "title": "G",
     }
-    told = describe(defined("Glider", **more))
-    assert (told.max_episode_steps, told.task_text, told.success, told.title) == (7, "# Fly", "near", "G")
-    assert told.action_space["high"] == [2.0]
-    assert told.digest() != describe("acme_envs:Glider-v0").digest()
+    description = describe(defined("Glider", **more))
+    assert (description.max_episode_steps, description.task_text, description.success, description.title) == (7, "# Fly", "near", "G")
+    assert description.action_space["high"] == [2.0]
+    assert description.digest() != describe("acme_envs:Glider-v0").digest()
     environment = make("acme/Glider")
     environment.reset(Case(seed=1))
     assert [environment.step(np.zeros(1, "f")).truncated for _ in range(7)] == [False] * 6 + [True]
@@ -166,12 +166,12 @@ def test_a_package_that_is_missing_is_named_with_what_to_install() -> None:
 
 
 def test_a_reward_vector_is_recorded_whole_and_counts_by_its_weights() -> None:
-    told = describe("acme_envs:Treasure-v0")
-    assert told.reward_weights == {"reward_0": 1.0, "reward_1": 1.0}
+    description = describe("acme_envs:Treasure-v0")
+    assert description.reward_weights == {"reward_0": 1.0, "reward_1": 1.0}
     name = defined("Treasure", reward_vector=("distance", "effort"), reward_weights={"effort": 0.5})
-    told = describe(name)
-    assert told.reward_components == ("distance", "effort")
-    assert told.reward_texts["effort"] == "element of the reward vector; weight 0.5"
+    description = describe(name)
+    assert description.reward_components == ("distance", "effort")
+    assert description.reward_texts["effort"] == "element of the reward vector; weight 0.5"
     environment = make(name)
     environment.reset(Case(seed=0))
     step = environment.step(np.ones(1, "f"))
@@ -291,9 +291,9 @@ def test_the_readmes_environment_is_played(tmp_path: Path, monkeypatch: pytest.M
     (source,) = [block for block in readme.split("```python\n")[1:] if block.startswith("# my_env.py\n")]
     (tmp_path / "my_env.py").write_text(source.partition("```")[0], encoding="utf-8")
     monkeypatch.syspath_prepend(str(tmp_path))
-    told = describe("my_env:Glider-v0")
-    assert told.max_episode_steps == 50
-    assert "A point is steered to the origin." in told.task_text
+    description = describe("my_env:Glider-v0")
+    assert description.max_episode_steps == 50
+    assert "A point is steered to the origin." in description.task_text
 
 
 def test_a_family_encodes_spaces_that_are_not_its_own(monkeypatch: pytest.MonkeyPatch) -> None:

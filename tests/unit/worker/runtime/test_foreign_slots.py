@@ -84,11 +84,11 @@ def test_an_environment_that_breaks_down_and_cannot_be_closed_plays_the_episode_
 def test_pages_with_options_of_ones_own_have_browser_and_fonts_in_their_fingerprint(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    told = {"chromium": "1.2", "fonts": "f"}
-    monkeypatch.setattr(Page, "identity", lambda self: told)
+    versions = {"chromium": "1.2", "fonts": "f"}
+    monkeypatch.setattr(Page, "identity", lambda self: versions)
     name = "evopolicy_worker.environments.browser.registered:evopolicy/MiniWoB-v0"
     packages = ForeignFamily(name).packages(Entry(id="my/page", gymnasium_id=name))
-    assert told.items() <= packages.items()
+    assert versions.items() <= packages.items()
 
 
 def test_success_is_told_by_the_last_step_or_by_any(slots: Slots) -> None:
@@ -296,8 +296,8 @@ def test_opaque_objects_are_encoded_by_their_family_on_the_way_to_the_policy_and
     slot = slot_of(slots, "Browser")
     slots.run(slot.start())
     try:
-        (told,) = slots.run(slot.describe(["acme/Browser"]))
-        assert "page.title" in told.task_text
+        (description,) = slots.run(slot.describe(["acme/Browser"]))
+        assert "page.title" in description.task_text
         (outcome,) = slots.play_all(BROWSES, slot=slot, env="acme/Browser")
         assert (outcome.failure, outcome.episode_return) == (None, 5.0)
         assert rows(outcome)[1].obs["page"] == {"title": "goal", "links": ("goal", "start")}

@@ -60,11 +60,11 @@ async def stopped(
     """Plays the job, and stops it after some steps."""
     reached = asyncio.Event()
 
-    def told(episodes_done: int, n_steps: int) -> None:
+    def on_progress(episodes_done: int, n_steps: int) -> None:
         if episodes_done >= episodes and n_steps >= steps:
             reached.set()
 
-    task = asyncio.create_task(slot.play(job, slots.bundle(source), told))
+    task = asyncio.create_task(slot.play(job, slots.bundle(source), on_progress))
     await asyncio.wait({task, asyncio.create_task(reached.wait())}, return_when=asyncio.FIRST_COMPLETED)
     await slot.cancel()
     return await asyncio.wait_for(task, 60)
@@ -92,7 +92,7 @@ def test_a_policy_whose_luck_is_the_clock_throws_once_however_often_it_is_stoppe
         assert slots.run(stopped(slots, slot, job, SLOW, 12)) == ()
         job = going_on(job, slot)
         thrown.append(prefix(job))
-    (outcome,) = slots.run(slot.play(job, slots.bundle(SLOW), lambda *told: None))
+    (outcome,) = slots.run(slot.play(job, slots.bundle(SLOW), lambda *progress: None))
     assert outcome.failure is None
     assert len(thrown[0]) >= 12
     for shorter, longer in itertools.pairwise([*thrown, actions(outcome)]):
@@ -111,7 +111,7 @@ def test_a_failure_stands_and_so_do_the_episodes_before_it(slots: Slots) -> None
     assert known[0].failure is not None
     # Now it would not fail any more.
     lucky = source.replace(str(until), "0")
-    outcomes = slots.run(slot.play(job, slots.bundle(lucky), lambda *told: None))
+    outcomes = slots.run(slot.play(job, slots.bundle(lucky), lambda *progress: None))
     assert outcomes[0].failure is not None
     assert (outcomes[0].failure.category, outcomes[0].failure.step_index) == ("act_error", 4)
     assert actions(outcomes[0])[:4] == prefix(job, 0)
@@ -126,7 +126,7 @@ def test_a_policy_that_fails_while_its_actions_are_played_again_keeps_them(slots
     job = going_on(job, slot)
     stands = prefix(job)
     fails = SLOW.replace("self.n += 1", "raise ValueError('I know what comes')")
-    (outcome,) = slots.run(slot.play(job, slots.bundle(fails), lambda *told: None))
+    (outcome,) = slots.run(slot.play(job, slots.bundle(fails), lambda *progress: None))
     assert outcome.failure is not None
     assert actions(outcome)[: len(stands)] == stands
     # What follows are the random actions of any policy that fails.
@@ -140,7 +140,7 @@ def test_an_honest_policy_comes_to_the_same_when_it_is_stopped(slots: Slots) -> 
     slot = slots.slot()
     job = hidden()
     assert slots.run(stopped(slots, slot, job, source, 10)) == ()
-    (outcome,) = slots.run(slot.play(going_on(job, slot), slots.bundle(source), lambda *told: None))
+    (outcome,) = slots.run(slot.play(going_on(job, slot), slots.bundle(source), lambda *progress: None))
     (whole,) = slots.play_all(HONEST, record="actions", limits=PATIENT)
     assert outcome.trajectory == whole.trajectory
     assert outcome.episode_return == whole.episode_return
@@ -150,7 +150,7 @@ def test_nothing_stands_of_a_policy_that_has_returned_nothing_or_plays_for_train
     slot = slots.slot()
 
     async def at_once(job: Job, source: str) -> None:
-        task = asyncio.create_task(slot.play(job, slots.bundle(source), lambda *told: None))
+        task = asyncio.create_task(slot.play(job, slots.bundle(source), lambda *progress: None))
         await asyncio.sleep(1.0)
         await slot.cancel()
         assert await task == ()
@@ -176,5 +176,5 @@ def test_a_failure_by_a_limit_is_told_as_one(slots: Slots) -> None:
 @pytest.mark.parametrize("data", [b"\xc1 none of it", begun_by(b"no recording"), begun_by(b"")])
 def test_what_cannot_be_read_is_begun_anew(slots: Slots, data: bytes) -> None:
     job = hidden(begun=BlobRef(digest=digest_of(data), size=len(data), inline=data))
-    (outcome,) = slots.run(slots.slot().play(job, slots.bundle(HONEST), lambda *told: None))
+    (outcome,) = slots.run(slots.slot().play(job, slots.bundle(HONEST), lambda *progress: None))
     assert outcome.failure is None

@@ -112,7 +112,7 @@ def test_whatever_comes_as_an_action_reaches_the_hand_in_whole(
 
 
 def finished(frame: bytes) -> list[EpisodeOutcome]:
-    message = messages.answers.decode(frame[messages.LENGTH.size :])
+    message = messages.replies.decode(frame[messages.LENGTH.size :])
     return [message.outcome] if isinstance(message, messages.Finished) else []
 
 
@@ -154,7 +154,7 @@ def plain(value: Any) -> Any:
 def test_whatever_comes_as_a_report_is_a_bounded_failure(
     policy: PolicyProcess, report: dict[str, Any], what: str
 ) -> None:
-    error = policy._told(frames.FAILED, json.dumps(plain(report)).encode("utf-8", "surrogatepass"), what)
+    error = policy._reported_failure(frames.FAILED, json.dumps(plain(report)).encode("utf-8", "surrogatepass"), what)
     failure = error.failure
     assert len(failure.message) <= 2000
     assert len(failure.traceback) <= 16_000
@@ -362,7 +362,7 @@ def test_an_answer_of_a_slots_process_that_is_none_is_told(slots: Slots) -> None
         assert process.stdout is not None
         process.stdout.feed_data(messages.LENGTH.pack(3) + b"abc")
         with pytest.raises(WorkerError, match="cannot be read"):
-            await slot.play(make_job(bundle=None, n=200, policy_scope="submit"), None, lambda *told: None)
+            await slot.play(make_job(bundle=None, n=200, policy_scope="submit"), None, lambda *progress: None)
         await slot.close()
 
     slots.run(work())

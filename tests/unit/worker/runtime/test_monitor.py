@@ -12,10 +12,10 @@ from evopolicy_worker.episodes.monitor import Monitor
 def bug():
     raise LookupError("a bug")
 
-commands, told = os.pipe()
+commands, writer = os.pipe()
 monitor = Monitor(commands, bug, lambda: None)
 monitor.start()
-os.write(told, b"x")
+os.write(writer, b"x")
 time.sleep(60)
 """
 

@@ -409,7 +409,7 @@ def test_a_policy_computes_with_the_defaults_on_one_thread_in_a_fixed_locale(slo
             def reset(self, episode_index): pass
             def act(self, obs): return [0.0]
     """
-    said = {slots.play(policy, slot=slots.slot()).stdout.decode() for _ in range(2)}
+    outputs = {slots.play(policy, slot=slots.slot()).stdout.decode() for _ in range(2)}
     other = slots.new()
     with pytest.MonkeyPatch.context() as patch:
         for name, value in {
@@ -420,13 +420,13 @@ def test_a_policy_computes_with_the_defaults_on_one_thread_in_a_fixed_locale(slo
         }.items():
             patch.setenv(name, value)
         slots.run(other.start())
-    said.add(slots.play(policy, slot=other).stdout.decode())
+    outputs.add(slots.play(policy, slot=other).stdout.decode())
     slots.run(other.close())
-    (told,) = said
-    assert told.startswith("['1', '1', '1', '0'] ")
+    (output,) = outputs
+    assert output.startswith("['1', '1', '1', '0'] ")
     # Where a system's C library has no C.UTF-8, it is C, and Python reads UTF-8 all the same.
-    assert "C.UTF-8 ('UTC', 'UTC')" in told or " C ('UTC', 'UTC')" in told
-    assert told.endswith("0 True\n")
+    assert "C.UTF-8 ('UTC', 'UTC')" in output or " C ('UTC', 'UTC')" in output
+    assert output.endswith("0 True\n")
 
 
 def test_an_episode_is_cut_after_the_jobs_steps_and_no_later_than_its_environments(slots: Slots) -> None:

@@ -49,19 +49,19 @@ def test_an_episode_of_random_actions_can_be_cancelled_too(slots: Slots) -> None
 
 
 def test_progress_is_told_while_a_job_runs(slots: Slots) -> None:
-    told: list[tuple[int, int]] = []
+    reports: list[tuple[int, int]] = []
     policy = HONEST.replace("return [", "import time; time.sleep(0.01); return [")
     slot = slots.slot()
     slots.run(
         slot.play(
             make_job(n=2, policy_scope="submit"),
             slots.bundle(policy),
-            lambda *progress: told.append(progress),
+            lambda *progress: reports.append(progress),
         )
     )
-    assert told == sorted(told)
-    assert any(0 < steps < 120 for _, steps in told)
-    assert any(done == 1 for done, _ in told)
+    assert reports == sorted(reports)
+    assert any(0 < steps < 120 for _, steps in reports)
+    assert any(done == 1 for done, _ in reports)
 
 
 @pytest.mark.parametrize("victim", ["env process", "zygote"])

@@ -52,6 +52,6 @@ def test_what_cannot_be_drawn_has_no_video_and_a_note(capfd: pytest.CaptureFixtu
     undrawn = msgspec.structs.replace(description, renders=False)
     assert recorder.record(undrawn, case, b"", 1, lambda: False) is None
     recorder.close()
-    said = capfd.readouterr().err
-    assert "note: no video of an episode of toy/line" in said
-    assert "note: no video: toy/line does not render" in said
+    printed = capfd.readouterr().err
+    assert "note: no video of an episode of toy/line" in printed
+    assert "note: no video: toy/line does not render" in printed

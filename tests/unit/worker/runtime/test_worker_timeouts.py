@@ -140,14 +140,14 @@ def test_a_slots_process_that_hangs_up_and_stays_is_told_without_its_status(
     monkeypatch.setattr(slot, "LAST_WORDS_S", SOON_S)
     own = slots.new("none")
 
-    async def told() -> str:
+    async def last_words() -> str:
         own._process = await asyncio.create_subprocess_exec("sleep", "1000", start_new_session=True)
         try:
             return await own._last_words()
         finally:
             await own.close()
 
-    assert "ended with status ?" in slots.run(told())
+    assert "ended with status ?" in slots.run(last_words())
 
 
 @pytest.mark.parametrize(("bound", "frames"), [("start_s", 0), ("frame_s", 1), ("MAX_S", 1)])

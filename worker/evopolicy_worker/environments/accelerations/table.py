@@ -28,7 +28,7 @@ random positions, angles, speeds and times.
 """
 
 
-_told: set[str] = set()
+_reported: set[str] = set()
 """Accelerations that a warning was logged about."""
 
 
@@ -51,8 +51,8 @@ class Acceleration:
         check = getattr(self._module(), "holds", None)
         if check is None or check():
             return True
-        if self.name not in _told:
-            _told.add(self.name)
+        if self.name not in _reported:
+            _reported.add(self.name)
             _warn("not exact on this machine", acceleration=self.name)
         return False
 
@@ -102,8 +102,8 @@ def usable(acceleration: Acceleration) -> bool:
     """Whether the installed versions are proved ones. Logs a warning, once per acceleration, when they are not."""
     installed = {name: _version(name) for name in acceleration.distributions}
     unproved = {name: found for name, found in installed.items() if found not in PROVED[name]}
-    if unproved and acceleration.name not in _told:
-        _told.add(acceleration.name)
+    if unproved and acceleration.name not in _reported:
+        _reported.add(acceleration.name)
         _warn(
             "not proved with the installed version",
             acceleration=acceleration.name,

@@ -86,15 +86,15 @@ def _call(node: ast.stmt) -> tuple[str, dict[str, Any]]:
         raise ValueError(f"{name}: its arguments have to be texts, numbers or lists of them") from error
     if len(call.args) > len(wanted) or not given.keys() <= wanted.keys():
         raise ValueError(f"{name} takes {', '.join(wanted)}; it was given {ast.unparse(call)[:200]}")
-    return name, {each: _argument(name, each, told, given) for each, told in wanted.items()}
+    return name, {each: _argument(name, each, parameter, given) for each, parameter in wanted.items()}
 
 
-def _argument(name: str, argument: str, told: Any, given: Mapping[str, Any]) -> Any:
-    has_default = isinstance(told, tuple) and not isinstance(told[0], type)
-    types = told[1] if has_default else told
+def _argument(name: str, argument: str, parameter: Any, given: Mapping[str, Any]) -> Any:
+    has_default = isinstance(parameter, tuple) and not isinstance(parameter[0], type)
+    types = parameter[1] if has_default else parameter
     if argument not in given:
         if has_default:
-            return told[0]
+            return parameter[0]
         raise ValueError(f"{name}() misses its argument {argument!r}")
     value = given[argument]
     numbers = isinstance(value, int | float) and not abs(value) <= MAX_NUMBER

@@ -163,10 +163,10 @@ class Chromium:
         try:
             self.version = str(self.devtools.call("Browser.getVersion", timeout_s=_START_S)["product"])
         except WorkerError as error:
-            said = (self.profile / "stderr").read_text(errors="replace").strip().splitlines()[-3:]
+            stderr = (self.profile / "stderr").read_text(errors="replace").strip().splitlines()[-3:]
             self.close()
             raise WorkerError(
-                f"{path} does not start: {error}; it said: {' | '.join(said) or 'nothing'}"
+                f"{path} does not start: {error}; it said: {' | '.join(stderr) or 'nothing'}"
             ) from error
 
     def megabytes(self) -> int:

@@ -39,11 +39,11 @@ class DevTools:
     """Both ends of the pipe. `on_event(method, params, session)` is called for every event, while a result is waited for."""
 
     def __init__(
-        self, commands: int, answers: int, on_event: Callable[[str, dict[str, Any], str], None]
+        self, commands: int, replies: int, on_event: Callable[[str, dict[str, Any], str], None]
     ) -> None:
         """`commands`, `answers`: descriptors to write to and to read from, owned by this object."""
         self._commands = commands
-        self._answers = answers
+        self._replies = replies
         self._on_event = on_event
         self._encode = msgspec.json.Encoder().encode
         self._decode = msgspec.json.Decoder(_Answer).decode
@@ -91,15 +91,15 @@ class DevTools:
 
     def close(self) -> None:
         """Closes both ends, on which the browser ends."""
-        for descriptor in (self._commands, self._answers):
+        for descriptor in (self._commands, self._replies):
             os.close(descriptor)
 
     def _receive(self, deadline: float) -> None:
         """Reads once, and takes every whole message."""
         left = deadline - time.monotonic()
-        if left <= 0 or not select.select([self._answers], [], [], left)[0]:
+        if left <= 0 or not select.select([self._replies], [], [], left)[0]:
             raise BrowserLostError("the page does not answer: it hangs")
-        data = os.read(self._answers, _READ)
+        data = os.read(self._replies, _READ)
         if not data:
             raise BrowserLostError("the browser has ended")
         self._received += data

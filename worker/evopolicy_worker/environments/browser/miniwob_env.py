@@ -78,11 +78,11 @@ class MiniWoBEnv(PageEnv):
         self._fields: miniwob_pages.Fields = ()
 
     def _first(self, found: dict[str, Any]) -> Any:
-        told = found["fields"]
+        fields = found["fields"]
         self._fields = (
             miniwob_pages.fields(self.name, found["utterance"])
-            if told is None
-            else tuple((str(key), str(value)) for key, value in told)
+            if fields is None
+            else tuple((str(key), str(value)) for key, value in fields)
         )
         return self._observation(found)
 

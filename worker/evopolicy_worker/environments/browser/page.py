@@ -155,8 +155,8 @@ class Page:
         )
         found = self.browser.devtools.result(number, CALL_S)
         if "exceptionDetails" in found:
-            told = found["exceptionDetails"]
-            text = told.get("exception", {}).get("description") or told.get("text", "")
+            details = found["exceptionDetails"]
+            text = details.get("exception", {}).get("description") or details.get("text", "")
             raise BrowserLostError(f"a script failed in the page: {str(text)[:500]}")
         return found["result"].get("value")
 
@@ -188,7 +188,7 @@ class Page:
                 self._buttons = self._buttons | bit if kind == "mousePressed" else self._buttons & ~bit
                 self._held = button if self._buttons else "none"
             self.mouse_at = x, y
-            told: dict[str, Any] = {
+            event: dict[str, Any] = {
                 "type": kind,
                 "x": x,
                 "y": y,
@@ -197,7 +197,7 @@ class Page:
                 "clickCount": clicks,
             }
             # The time tells the page's script that it is an action's.
-            numbers.append(self._send("Input.dispatchMouseEvent", **told, modifiers=modifiers, timestamp=1))
+            numbers.append(self._send("Input.dispatchMouseEvent", **event, modifiers=modifiers, timestamp=1))
         self._await(numbers)
 
     def wheel(self, x: float, y: float, delta_x: float, delta_y: float) -> None:
@@ -209,7 +209,7 @@ class Page:
         """Keys pressed and released in order, each with the modifiers held (1 Alt, 2 Control, 4 Meta, 8 Shift)."""
         numbers = []
         for kind, key, modifiers in events:
-            told: dict[str, Any] = {
+            event: dict[str, Any] = {
                 "key": key.key,
                 "code": key.code,
                 "windowsVirtualKeyCode": key.number,
@@ -218,10 +218,10 @@ class Page:
                 "isKeypad": key.location == 3,
             }
             if kind == "down" and key.text and not modifiers & 7:
-                told |= {"type": "keyDown", "text": key.text, "unmodifiedText": key.text}
+                event |= {"type": "keyDown", "text": key.text, "unmodifiedText": key.text}
             else:
-                told["type"] = "rawKeyDown" if kind == "down" else "keyUp"
-            numbers.append(self._send("Input.dispatchKeyEvent", **told))
+                event["type"] = "rawKeyDown" if kind == "down" else "keyUp"
+            numbers.append(self._send("Input.dispatchKeyEvent", **event))
         self._await(numbers)
 
     def press(self, key: Key, modifiers: int = 0) -> None:

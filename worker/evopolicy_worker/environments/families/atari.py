@@ -49,19 +49,19 @@ class AtariFamily(GymnasiumFamily):
         choices = [f"| `{k}` | {_choice(each)} |" for k, each in enumerate(console.get_action_meanings())]
         held = settings.get("frameskip", 1)
         if isinstance(held, int):
-            told = (
+            duration = (
                 "It is held for one frame."
                 if held == 1
                 else f"It is held for {held} frames; you see the last."
             )
         else:
-            told = f"It is held for {held[0]} to {held[1] - 1} frames, at random; you see the last."
+            duration = f"It is held for {held[0]} to {held[1] - 1} frames, at random; you see the last."
         if settings.get("repeat_action_probability"):
-            told += " Now and then, at random, the console goes on with the choice before."
+            duration += " Now and then, at random, the console goes on with the choice before."
         return {
             "": _games()[settings["game"]],
             "Observation": _OBSERVATION,
-            "Action": f"What is done with the joystick. {told}\n\n| choice | joystick |\n|---|---|\n"
+            "Action": f"What is done with the joystick. {duration}\n\n| choice | joystick |\n|---|---|\n"
             + "\n".join(choices),
             "Reward": _REWARD,
             "Start": "The game's beginning, the same in every episode. Where something is at random, the episode's seed decides it.",

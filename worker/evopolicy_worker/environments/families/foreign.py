@@ -50,8 +50,8 @@ class ForeignFamily(GymnasiumFamily):
         return common | own | (miniwob.FAMILY.packages(entry) if self._module == _PAGES else {})
 
     def version(self, entry: Entry) -> str:
-        told = ", ".join(f"{name} {each}" for name, each in self.packages(entry).items() if name != "numpy")
-        return f"{entry.gymnasium_id} ({told})"
+        packages = ", ".join(f"{name} {each}" for name, each in self.packages(entry).items() if name != "numpy")
+        return f"{entry.gymnasium_id} ({packages})"
 
 
 @cache

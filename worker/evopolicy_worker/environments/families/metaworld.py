@@ -79,8 +79,8 @@ class _Tasks:
         self._index = 0
         self._task: Any = _task(names[0], render=render)
         self.action_space = self._task.action_space
-        told = self._task.sawyer_observation_space
-        low, high = told.low.copy(), told.high.copy()
+        space = self._task.sawyer_observation_space
+        low, high = space.low.copy(), space.high.copy()
         if len(names) > 1:
             # The goals of other tasks lie elsewhere.
             low[_GOAL], high[_GOAL] = -np.inf, np.inf

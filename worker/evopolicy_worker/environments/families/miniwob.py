@@ -65,11 +65,11 @@ class MiniWoBFamily(GymnasiumFamily):
 
 def _documentation(name: str) -> str:
     """What the package says of a page, with examples of its instructions, for the task text."""
-    told = miniwob_pages.texts().get(name, miniwob_pages.PageText())
-    examples = "\n".join(f"* {each}" for each in told.examples)
+    page = miniwob_pages.texts().get(name, miniwob_pages.PageText())
+    examples = "\n".join(f"* {each}" for each in page.examples)
     parts = [
-        told.description,
-        told.notes,
+        page.description,
+        page.notes,
         f"The page's instruction is such as:\n\n{examples}" if examples else "",
     ]
     return "\n\n".join(["## Description", *filter(None, parts)])

@@ -86,7 +86,7 @@ class MiniWorldFamily(GymnasiumFamily):
         name = str(entry.gymnasium_id).split("-")[1]
         space: Any = env.action_space
         meanings = [*_ACTIONS[:3], "end the episode"] if name == "Sign" else _ACTIONS[: int(space.n)]
-        rows = [f"| `{k}` | {told} |" for k, told in enumerate(meanings)]
+        rows = [f"| `{k}` | {meaning} |" for k, meaning in enumerate(meanings)]
         observation = f"The observation is {_PICTURE}."
         if name == "Sign":
             observation = f"`obs` is {_PICTURE}. `goal` is 0 for a box and 1 for a key."

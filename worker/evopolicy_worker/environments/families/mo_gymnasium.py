@@ -56,9 +56,9 @@ class MoGymnasiumFamily(MujocoFamily):
         """The class's documentation, completed by that of the environment from which it is made."""
         found: dict[str, str] = {}
         for each in reversed(type(env.unwrapped).__mro__):
-            told = vars(each).get("__doc__") or ""
+            docstring = vars(each).get("__doc__") or ""
             if each.__module__.startswith(_DOCUMENTED):
-                found |= template.documented(inspect.cleandoc(told))
+                found |= template.documented(inspect.cleandoc(docstring))
         if "highway" in str(entry.gymnasium_id):
             found |= _HIGHWAY
         scalarisation = rewards.Scalarisation.of(entry, env)

@@ -81,16 +81,16 @@ def test_ordinary_work_raises_no_signal(command: str) -> None:
 
 
 def test_prose_and_output_of_tools_raise_no_signal() -> None:
-    said = "I could pip install gymnasium, or curl https://example.org, or read /etc/passwd. I will not."
+    message = "I could pip install gymnasium, or curl https://example.org, or read /etc/passwd. I will not."
     lines = [
-        {"type": "assistant", "message": {"content": [{"type": "text", "text": said}]}},
-        {"type": "user", "message": {"content": [{"type": "tool_result", "content": said}]}},
-        {"type": "item.completed", "item": {"type": "agent_message", "text": said}},
+        {"type": "assistant", "message": {"content": [{"type": "text", "text": message}]}},
+        {"type": "user", "message": {"content": [{"type": "tool_result", "content": message}]}},
+        {"type": "item.completed", "item": {"type": "agent_message", "text": message}},
         {
             "type": "item.completed",
-            "item": {"type": "command_execution", "command": "ls", "aggregated_output": said},
+            "item": {"type": "command_execution", "command": "ls", "aggregated_output": message},
         },
-        {"type": "stdout", "text": said},
+        {"type": "stdout", "text": message},
     ]
     assert list(log_signals(json.dumps(line).encode() for line in lines)) == []
 

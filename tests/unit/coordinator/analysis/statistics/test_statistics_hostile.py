@@ -38,8 +38,8 @@ from evopolicy_coordinator.analysis.tables.table import Table
 def run(*returns: float, case_set: str = "cases", score: float | None = math.nan) -> RunReturns:
     finite = [value for value in returns if math.isfinite(value)]
     own = float(np.mean(finite)) if finite else 0.0
-    told = own if score is not None and math.isnan(score) else score
-    return RunReturns(score=told, returns=returns, case_set=case_set)
+    expected = own if score is not None and math.isnan(score) else score
+    return RunReturns(score=expected, returns=returns, case_set=case_set)
 
 
 def entry(name: str, *runs: RunReturns, env: str = "env", is_fixed: bool = False) -> Sample:
@@ -341,7 +341,7 @@ def test_success_is_told_where_the_return_tells_it(
 
 
 @pytest.mark.parametrize(
-    ("told", "rate"),
+    ("repaired", "rate"),
     [
         ({"steps": 1000, "action_invalid": 5}, 0.005),
         ({"steps": 0, "action_invalid": 0}, None),
@@ -352,12 +352,12 @@ def test_success_is_told_where_the_return_tells_it(
     ],
 )
 def test_rate_of_repaired_actions_is_told_where_it_was_recorded(
-    tmp_path: Path, told: object, rate: float | None
+    tmp_path: Path, repaired: object, rate: float | None
 ) -> None:
     folder = write_run(tmp_path / "runs", [Version(policy(gain=1.0), (1.0,), 1.0)])
     record = json.loads((folder / "run.json").read_bytes())
-    if told is not None:
-        record["outcome"]["auxiliary"]["transitions"] = told
+    if repaired is not None:
+        record["outcome"]["auxiliary"]["transitions"] = repaired
     (folder / "run.json").write_text(json.dumps(record))
     found = study([tmp_path / "runs"])
     assert found.audit[0].repaired_rate == rate

@@ -113,13 +113,13 @@ def _choice(name: str) -> str:
 def _needs(constants: Any) -> list[str]:
     """Rows of what collecting, placing and making take, from the package's own table."""
     rows = []
-    for material, told in constants.collect.items():
-        rows.append((f"collecting from {material}", told["require"], material))
-    for name, told in constants.place.items():
-        rows.append((f"placing {name}", told["uses"], " or ".join(told["where"])))
-    for name, told in constants.make.items():
+    for material, recipe in constants.collect.items():
+        rows.append((f"collecting from {material}", recipe["require"], material))
+    for name, recipe in constants.place.items():
+        rows.append((f"placing {name}", recipe["uses"], " or ".join(recipe["where"])))
+    for name, recipe in constants.make.items():
         rows.append(
-            (f"making {name.replace('_', ' ')}", told["uses"], "near " + " and ".join(told["nearby"]))
+            (f"making {name.replace('_', ' ')}", recipe["uses"], "near " + " and ".join(recipe["nearby"]))
         )
 
     def listed(items: Mapping[str, int]) -> str:
@@ -173,16 +173,16 @@ class _Game:
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         before = set(self._game._unlocked)
-        obs, reward, _, told = self._game.step(action)
-        new = [name for name in told["achievements"] if name in self._game._unlocked - before]
+        obs, reward, _, game_info = self._game.step(action)
+        new = [name for name in game_info["achievements"] if name in self._game._unlocked - before]
         self._unlocked += len(new)
         info = {
-            "inventory": told["inventory"],
+            "inventory": game_info["inventory"],
             "achievements": self._unlocked,
             "unlocked": ", ".join(new),
         }
         # Its own end includes its limit, which the adapter keeps.
-        return obs, reward, not told["discount"], False, info
+        return obs, reward, not game_info["discount"], False, info
 
     def render(self) -> Any:
         random = self._world.random

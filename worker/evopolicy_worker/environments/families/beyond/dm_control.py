@@ -60,9 +60,9 @@ class DmControlFamily(MujocoFamily):
 
     def words(self, entry: Entry, env: gymnasium.Env[Any, Any]) -> dict[str, str]:
         domain, task = _names(entry)
-        told = _texts()[domain]
-        objective, reward = told["tasks"][task]
-        parts = told["observation"] | told.get("also", {})
+        texts = _texts()[domain]
+        objective, reward = texts["tasks"][task]
+        parts = texts["observation"] | texts.get("also", {})
         observed: Any = env.observation_space
         rows = [
             f"| `{name}` | {parts[name]} | {template.words(spaces.to_schema(part))} |"
@@ -70,16 +70,16 @@ class DmControlFamily(MujocoFamily):
         ]
         motors = [f"| `{k}` | {name} |" for k, name in enumerate(cast(_Task, env).actuators)]
         return {
-            "": f"{told['about']} {objective}",
+            "": f"{texts['about']} {objective}",
             "Observation": "\n".join(
                 [f"A dict. {_UNITS}", "", "| component | what it is | values |", "|---|---|---|", *rows]
             ),
             "Action": "\n".join(
-                [told["action"], "", "| number | its name in the model |", "|---|---|", *motors]
+                [texts["action"], "", "| number | its name in the model |", "|---|---|", *motors]
             ),
             "Reward": f"What each step pays: {reward[0].lower()}{reward[1:]}",
-            "Start": f"{told['start']} The seed of the episode decides.",
-            "End": told.get("end", "Nothing ends an episode early."),
+            "Start": f"{texts['start']} The seed of the episode decides.",
+            "End": texts.get("end", "Nothing ends an episode early."),
         }
 
 
@@ -108,10 +108,10 @@ class _Task:
         self._physics: Any = self._task.physics
         _without_opengl(self._physics)
         self._renderer: Any = None
-        told = self._task.action_spec()
+        spec = self._task.action_spec()
         low, high = (
-            np.broadcast_to(np.where(np.abs(each) < _UNLIMITED, each, np.copysign(np.inf, each)), told.shape)
-            for each in (told.minimum, told.maximum)
+            np.broadcast_to(np.where(np.abs(each) < _UNLIMITED, each, np.copysign(np.inf, each)), spec.shape)
+            for each in (spec.minimum, spec.maximum)
         )
         self.action_space = spaces.Box(low.astype(np.float64), high.astype(np.float64), dtype=np.float64)
         self.observation_space = spaces.Dict(

@@ -64,8 +64,8 @@ class NetHackFamily(GymnasiumFamily):
         return versions(("numpy", "gymnasium", *_distributions(entry)))
 
     def version(self, entry: Entry) -> str:
-        told = ", ".join(f"{name} {each}" for name, each in versions(_distributions(entry)).items())
-        return f"{entry.gymnasium_id} ({told})"
+        packages = ", ".join(f"{name} {each}" for name, each in versions(_distributions(entry)).items())
+        return f"{entry.gymnasium_id} ({packages})"
 
     def needs(self) -> str:
         return f"{super().needs()} and pip install --no-deps {' '.join(installs.apart((self.extra,)))}"
@@ -118,13 +118,13 @@ class _Game:
         self._raw.seed(seed + 1, seed + 1, False)
         obs, info = self._raw.reset()
         _set_birthday(self._raw.nethack.dlpath)
-        return obs, _told(info)
+        return obs, _info(info)
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         obs, reward, terminated, truncated, info = self._raw.step(action)
         # At its step limit a game is given up, and says that it has ended.
         aborted = info["end_status"].name == "ABORTED"
-        return obs, reward, terminated and not aborted, truncated or aborted, _told(info)
+        return obs, reward, terminated and not aborted, truncated or aborted, _info(info)
 
     def render(self) -> NDArray[np.uint8]:
         raw = self._raw
@@ -148,7 +148,7 @@ class _Game:
             path.unlink()
 
 
-def _told(info: dict[str, Any]) -> dict[str, Any]:
+def _info(info: dict[str, Any]) -> dict[str, Any]:
     """How the game stands, in words: `running`, `death`, `task_successful`, or `aborted` at the step limit."""
     status = info["end_status"].name
     return {
@@ -184,10 +184,10 @@ def _choice(action: Any, common: Mapping[str, Any]) -> str:
     kind, name = type(action).__name__, action.name
     if kind.startswith("Compass"):
         way = common["direction"][name]
-        told = f"go far {way}, until something is of interest" if kind.endswith("Longer") else f"go {way}"
+        effect = f"go far {way}, until something is of interest" if kind.endswith("Longer") else f"go {way}"
     else:
-        told = common["action"].get(f"{kind}.{name}") or common["action"][name]
-    return f"{told} (key {_key(int(action))})"
+        effect = common["action"].get(f"{kind}.{name}") or common["action"][name]
+    return f"{effect} (key {_key(int(action))})"
 
 
 def _key(code: int) -> str:
