@@ -8,6 +8,7 @@ from __future__ import annotations
 import statistics
 import tomllib
 from pathlib import Path
+from typing import Any
 
 from evopolicy_common import catalogue
 from evopolicy_common.catalogue import installs
@@ -15,26 +16,20 @@ from evopolicy_common.catalogue import installs
 TOP = Path(__file__).parents[2]
 PLAYED = TOP / "docs" / "reference" / "environments.md"
 DOCUMENTS = (TOP / "README.md", PLAYED)
-BEGIN, END = "<!-- Written by docs/_site/families.py. -->", "<!-- End of what it writes. -->"
+END = "<!-- End of what it writes. -->"
 
 
 def table() -> str:
-    """The table and the line beneath it, as Markdown."""
-    original = tomllib.loads((TOP / "docs" / "_site" / "original.toml").read_text("utf-8"))
+    """The table of docs/reference/environments.md and the lines beneath it, as Markdown."""
+    original, families, costs = _original(), _families(), _costs()
     named, newest = original["paper"]["families"], original["newest"]
-    costs = _costs()
     lines = [
-        "| suite | environments | named in the paper | repeat | played | ms a step | to install |",
+        "| suite | environments | named in the paper | deterministic | played | ms a step | to install |",
         "|---|--:|---|--:|--:|--:|---|",
-    ]
-    families = [
-        each for name, each in catalogue.suites().items() if name in catalogue.families() and name != "toy"
     ]
     for suite in families:
         ids = suite.environments
-        repeat = sum(catalogue.entry(each).deterministic for each in ids)
-        found = [costs[each] for each in ids if each in costs]
-        cost = f"{statistics.median(found) / 1000:.3g}" if found else "-"
+        deterministic, found = _deterministic(suite), [costs[each] for each in ids if each in costs]
         family = installs.family_of(ids[0])
         row = installs.installs()[family]
         how = f"`evopolicy-worker setup {family}`" if row.pins or row.apart else f"`evopolicy[{row.extra}]`"
@@ -42,21 +37,73 @@ def table() -> str:
             f"`{suite.name}`",
             f"{len(ids):,}",
             named.get(suite.name, "-"),
-            "all" if repeat == len(ids) else f"{repeat:,}",
+            "all" if deterministic == len(ids) else f"{deterministic:,}",
             "all" if len(found) == len(ids) else f"{len(found):,}",
-            cost,
+            _cost(suite, costs),
             how + (" and Chromium" if row.browser else ""),
         )
         lines.append(f"| {' | '.join(cells)} |")
-    total = len({each for suite in families for each in suite.environments})
     lines += [
         "",
-        f"Together {total:,} environments in {len(families)} suites; `paper13` has the {len(named)} families that the paper names. The paper",
-        f"validates its protocol on {original['paper']['validated']} tasks; the original's newest version has about {newest['profiles']} profiles in {newest['ecosystems']} ecosystems, each a",
-        'project with a lock file of its own. "Repeat" counts ids whose episodes follow from seed and actions; "played", those that',
-        "`check-env` has played; times are medians of a bare step over these, on a busy machine.",
+        f"The {len(families)} suites hold {_total(families):,} environments; the suite `paper13` holds the {len(named)} families that the paper",
+        f"names. The paper validates its protocol on {original['paper']['validated']} tasks. The newest version of the original has about",
+        f"{newest['profiles']} profiles in {newest['ecosystems']} ecosystems, each a project with its own lock file. *Deterministic*: ids whose episodes depend",
+        "only on seed and actions. *Played*: ids that `check-env` has played. *ms a step*: median of a bare step over the played ids,",
+        "on a busy machine.",
     ]
     return "\n".join(lines)
+
+
+def short() -> str:
+    """The table of README.md, two suites to a row, and the lines beneath it."""
+    original, families, costs = _original(), _families(), _costs()
+    named, newest = original["paper"]["families"], original["newest"]
+    cells = [
+        f"{f'**`{suite.name}`**' if suite.name in named else f'`{suite.name}`'} | {len(suite.environments):,} | {_cost(suite, costs)}"
+        for suite in families
+    ]
+    half = (len(cells) + 1) // 2
+    rows = zip(cells[:half], [*cells[half:], " |  | "], strict=False)
+    total, deterministic = _total(families), sum(map(_deterministic, families))
+    every = "All ids are" if deterministic == sum(len(suite.environments) for suite in families) else f"{deterministic:,} ids are"
+    return "\n".join(
+        [
+            "| suite | environments | ms a step | suite | environments | ms a step |",
+            "|---|--:|--:|---|--:|--:|",
+            *(f"| {left} | {right} |" for left, right in rows),
+            "",
+            f"The {len(families)} suites hold {total:,} environments; the paper names the families in bold (together `paper13`). The newest version of",
+            f"the original has about {newest['profiles']} profiles in {newest['ecosystems']} ecosystems. {every} deterministic: seed and actions determine the episode.",
+        ]
+    )
+
+
+MARKS = {
+    "<!-- Written by docs/_site/families.py. -->": table,
+    "<!-- Written by docs/_site/families.py, short. -->": short,
+}
+
+
+def _original() -> dict[str, Any]:
+    return tomllib.loads((TOP / "docs" / "_site" / "original.toml").read_text("utf-8"))
+
+
+def _families() -> list[catalogue.Suite]:
+    suites, families = catalogue.suites(), catalogue.families()
+    return [each for name, each in suites.items() if name in families and name != "toy"]
+
+
+def _deterministic(suite: catalogue.Suite) -> int:
+    return sum(catalogue.entry(each).deterministic for each in suite.environments)
+
+
+def _total(families: list[catalogue.Suite]) -> int:
+    return len({each for suite in families for each in suite.environments})
+
+
+def _cost(suite: catalogue.Suite, costs: dict[str, float]) -> str:
+    found = [costs[each] for each in suite.environments if each in costs]
+    return f"{statistics.median(found) / 1000:.3g}" if found else "-"
 
 
 def _costs() -> dict[str, float]:
@@ -74,10 +121,11 @@ def _costs() -> dict[str, float]:
 
 def written(document: str) -> str:
     """A document with the table between its marks."""
-    before, _, rest = document.partition(BEGIN)
+    begin = next(mark for mark in MARKS if mark in document)
+    before, _, rest = document.partition(begin)
     _, end, after = rest.partition(END)
-    assert end, f"the document has no lines {BEGIN!r} and {END!r}"
-    return f"{before}{BEGIN}\n\n{table()}\n\n{END}{after}"
+    assert end, f"the document has no line {END!r} after {begin!r}"
+    return f"{before}{begin}\n\n{MARKS[begin]()}\n\n{END}{after}"
 
 
 if __name__ == "__main__":

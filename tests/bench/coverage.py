@@ -23,10 +23,10 @@ RUNS = (2, 3, 5, 10, 16)
 
 
 def shown(rate: Rate) -> str:
-    """Coverage of the intervals that were told, and how many were not, in percent."""
-    if not rate.distinguished:
+    """Coverage of the intervals that were given, and how many were not, in percent."""
+    if not rate.given:
         return "none"
-    missing = 100.0 * (1.0 - rate.distinguished / rate.trials)
+    missing = 100.0 * (1.0 - rate.given / rate.trials)
     return f"{100.0 * rate.share:.1f}" + (f" ({missing:.0f} none)" if missing >= 0.5 else "")
 
 
@@ -56,7 +56,7 @@ def main() -> None:
             rows[f"{n_runs} run{'s' * (n_runs > 1)}, gaps {spread:g}"] = [
                 shown(found.score), shown(found.rank), shown(found.false_gap), f"{100 * found.pairs_apart:.0f}"
             ]  # fmt: skip
-    table("rank scores", ("score covered", "ranks covered", "false gaps", "pairs told apart"), rows)
+    table("rank scores", ("score covered", "ranks covered", "false gaps", "pairs separated"), rows)
     table(
         "Holm, equal entries",
         (1, 4, 10),

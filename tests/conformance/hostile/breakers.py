@@ -128,7 +128,7 @@ BREAKERS = (
         off=limits(files=20_000),
     ),
     Breaker(
-        name="folders nested deeper than Python recurses, which nobody may open",
+        name="folders without permissions, nested deeper than Python recurses",
         act="[(os.mkdir('d'), os.chdir('d')) for _ in range(1500)]; os.chmod('..', 0)",
         verdict=None,
         harmless_anywhere=True,
@@ -152,33 +152,33 @@ BREAKERS = (
         verdict="process_limit",
         unsealed=True,
     ),
-    Breaker(name="closes its answers", act="os.close(4); time.sleep(60)", verdict="killed"),
-    Breaker(name="closes its questions", act="os.close(3)", verdict="killed"),
-    Breaker(name="closes everything", act="os.closerange(0, 256)", verdict="killed"),
-    Breaker(name="garbage for an answer", act="os.write(4, os.urandom(300))", verdict="killed"),
+    Breaker(name="closes its reply pipe", act="os.close(4); time.sleep(60)", verdict="killed"),
+    Breaker(name="closes its request pipe", act="os.close(3)", verdict="killed"),
+    Breaker(name="closes every descriptor", act="os.closerange(0, 256)", verdict="killed"),
+    Breaker(name="a random reply", act="os.write(4, os.urandom(300))", verdict="killed"),
     Breaker(
-        name="an answer without end",
+        name="an endless reply",
         act="os.write(4, struct.pack('<IBxxx', 1 << 31, 3)); time.sleep(60)",
         verdict="killed",
     ),
     Breaker(
-        name="half an answer",
+        name="half a reply",
         act="os.write(4, b'abc'); time.sleep(60)",
         verdict="act_timeout",
         limits=limits(act_wall_s=0.3),
     ),
     Breaker(
-        name="two answers to one question",
+        name="two replies to one request",
         act="os.write(4, struct.pack('<IBxxxqIBxxxq', 8, 1, 0, 8, 1, 0))",
         verdict="killed",
     ),
     Breaker(
-        name="a wrong kind of answer",
+        name="a reply of the wrong kind",
         act="os.write(4, struct.pack('<IBxxx', 0, 0)); time.sleep(60)",
         verdict="killed",
     ),
     Breaker(
-        name="an array of objects for an answer",
+        name="an array of objects as a reply",
         act="os.write(4, struct.pack('<IBxxx4sIIQ', 20, 3, b'|O\\0\\0', 1, 1, id(self))); time.sleep(60)",
         verdict="killed",
     ),
@@ -188,18 +188,18 @@ BREAKERS = (
         verdict="killed",
     ),
     Breaker(
-        name="a forged count that no encoder takes",
+        name="a forged count that no encoder accepts",
         act='b = b\'{"stage":"act","kind":"action","message":"","traceback":"","used":1\' + b"0" * 30 + b"}"\n'
         "            os.write(4, struct.pack('<IBxxx', len(b), 6) + b); time.sleep(60)",
         verdict="killed",
     ),
     Breaker(
-        name="a forged fault of the sandbox",
+        name="a forged sandbox failure",
         act="os.write(4, struct.pack('<IBxxx', 4, 7) + b'ours'); time.sleep(60)",
         verdict="killed",
     ),
     Breaker(
-        name="a flood of answers", act="[os.write(4, bytes(65536)) for _ in iter(int, 1)]", verdict="killed"
+        name="a flood of replies", act="[os.write(4, bytes(65536)) for _ in iter(int, 1)]", verdict="killed"
     ),
     Breaker(
         name="a huge action",
@@ -235,34 +235,34 @@ BREAKERS = (
         off=PATIENT,
     ),
     Breaker(
-        name="a dict without end",
+        name="an endless dict",
         act="D = type('D', (dict,), {'items': lambda s: iter(lambda: ('a', 1), None)}); return D()",
         verdict="act_error",
     ),
     Breaker(
-        name="a list that lies about its length",
+        name="a list that reports a wrong length",
         act="L = type('L', (list,), {'__len__': lambda s: 1 << 40}); return L([1.0])",
         verdict="act_error",
     ),
     Breaker(
-        name="an array of objects for an action",
+        name="an array of objects as an action",
         act="return np.array([self, None], dtype=object)",
         verdict=None,
     ),
-    Breaker(name="a generator for an action", act="return (x for x in [1.0])", verdict=None),
-    Breaker(name="infinity for an action", act="return [float('inf')]", verdict=None),
-    Breaker(name="NaN for an action", act="return [float('nan')]", verdict=None),
+    Breaker(name="a generator as an action", act="return (x for x in [1.0])", verdict=None),
+    Breaker(name="infinity as an action", act="return [float('inf')]", verdict=None),
+    Breaker(name="NaN as an action", act="return [float('nan')]", verdict=None),
     Breaker(
         name="a nested action", act="a = []; [a := [a] for _ in range(100000)]; return a", verdict="act_error"
     ),
-    Breaker(name="an action that holds itself", act="a = []; a.append(a); return a", verdict="act_error"),
+    Breaker(name="an action that contains itself", act="a = []; a.append(a); return a", verdict="act_error"),
     Breaker(
         name="a pickle",
         act="return type('P', (), {'__reduce__': lambda s: (os.system, ('touch /tmp/evopolicy-pickled',))})()",
         verdict=None,
     ),
     Breaker(
-        name="an action that lies about itself",
+        name="an action whose `__array__` raises",
         act="return type('L', (), {'__array__': lambda s, *a, **k: 1 / 0})()",
         verdict="act_error",
     ),
@@ -270,7 +270,7 @@ BREAKERS = (
     Breaker(name="a segmentation fault", act="ctypes.string_at(1)", verdict="killed"),
     Breaker(name="an abort", act="os.abort()", verdict="killed"),
     Breaker(
-        name="a signal of an illegal instruction", act="signal.raise_signal(signal.SIGILL)", verdict=None
+        name="a signal for an illegal instruction", act="signal.raise_signal(signal.SIGILL)", verdict=None
     ),
     Breaker(
         name="stopping itself",
@@ -291,7 +291,7 @@ BREAKERS = (
         verdict="act_error",
     ),
     Breaker(
-        name="a lower limit on its processor time, to be killed by the kernel",
+        name="a lower limit on its CPU time, to be killed by the kernel",
         act="import resource; resource.setrlimit(resource.RLIMIT_CPU, (1, 1))\n            while True: pass",
         verdict="act_error",
     ),
@@ -302,12 +302,12 @@ BREAKERS = (
         verdict="act_error",
     ),
     Breaker(
-        name="an error that raises when it is looked at",
+        name="an error that raises when it is read",
         act="raise type('E', (OSError,), {'errno': property(lambda s: 1 / 0)})",
         verdict="act_error",
     ),
     Breaker(
-        name="an error with half a character in its text",
+        name="an error with half a surrogate pair in its text",
         act="raise ValueError(chr(0xD800))",
         verdict="act_error",
     ),
@@ -317,7 +317,7 @@ BREAKERS = (
         verdict=None,
     ),
     Breaker(
-        name="another shim",
+        name="a replaced shim",
         act="import gc\n"
         "            for m in list(sys.modules.values()):\n"
         "                for n in ('encoded', 'reply', 'answer', 'check', 'seal'):\n"
@@ -326,17 +326,17 @@ BREAKERS = (
         verdict=None,
     ),
     Breaker(
-        name="no modules any more",
+        name="all modules deleted",
         act="sys.modules.clear(); sys.stdout = sys.stderr = None; return []",
         verdict=None,
     ),
     Breaker(
-        name="no built-in functions any more",
+        name="all built-in functions deleted",
         act="import builtins\n            vars(builtins).clear()",
         verdict="killed",
     ),
     Breaker(
-        name="another os module under the shim",
+        name="a replaced os module under the shim",
         act="os.write = lambda *a: 0; os.readv = None",
         verdict=None,
         limits=limits(act_wall_s=0.3),
@@ -348,24 +348,24 @@ BREAKERS = (
         verdict="killed",
     ),
     Breaker(
-        name="its output in place of its answers",
+        name="its output in place of the reply pipe",
         act="os.dup2(1, 4)",
         verdict="killed",
         limits=limits(act_wall_s=0.3),
     ),
     Breaker(
-        name="a file of its own in place of its answers",
+        name="a file of its own in place of the reply pipe",
         act="os.dup2(os.open('f', os.O_RDWR | os.O_CREAT), 4); time.sleep(60)",
         verdict="killed",
     ),
     Breaker(
-        name="signals in the middle of an answer",
+        name="signals in the middle of a reply",
         act="signal.signal(signal.SIGALRM, lambda *a: os.write(4, b'zz'))\n"
         "            signal.setitimer(signal.ITIMER_REAL, 0.001, 0.001); time.sleep(0.1)",
         verdict="killed",
     ),
     Breaker(
-        name="an answer before the question",
+        name="a reply before the request",
         init="os.write(4, struct.pack('<IBxxx', 0, 0)); time.sleep(0.5)",
         verdict="killed",
     ),
@@ -382,7 +382,7 @@ BREAKERS = (
         else ()
     ),
     Breaker(
-        name="a C function at no address, which scipy calls",
+        name="a C function at address 0, which scipy calls",
         act="from scipy import LowLevelCallable, integrate\n"
         "            kind = ctypes.CFUNCTYPE(ctypes.c_double, ctypes.c_double)\n"
         "            integrate.quad(LowLevelCallable(ctypes.cast(1, kind)), 0.0, 1.0)",
@@ -404,7 +404,7 @@ BREAKERS = (
         unsealed=True,
     ),
     Breaker(
-        name="a thread that goes on answering",
+        name="a thread that continues to reply",
         act="threading.Thread(target=lambda: [os.write(4, 2 * struct.pack('<IBxxxq', 8, 1, 0)) or time.sleep(0.001) for _ in range(9999)]).start(); time.sleep(0.1)",
         verdict="killed",
     ),

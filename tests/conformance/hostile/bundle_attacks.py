@@ -127,7 +127,7 @@ BUNDLES = (
         harm=_tells_the_secret,
     ),
     BundleAttack(
-        name="a bundle with a named pipe, which nobody writes to",
+        name="a bundle with a named pipe without a writer",
         spoil=_pipe,
         verdict="import_error",
         words="named pipe",
@@ -151,7 +151,7 @@ BUNDLES = (
         harm=_copies_every_depth,
     ),
     BundleAttack(
-        name="a bundle with a file of a terabyte of nothing",
+        name="a bundle with a sparse file of a terabyte",
         spoil=_huge,
         verdict="import_error",
         words="1,099,511,627,776",

@@ -1,6 +1,6 @@
 """The corpus of hostile policies: what each does, the verdict it must get, and how its defence is switched off.
 
-Two kinds. *Probes* (files in `policies/`) try one door after another and print `held: …` or `THROUGH: …`: their verdict
+Two kinds. *Probes* (files in `policies/`) try one attack after another and print `held: …` or `THROUGH: …`: their verdict
 is an ordinary episode in which every attempt fails. *Breakers* (`breakers.py`) misbehave at step 3 of an episode, or before its
 first; their verdict is the failure's category. docs/explanation/hostile-policies.md is made by
 
@@ -50,9 +50,9 @@ class Probe(msgspec.Struct, frozen=True, kw_only=True):
     """Options under which every attempt not in `stays_shut` is seen to succeed: a weaker tier, or no seal; None where no
     unprivileged process of an ordinary machine gets through."""
     stays_shut: frozenset[str] = frozenset()
-    """Doors that something else shuts too when this defence is off, or that this machine may not have."""
+    """Attempts that still fail when this defence is off, or that this machine may not support."""
     opens_for_root: frozenset[str] = frozenset()
-    """Doors that file permissions shut too, unless the worker runs as root."""
+    """Attempts that file permissions refuse too, unless the worker runs as root."""
     packages: tuple[str, ...] = ()
     """Packages besides numpy that it imports."""
 
@@ -135,7 +135,7 @@ PROBES = (
 
 
 def document() -> str:
-    """What docs/explanation/hostile-policies.md holds: the corpus as a table, and the words around it from `document.md`."""
+    """docs/explanation/hostile-policies.md: the corpus as a table, inside the text of `document.md`."""
     rows = []
     for probe in PROBES:
         first = (POLICIES / f"{probe.name}.py").read_text().split('"""')[1].rstrip(".")
@@ -160,16 +160,16 @@ def document() -> str:
 
 
 PAIRS = {
-    "Leaves files, shared memory and state for the next episode, which looks for them": "with tier `none`",
-    "Two policies in parallel slots talk by files, shared memory, sockets, locks, a page of a shared file or a device's"
-    " times": "with tier `none`",
-    "Reads all of its memory for what the policies before it in the slot have left: their number, how long they took, how"
-    " they ended": "-",
-    "Looks for names that are not there, which the kernel remembers; a policy in another slot asks by the clock which they"
+    "Leaves files, shared memory, and state for the next episode, which searches for them": "with tier `none`",
+    "Two policies in parallel slots communicate by files, shared memory, sockets, locks, a page of a shared file, or the"
+    " timestamps of a device": "with tier `none`",
+    "Searches all of its memory for traces of earlier policies of the slot: their number, their durations, their exit"
+    " statuses": "-",
+    "Looks up missing names, which the kernel caches; a policy in another slot measures by timing which ones they"
     " were": "with tier `none`",
     "Searches all objects, frames and generators for the case's seed": "with tier `none`",
 }
-"""What is tried with more than one episode, and how it was seen to succeed."""
+"""Attacks that need more than one episode, and how each succeeds without its defence."""
 
 
 if __name__ == "__main__":

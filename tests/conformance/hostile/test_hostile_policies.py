@@ -175,7 +175,7 @@ WEAKER: dict[str, set[str | None]] = {
     # Threads are counted ten times a second, and only while it owes an answer.
     "thread bomb": {None, "process_limit"},
     # It is no process 1, which signals without a handler do not reach.
-    "a signal of an illegal instruction": {"killed"},
+    "a signal for an illegal instruction": {"killed"},
 }
 """Where the weaker tier comes to another verdict."""
 

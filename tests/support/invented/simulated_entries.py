@@ -25,14 +25,14 @@ class Rate(msgspec.Struct, frozen=True, kw_only=True):
     """How often something held."""
 
     held: int
-    distinguished: int
+    given: int
     """Trials in which there was an interval or a verdict."""
     trials: int
     methods: tuple[str, ...] = ()
 
     @property
     def share(self) -> float:
-        return self.held / self.distinguished if self.distinguished else math.nan
+        return self.held / self.given if self.given else math.nan
 
 
 def _normal(g: Generator, n: int) -> tuple[Floats, Floats, float]:
@@ -138,7 +138,7 @@ def coverage(
 ) -> Rate:
     """How often the interval of a difference holds the true gap."""
     generator = np.random.default_rng(seed)
-    held = distinguished = 0
+    held = given = 0
     methods: dict[str, int] = {}
     for _ in range(trials):
         one, other, gap = draw(generator)
@@ -146,10 +146,10 @@ def coverage(
         if found.low is None or found.high is None:
             continue
         methods[found.method] = methods.get(found.method, 0) + 1
-        distinguished += 1
+        given += 1
         held += found.low - 1e-9 <= gap <= found.high + 1e-9
     return Rate(
-        held=held, distinguished=distinguished, trials=trials, methods=tuple(sorted(methods, key=lambda m: -methods[m]))
+        held=held, given=given, trials=trials, methods=tuple(sorted(methods, key=lambda m: -methods[m]))
     )
 
 
@@ -254,9 +254,9 @@ def rank_rates(
                 wrong = wrong or (distinguished and average[i] <= average[j])
         false_gaps += wrong
     return RankRates(
-        score=Rate(held=held, distinguished=trials * n_entries, trials=trials * n_entries),
-        rank=Rate(held=ranks_held, distinguished=trials, trials=trials),
-        false_gap=Rate(held=false_gaps, distinguished=trials, trials=trials),
+        score=Rate(held=held, given=trials * n_entries, trials=trials * n_entries),
+        rank=Rate(held=ranks_held, given=trials, trials=trials),
+        false_gap=Rate(held=false_gaps, given=trials, trials=trials),
         pairs_apart=apart / unequal if unequal else math.nan,
     )
 
@@ -276,7 +276,7 @@ def false_gaps_by_holm(
         wrong += any(
             pair.verdict in ("first", "second") for pair in pairs(samples, names, environments, resamples=50)
         )
-    return Rate(held=wrong, distinguished=trials, trials=trials)
+    return Rate(held=wrong, given=trials, trials=trials)
 
 
 def iqm_coverage(n_runs: int, trials: int, *, n_environments: int = 16, seed: int = 0) -> Rate:
@@ -300,4 +300,4 @@ def iqm_coverage(n_runs: int, trials: int, *, n_environments: int = 16, seed: in
         assert found.iqm.low is not None
         assert found.iqm.high is not None
         held += found.iqm.low <= true <= found.iqm.high
-    return Rate(held=held, distinguished=trials, trials=trials)
+    return Rate(held=held, given=trials, trials=trials)

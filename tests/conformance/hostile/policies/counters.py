@@ -1,4 +1,4 @@
-"""Moves or reads numbers that the kernel keeps for the whole machine: inodes, free blocks, mounts, huge pages"""
+"""Changes or reads machine-wide numbers of the kernel: inodes, free blocks, mounts, huge pages"""
 import ctypes, errno, mmap, os, struct
 libc = ctypes.CDLL(None, use_errno=True)
 libc.mmap.restype = ctypes.c_void_p

@@ -1,4 +1,4 @@
-"""Reaches beyond its process with what it has open: owners, signals, leases, watches, larger pipes"""
+"""Acts beyond its process through its open descriptors: owners, signals, leases, watches, larger pipes"""
 import ctypes, fcntl, os
 libc = ctypes.CDLL(None, use_errno=True)
 

@@ -1,4 +1,4 @@
-"""Becomes another program: the interpreter once more, without the seal."""
+"""Replaces itself by another program: a new interpreter without the filter."""
 import os, sys
 
 def attempts():

@@ -1,4 +1,4 @@
-"""Starts processes in every way there is, also one that would outlive the episode."""
+"""Starts processes in every possible way, including one that would outlive the episode."""
 import ctypes, os, signal, subprocess
 libc = ctypes.CDLL(None, use_errno=True)
 X86 = os.uname().machine == "x86_64"

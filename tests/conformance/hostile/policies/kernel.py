@@ -1,4 +1,4 @@
-"""Asks the kernel for what only sandbox builders and attackers need."""
+"""Makes the system calls that only sandboxes and attackers need."""
 import ctypes, os, struct
 libc = ctypes.CDLL(None, use_errno=True)
 X86 = os.uname().machine == "x86_64"

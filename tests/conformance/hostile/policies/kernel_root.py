@@ -1,4 +1,4 @@
-"""Kernel doors that are shut to every unprivileged process on most machines: only seen to be shut here."""
+"""Makes system calls that most machines refuse to every unprivileged process; the test only checks the refusal."""
 import ctypes, os
 libc = ctypes.CDLL(None, use_errno=True)
 X86 = os.uname().machine == "x86_64"

@@ -1,4 +1,4 @@
-"""Traces, reads and hinders processes, and moves to another core."""
+"""Traces, reads, and disturbs processes, and moves to another core."""
 import ctypes, os, resource, signal
 libc = ctypes.CDLL(None, use_errno=True)
 X86 = os.uname().machine == "x86_64"

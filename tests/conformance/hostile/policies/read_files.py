@@ -1,4 +1,4 @@
-"""Reads what is not the policy's: the machine's files, the simulators, our code, by name, by link and upwards."""
+"""Reads files outside its own: the machine's files, the simulators, our code, by name, by link, and through parent folders."""
 import json, os, sys
 TARGET = json.load(open("target.json"))
 

@@ -1,4 +1,4 @@
-"""Opens connections of every kind to targets on this machine's loopback."""
+"""Opens connections of every kind to targets on the machine's loopback."""
 import json, os, socket
 TARGET = json.load(open("target.json"))
 

@@ -1,4 +1,4 @@
-"""With scipy allowed: C functions that it calls, files in its formats, its worker pools, f2py, the packages beside it."""
+"""With scipy allowed: C callbacks, files in its formats, its worker pools, f2py, neighbouring packages."""
 
 import contextlib
 import ctypes

@@ -1,4 +1,4 @@
-"""Writes where it may not: the interpreter, the packages, the devices, the root."""
+"""Writes to protected places: the interpreter, the packages, the devices, the root."""
 import os, sys
 import numpy
 

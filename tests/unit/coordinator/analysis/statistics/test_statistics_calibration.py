@@ -26,7 +26,7 @@ SLACK = 0.05
 
 
 def assert_covers(rate: Rate, low: float = 0.93, high: float = 0.97) -> None:
-    assert rate.distinguished == rate.trials
+    assert rate.given == rate.trials
     assert low - SLACK <= rate.share <= high + SLACK
 
 
@@ -39,7 +39,7 @@ def test_interval_of_one_run_covers_from_32_cases(shape: str) -> None:
 @pytest.mark.parametrize("n_runs", [2, 5, 10])
 def test_interval_over_runs_covers(kind: str, n_runs: int) -> None:
     found = run_coverage(kind, n_runs, TRIALS, resamples=800)
-    assert found.distinguished >= 0.97 * found.trials  # two runs of 0/1 returns may have equal means
+    assert found.given >= 0.97 * found.trials  # two runs of 0/1 returns may have equal means
     assert 0.92 - SLACK <= found.share <= 0.98
 
 
