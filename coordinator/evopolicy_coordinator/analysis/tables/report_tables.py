@@ -92,7 +92,7 @@ def _aggregate(suite: Suite, study: Study) -> Table:
     if standings.rows:
         columns.append(Column("score_interval", "95 % interval"))
         columns.append(Column("rank_interval", "Rank interval"))
-        columns.append(Column("ties", "Tie group", note="Entries that share a letter cannot be told apart."))
+        columns.append(Column("ties", "Tie group", note="Entries that share a letter do not differ significantly."))
     if budgets:
         columns.append(Column("budget", "Budget", "integer", note="Train episodes of a run."))
     columns += [
@@ -109,7 +109,7 @@ def _aggregate(suite: Suite, study: Study) -> Table:
     if standings.rows:
         caption += (
             f" 95 % interval: of the rank score that a repetition with new {standings.over} would give on average. Tie group: "
-            "entries that share a letter cannot be told apart (all pairs together at 5 %, Holm); the rank interval "
+            "entries that share a letter do not differ significantly (all pairs together at 5 %, Holm); the rank interval "
             "is what these comparisons leave."
         )
         if has_single_runs(suite):

@@ -462,11 +462,11 @@ def _missing(study: Study) -> Table:
     counts = [(table, what, sum(map(lacks, runs))) for table, what, lacks in _MISSING]
     return Table(
         name="not_told",
-        title="Not told",
-        caption="What run directories of the published software do not tell, by the table that lacks it. Nothing is put in its place.",
+        title="Missing values",
+        caption="Values that run directories of the published software lack, by table. They are left empty.",
         columns=(
             Column("table", "Table"),
-            Column("what", "Not told"),
+            Column("what", "Missing value"),
             Column("runs", "Runs", "integer"),
         ),
         rows=tuple({"table": table, "what": what, "runs": n} for table, what, n in counts if n),

@@ -64,7 +64,7 @@ def _pairs(suite: Suite) -> Table:
         caption="Every two entries on every environment: first minus second, in held-out returns of the cases that both have. Interval: "
         "95 %, for one environment and pair alone, over what the column Over names. p: permutation test of no difference, two-sided (over "
         "cases signs are flipped, over runs labels change). Corrected p: Holm, over all pairs of agents of the "
-        "suite; comparisons with the random reference are a family of their own. Told apart: corrected p at most 0.05."
+        "suite; comparisons with the random reference are a family of their own. Significant: corrected p at most 0.05."
         + (f" {CHECKPOINTS}" if has_single_runs(suite) else "")
         + (
             f" In {left_out} rows the entries' cases differ: only common cases pair, and the others are left out."
@@ -81,7 +81,7 @@ def _pairs(suite: Suite) -> Table:
             Column("method", "Method"),
             Column("p", "p", "number", digits=4, below=True),
             Column("p_holm", "Corrected p", "number", digits=4, below=True),
-            Column("told_apart", "Told apart", note="The better entry, or why there is none."),
+            Column("told_apart", "Significantly better", note="The better entry, or the reason for none."),
             Column("compares", "Compares", note="Checkpoints, where an entry has one run; else agents."),
             Column("runs", "Runs"),
             Column("cases", "Cases", "integer"),
