@@ -6,12 +6,13 @@ from collections.abc import Iterator
 from pathlib import Path
 
 NAMES = ("examples/policies", "examples/agents", "examples/notebooks", "deploy", "docs", "constraints.txt")
-"""What is shipped, by its path in the repository; `pyproject.toml` puts it into the package under the same one."""
+"""Shipped files by their path in the repository; `pyproject.toml` packs them under the same path."""
 _NOT_TEXT = ("images", "_site", "__pycache__")
 
 
 def found(path: str | Path, started_in: Path) -> Path:
-    """`path` from where the operator stands, or the package's own where nothing is there, such as `examples/policies`."""
+    """`path` relative to the current folder if it exists there, otherwise the package's copy, such as
+    `examples/policies`."""
     here = started_in / path
     if here.exists() or not any(Path(path).is_relative_to(name) for name in NAMES):
         return here

@@ -105,7 +105,7 @@ def end_without_reader() -> None:
     stream = sys.stdout
     if not isinstance(stream, io.TextIOWrapper):
         return  # closed, or replaced by someone else
-    # SystemExit ends the loop, so asyncio need not report that nobody retrieved the task's exception.
+    # SystemExit ends the loop, so asyncio must not report an unretrieved exception of the task.
     logging.getLogger("asyncio").addFilter(_is_no_exit)
     raw = _WatchedStdout(stream.fileno(), "wb", closefd=False)
     sys.stdout = io.TextIOWrapper(

@@ -65,7 +65,11 @@ def short() -> str:
     half = (len(cells) + 1) // 2
     rows = zip(cells[:half], [*cells[half:], " |  | "], strict=False)
     total, deterministic = _total(families), sum(map(_deterministic, families))
-    every = "All ids are" if deterministic == sum(len(suite.environments) for suite in families) else f"{deterministic:,} ids are"
+    every = (
+        "All ids are"
+        if deterministic == sum(len(suite.environments) for suite in families)
+        else f"{deterministic:,} ids are"
+    )
     return "\n".join(
         [
             "| suite | environments | ms a step | suite | environments | ms a step |",

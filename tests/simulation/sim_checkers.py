@@ -221,7 +221,9 @@ class Checkers:
             for held in request.held:
                 group, _, first = held.job_id.rpartition("/")
                 row = disk.outcome(group, int(first))
-                notified = row is None or held.lease_id in self._handed_in or held.lease_id in message.cancelled
+                notified = (
+                    row is None or held.lease_id in self._handed_in or held.lease_id in message.cancelled
+                )
                 want(notified, "who plays what is done already is told to stop", held, row)
         elif isinstance(message, wire.Leases) and isinstance(request, wire.LeaseRequest):
             for lease in message.leases:
@@ -289,7 +291,9 @@ class Checkers:
             if worker.name in self.named:
                 continue
             last, since = self._heard.get(worker.name, (-1e9, now))
-            reported = [each for each in worker.outbox if each.job_id == job.job_id and each.begun is not None]
+            reported = [
+                each for each in worker.outbox if each.job_id == job.job_id and each.begun is not None
+            ]
             played = [
                 each.lease_id
                 for each in worker.running.values()

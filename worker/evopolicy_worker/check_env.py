@@ -49,7 +49,7 @@ COLUMNS = (
 
 
 class InASlot(msgspec.Struct, frozen=True, kw_only=True):
-    """What a worker's slot costs with the environment in it."""
+    """The cost of a worker's slot that plays the environment."""
 
     microseconds: float = 0.0
     """A step of a train episode with a policy that always returns the same; 0: not measured."""

@@ -37,7 +37,7 @@ PAUSE_S = 0.5
 
 
 class Describes(Protocol):
-    """What is needed of a slot."""
+    """The methods of a slot that are used here."""
 
     async def start(self) -> None: ...
 
@@ -53,7 +53,7 @@ class Cache:
         self._folder = folder or cache_home() / "descriptions"
 
     def get(self, env_id: str) -> EnvironmentDescription | None:
-        """The description, if it is there and holds now."""
+        """The cached description, if it is still valid."""
         try:
             kept = _files.decode(self._path(env_id).read_bytes())
         except (OSError, *DECODE_ERRORS):
@@ -62,7 +62,7 @@ class Cache:
         return kept.description if holds else None
 
     def put(self, description: EnvironmentDescription) -> None:
-        """Keeps a description, if it can be told later whether it holds. A folder that cannot be written costs only time."""
+        """Stores a description, if its validity can be checked later. An unwritable folder only costs time."""
         key = self._key(description.env)
         if not key:
             return

@@ -100,7 +100,7 @@ class Outbox:
             self.hurry()
 
     def hurry(self) -> None:
-        """Reports what is there without waiting for more."""
+        """Reports the available results without waiting for more."""
         self._hurried.set()
 
     async def wait_empty(self) -> None:

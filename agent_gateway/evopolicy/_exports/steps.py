@@ -39,7 +39,7 @@ class Call:
 
 @dataclass(kw_only=True)
 class Result:
-    """What a tool call returned."""
+    """The result of one tool call."""
 
     call: Call | None
     """None when the log does not show the call."""
@@ -70,7 +70,7 @@ def read_steps(path: Path) -> list[Step]:
     """The steps of a log in order; none when it is missing or not a regular file."""
     log = _Log()
     try:
-        # A run's directory may come from somebody else: a link would quote another file, a pipe would never end.
+        # A run directory may be untrusted: a link would quote another file, and reading a pipe would block.
         with open(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
             if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
                 return []
@@ -202,7 +202,7 @@ def _text(value: Any, depth: int = 0) -> str:
 
 
 def _is_deeper(value: Any, levels: int) -> bool:
-    """Whether lists and objects are nested in more than so many levels."""
+    """Whether lists and objects are nested more than `levels` deep."""
     if not isinstance(value, dict | list):
         return False
     inner = value.values() if isinstance(value, dict) else value

@@ -83,7 +83,7 @@ class Point(NamedTuple):
 
 
 class Tracker(Protocol):
-    """Where metrics go."""
+    """The destination of metrics."""
 
     def n_known(self, curve: Curve) -> int:
         """Number of submits of this run that it has; -1 when it has the whole run."""
@@ -92,7 +92,7 @@ class Tracker(Protocol):
         """Adds metrics; `n_submits` counts those that it has now."""
 
     def close(self) -> None:
-        """Writes what is left."""
+        """Writes the remaining data."""
 
 
 def track(paths: list[Path], tracker: Tracker, *, follow: bool) -> Iterator[str]:
@@ -209,7 +209,7 @@ def _record(folder: Path) -> RunRecord | None:
 
 
 class _Known(msgspec.Struct, frozen=True):
-    """What a file beside a tracker's own files remembers of a run."""
+    """The state of a run's export, stored beside a tracker's own files."""
 
     run: str
     """`Curve.id`."""

@@ -18,7 +18,7 @@ ATIF = "ATIF-v1.7"
 
 
 def write_atif(runs: Runs, out: Path) -> list[Path]:
-    """Writes `<entry>/<env>/<experiment>/trajectory.json` for each run; a file that is there is replaced."""
+    """Writes `<entry>/<env>/<experiment>/trajectory.json` for each run, over existing files."""
 
     def write(run: Run, steps: list[Step]) -> Path:
         path = out / _name(run) / "trajectory.json"

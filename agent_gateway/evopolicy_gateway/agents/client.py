@@ -151,7 +151,7 @@ class Client:
             self.sleep(self.poll_s)
 
 
-# The gateway is on this machine; a proxy from the surroundings must not be asked for it.
+# The gateway is on this machine, so a proxy of the environment must not be used.
 _OPENER = urllib.request.build_opener(urllib.request.ProxyHandler({}))
 
 

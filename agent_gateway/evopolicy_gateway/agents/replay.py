@@ -80,7 +80,7 @@ def play(client: Client, folder: Path, workspace: Path) -> int:
         int(info["min_episodes_per_submit"]),
         int(info["max_episodes_per_submit"]),
     )
-    # The policies that got no episodes are said, not dropped in silence.
+    # Report the policies that got no episodes.
     for policy in policies[len(plan) :]:
         print(f"{policy}: no budget left", flush=True)
     n_taken = 0

@@ -118,7 +118,7 @@ PLACES = {name: place for places in GROUPS.values() for name, place in places.it
 
 
 class _Commands(Mapping[str, Any]):
-    """The commands by name, each imported when it is asked for."""
+    """The commands by name, each imported on first use."""
 
     def __getitem__(self, name: str) -> Any:
         module, _, app = PLACES[name].app.partition(":")

@@ -154,7 +154,7 @@ OWN = {
     "hidden_cases": "shared",
     "feedback": "pictures",
 }
-"""What is chosen where neither an option nor a profile says."""
+"""Defaults of settings that neither an option nor a profile gives."""
 
 
 def settings_of(profile: str | None, **given: str | None) -> dict[str, str]:
@@ -173,10 +173,8 @@ def settings_of(profile: str | None, **given: str | None) -> dict[str, str]:
 
 
 def run_settings(given: Any, limits: ResourceLimits, **named: Any) -> RunSettings:
-    """Of one run. `given`: the options of `run` or a suite's table, which have the same names; None for what was not told.
-
-    ConfigError naming what is wrong.
-    """
+    """The settings of one run. `given`: the options of `run`, or a table of a suite, which have the same names; None
+    for options that were not given. Raises ConfigError that names the invalid option."""
     names = ("policy_scope", "observations", "simulation", "finish", "step_limit", "feedback")
     chosen: dict[str, Any] = settings_of(
         given.profile,
@@ -204,7 +202,7 @@ def run_settings(given: Any, limits: ResourceLimits, **named: Any) -> RunSetting
 
 
 def state_of(state: Path | None, *, fresh: bool) -> Path | None:
-    """The state folder of a local cluster; None for one that is thrown away. ConfigError for both options."""
+    """The state folder of a local cluster; None for a temporary one. Raises ConfigError when both options are given."""
     if fresh and state is not None:
         raise ConfigError(f"--fresh and --state {state}: give only one of them")
     return None if fresh else state or local_state_dir()

@@ -300,7 +300,7 @@ def finish(
 def _plans(
     given: RunOptions, env_ids: list[str], jail: JailSettings, served: ListenerOptions | None = None
 ) -> list[Plan]:
-    """A plan for each environment. ConfigError for whatever is wrong with any of them, before anything is started."""
+    """A plan for each environment. Raises ConfigError for any error before anything is started."""
     if given.resume and (given.overwrite or given.exp_id is None):
         raise ConfigError("--resume needs --exp-id, and cannot be combined with --overwrite")
     started_in = Path.cwd()

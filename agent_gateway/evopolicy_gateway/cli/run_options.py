@@ -204,7 +204,7 @@ class RunOptions(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class JailOptions(msgspec.Struct, frozen=True, kw_only=True):
-    """What the agent sees and reaches."""
+    """The agent's view of its episodes, and its access to files and hosts."""
 
     jail: Annotated[
         Mode,
@@ -247,7 +247,7 @@ class JailOptions(msgspec.Struct, frozen=True, kw_only=True):
     ] = None
 
     def settings(self) -> JailSettings:
-        """The jail that is asked for. ConfigError naming the option that is wrong, or what this machine lacks."""
+        """The requested jail. Raises ConfigError that names the invalid option, or the missing part of this machine."""
         started_in = Path.cwd()
         settings = JailSettings(
             mode=self.jail,
@@ -260,7 +260,7 @@ class JailOptions(msgspec.Struct, frozen=True, kw_only=True):
         return settings
 
     def of_remote_agent(self) -> JailSettings:
-        """None of ours, as somebody else starts the agent. ConfigError when one is asked for."""
+        """No jail, since the operator starts a remote agent. Raises ConfigError when one is requested."""
         widened = (self.jail_bind, self.jail_bind_rw, self.jail_env, self.allow_host)
         if self.jail == "open-network" or any(widened):
             raise ConfigError(
@@ -270,7 +270,7 @@ class JailOptions(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class ListenerOptions(msgspec.Struct, frozen=True, kw_only=True):
-    """Where a remote agent is served."""
+    """A remote agent's HTTP address."""
 
     http: Annotated[
         str | None,

@@ -182,7 +182,7 @@ async def _listen(gateway: Gateway) -> None:
 
 
 def progress_of(pipeline: SubmitPipeline) -> Progress:
-    """What the operator's live view shows of a run."""
+    """A run in the operator's live view."""
     settled = [ticket for ticket in pipeline.tickets if ticket.status is not None]
     means = [ticket.mean for ticket in settled if ticket.mean is not None]
     running = pipeline.in_flight

@@ -38,7 +38,7 @@ app = App()
 
 
 class Order(msgspec.Struct, frozen=True, kw_only=True):
-    """What the command was asked for."""
+    """The command's options."""
 
     suite: SuiteFile
     runs: tuple[Plan, ...]
@@ -174,7 +174,7 @@ async def _suite(order: Order) -> int:
                 if one.kind == "keep":
                     _keep(order, index, one)
                 elif one.run.name not in index.runs:
-                    # So that whoever looks at the sweep sees what waits, too.
+                    # The live view then also shows the reasons of waiting runs.
                     index.runs[one.run.name] = suite_index.waiting(one.run)
             suite_index.save(order.root, index)
             names = [run.name for run in order.runs]

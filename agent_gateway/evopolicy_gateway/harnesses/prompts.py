@@ -118,4 +118,6 @@ def check_text(where: str, text: str, known: tuple[str, ...]) -> None:
 
 def _filled(text: str, standard: str, left: int | None) -> str:
     episodes_left = "unknown" if left is None else str(left)
-    return Template(text).substitute(standard=Template(standard).substitute(left=episodes_left), left=episodes_left)
+    return Template(text).substitute(
+        standard=Template(standard).substitute(left=episodes_left), left=episodes_left
+    )

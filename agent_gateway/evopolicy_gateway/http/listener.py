@@ -107,7 +107,7 @@ def place_of(named: str) -> AgentPlace:
 
 
 def agent_place(folder: RunFolder) -> AgentPlace:
-    """Where the agent of an open run is alive: on the gateway's kernel, unless it is started elsewhere."""
+    """The place of an open run's agent: the gateway's kernel, unless the agent is started elsewhere."""
     if not folder.listener.exists():
         return AgentPlace(boot_id=host.boot_id(), machine_id=host.machine_id(), host=platform.node())
     named = _agent_host(folder)

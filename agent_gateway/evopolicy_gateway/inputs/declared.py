@@ -22,7 +22,7 @@ from evopolicy_common.records.run_record import AgentInput
 from evopolicy_gateway.jail.settings import host
 
 IN_JAIL = "/inputs"
-"""Where a jail shows them."""
+"""Their folder in a jail."""
 SKILL = "SKILL.md"
 MAX_FILES = 2000
 MAX_BYTES = 16 << 20

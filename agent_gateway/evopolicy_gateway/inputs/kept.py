@@ -129,7 +129,7 @@ def _write(declared: Sequence[Content], folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     servers = {each.recorded.name: _start(each) for each in declared if each.recorded.kind == "mcp"}
     document: dict[str, Any] = {"mcpServers": msgspec.to_builtins(servers)}
-    # Last and at once: it tells that all copies are there.
+    # Written last and atomically: it marks the copies as complete.
     write_atomically(folder / "mcp.json", json.dumps(document, indent=2).encode())
 
 

@@ -51,7 +51,8 @@ _MIN_SECRET = 16
 
 
 def places(user_config: bool | tuple[str, ...], program: str) -> tuple[str, ...]:
-    """What `user_config` copies. Raises ConfigError for a path that is not below `~/`, and where nothing is known of the program."""
+    """Paths that `user_config` copies. Raises ConfigError for a path that is not below `~/`, and for `true` with an
+    unknown program."""
     if not isinstance(user_config, bool):
         for path in user_config:
             if not path.startswith("~/") or os.path.normpath(path) != path.rstrip("/") or path == "~/":

@@ -257,6 +257,6 @@ class Orders:
                         continue
                     loop.call_soon_threadsafe(self._queue.put_nowait, order)
         finally:
-            # A child that can no longer read orders, for whatever reason, ends as if its parent were gone.
+            # A child that can no longer read commands ends as if its parent were gone.
             with contextlib.suppress(RuntimeError):  # the loop is closed already
                 loop.call_soon_threadsafe(self._queue.put_nowait, None)

@@ -57,7 +57,7 @@ class TriedEpisode(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def played_by(self) -> str:
-        """Whose actions produced the return."""
+        """The source of the actions."""
         if self.episode_return is None:
             return "not played"
         if self.failure is None:

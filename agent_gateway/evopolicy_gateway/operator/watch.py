@@ -60,7 +60,7 @@ class Row:
         self.phase: RunProgress | None = None
         self.action = ""
         self.held = ""
-        """What it waits for before it may start or close; also in `waits_for`."""
+        """The reason why it waits to start or to close; also in `waits_for`."""
         self.waits_for = ""
 
 

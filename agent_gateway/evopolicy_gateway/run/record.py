@@ -356,7 +356,7 @@ def _env_log(finished: RunFinished) -> bytes:
 
 
 def _put_in_place(system: Path, bundle: Bundle) -> None:
-    """Replaces `system`, whatever the agent left there, by the bundle."""
+    """Replaces `system/` by the bundle, whatever it contains."""
     give_back_rights(system.parent)
     # Only a real folder is removed recursively; opening a pipe would block until its other end opens.
     if system.is_dir() and not system.is_symlink():

@@ -71,7 +71,7 @@ FETCHES_AT_ONCE = 4
 RUN_CLOSED = "run_closed"
 """The published protocol's status for a submit after the last possible one."""
 MAX_DEATHS = 2
-"""Number of gateway deaths over one submit, or over one episode's files, after which that is given up."""
+"""Number of gateway crashes over one submit, or over one episode's files, after which it is abandoned."""
 _REQUEST_STATUSES = (Refusal.BUDGET_INVALID, Refusal.INVALID_ENV_INSTANCE)
 
 
@@ -355,7 +355,7 @@ class SubmitPipeline:
         self._on_change()
 
     async def _goes_on_without(self, ticket: Ticket, error: Exception) -> bool:
-        """True when the submit is given up. The first failure ends this gateway instead; the next one retries."""
+        """True when the submit is abandoned. The first failure ends this gateway; the next gateway retries."""
         key = ticket.request.key
         log.error("submit failed", submit=ticket.submit_id, exc_info=error)
         self._deaths[key, None] += 1

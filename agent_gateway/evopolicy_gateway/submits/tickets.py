@@ -58,7 +58,7 @@ class Ticket:
         self.warning: str | None = None
         """The warning to the agent about policy failures."""
         self.error: RequestError | None = None
-        """Why it was given up or refused."""
+        """The reason for its failure or refusal."""
         self.n_episodes = len(request.env_instances)
         self._episode_budget = episode_budget
         self._load: Callable[[], bytes] | None = None

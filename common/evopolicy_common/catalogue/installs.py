@@ -61,7 +61,7 @@ class Made(msgspec.Struct, frozen=True, kw_only=True):
     ready: bool = False
     """False while it is being made, or when that failed."""
     folder: str = ""
-    """Where it was found; not in the file."""
+    """Its folder; not in the file."""
 
     @property
     def python(self) -> str:
@@ -87,7 +87,8 @@ def family_of(env_id: str) -> str:
 
 
 def apart(families: Iterable[str] = ()) -> list[str]:
-    """What pip installs with `--no-deps` for the families, by default all that share an installation: `NAME==VERSION`."""
+    """Requirements (`NAME==VERSION`) that pip installs with `--no-deps` for the families; by default for all that
+    share an installation."""
     rows = [each for name, each in installs().items() if name in families or not (families or each.pins)]
     return [f"{name}=={version}" for each in rows for name, version in each.apart.items()]
 

@@ -42,12 +42,13 @@ class EnvironmentDescription(msgspec.Struct, frozen=True, kw_only=True):
     obs_space: SpaceSchema
     action_space: SpaceSchema
     obs_storage: ObsStorage = "inline"
-    """Where feedback keeps observations: in the trajectory's rows, or in `observations.npy` / `.npz` beside it."""
+    """Storage of observations in feedback: in the rows of the trajectory, or in `observations.npy` / `.npz` beside
+    it."""
     max_episode_steps: Int
     reward_components: Many[Text] = ()
     """Names under which `info`, or its `rewards`, reports parts of the reward; summed per episode in the summary."""
     reward_texts: Named[Text] = {}
-    """What each reward component stands for; empty from workers of older versions."""
+    """Meaning of each reward component; empty from workers of older versions."""
     task_text: Text
     """Markdown for `/task`: objective, observation, action, reward, how an episode ends."""
     deterministic: bool = True
@@ -67,8 +68,8 @@ class EnvironmentDescription(msgspec.Struct, frozen=True, kw_only=True):
     success_at: Literal["end", "any"] = "end"
     """Whether only the last step's value counts, or a true value at any step."""
     adapter: Word = ""
-    """What plays it: the revision of its adapter, `+`, and a digest of the adapter's code. Empty from workers of
-    older versions, whose fingerprint is that of the whole worker."""
+    """Revision of the adapter, `+`, and a digest of the adapter's code. Empty from workers of older versions, whose
+    fingerprint is that of the whole worker."""
     packages: Named[Text] = {}
     """Name to exact version of the distributions that decide this environment's numbers."""
     step_us: Number = 0.0

@@ -34,7 +34,7 @@ TIME_LIMITS: frozenset[str] = frozenset({"act_timeout", "episode_timeout", "cpu_
 """Failure categories that the summary also lists under `timeouts`."""
 
 Record = Literal["full", "actions"]
-"""What a worker keeps of an episode: the whole trajectory, or (for hidden episodes) only the action log."""
+"""A worker's record of an episode: the whole trajectory, or (for hidden episodes) only the action log."""
 
 Tier = Literal["bwrap", "landlock", "none"]
 
@@ -138,7 +138,7 @@ class Job(msgspec.Struct, frozen=True, kw_only=True):
     max_steps: Int = 0
     """An episode is cut after this many steps; 0: only its environment ends it."""
     begun: BlobRef | None = None
-    """What the policy returned in an earlier attempt, which stays valid (`JobResult.begun`); None: start afresh."""
+    """The policy's actions of an earlier attempt, which remain valid (`JobResult.begun`); None for a first attempt."""
 
 
 class PolicyFailure(msgspec.Struct, frozen=True, kw_only=True):
@@ -152,7 +152,7 @@ class PolicyFailure(msgspec.Struct, frozen=True, kw_only=True):
     limit: Number | None = None
     """Value of the exceeded limit, in its own unit; None when it was no limit."""
     used: Number | None = None
-    """What the policy used of that limit, in the same unit."""
+    """The policy's use of that limit, in the same unit."""
 
 
 class EpisodeOutcome(msgspec.Struct, frozen=True, kw_only=True):

@@ -40,8 +40,8 @@ SimulationRule = Literal["forbidden", "allowed"]
 FinishRule = Literal["early", "budget"]
 """Whether a run whose agent stops before it has spent its budget is scored (`early`) or is an error (`budget`)."""
 FeedbackDetail = Literal["scores", "trajectories", "pictures"]
-"""What an agent is shown of its episodes: `scores` is the summary alone, `trajectories` adds what is text, `pictures`
-adds observations that are stored outside the rows, and videos where they are recorded."""
+"""Feedback level: `scores` is the summary alone, `trajectories` adds text, and `pictures` adds observations that are
+stored outside the rows, and recorded videos."""
 Profile = Literal["own", "published"]
 """`published`: all choices of the published protocol together (`operator.off_profile`)."""
 
@@ -81,7 +81,7 @@ class Permit(Message, frozen=True, kw_only=True, tag="permit"):
     granted: bool
     """False: not granted within `wait_s`; the agent must not start, and the gateway sends the request again."""
     waits_for: Text = ""
-    """What the permit waits for, in words that reveal nothing of other runs' results."""
+    """The reason why the permit waits, in words that reveal nothing about other runs' results."""
 
 
 FREE_SLOT = "a free slot"
@@ -95,7 +95,7 @@ class SubmitInFlight(msgspec.Struct, frozen=True, kw_only=True):
     n_episodes: Int
     n_done: Int
     waits_for: Text = ""
-    """What it waits for while none of its episodes runs, in words for the agent; empty while episodes run."""
+    """The reason why none of its episodes runs, in words for the agent; empty while episodes run."""
     held_s: Number = 0.0
     """Seconds in which none of its episodes ran because hidden work had the machines; they count against no limit."""
 

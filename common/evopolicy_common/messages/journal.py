@@ -8,8 +8,7 @@ from evopolicy_common.messages.bounds import Int, Word
 
 
 class Committed(msgspec.Struct, frozen=True, kw_only=True):
-    """What the coordinator committed to before the run's agent started, with its journal entries. See
-    `records.journal`."""
+    """The coordinator's commitment before the run's agent started, with its journal entries. See `records.journal`."""
 
     commitment: Word
     """Salted SHA-256 (hex) of the run's splits and settings."""

@@ -434,7 +434,7 @@ class ClaimState(Message, frozen=True, kw_only=True, tag="claim_state"):
     """True when the requester holds the claim or has just settled it. False: another host holds it, it was settled
     before, or this request released it."""
     holder: Word
-    """The present or last holder; empty: nobody."""
+    """The present or last holder; empty for none."""
     run: Word
     """The run that the last holder played for it; empty: none yet."""
     previous: Word = ""
@@ -596,7 +596,7 @@ class RunStatus(msgspec.Struct, frozen=True, kw_only=True):
     """Finished episode jobs, train and hidden together."""
     waits_for: Text = ""
     agent_host: Word = ""
-    """Where its agent may be alive: a host's name, a boot id, or `everywhere`; empty: nowhere."""
+    """Place of its agent: a host's name, a boot id, or `everywhere`; empty: nowhere."""
     exp_id: Word = ""
     repeat: Int = 0
     best_mean: Number | None = None
@@ -653,7 +653,7 @@ class StatusReply(Message, frozen=True, kw_only=True, tag="status_reply"):
     workers: Many[WorkerStatus]
     runs: Many[RunStatus]
     stalls: Many[Text] = ()
-    """What waits longer than it should, and for what."""
+    """Items that have waited too long, with the reasons."""
     audit_share: Number = 0.0
     """Share of the episodes of new runs that is audited, 0 to 1."""
     audits: Named[Int] = {}

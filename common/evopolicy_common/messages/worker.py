@@ -30,7 +30,8 @@ class Refused(Message, frozen=True, kw_only=True, tag="refused"):
 
 
 class Fingerprint(msgspec.Struct, frozen=True, kw_only=True):
-    """What a worker's numbers depend on besides the seed: of the whole worker, or of one environment (see `of`)."""
+    """Everything besides the seed that determines numerical results: of the whole worker, or of one environment (see
+    `of`)."""
 
     code_version: Word
     """Version and source digest of the worker's own code."""

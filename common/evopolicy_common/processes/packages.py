@@ -73,15 +73,15 @@ def versions_of(names: Iterable[str]) -> dict[str, str]:
 
 
 def policy_versions(names: Iterable[str]) -> dict[str, str]:
-    """What a fingerprint says of the packages that policies may import besides numpy: the names, and all versions.
-
-    Empty without packages. Raises as `files_of`.
-    """
+    """The entries of a fingerprint for the packages that policies may import besides numpy: their names, and all
+    versions. Empty without packages. Raises as `files_of`."""
     requested = sorted(set(names))
     if not requested:
         return {}
     files_of(requested)
-    found = {f"{POLICY}:{name}": version for name, version in versions_of(requested).items() if name != "numpy"}
+    found = {
+        f"{POLICY}:{name}": version for name, version in versions_of(requested).items() if name != "numpy"
+    }
     return {POLICY: ",".join(requested), **found}
 
 
@@ -91,7 +91,7 @@ def packages_in(fingerprint: Mapping[str, str]) -> tuple[str, ...]:
 
 
 def modules_of(names: Iterable[str]) -> list[str]:
-    """What to import of the named distributions (or import names): scikit-learn is imported as `sklearn`."""
+    """Import names of the named distributions (or import names): scikit-learn is imported as `sklearn`."""
     found: list[str] = []
     for name in names:
         if name.isidentifier() and importlib.util.find_spec(name) is not None:
@@ -115,9 +115,11 @@ def _numpy() -> tuple[dict[str, str], list[str]]:
     return {path.name: str(path) for path in both if path.is_dir()}, []
 
 
-def _one(name: str, requested: str, *, required: bool, metadata_too: bool) -> tuple[dict[str, str], list[str]]:
+def _one(
+    name: str, requested: str, *, required: bool, metadata_too: bool
+) -> tuple[dict[str, str], list[str]]:
     """Folders and modules of one distribution, and what it requires."""
-    # A run.json of somebody else may name anything, which would stand in a command to be copied.
+    # A run.json may be untrusted and name anything; the name appears in a command for the user to copy.
     if required and not _NAME.fullmatch(name):
         raise ConfigError(f"{name!r} is no name of a package; leave it out")
     distribution = _distribution(name)

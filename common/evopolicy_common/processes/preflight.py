@@ -44,7 +44,8 @@ _MAY_PASS = frozenset(
 
 
 def explained(error: OSError) -> str | None:
-    """The machine's fault with path and remedy, in one line; None for any other error, which may be a bug of ours."""
+    """The machine's fault with path and remedy, in one line; None for any other error, which may be a bug of this
+    software."""
     remedy = _REMEDIES.get(error.errno or 0)
     if remedy is None:
         return None

@@ -60,7 +60,7 @@ OLD_FIELDS: Mapping[str, tuple[str, ...]] = {
 _OLD_SYSTEM = re.compile(r"^(checkpoints/[^/]+/)system/")
 
 MAX_PARSED_BYTES = 64 << 20
-"""Larger files, in bytes, come from an agent, whatever their name, and are compared as plain bytes."""
+"""Files above this size (bytes) were written by an agent, whatever their names, and are compared as plain bytes."""
 MAX_COMPARED_BYTES = 1 << 30
 """Larger files, in bytes, are not compared: an agent may leave huge sparse files."""
 

@@ -87,7 +87,7 @@ class Agent(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class ExperimentDimensions(msgspec.Struct, frozen=True, kw_only=True):
-    """What defines the experiment besides agent and environment; runs that differ here are not comparable."""
+    """Settings that define the experiment besides agent and environment; runs that differ here are not comparable."""
 
     episode_budget: int
     min_episodes_per_submit: int
@@ -105,12 +105,12 @@ class ExperimentDimensions(msgspec.Struct, frozen=True, kw_only=True):
     finish: FinishRule = "early"
     """Whether a run whose agent stops before it has spent its budget is scored (`early`) or is an error (`budget`)."""
     step_limit: StepLimit = "natural"
-    """Where episodes are cut: where the published software cuts them, or only by their environment's own limit, as
-    in all runs from before this was recorded."""
+    """Step limit: that of the published software, or only the environment's own limit, as in all runs from before
+    this field existed."""
     profile: Profile = "own"
     """`published`: all choices of the published protocol together, including its public case files."""
     feedback: FeedbackDetail = "pictures"
-    """What the agent was shown of its episodes; everything, in all runs from before this was recorded."""
+    """The agent's feedback level; all feedback in runs from before this field existed."""
     agents_md: str = ""
     """SHA-256 (`sha256:…`) of the operator's text in place of `AGENTS.md`; empty: the standard text."""
     hidden_cases: HiddenCases = "shared"
@@ -160,8 +160,8 @@ class ReferenceScore(msgspec.Struct, frozen=True, kw_only=True):
     """Population standard deviation."""
     returns: tuple[float, ...] = ()
     seeded_by: Literal["case", "run"] = "run"
-    """What determines the actions. `case`: only split and case, so the numbers are the same in every run on the
-    split. `run`: a run's own secret, as in runs of earlier versions, which differ from run to run."""
+    """Source of the actions. `case`: split and case only, so the numbers are equal in every run on the split. `run`:
+    a secret of the run, as in earlier versions, so the numbers differ between runs."""
 
 
 class Outcome(msgspec.Struct, frozen=True, kw_only=True):
@@ -329,7 +329,7 @@ class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
     audit: AuditRecord | None = None
     """Result of the audits on other workers; None without audits."""
     committed: Committed | None = None
-    """What the coordinator committed to before the agent started; None for runs from before it kept a journal."""
+    """The coordinator's commitment before the agent started; None for runs from before the journal."""
 
 
 class _Header(msgspec.Struct, frozen=True, kw_only=True):

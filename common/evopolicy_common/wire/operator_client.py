@@ -90,8 +90,7 @@ class OperatorClient:
         await self._done("worker", SetWorker(token=self._token, worker=worker, state=state))
 
     async def describe(self, message: DescribeEnvironment) -> EnvironmentState:
-        """What the cluster has for replaying a finished run's episodes. Waits for a worker that describes the environment
-        now."""
+        """Data for replaying a finished run's episodes. Waits for a worker that describes the environment now."""
         request = replace(message, token=self._token)
         until = time.monotonic() + DESCRIPTION_S
         while True:
@@ -155,7 +154,7 @@ class OperatorClient:
                 return entries
 
     async def opening(self, run: str) -> RunOpening:
-        """What the coordinator committed to for a disclosed run."""
+        """The committed document of a disclosed run."""
         message = OpeningRequest(token=self._token, run=run)
         return await self._requests.until_answered("opening", message, RunOpening, timeout_s=TIMEOUT_S)
 

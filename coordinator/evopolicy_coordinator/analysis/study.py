@@ -83,7 +83,7 @@ class Study(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def post_hoc(self) -> str:
-        """What the held-out scores are of when they are a re-score's; empty for the runs' own."""
+        """The name of the re-score that the held-out scores come from; empty for the runs' own scores."""
         found = next((run.rescore for run in self.runs if run.rescore is not None), None)
         if found is None:
             return ""

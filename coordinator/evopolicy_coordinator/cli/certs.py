@@ -24,7 +24,7 @@ from evopolicy_coordinator.storage.state_folder import cluster_of
 app = App(help="Certificates for the machines of a cluster.", no_args_is_help=True)
 
 PORT = 7447
-"""Where a coordinator is taken to listen, unless told otherwise."""
+"""A coordinator's default address."""
 _LOOPBACK = ("localhost", "127.0.0.1", "::1")
 
 State = Annotated[
@@ -198,7 +198,7 @@ def _validity(expires: dt.datetime, revoked: dt.datetime | None, now: dt.datetim
 
 
 def _facts(machine: Machine) -> dict[str, object]:
-    """What may be shown of a machine: neither its password nor its token."""
+    """A machine's public fields: neither its password nor its token."""
     return {
         "name": machine.name,
         "role": machine.role,
@@ -211,7 +211,7 @@ def _facts(machine: Machine) -> dict[str, object]:
 
 
 def first_endpoint(root: Path) -> str:
-    """Where the coordinator is taken to listen; ConfigError before `certs init`."""
+    """The coordinator's address. Raises ConfigError before `certs init`."""
     own = machines.coordinators_certificate(root)
     if own is None:
         raise ConfigError(f"{root} has no certificate authority yet: evopolicy-coordinator certs init")
@@ -227,7 +227,9 @@ def _own_hosts() -> tuple[str, ...]:
     """This machine's address on the way out, if it has one, and its names."""
     found = []
     with contextlib.suppress(OSError), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.connect(("192.0.2.1", 9))  # sends nothing: only the route is asked for
+        probe.connect(
+            ("192.0.2.1", 9)
+        )  # connect() on a datagram socket sends nothing; it only selects the route
         found.append(str(probe.getsockname()[0]))
     for name in (socket.getfqdn(), socket.gethostname()):
         with contextlib.suppress(ConfigError):

@@ -134,7 +134,7 @@ def check(
 
 
 def _report(folder: Path) -> dict[str, Any]:
-    """What is to be said of one environment's folder."""
+    """The report on one environment's folder."""
     loaded, findings = splits.load(folder)
     if loaded is None:
         return {"folder": str(folder), "env": None, "findings": findings}

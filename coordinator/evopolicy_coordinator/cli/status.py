@@ -129,7 +129,7 @@ def list_workers(connect: Connect = None, file: CredentialsFile = None, as_json:
 
 
 def _names(env_ids: Sequence[str]) -> str:
-    """Environments as they are asked for: a suite's name for all of a suite."""
+    """Environments in short form: a suite's name for all of a suite."""
     left, names = set(env_ids), []
     for suite in catalogue.suites():
         members = set(catalogue.resolve([suite]))
@@ -275,7 +275,7 @@ def _workers(reply: StatusReply) -> Table:
 
 
 def _classes(reply: StatusReply) -> Iterator[Text]:
-    """What the workers' classes stand for, and of which environments workers are of several: only one of them plays a run."""
+    """The members of the workers' classes, and environments with several classes, of which only one plays a run."""
     for name, versions in sorted({worker.fingerprint: worker.versions for worker in reply.workers}.items()):
         yield Text(f"class {name}: " + ", ".join(f"{what} {version}" for what, version in versions.items()))
     played: dict[str, dict[str, list[str]]] = {}

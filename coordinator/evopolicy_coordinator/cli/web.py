@@ -133,7 +133,7 @@ def web(
 
 @dataclass(frozen=True, kw_only=True)
 class _Order:
-    """What the command was asked for."""
+    """The command's options."""
 
     roots: list[Path]
     tokens: Tokens
@@ -194,7 +194,7 @@ def site_roots(roots: list[Path]) -> list[Path]:
 
 
 async def _is_reachable(found: Credentials) -> bool:
-    """Whether this machine's coordinator is there."""
+    """Whether this machine's coordinator answers."""
     try:
         async with asyncio.timeout(_REACH_S), transport.connect(found) as link:
             await OperatorClient(link).status()

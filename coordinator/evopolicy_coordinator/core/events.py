@@ -80,7 +80,7 @@ class LivenessLost(Event, frozen=True, kw_only=True):
 
 
 class DescriptionAwaited(Event, frozen=True, kw_only=True):
-    """An operator asked for an environment that workers offer and have yet to describe."""
+    """An operator requested an environment that workers offer and have yet to describe."""
 
     env: str
 

@@ -127,7 +127,7 @@ class JobState:
     failures: int = 0
     """Infrastructure failures so far, in this incarnation."""
     failures_counted: int = 0
-    """Those of them after which the submit's limit on wall time has begun again."""
+    """Faults after which the submit's wall-clock limit has started again."""
     last_failure: str = ""
     """The last failure and its worker, for an operator."""
     avoid: str | None = None
@@ -270,7 +270,7 @@ class Lease:
     steps: int = 0
     progress_at: float = 0.0
     live: bool = True
-    """False once it was given up: preempted, cancelled, expired, or its job is done."""
+    """False once the lease was preempted, cancelled, or has expired, or its job is done."""
     orphan_until: float | None = None
     """Its session ended; a heartbeat may claim it until then."""
     doubtful: bool = False
@@ -494,11 +494,11 @@ class Occupancy:
     serial: int = 0
     """Number of the poll that it was granted to; 0: it had arrived before the worker's first request."""
     until: float | None = None
-    """When it has surely ended, once its lease was given up."""
+    """The time at which the job has certainly ended after its lease did."""
 
     @property
     def key(self) -> str:
-        """Several workers may hold the same lease id after it was given up, so the key includes the worker."""
+        """Several workers may hold one lease id after the lease ended, so the key includes the worker."""
         return f"{self.worker} {self.id}"
 
 
@@ -664,7 +664,7 @@ class Evaluation:
 
 @dataclass(slots=True, frozen=True)
 class Ended:
-    """What stays known of a finished evaluation."""
+    """The remaining record of a finished evaluation."""
 
     total: int
     """Number of stored outcomes."""

@@ -114,7 +114,7 @@ class State:
         # Workers and leases.
         self.workers: dict[str, Worker] = {}
         self.awaited: dict[str, None] = {}
-        """Undescribed environments that an operator asked for."""
+        """Undescribed environments that an operator requested."""
         self.sessions: dict[str, str] = {}
         """Current session to its worker."""
         self.out_of_service: dict[str, OutOfService] = {}

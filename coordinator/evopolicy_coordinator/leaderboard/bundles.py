@@ -175,7 +175,7 @@ def _unpack(archive: Archive, run: PublishedRun, place: Path) -> None:
             record.agent, entry=_short(record.agent.entry), harness=_short(record.agent.harness)
         ),
         versions=versions,
-        # They name files of a run directory, and this one has only what is written here.
+        # They name files of a run directory; this folder contains only the files written here.
         artifacts=Artifacts(),
         replays=(),
     )

@@ -179,7 +179,9 @@ def _board(board: Board, study: Study, number: int, folder: str, pages: dict[int
         f"board-{number}",
         name,
         title=f"{name}: {suites}",
-        texts=["Intervals are at 95 %. Entries that share a letter in Tie group do not differ significantly."],
+        texts=[
+            "Intervals are at 95 %. Entries that share a letter in Tie group do not differ significantly."
+        ],
         reasons=board.apart,
         reasons_title=reasons_title,
         tables=views,

@@ -51,7 +51,7 @@ _NEVER = (
 
 
 class Published(msgspec.Struct, frozen=True, kw_only=True):
-    """What was published."""
+    """The published runs."""
 
     path: str
     bytes: int
@@ -98,7 +98,7 @@ class Publisher:
         self._removed: list[Removed] = [_OTHER_LOGS if with_logs else _LOGS, *_NEVER]
 
     async def publish(self, runs: Sequence[tuple[Path, RunRecord]], out: Path) -> Published:
-        """Writes `out`, which nobody sees before it is whole. RefusedError when the coordinator refuses."""
+        """Writes `out` atomically. Raises RefusedError when the coordinator refuses."""
         ids = tuple(record.run for _, record in runs)
         await self._ask.disclose(ids)
         entries = await self._ask.journal()
@@ -283,7 +283,7 @@ def _texts(trajectory: Trajectory) -> bytes:
 
 
 def needles_of_this_machine(link: Link, *folders: Path) -> tuple[scrub.Needle, ...]:
-    """What the search looks for: this process's environment, user, host and folders, and its credentials."""
+    """The search's terms: this process's environment, user, host and folders, and its credentials."""
     names = {getpass.getuser(): "the user's name", socket.gethostname(): "the host's name"}
     names.setdefault(socket.getfqdn(), "the host's full name")
     credentials = link.credentials

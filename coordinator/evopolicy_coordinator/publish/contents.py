@@ -85,12 +85,12 @@ class Countersignature(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def head_digest(head: str, at: float) -> str:
-    """What a countersignature is of."""
+    """The signed bytes of a countersignature."""
     return digest(f"{head} {at!r}".encode())
 
 
 class Episode(msgspec.Struct, frozen=True, kw_only=True):
-    """What one episode came to."""
+    """The result of one episode."""
 
     index: Int
     """Position in its group's list."""
@@ -114,7 +114,7 @@ class Group(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Removed(msgspec.Struct, frozen=True, kw_only=True):
-    """What was taken out."""
+    """A removed part."""
 
     what: str
     """A field of a file, or a file."""
@@ -141,7 +141,7 @@ def wanted_groups(result: Result) -> list[tuple[Split, int, int]]:
 
 
 def run_folder(number: int) -> str:
-    """Where a run's files are."""
+    """A run's folder in the archive."""
     return f"runs/{number:04d}"
 
 

@@ -38,7 +38,7 @@ KINDS = {
     "policies": "the actions came from the policies",
     "replay": "the environments give the recorded rewards for the recorded actions",
 }
-"""What is checked, in the order in which it is told."""
+"""The checks, in the order of the output."""
 
 
 class Finding(msgspec.Struct, frozen=True, kw_only=True):
@@ -83,7 +83,7 @@ class PublishedRun(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Checked(msgspec.Struct, kw_only=True):
-    """What a check came to; grows while it goes on."""
+    """The result of a check so far."""
 
     signer: str = ""
     """Public key, hexadecimal; empty without a valid signature."""

@@ -48,7 +48,7 @@ _KIND = "policies"
 
 
 class _Tally(msgspec.Struct):
-    """What the play of one run's policies came to."""
+    """The result of replaying one run's policies."""
 
     same: int = 0
     differ: list[str] = []
@@ -126,7 +126,7 @@ def _declared(files: Files, run: PublishedRun) -> dict[int, Bundle]:
         try:
             bundle = bundles.load(files.read(name, contents.MAX_DOCUMENT_BYTES * 2), submit.bundle)
         except (BundleError, ProtocolError):
-            continue  # told by the check of checkpoints
+            continue  # reported by the check of checkpoints
         if declares_deterministic({file.path: file.data for file in bundle.files}):
             found[submit.submit_index] = bundle
     return found

@@ -38,7 +38,7 @@ from evopolicy_coordinator.splits import FILE_STEMS, SPLITS, SplitFile, cases_ha
 from evopolicy_coordinator.verify import compare
 
 Tell = Callable[[int, int], None]
-"""Is told how many episodes were played, of how many."""
+"""Receives the number of episodes played, and the total."""
 
 
 class Chosen(msgspec.Struct, frozen=True):
@@ -70,7 +70,7 @@ async def replay(files: Files, checked: Checked, share: float, seed: int, slots:
 
 
 def installed(chosen: Sequence[Chosen], checked: Checked, kind: str) -> dict[str, list[Chosen]]:
-    """What can be played here, by the run's folder; the rest is added to `checked` as open."""
+    """The runs that can be replayed here, by the run's folder; the others are added to `checked` as open."""
     by_run: dict[str, list[Chosen]] = {}
     missing: dict[str, str] = {}
     for each in chosen:
@@ -236,7 +236,7 @@ async def _play(ask: OperatorClient, files: Files, part: Chosen) -> tuple[int, l
     try:
         recordings = contents.unpack_recordings(files.read(path, contents.MAX_RECORDING_BYTES))
     except ProtocolError:
-        return 0, []  # told by the check of recordings
+        return 0, []  # reported by the check of recordings
     stored: list[tuple[int, bytes]] = []
     case_ids, refs = [], []
     for index, case_id in zip(part.indexes, part.case_ids, strict=True):

@@ -184,7 +184,7 @@ def _order(history: History, noted: Sequence[str | Countersignature], checked: C
 
 
 def _history_fault(entries: Sequence[journal.Entry]) -> str | None:
-    """What cannot have happened in this order; None when all can."""
+    """A contradiction in the order of the entries; None if there is none."""
     opened: dict[str, str] = {}
     ended: set[str] = set()
     revealed: set[str] = set()

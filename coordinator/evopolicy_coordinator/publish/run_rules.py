@@ -135,7 +135,7 @@ def _result(run: PublishedRun, history: History) -> Iterator[Fault]:
 
 
 def _record(run: PublishedRun) -> Iterator[Fault]:
-    """What `run.json` tells, against what was fixed."""
+    """`run.json`, compared with the committed documents."""
     record, opening, result = run.record, run.opening, run.result
     settings, dimensions, outcome = opening.settings, record.experiment_dimensions, record.outcome
     staged = dimensions.n_train > 0
@@ -320,7 +320,7 @@ def _recordings(files: Files, run: PublishedRun, damaged: set[str], checked: Che
 
 
 def recording_fault(episode: contents.Episode, data: bytes) -> str | None:
-    """Where a recording contradicts what is told of its episode; None when it does not."""
+    """The contradiction between a recording and the stated result of its episode; None if there is none."""
     try:
         recording = recording_of(data)
     except ProtocolError as error:
@@ -334,7 +334,8 @@ def recording_fault(episode: contents.Episode, data: bytes) -> str | None:
 
 
 def recording_of(data: bytes) -> Trajectory:
-    """A published recording; ProtocolError for what is none, or holds more than actions and rewards."""
+    """A published recording. Raises ProtocolError for other bytes, and for a recording of more than actions and
+    rewards."""
     found = decode(data, contents.MAX_EPISODE_BYTES)
     if found.record != "actions":
         raise ProtocolError("it holds more than actions and rewards")

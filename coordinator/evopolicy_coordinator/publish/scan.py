@@ -56,5 +56,5 @@ def _checkpoints(files: Files, run: PublishedRun) -> Iterator[tuple[int, dict[st
         try:
             bundle = bundles.load(files.read(path, contents.MAX_DOCUMENT_BYTES * 2), submit.bundle)
         except BundleError:
-            continue  # told by the check of checkpoints
+            continue  # reported by the check of checkpoints
         yield submit.submit_index, {file.path: file.data for file in bundle.files}

@@ -39,7 +39,7 @@ _PLAIN_VARIABLES = re.compile(
 _NOBODY = frozenset(
     {"root", "user", "admin", "ubuntu", "debian", "runner", "nobody", "localhost", "evopolicy"}
 )
-"""Names that tell nobody apart."""
+"""Names that identify nobody."""
 _PATTERNS = (
     (re.compile(rb"/(?:home|Users)/[A-Za-z0-9._-]+"), "a home folder"),
     (re.compile(rb"-----BEGIN [A-Z ]*PRIVATE KEY-----"), "a private key"),
@@ -52,7 +52,7 @@ class Needle(msgspec.Struct, frozen=True):
 
     text: bytes
     what: str
-    """What it is, without telling it."""
+    """The kind of the match, without its text."""
 
 
 def record(full: RunRecord) -> tuple[RunRecord, list[Removed]]:
@@ -107,7 +107,8 @@ def record(full: RunRecord) -> tuple[RunRecord, list[Removed]]:
 def needles(
     variables: Mapping[str, str], names: Mapping[str, str], paths: Iterable[str], secrets: Iterable[str]
 ) -> tuple[Needle, ...]:
-    """What to search for: values of environment variables, names of users and hosts (with what each is), folders, secrets."""
+    """The search terms: values of environment variables, names of users and hosts (each with its kind), folders,
+    secrets."""
     found: dict[bytes, str] = {}
 
     def add(text: str, what: str, least: int) -> None:
@@ -134,7 +135,7 @@ def needles(
 
 
 def search(data: bytes, needles: Iterable[Needle]) -> list[str]:
-    """What of it is in `data`, in words that do not tell it; a name counts only where no letter or digit adjoins it."""
+    """The kinds of terms found in `data`, without their texts; a name counts only if no letter or digit adjoins it."""
     found = [what for pattern, what in _PATTERNS if pattern.search(data)]
     found += [needle.what for needle in needles if next(_places(data, needle.text), None) is not None]
     return found
@@ -162,7 +163,7 @@ _ESCAPES = (rb"\n", rb"\t", rb"\r", rb"\b", rb"\f")
 
 
 def _places(data: bytes, text: bytes) -> Iterator[int]:
-    """Where `text` is in `data` without an adjoining letter or digit; places do not overlap."""
+    """Positions of `text` in `data` without an adjoining letter or digit; they do not overlap."""
     at = data.find(text)
     while at >= 0:
         end = at + len(text)

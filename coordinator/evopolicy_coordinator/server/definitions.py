@@ -122,7 +122,8 @@ class Definitions:
             return requested[:DEFINITION_DIGITS]
         offered = ", ".join(offers) or "none"
         raise RefusedError(
-            Refusal.INVALID_SETTINGS, f"no worker offers {env} in definition {requested}; offered are: {offered}"
+            Refusal.INVALID_SETTINGS,
+            f"no worker offers {env} in definition {requested}; offered are: {offered}",
         )
 
     def approve(self, env: str, requested: str, workers: Iterable[Worker]) -> None:

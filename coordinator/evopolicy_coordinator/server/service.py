@@ -219,7 +219,7 @@ class Service:
         except ProtocolError as error:
             self._refuse(query, RefusedError(Refusal.BAD_MESSAGE, str(error)))
         except Exception:
-            # A bug of ours must not stop the service. The client is notified at once and may retry.
+            # A bug here must not stop the service. The client is notified immediately and may retry.
             log.exception("request failed", key=query.key)
             query.drop()
 

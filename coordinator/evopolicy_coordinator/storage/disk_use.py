@@ -47,7 +47,7 @@ GUESS_BYTES = 1 << 20
 
 
 class Collected(msgspec.Struct, frozen=True, kw_only=True):
-    """What was removed, or would be."""
+    """The removed data, or the data to be removed."""
 
     runs: int
     evaluations: int

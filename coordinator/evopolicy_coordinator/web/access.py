@@ -94,7 +94,7 @@ class Access:
             self._tokens["act"] = tokens.act
 
     def role_of_token(self, token: str) -> Role | None:
-        """What a token allows; None for a wrong one."""
+        """A token's rights; None for a wrong token."""
         given = token.encode()
         found: Role | None = None
         for role, right in self._tokens.items():
@@ -103,11 +103,11 @@ class Access:
         return found
 
     def cookie_of(self, role: Role) -> str:
-        """What the cookie holds: it follows from the token, so it outlives a restart where the token does."""
+        """The cookie's value. It is derived from the token, so it outlives a restart if the token does."""
         return hmac.new(self._tokens[role].encode(), b"evopolicy web cookie", hashlib.sha256).hexdigest()
 
     def role_of(self, headers: Headers) -> Role | None:
-        """What a request may do, by its cookie or its `Authorization`."""
+        """A request's rights, by its cookie or its `Authorization`."""
         scheme, _, token = headers.get("authorization", "").partition(" ")
         if scheme.lower() == "bearer":
             return self.role_of_token(token.strip())
@@ -123,7 +123,7 @@ class Access:
         return found
 
     def is_own_host(self, host: str) -> bool:
-        """Whether `Host` names this server: an address, which nobody can rebind, or one of its names."""
+        """Whether `Host` names this server: an address, which cannot be rebound, or one of its names."""
         name = _name_of(host)
         try:
             ipaddress.ip_address(name.strip("[]"))

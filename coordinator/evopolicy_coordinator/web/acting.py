@@ -32,7 +32,7 @@ class Act(msgspec.Struct, frozen=True, kw_only=True):
 
     title: str
     happens: str
-    """What happens, said before it is confirmed."""
+    """The act's effect, shown before it is confirmed."""
     needs: str = ""
     """Name of a text that the operator gives; empty for none."""
     cluster: bool = True

@@ -43,20 +43,21 @@ from evopolicy_coordinator.web.views.run import episode_values, run_view, submit
 from evopolicy_coordinator.web.views.sweeps import sweeps_view
 
 _LOOK_S = 1.0
-"""Least pause between two looks at the folders."""
+"""Minimum pause between two scans of the folders."""
 _SHARE = 20.0
-"""And between two so many times what one took."""
+"""The pause is also at least this multiple of the last scan's duration."""
 _CHUNK = 256 << 10
 _MAX_Q = 200
 _SANDBOXED = "default-src 'none'; sandbox"
-"""Policy of files that agents and policies wrote: even opened by themselves they are no pages of ours."""
+"""Content security policy of files that agents and policies wrote: even when opened directly, they have none of our
+pages' rights."""
 _RANGE = re.compile(r"bytes=(\d{0,15})-(\d{0,15})")
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
 
 class Site:
-    """What the pages are made of, kept up to date."""
+    """The data behind the pages, kept up to date."""
 
     def __init__(
         self,
@@ -68,7 +69,7 @@ class Site:
         report: Path | None = None,
         action_log: Path | None = None,
     ) -> None:
-        """`credentials` None: there is no cluster, only folders. `action_log` None: nobody may act."""
+        """`credentials` None: no cluster, only folders. `action_log` None: no actions."""
         self.title = title
         self.access = access
         self.feeds = Feeds()
@@ -118,7 +119,7 @@ class Site:
             self._took_s = self._looked_at - began
 
     async def _tell(self) -> None:
-        """Updates the pages that somebody has open."""
+        """Updates the open pages."""
         while True:
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(_LOOK_S):
@@ -140,7 +141,7 @@ class Site:
     # ---- views by page ----
 
     def view_of(self, page: str, words: Words, *, may_act: bool) -> Callable[[], View] | None:
-        """What makes the parts of a page; None for no such page."""
+        """The function that makes the parts of a page; None for an unknown page."""
         if page == "runs":
             return lambda: sweeps_view(self.runs, self.cluster, words, self.reader.roots, acting=may_act)
         if page == "cluster" and self.cluster is not None:
@@ -160,7 +161,7 @@ class Site:
     # ---- answers ----
 
     def _shown(self, request: Request, here: str) -> dict[str, Any]:
-        """What every page needs."""
+        """The data that every page needs."""
         return {
             "here": here,
             "has_cluster": self.cluster is not None,
@@ -337,7 +338,7 @@ class Site:
         return PlainTextResponse("ok\n")
 
     async def metrics(self, request: Request) -> Response:
-        """What the coordinator told last, and this process's own figures, in Prometheus' text format."""
+        """The coordinator's last metrics, and those of this process, in Prometheus' text format."""
         if self.cluster is not None:
             self.cluster.look()
         return Response(await asyncio.to_thread(generate_latest, self._registry), media_type=CONTENT_TYPE)
@@ -434,7 +435,7 @@ async def _failed(request: Request, error: Exception) -> Response:
 
 
 def report_policy() -> str:
-    """Policy of a report's pages, which hold their style and the one script of ours."""
+    """Content security policy of a report's pages, which contain their style and our single script."""
     script = b"\n" + rendering.static_files()["report.js"][0]
     digest = base64.b64encode(hashlib.sha256(script).digest()).decode()
     return (
@@ -494,7 +495,7 @@ def _episode(run: RunFacts, folder: Path, index: int, episode: int) -> dict[str,
 
 
 def _file(request: Request, files: Confined, path: str, kind: str, policy: str) -> Response:
-    """A file, or the range of it that is asked for. NotThereError for none."""
+    """A file, or the requested range of it. Raises NotThereError if it does not exist."""
     fd = files.open(path)
     size = os.fstat(fd).st_size
     first, last, status = 0, size - 1, 200
@@ -527,7 +528,7 @@ async def _chunks(fd: int, first: int, last: int) -> AsyncIterator[bytes]:
 
 
 class Address(msgspec.Struct, frozen=True, kw_only=True):
-    """Where it listens."""
+    """The address of the listener."""
 
     host: str
     port: int

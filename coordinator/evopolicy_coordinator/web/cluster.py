@@ -32,7 +32,7 @@ _SAMPLES = 24 * 60
 _RETRIES_OF_A_RUN = 100
 _RETRIED_RUNS = 1000
 STALE_S = 90.0
-"""After so long without an answer nothing of the last one is relied on."""
+"""Age in seconds after which the last reply is no longer used."""
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
@@ -49,7 +49,7 @@ class Sample(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Cluster:
-    """The latest status of a cluster, and its history. `watched` says whether somebody looks."""
+    """The latest status of a cluster, and its history. `watched` states whether a page is open."""
 
     def __init__(
         self, credentials: Credentials, watched: Callable[[], bool], changed: Callable[[], None]
@@ -60,7 +60,7 @@ class Cluster:
         """Why there is no answer now; empty while there is."""
         self.operator: OperatorClient | None = None
         self.retries: OrderedDict[str, dict[RetriedJobs, None]] = OrderedDict()
-        """What was played again of each run, oldest first: the coordinator tells of each run's last ones only."""
+        """Repeated jobs of each run, oldest first; the coordinator reports only each run's last ones."""
         self._pause_s = 0.0
         self._acted = asyncio.Event()
         self._at = float("-inf")
@@ -156,7 +156,7 @@ class Cluster:
 
 
 async def _set_within(event: asyncio.Event, seconds: float) -> None:
-    """Waits until the event is set, or for so long."""
+    """Waits until the event is set, or for this time."""
     with contextlib.suppress(TimeoutError):
         async with asyncio.timeout(seconds):
             await event.wait()

@@ -31,7 +31,8 @@ class Name(NamedTuple):
 
 
 class Confined:
-    """What lies below `root`, which is trusted itself. Paths are relative, with `/`; NotThereError for all that is refused."""
+    """Files below `root`, which is trusted itself. Paths are relative, with `/`. Raises NotThereError for every
+    refused path."""
 
     def __init__(self, root: Path) -> None:
         self.root = root

@@ -17,9 +17,9 @@ import msgspec
 LEAST_PAUSE_S = 0.5
 """Between two updates of one browser."""
 KEEP_ALIVE_S = 15.0
-"""A comment is sent after so long without an update, so that dead connections are noticed."""
+"""A comment is sent after this time without an update, so that dead connections are noticed."""
 MAX_FEEDS = 512
-"""Pages that are kept for browsers; those that nobody watches are let go of first."""
+"""Number of pages kept for browsers; pages without a browser are dropped first."""
 
 
 class View(msgspec.Struct, frozen=True, kw_only=True):
@@ -44,7 +44,7 @@ class Feed:
 
     @property
     def cursor(self) -> str:
-        """Where a browser stands that has all of it."""
+        """The cursor of a browser that has everything."""
         return f"{self.epoch}.{self.version}"
 
     def update(self, view: View) -> None:
@@ -70,7 +70,7 @@ class Feed:
             event.set()
 
     def since(self, cursor: str) -> dict[str, Any] | None:
-        """What has changed since a cursor, all of it for a cursor that is not known; None where nothing has."""
+        """The changes since a cursor; everything for an unknown cursor; None without changes."""
         epoch, _, number = cursor.partition(".")
         known = int(number) if epoch == self.epoch and number.isdecimal() and len(number) < 16 else -1
         if known >= self.version:
@@ -81,7 +81,7 @@ class Feed:
         }
 
     async def events(self, cursor: str) -> AsyncIterator[bytes]:
-        """Server-sent events from a cursor on, for as long as they are asked for."""
+        """Server-sent events from a cursor on, until the client closes the stream."""
         self.watchers += 1
         try:
             yield b"retry: 2000\n\n"
@@ -103,7 +103,7 @@ class Feed:
 
 
 class Feeds:
-    """The feeds of all pages that somebody has open, by what makes their view."""
+    """The feeds of all open pages, by the function that makes their view."""
 
     def __init__(self) -> None:
         self._feeds: dict[str, tuple[Feed, Callable[[], View]]] = {}

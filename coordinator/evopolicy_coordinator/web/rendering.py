@@ -53,7 +53,7 @@ def _environment() -> Environment:
 
 @cache
 def static_files() -> dict[str, tuple[bytes, str]]:
-    """What pages load, by name: bytes and content type."""
+    """Static files of the pages, by name: bytes and content type."""
     types = {".css": "text/css; charset=utf-8", ".js": "text/javascript; charset=utf-8"}
     found: dict[str, tuple[bytes, str]] = {}
     report = files("evopolicy_coordinator.analysis.html").joinpath("templates")

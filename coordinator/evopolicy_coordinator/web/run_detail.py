@@ -94,7 +94,7 @@ class Played(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Detail:
-    """Reads one run's folder. Cheap to make; what is costly is kept by the caller."""
+    """Reads one run's folder. Cheap to create; the caller keeps costly results."""
 
     def __init__(self, folder: Path) -> None:
         self.files = Confined(folder)
@@ -347,7 +347,7 @@ def _objects(lines: list[bytes]) -> Iterator[dict[str, Any]]:
 
 
 def _series(columns: Any, n: int, name: str) -> tuple[tuple[Series, ...], str]:
-    """Lines of what is numbers of one length; and a note where something is left out."""
+    """Lines of those values that are numeric with one length; and a note if some are left out."""
     if columns is None:
         return (), ""
     if isinstance(columns, dict):

@@ -34,7 +34,7 @@ _MAX_INDEX_BYTES = 64 << 20
 
 
 class SuiteEntry(msgspec.Struct, frozen=True, kw_only=True):
-    """What is read of one run in a sweep's `suite.json`; other fields are skipped."""
+    """The fields of one run in a sweep's `suite.json`; other fields are skipped."""
 
     name: str
     agent: str
@@ -57,7 +57,7 @@ class SuiteEntry(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class SuiteIndex(msgspec.Struct, frozen=True, kw_only=True):
-    """What is read of `suite.json`."""
+    """The fields of `suite.json`."""
 
     suite: str
     runs: dict[str, SuiteEntry] = {}
@@ -72,7 +72,7 @@ class _Opened(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class SubmitFacts(msgspec.Struct, frozen=True, kw_only=True):
-    """One submit as its agent was told of it."""
+    """One submit, as its agent sees it."""
 
     index: int
     status: str
@@ -123,7 +123,7 @@ class RunFacts(msgspec.Struct, frozen=True, kw_only=True):
     host: str = ""
     waits_for: str = ""
     retries: int = 0
-    """Jobs that were played again after failures of ours, of a finished run."""
+    """Jobs of a finished run that were repeated after infrastructure failures."""
     running: int = 0
     queued: int = 0
     agent_alive: bool = False
@@ -139,7 +139,7 @@ class RunFacts(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def left_s(self) -> float | None:
-        """Seconds until the budget is spent, if it goes on as so far."""
+        """Seconds until the budget is spent, at the present rate."""
         if self.finished or self.started_at is None or not self.budget or not self.used:
             return None
         return max(0.0, (time.time() - self.started_at) * (self.budget - self.used) / self.used)
@@ -215,7 +215,7 @@ class Reader:
             }
             for entry in entries.values():
                 if entry.name in listed:
-                    # Another host of the sweep may have begun it, which tells its id to the coordinator alone.
+                    # Another host of the sweep may have started it and reported its id only to the coordinator.
                     name = "" if index is None else f"{index.suite}-{entry.repeat}"
                     status = by_run.get(entry.run) or by_name.get((entry.agent, entry.env, name))
                     found.append(_without_folder(root, entry, status))
@@ -402,7 +402,7 @@ def _of_record(folder: Path, record: RunRecord) -> RunFacts:
 
 
 def _without_folder(root: Path, entry: SuiteEntry, status: RunStatus | None) -> RunFacts:
-    """A run of a sweep that has no folder here: it has not begun, or another host has it."""
+    """A run of a sweep without a folder here: it has not started, or another host plays it."""
     ended = entry.state not in ("pending", "running")
     return RunFacts(
         key=key_of(f"{root}\n{entry.name}"),
@@ -509,7 +509,7 @@ def _began(folder: Path) -> float | None:
 
 
 def _agent_alive(folder: Path) -> bool:
-    """Whether an agent of an open run may be alive: a lock of its folder is held, or nobody here watches it."""
+    """Whether an agent of an open run may be alive: a lock of its folder is held, or no process here watches it."""
     state = folder / ".gateway"
     if any((state / name).exists() for name in ("door.json", "unwatched")):
         return True

@@ -15,7 +15,7 @@ PAGE_ROWS = 50
 
 
 class Words(msgspec.Struct, frozen=True, kw_only=True):
-    """What a request asks to see of a table."""
+    """A request's selection of a table."""
 
     q: str = ""
     """Words that must all occur in a row."""

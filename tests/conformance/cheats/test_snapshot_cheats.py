@@ -56,7 +56,11 @@ def test_no_submit_holds_what_its_agent_has_not_written(swapped: Swapped) -> Non
 
 
 def test_what_is_a_link_a_pipe_or_too_much_is_charged_and_named(swapped: Swapped) -> None:
-    honest, raced, spoiled = swapped.verdicts[0], swapped.verdicts[1 : 1 + N_RACES], swapped.verdicts[1 + N_RACES : -1]
+    honest, raced, spoiled = (
+        swapped.verdicts[0],
+        swapped.verdicts[1 : 1 + N_RACES],
+        swapped.verdicts[1 + N_RACES : -1],
+    )
     assert honest[0] == swapped.verdicts[-1][0] == "ok"
     assert {status for status, _ in raced} <= {"ok", "missing_policy", "import_error"}
     assert [status for status, _ in spoiled] == [status for status, _ in REFUSED]

@@ -98,7 +98,9 @@ def test_what_a_policy_sees_is_the_same_in_train_validation_and_held_out(probed:
     differences = {
         (split, index, name): (facts[name], train_facts[name])
         for split in ("validation", "heldout")
-        for index, (facts, train_facts) in enumerate(zip(probed.seen[split], probed.seen["train"], strict=True))
+        for index, (facts, train_facts) in enumerate(
+            zip(probed.seen[split], probed.seen["train"], strict=True)
+        )
         for name in fixed
         if facts[name] != train_facts[name]
     }

@@ -85,7 +85,9 @@ def serve(listener: socket.socket) -> None:
 def probe(slots: Slots, name: str, parameters: dict[str, Any], **options: Any) -> EpisodeOutcome:
     attack = (POLICIES / f"{name}.py").read_text()
     options = {"limits": PATIENT} | options
-    return slots.play({"policy.py": PROBE, "attack.py": attack, "target.json": json.dumps(parameters)}, **options)
+    return slots.play(
+        {"policy.py": PROBE, "attack.py": attack, "target.json": json.dumps(parameters)}, **options
+    )
 
 
 def attempts(outcome: EpisodeOutcome) -> dict[str, list[str]]:
@@ -146,7 +148,9 @@ def test_little_gets_through_in_the_weaker_tier(slots: Slots, target: dict[str, 
 @pytest.mark.parametrize(
     "attack", [attack for attack in PROBES if attack.off], ids=lambda attack: attack.name
 )
-def test_without_its_defence_each_attack_succeeds(slots: Slots, target: dict[str, Any], attack: Probe) -> None:
+def test_without_its_defence_each_attack_succeeds(
+    slots: Slots, target: dict[str, Any], attack: Probe
+) -> None:
     assert attack.off is not None
     found = attempts(probe(slots, attack.name, target, packages=attack.packages, **attack.off))
     shut = attack.stays_shut if os.geteuid() == 0 else attack.stays_shut | attack.opens_for_root
@@ -253,7 +257,10 @@ def test_names_that_a_policy_looked_for_tell_a_later_one_nothing(slots: Slots, t
     source = (POLICIES / "names.py").read_text()
 
     def play(slot: Any, **parameters: Any) -> EpisodeOutcome:
-        files: dict[str, str | bytes] = {"policy.py": source, "target.json": json.dumps({"tag": tag, **parameters})}
+        files: dict[str, str | bytes] = {
+            "policy.py": source,
+            "target.json": json.dumps({"tag": tag, **parameters}),
+        }
         outcome = slots.play(files, slot=slot, tier=tier, limits=PATIENT)
         assert outcome.failure is None, outcome.failure
         return outcome

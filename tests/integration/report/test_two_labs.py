@@ -139,7 +139,9 @@ def test_what_cannot_be_compared_or_does_not_stand_is_apart_with_the_reason(
         document = json.loads(archive.read("runs/0000/run.json", 1 << 20))
     assert record.agent.entry == "evolve"
     document["agent"]["entry"] = "<script>alert(1)</script>"
-    changed(labs / "lab-b.evp", tmp_path / "<b>forged.evp", "runs/0000/run.json", json.dumps(document).encode())
+    changed(
+        labs / "lab-b.evp", tmp_path / "<b>forged.evp", "runs/0000/run.json", json.dumps(document).encode()
+    )
     (tmp_path / "torn.evp").write_bytes((labs / "lab-a.evp").read_bytes()[:5000])
     # Another budget: no comparison with the first two.
     sweep = (

@@ -40,7 +40,9 @@ async def coordinator(certs: OwnCerts) -> AsyncIterator[list[str]]:
             asked.append(query.key)
             query.reply(b"coordinator")
 
-    listener = remote_listener(CLUSTER, (certs.endpoint,), Machines(certs.state), answer, lambda key, alive: None)
+    listener = remote_listener(
+        CLUSTER, (certs.endpoint,), Machines(certs.state), answer, lambda key, alive: None
+    )
     async with listener:
         yield asked
 

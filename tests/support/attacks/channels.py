@@ -282,7 +282,12 @@ def afterwards(slots: Slots, reader: JailedReader, wait_s: float, n: int) -> dic
     moved: dict[str, list[float | None]] = {}
     for kind in kinds:
         before = reader.look()
-        parameters = {"way": "all that lasts", "bits": [kind] * 4, "start": time.monotonic() + 0.5, "period": 0.7}
+        parameters = {
+            "way": "all that lasts",
+            "bits": [kind] * 4,
+            "start": time.monotonic() + 0.5,
+            "period": 0.7,
+        }
         play(slots, parameters)
         time.sleep(wait_s)
         for name, value in reader.look().items():

@@ -46,7 +46,7 @@ class ActionCodec(Protocol):
         """
 
     def neutral(self) -> Any:
-        """What stands for an action that cannot be read."""
+        """The replacement for an action that cannot be read."""
 
 
 def compile_actions(schema: SpaceSchema) -> ActionCodec:

@@ -29,7 +29,7 @@ Frame = NDArray[np.uint8]
 
 
 class Step(NamedTuple):
-    """What one step gave. `obs` is what the policy is shown next."""
+    """The result of one step. `obs` is the next observation of the policy."""
 
     obs: Observation
     reward: float

@@ -56,7 +56,7 @@ current = Call()
 
 
 class Limits(msgspec.Struct, frozen=True, kw_only=True):
-    """What an environment may use of its slot. Passing a limit is never blamed on a policy."""
+    """Resources of the slot that an environment may use. Exceeding a limit is never the policy's failure."""
 
     call_s: float = 300.0
     """Longest that one call of the environment may take, seconds."""

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     import gymnasium
 
 _MISSHAPEN = (TypeError, ValueError, OverflowError, AttributeError, LookupError)
-"""What values of a wrong form raise where they are read."""
+"""Exceptions that values of a wrong form raise when they are read."""
 _PLAIN_WRAPPERS = {"OrderEnforcing", "PassiveEnvChecker", "TimeLimit"}
 """Wrappers that change no value; the adapter counts the steps itself, and calls in order."""
 
@@ -46,9 +46,9 @@ class GymnasiumFamily:
     """How the environments of one package are made and read. The defaults suit most."""
 
     distributions: tuple[str, ...] = ("gymnasium",)
-    """Distributions whose versions decide what is played, the one that registers the environments first."""
+    """Distributions whose versions determine the episodes; the first one registers the environments."""
     also: tuple[str, ...] = ()
-    """Further distributions that decide what is played; numpy and gymnasium always do."""
+    """Further distributions that determine the episodes; numpy and gymnasium always do."""
     modules: tuple[str, ...] = ("gymnasium",)
     """Packages to import; a family is offered where all of them are installed."""
     extra: str = "worker"
@@ -66,11 +66,11 @@ class GymnasiumFamily:
     """Whether `packages` measures something in an environment that has been made."""
 
     def installed(self) -> bool:
-        """Whether all packages are there, found out without importing them."""
+        """Whether all packages are installed, without importing them."""
         return all(find_spec(module) is not None for module in self.modules)
 
     def needs(self) -> str:
-        """What is to be installed for it, in words."""
+        """The packages to install, in words."""
         return f"{' and '.join(self.distributions)}: pip install 'evopolicy[{self.extra}]'"
 
     def load(self) -> None:
@@ -87,7 +87,7 @@ class GymnasiumFamily:
         import gymnasium
 
         assert entry.gymnasium_id is not None
-        # Told only where it is needed: not every environment takes a render mode.
+        # Passed only when needed: not every environment accepts a render mode.
         mode: dict[str, Any] = {"render_mode": "rgb_array"} if render else {}
         return gymnasium.make(entry.gymnasium_id, disable_env_checker=True, **mode, **entry.kwargs)
 
@@ -123,7 +123,7 @@ class GymnasiumFamily:
         return versions(("numpy", "gymnasium", *self.distributions, *self.also))
 
     def version(self, entry: Entry) -> str:
-        """What is played, with the versions that decide it: `Ant-v5 (gymnasium 1.4.0, mujoco 3.10.0)`."""
+        """The environment with the versions that determine its episodes: `Ant-v5 (gymnasium 1.4.0, mujoco 3.10.0)`."""
         versions = ", ".join(f"{name} {version(name)}" for name in self.distributions)
         return f"{entry.gymnasium_id} ({versions})"
 
@@ -204,7 +204,7 @@ class GymnasiumEnvironment(Environment):
 
     @property
     def bare(self) -> gymnasium.Env[Any, Any]:
-        """What is played now, without the adapter."""
+        """The environment of the current episode, without the adapter."""
         return self._env
 
     def reset(self, case: Case) -> Observation:

@@ -47,7 +47,7 @@ def _array(dtype: np.dtype[Any]) -> Converter:
     array = np.array
 
     def convert(raw: Any) -> Any:
-        # A transposed picture keeps its layout unless told otherwise, and would be sent with its axes mixed.
+        # A transposed image keeps its layout by default, and would be sent with swapped axes.
         return array(raw, dtype=dtype, order="C")
 
     return convert

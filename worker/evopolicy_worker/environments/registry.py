@@ -129,7 +129,8 @@ def offers(env_id: str) -> bool:
 
 
 def missing(env_id: str) -> str:
-    """What must be installed to play an environment here, or why its id is unknown. Empty when it can be played."""
+    """The packages to install for an environment here, or the reason why its id is unknown; empty when it can be
+    played."""
     try:
         found = _entry(env_id)
     except ConfigError as error:

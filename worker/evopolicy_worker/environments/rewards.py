@@ -49,7 +49,7 @@ class Scalarisation:
         return cls(entry.id, {name: entry.reward_weights.get(name, 1.0) for name in names})
 
     def texts(self, descriptions: Mapping[str, str]) -> dict[str, str]:
-        """A text for each element: its description from `told`, or a default, and its weight."""
+        """A text for each element: its description, or a default, and its weight."""
         return {
             name: f"{descriptions.get(name, 'element of the reward vector')}; weight {weight:g}"
             for name, weight in self.weights.items()

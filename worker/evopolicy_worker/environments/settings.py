@@ -64,7 +64,7 @@ def accelerations_on() -> bool:
 
 
 def apply(*, render: bool = False) -> None:
-    """Set in this process what is not set yet; for simulators that are imported after this call."""
+    """Sets unset variables in this process, for simulators that are imported after this call."""
     for name, value in process_environment(render=render).items():
         if name not in _ONLY_AT_START:
             os.environ.setdefault(name, value)

@@ -89,7 +89,8 @@ def to_schema(space: gymnasium.Space[Any]) -> SpaceSchema:
 
 
 def obs_storage(schema: SpaceSchema) -> ObsStorage:
-    """Where feedback keeps observations of this space: in the rows, or beside them when they are large or hold a picture."""
+    """Storage of observations of this space in feedback: in the rows, or beside them if they are large or contain an
+    image."""
     if varies(schema) or not (_has_image(schema) or _bytes(schema) > MAX_INLINE_BYTES):
         return "inline"
     return "npz"
@@ -195,7 +196,7 @@ def _has_image(schema: SpaceSchema) -> bool:
 
 
 def _bytes(schema: SpaceSchema) -> int:
-    """What the arrays of one observation take, bytes."""
+    """Size of the arrays of one observation, bytes."""
     if "shape" in schema:
         return math.prod(schema["shape"]) * np.dtype(schema["dtype"]).itemsize
     if schema["type"] in ("MultiDiscrete", "MultiBinary"):

@@ -69,7 +69,7 @@ class Promises:
 
 
 def misshapen(returned: Any, error: Exception, *, vector: bool) -> str:
-    """What is wrong with the values that `step` returned, with field and remedy. `error`: what reading them raised.
+    """The error in the values that `step` returned, with field and remedy. `error`: the exception from reading them.
     `vector`: whether rewards are vectors."""
     if not isinstance(returned, tuple | list) or len(returned) != 5:
         return (

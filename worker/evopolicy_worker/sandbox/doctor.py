@@ -46,7 +46,7 @@ class Check(msgspec.Struct, frozen=True, kw_only=True):
     advice: str = ""
     """The remedy when something is missing."""
     without: str = ""
-    """What works without it."""
+    """The functions that work without it."""
 
 
 def examine(allowed_packages: tuple[str, ...] = ("numpy",)) -> tuple[Check, ...]:

@@ -37,7 +37,8 @@ _SYSTEM = ("/usr", "/bin", "/sbin", "/lib", "/lib32", "/lib64")
 _ETC = ("ld.so.cache", "alternatives", "fonts", "glvnd", "drirc", "localtime", "nvidia", "vulkan", "OpenCL")
 _DEVICES = ("/dev/null", "/dev/zero", "/dev/full", "/dev/random", "/dev/urandom")
 _GRAPHICS = ("/dev/dri", "/dev/nvidia*", "/sys/dev/char", "/sys/devices", "/sys/bus/pci")
-"""What a driver needs to render with a graphics card. Without one Mesa renders on the CPU and needs none of it."""
+"""Paths that a driver needs to render with a graphics card. Without one, Mesa renders on the CPU and needs none of
+them."""
 _SCOPES_SIGNALS = 6
 """First ABI version of Landlock that blocks signals to processes outside."""
 _UNHEEDING = ("/bin/sh", "-c", 'trap "" TERM; exec "$@"', "sh")
@@ -186,7 +187,7 @@ def _explained(what: str) -> Iterator[None]:
         raise SandboxError(f"the environment process cannot {what}: {error}") from error
 
 
-# What the process can see.
+# The file system of the process.
 
 
 def _bubblewrap(scratch: Path, draws: bool) -> list[str]:

@@ -16,7 +16,7 @@ from evopolicy_common.processes.packages import modules_of
 from evopolicy_worker.sandbox import python_files, seccomp
 
 INSIDE = Path(__file__).parent / "inside"
-"""The only code of ours that the sandbox shows: `zygote`, `player` and `files`."""
+"""The only modules of this software that the sandbox shows: `zygote`, `player` and `files`."""
 
 
 POLICY_HOME = "/home/policy"

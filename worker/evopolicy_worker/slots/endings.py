@@ -36,7 +36,7 @@ class EndedFromOutsideError(SandboxError):
 
 
 class Ending(NamedTuple):
-    """What is known about an ending."""
+    """The known facts of an ending."""
 
     first: First
     how: How

@@ -33,7 +33,7 @@ FRAME_S = 1.0
 MAX_S = 1800.0
 """Maximum time for one video; below the hour of grace that a lease has beyond its episode's limits."""
 MAX_FAILURES = 3
-"""After so many consecutive failures this slot makes no more videos of an environment."""
+"""Number of consecutive failures after which this slot makes no more videos of an environment."""
 _LOOK_S = 0.1
 _PIECE = 1 << 20
 

@@ -57,7 +57,7 @@ SILENT_S = 60.0
 """Processes that say nothing for so much longer than a call of an environment may take are killed: the call holds the
 interpreter."""
 DESCRIBED_CALLS = 3
-"""A description may take as long as so many calls."""
+"""A description may take as long as this number of calls."""
 _LOOK_S = 5.0
 MAX_ANSWER_BYTES = 1 << 31
 
@@ -230,7 +230,7 @@ class Slot:
 
     @property
     def begun(self) -> HandedBack | None:
-        """What the policy has returned in the last, unfinished job; None for nothing."""
+        """The policy's actions in the last, unfinished job; None without any."""
         return begun.pack(self._begun)
 
     async def describe(self, env_ids: Sequence[str]) -> tuple[EnvironmentDescription, ...]:

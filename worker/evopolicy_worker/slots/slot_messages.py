@@ -48,8 +48,8 @@ class Files(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Play(Message, frozen=True, kw_only=True, tag="play"):
-    """Play this job. Answered by any number of Progress; for each episode by Acting, when a policy's first action is due,
-    and Finished; by Begun when an episode is given up; and last by Played or Fault."""
+    """Play this job. The replies are any number of Progress; for each episode Acting, when its policy's first action
+    is due, and Finished; Begun when an episode is stopped; and last Played or Fault."""
 
     job: Job
     bundle: Files | None
@@ -89,11 +89,11 @@ class Finished(Message, frozen=True, kw_only=True, tag="finished"):
 
     outcome: EpisodeOutcome
     begun: PackedBegun | None = None
-    """What the policy returned in it. Only in jobs of several episodes, which are given back as a whole."""
+    """The policy's actions in it. Only in jobs of several episodes, which are returned as a whole."""
 
 
 class Begun(Message, frozen=True, kw_only=True, tag="begun"):
-    """What the policy has returned so far in an episode that is given up. Sent on Cancel, and before a Fault."""
+    """The policy's actions so far in a stopped episode. Sent on Cancel, and before a Fault."""
 
     place: int
     """The episode's index in the job."""

@@ -91,7 +91,7 @@ def _match_axes(
     axes: list[tuple[int, int]] = []
     for axis in range(achieved.shape[1]):
         far = np.abs(observed.mean(axis=0) - achieved[:, axis].mean())
-        # What merely repeats the achieved goal is the thing, not the effector.
+        # A component that repeats the achieved goal is the object, not the effector.
         same = np.abs(observed - achieved[:, axis : axis + 1]).mean(axis=0) < 1e-9
         taken = [component for component, _ in axes]
         able = (correlation.max(axis=1) > MIN_CORRELATION) & (far < 2 * reach) & ~same

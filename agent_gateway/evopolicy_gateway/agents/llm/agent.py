@@ -49,7 +49,7 @@ class Events:
             self._session = None
 
     def reply(self, reply: Reply) -> None:
-        """What the model said and called, and the tokens that it took."""
+        """The model's text and tool calls, and the tokens that they took."""
         blocks: list[dict[str, Any]] = [{"type": "text", "text": reply.text}] if reply.text else []
         for call in reply.calls:
             given = {"command": call.command}

@@ -274,7 +274,7 @@ def open_api(settings: dict[str, Any], key: str, messages: list[Message]) -> Api
 
 
 def _skills(paths: Sequence[str]) -> str:
-    """What the system prompt says of skills: each file with the header that describes it, not the whole text."""
+    """The part of the system prompt that lists skills: path and describing header of each file, not the whole text."""
     listed = []
     for path in paths:
         text = Path(path).expanduser().read_text(errors="replace")

@@ -23,7 +23,7 @@ _CHANGES = ("edit", "delete", "move")
 """Kinds of tools that change files."""
 _MAX_TEXT_CHARS = 1 << 20
 _SKILLS = {"claude-agent-acp": "~/.claude/skills", "qwen": "~/.qwen/skills"}
-"""Where agents look for skills that do not look in `~/.agents/skills`, by the name of the program."""
+"""Skill folders of programs that do not read `~/.agents/skills`, by program name."""
 
 
 class Acp(Dialect):

@@ -92,7 +92,7 @@ class Dialect(ABC):
         """A reader for the next turn."""
 
     def stdin(self, prompt: str) -> str:
-        """What the program reads on stdin, where it reads its prompt there."""
+        """Input on stdin, for a program that reads its prompt there."""
         return prompt
 
     def environment(self) -> dict[str, str]:

@@ -156,7 +156,7 @@ class _Shape:
 
 
 def _points(node: ast.AST) -> int:
-    """What a node adds to the complexity of its function."""
+    """The part of its function's complexity that a node adds."""
     match node:
         case ast.If() | ast.For() | ast.AsyncFor() | ast.While() | ast.IfExp() | ast.ExceptHandler():
             return 1

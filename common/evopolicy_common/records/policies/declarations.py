@@ -1,4 +1,4 @@
-"""What a policy declares of itself, read from its source without running it."""
+"""Declarations in a policy's source, read without executing it."""
 
 from __future__ import annotations
 

@@ -102,7 +102,7 @@ def front_page(
 def bundle_page(
     *, title: str, lead: str, facts: Sequence[tuple[str, object]], tables: Sequence[dict[str, Any]]
 ) -> str:
-    """What the check of one file found."""
+    """Findings of the check of one file."""
     return (
         environment()
         .get_template("site_bundle.html.j2")

@@ -86,7 +86,7 @@ class Run(msgspec.Struct, frozen=True, kw_only=True):
     simulator_flags: tuple[Flag, ...] = ()
     """Code that looks like a simulator; empty when the run's rules allow simulation, as no search is made then."""
     signals: tuple[Signal, ...] = ()
-    """What in its log and code deserves a human look."""
+    """Signals in its log and code for human review."""
     rescore: RescoreRecord | None = None
     """The re-score that the record's held-out results were replaced by; None for the run's own."""
 

@@ -83,7 +83,7 @@ def policy_files(folder: Path) -> dict[str, bytes]:
 
 
 def log_lines(path: Path | None) -> Iterator[bytes]:
-    """The lines of an agent's log; none for a missing or huge one, and for what is no file."""
+    """The lines of an agent's log; none for a missing or huge file, or for anything but a regular file."""
     try:
         if path is None or not _is_file(path):
             return

@@ -432,7 +432,7 @@ class Pass:
             root = node.func.value
             library = isinstance(root, ast.Name) and root.id in self.imported
             if not library:
-                if name == "act":  # the contract's name: its result is an action, whatever state it keeps
+                if name == "act":  # The contract's name: its result is an action, even if it keeps state.
                     return given._replace(chosen=True, bent=_NOTHING)
                 followed = [
                     (c, m) for c, m in self.code.methods.get(name, []) if m is not self._frames[-1].function

@@ -11,7 +11,7 @@ from evopolicy_coordinator.analysis.statistics.samples import Floats
 
 RESAMPLES = 2000
 EXACT_UP_TO = 1 << 13
-"""Up to so many sign or label patterns are all tried; otherwise a random sample of them."""
+"""Up to this number, all sign or label patterns are used; above, a random sample of them."""
 
 
 @lru_cache(maxsize=8)
@@ -39,8 +39,8 @@ def sign_patterns(n: int, n_random: int) -> tuple[Floats, bool]:
 
 @lru_cache(maxsize=4)
 def label_patterns(n_first: int, n_second: int, n_random: int) -> tuple[Floats, bool]:
-    """(patterns, n_first + n_second) with 1 for the first group and 0 for the second, and whether all are there.
-    Read-only."""
+    """(patterns, n_first + n_second) with 1 for the first group and 0 for the second, and whether the patterns are
+    complete. Read-only."""
     n = n_first + n_second
     n_all = 1
     for i in range(n_first):

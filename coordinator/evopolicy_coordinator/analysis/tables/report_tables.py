@@ -92,7 +92,9 @@ def _aggregate(suite: Suite, study: Study) -> Table:
     if standings.rows:
         columns.append(Column("score_interval", "95 % interval"))
         columns.append(Column("rank_interval", "Rank interval"))
-        columns.append(Column("ties", "Tie group", note="Entries that share a letter do not differ significantly."))
+        columns.append(
+            Column("ties", "Tie group", note="Entries that share a letter do not differ significantly.")
+        )
     if budgets:
         columns.append(Column("budget", "Budget", "integer", note="Train episodes of a run."))
     columns += [

@@ -195,7 +195,7 @@ def check(
 
 
 def _noted(text: str) -> str | Countersignature:
-    """A head as it was noted. Ends the command for what is none."""
+    """A noted head. Ends the command for anything else."""
     if re.fullmatch(r"[0-9a-fA-F]{64}", text):
         return text.lower()
     try:

@@ -137,10 +137,13 @@ async def _rescore(
 
 
 def _packages(runs: list[Finished]) -> tuple[str, ...]:
-    """What the runs' policies import besides numpy. ConfigError where they differ: a cluster offers one set of packages."""
+    """Packages besides numpy that the runs' policies import. Raises ConfigError where they differ, since a cluster
+    offers one set of packages."""
     found = {packages_in(run.record.versions.fingerprint): run.folder for run in runs}
     if len(found) > 1:
-        listed = "; ".join(f"{folder}: {', '.join(names) or 'none'}" for names, folder in sorted(found.items()))
+        listed = "; ".join(
+            f"{folder}: {', '.join(names) or 'none'}" for names, folder in sorted(found.items())
+        )
         raise ConfigError(
             f"policies of these runs import different packages ({listed}): re-score runs with the same packages at a time"
         )

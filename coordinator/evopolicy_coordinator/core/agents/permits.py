@@ -212,12 +212,12 @@ def load(
 
 
 def agents(state: State, run: str) -> str:
-    """Where a run's agent may be alive, in words; empty for nowhere."""
+    """The place of a run's agent, in words; empty for nowhere."""
     return ", ".join(sorted(place_of(row) for _, row in held(state, run)))
 
 
 def place_of(row: PermitRow) -> str:
-    """Where a permit is for, for people."""
+    """A permit's place, in words."""
     return row.host or row.boot_id or "everywhere"
 
 

@@ -1,4 +1,4 @@
-"""The cluster's page: workers, queue, history, and what is wrong."""
+"""The cluster's page: workers, queue, history, and problems."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _NOTICE_LINES = 5
 
 
 def cluster_view(cluster: Cluster, words: Words, runs: Runs, roots: Sequence[Path], *, acting: bool) -> View:
-    """Workers, queue, history, and what is wrong."""
+    """Workers, queue, history, and problems."""
     status = cluster.status
     if status is None:
         why = cluster.trouble or "It has not answered yet."

@@ -180,7 +180,7 @@ def _classes(run: RunFacts, status: StatusReply | None) -> list[str]:
 
 
 def submit_values(run: RunFacts, runs: Runs, reader: Reader, index: int) -> dict[str, Any] | None:
-    """What the page of one submit shows; None for no such submit."""
+    """The parts of one submit's page; None for an unknown submit."""
     if run.path is None:
         return None
     submits = {submit.index: submit for submit in reader.submits(run.path)}

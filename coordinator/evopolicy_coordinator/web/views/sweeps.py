@@ -64,7 +64,7 @@ def _order(run: RunFacts) -> tuple[int, str, str, int]:
 
 
 def _shown(run: RunFacts, may_show: bool) -> dict[str, Any]:
-    """What of a run's hidden results is shown, and its share of the budget."""
+    """The visible part of a run's hidden results, and its share of the budget."""
     return {
         "score": run.score if may_show else None,
         "random": run.random if may_show else None,

@@ -208,7 +208,8 @@ def test_a_real_agent_behind_the_protocol_edits_submits_and_goes_on(tmp_path: Pa
     usage = {"gemini": 4 * INPUT, "opencode": 2 * INPUT, "claude": 4 * (INPUT + CREATED), "qwen": 0}
     tokens = played.ending.facts.get("tokens", {})
     assert (
-        sum(tokens.get(kind, 0) for kind in ("input_noncached", "cache_read", "cache_creation")) == usage[name]
+        sum(tokens.get(kind, 0) for kind in ("input_noncached", "cache_read", "cache_creation"))
+        == usage[name]
     )
     assert KEY not in played.text
 

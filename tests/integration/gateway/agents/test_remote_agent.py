@@ -185,7 +185,9 @@ def test_the_rules_tell_the_url_by_which_the_agent_reaches_the_service(tmp_path:
         ("10.0.0.5:80", "https://gym.example/'; rm -rf x", "without quotes"),
     ],
 )
-def test_an_address_that_cannot_be_served_is_refused_by_name(http: str, url: str | None, problem: str) -> None:
+def test_an_address_that_cannot_be_served_is_refused_by_name(
+    http: str, url: str | None, problem: str
+) -> None:
     with pytest.raises(ConfigError, match=problem):
         listener_of(http, url)
 
@@ -217,7 +219,9 @@ def test_a_listener_has_the_address_that_the_operator_named() -> None:
         (["--agent", "evolve", "--hidden-cases", "mine"], "'shared', 'per-run'"),
     ],
 )
-def test_options_that_do_not_go_together_are_refused(tmp_path: Path, options: list[str], problem: str) -> None:
+def test_options_that_do_not_go_together_are_refused(
+    tmp_path: Path, options: list[str], problem: str
+) -> None:
     done = CliRunner().invoke(evopolicy, ["run", "--env", "toy/line", "--runs", str(tmp_path), *options])
     assert done.exit_code == 2, done.stderr
     assert problem in done.stderr

@@ -71,7 +71,9 @@ time.sleep(1000)
     assert (outcome.closed_reason, outcome.budget_used) == ("agent_stopped", 2)
 
 
-def test_an_agent_whose_supervisor_dies_again_and_again_has_failed(operator_file: Path, tmp_path: Path) -> None:
+def test_an_agent_whose_supervisor_dies_again_and_again_has_failed(
+    operator_file: Path, tmp_path: Path
+) -> None:
     code = "submit([0])\nos.kill(os.getppid(), 9)\ntime.sleep(1000)"
     exit_code, _, err = run_on(operator_file, tmp_path, agent(tmp_path, code), "--jail", "none")
     assert exit_code == 4, err

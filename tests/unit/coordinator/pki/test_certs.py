@@ -72,7 +72,9 @@ def test_a_machines_certificate_signs_nothing() -> None:
     days=st.integers(1, 3000),
 )
 def test_a_certificate_says_what_it_was_made_for(hosts: list[str], days: int) -> None:
-    description = certs.describe(certs.issue(AUTHORITY, "router/x", NOW, days, hosts=hosts, serves=True).certificate)
+    description = certs.describe(
+        certs.issue(AUTHORITY, "router/x", NOW, days, hosts=hosts, serves=True).certificate
+    )
     assert description.common_name == "router/x"
     assert description.hosts == tuple(hosts)
     assert description.expires == NOW + dt.timedelta(days=days)

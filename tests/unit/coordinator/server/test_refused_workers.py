@@ -38,7 +38,9 @@ def test_only_so_many_are_kept_and_only_for_a_while() -> None:
     workers = RefusedWorkers()
     for index in range(2 * KEPT):
         workers.answered(KEY, register(f"w{index}"), REFUSED, float(index))
-    assert [entry.worker for entry in workers.recent(100.0)] == [f"w{index}" for index in range(KEPT, 2 * KEPT)]
+    assert [entry.worker for entry in workers.recent(100.0)] == [
+        f"w{index}" for index in range(KEPT, 2 * KEPT)
+    ]
     assert workers.recent(100.0 + KEPT_S) == ()
 
 

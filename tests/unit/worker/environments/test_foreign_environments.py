@@ -65,7 +65,12 @@ def test_a_definition_sets_arguments_wrappers_limit_text_and_success() -> None:
         "title": "G",
     }
     description = describe(defined("Glider", **more))
-    assert (description.max_episode_steps, description.task_text, description.success, description.title) == (7, "# Fly", "near", "G")
+    assert (description.max_episode_steps, description.task_text, description.success, description.title) == (
+        7,
+        "# Fly",
+        "near",
+        "G",
+    )
     assert description.action_space["high"] == [2.0]
     assert description.digest() != describe("acme_envs:Glider-v0").digest()
     environment = make("acme/Glider")

@@ -154,7 +154,9 @@ def plain(value: Any) -> Any:
 def test_whatever_comes_as_a_report_is_a_bounded_failure(
     policy: PolicyProcess, report: dict[str, Any], what: str
 ) -> None:
-    error = policy._reported_failure(frames.FAILED, json.dumps(plain(report)).encode("utf-8", "surrogatepass"), what)
+    error = policy._reported_failure(
+        frames.FAILED, json.dumps(plain(report)).encode("utf-8", "surrogatepass"), what
+    )
     failure = error.failure
     assert len(failure.message) <= 2000
     assert len(failure.traceback) <= 16_000

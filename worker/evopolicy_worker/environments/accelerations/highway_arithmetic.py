@@ -14,7 +14,7 @@ TWO_PI = 2 * math.pi
 
 
 def clip(value: float, low: float, high: float) -> float:
-    """`np.clip` of one number: NaN stays, and so does a zero at a limit of zero, whatever its sign."""
+    """`np.clip` of one number: NaN stays, and so does a zero at a limit of zero, with its sign."""
     if value < low:
         return low
     return high if value > high else value

@@ -188,7 +188,7 @@ class ClosestLanes(Scene):
 
 
 def _shape(lane: Any) -> Shape | None:
-    """What of a lane decides distances, as plain numbers; None for a kind that has no estimate."""
+    """The numbers of a lane that determine distances; None for a kind without an estimate."""
     if isinstance(lane, CircularLane):
         return (
             "circular",

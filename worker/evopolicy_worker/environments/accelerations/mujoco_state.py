@@ -24,7 +24,7 @@ from evopolicy_worker.environments.accelerations.specialise import specialise
 
 
 class _Direct(MujocoEnv):
-    """What the three share."""
+    """The code that the three share."""
 
     def look_up(self) -> None:
         """Keep views of the arrays that every step reads."""

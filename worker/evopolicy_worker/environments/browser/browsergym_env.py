@@ -106,7 +106,7 @@ class BrowserGymEnv(PageEnv):
             observed["screenshot"] = self.picture(*self._size[:2])
         return observed
 
-    # What actions do; named after them. ValueError in words for what cannot be done.
+    # The actions, by their names. Raises ValueError with a text for an action that is not possible.
 
     def _noop(self, wait_ms: float) -> None:
         self.page.run(f"__evopolicy.pass({min(max(0.0, float(wait_ms)), MAX_WAIT_MS)})")

@@ -109,7 +109,7 @@ _FLAGS = (
 
 @cache
 def program() -> str:
-    """Path of the browser's program. WorkerError, with what is needed, when there is none."""
+    """Path of the browser's program. Raises WorkerError with the requirement when there is none."""
     named = os.environ.get(BROWSER, "")
     if named:
         if os.access(named, os.X_OK) and not os.path.isdir(named):
@@ -122,7 +122,7 @@ def program() -> str:
 
 
 def lacking() -> str:
-    """What is needed for a browser, in words; empty when there is one."""
+    """The missing requirement for a browser, in words; empty when there is a browser."""
     try:
         program()
     except WorkerError as error:
@@ -131,7 +131,7 @@ def lacking() -> str:
 
 
 class Chromium:
-    """A running browser. `devtools` speaks with it."""
+    """A running browser. `devtools` is the connection to it."""
 
     def __init__(self, on_event: Callable[[str, dict[str, Any], str], None]) -> None:
         """Raises WorkerError when there is no browser, and BrowserLostError when it does not start."""

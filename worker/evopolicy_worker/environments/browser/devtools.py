@@ -23,7 +23,7 @@ MAX_MESSAGE_BYTES = 64 << 20
 
 
 class BrowserLostError(WorkerError):
-    """The browser or its page has crashed, hangs, or does not do what it is told. A new browser may."""
+    """The browser or its page has crashed, hangs, or does not execute a command. A new browser may work."""
 
 
 class _Answer(msgspec.Struct):
@@ -54,7 +54,7 @@ class DevTools:
         self._wanted: set[int] = set()
 
     def send(self, method: str, session: str = "", *, wanted: bool = True, **params: Any) -> int:
-        """Sends a command and returns its number for `result`. `wanted=False`: its result will not be asked for."""
+        """Sends a command and returns its number for `result`. `wanted=False`: the result is discarded."""
         self._n += 1
         message: dict[str, Any] = {"id": self._n, "method": method, "params": params}
         if session:

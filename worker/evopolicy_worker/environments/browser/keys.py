@@ -20,7 +20,7 @@ class Key(msgspec.Struct, frozen=True):
     number: int
     """Virtual key code; 0 for a character of no key."""
     text: str = ""
-    """What it types."""
+    """The text that it types."""
     location: int = 0
     """3 on the number pad, 1 and 2 for the left and right of a pair."""
     shift: bool = False

@@ -50,7 +50,7 @@ KEYS = (
     "C-v",
     *"ABCDEFGHIJKLMNOPQRSTUVWXYZ",
 )
-"""What `key` of an action counts through."""
+"""The keys that `key` of an action indexes."""
 _PRESSED = tuple(filter(None, map(keys.miniwob, KEYS)))
 _FLAGS = np.int8
 
@@ -123,7 +123,7 @@ class MiniWoBEnv(PageEnv):
             page.type(self._fields[field][1] if field < len(self._fields) else "")
 
     def _observation(self, found: dict[str, Any]) -> dict[str, Any]:
-        """What there is to see; of an episode that has ended, nothing, as in MiniWoB++."""
+        """The observation; empty after the end of an episode, as in MiniWoB++."""
         observed: dict[str, Any] = {
             "utterance": found.get("utterance", ""),
             "dom_elements": tuple(map(_element, found.get("elements", ()))),

@@ -22,7 +22,7 @@ Fields = tuple[tuple[str, str], ...]
 
 
 class PageText(msgspec.Struct, frozen=True):
-    """What the package's documentation says of a page."""
+    """The package's documentation of a page."""
 
     description: str = ""
     examples: tuple[str, ...] = ()
@@ -31,7 +31,7 @@ class PageText(msgspec.Struct, frozen=True):
 
 
 def folder() -> Path | None:
-    """Where the package is installed; None when it is not."""
+    """Folder of the package; None when it is not installed."""
     spec = find_spec("miniwob")
     places = [] if spec is None else list(spec.submodule_search_locations or ())
     return Path(places[0]) if places else None
@@ -52,7 +52,7 @@ def document(name: str) -> str:
 
 @cache
 def texts() -> dict[str, PageText]:
-    """By name of the page, what is said of it."""
+    """The documentation by page name."""
     found: dict[str, PageText] = {}
     place = folder()
     for path in sorted(place.glob("envs/*.py")) if place is not None else []:

@@ -26,12 +26,12 @@ from evopolicy_worker.environments.browser.devtools import BrowserLostError
 from evopolicy_worker.environments.browser.keys import MODIFIERS, NAMED, SHIFT, Key, typed
 
 ORIGIN = "http://pages.invalid"
-"""Where pages seem to come from. Not `localhost`: that would be a secure context, with service workers."""
+"""Origin of the pages. Not `localhost`, which is a secure context with service workers."""
 CALL_S = 10.0
 """A page that takes longer over one command hangs."""
 LOAD_S = 30.0
 _LOOK_EVERY = 64
-"""After so many episodes the browser's memory is looked at."""
+"""Number of episodes between two checks of the browser's memory."""
 _NO_REASON = "BlockedByClient"
 _HALF_PAIR = re.compile(r"(?<!\\)((?:\\\\)*)\\ud[89a-f][0-9a-f]{2}")
 
@@ -55,7 +55,7 @@ Button = Literal["left", "middle", "right"]
 
 
 class Address(msgspec.Struct, frozen=True):
-    """What a page is: its files and how it begins."""
+    """Files and initial script of a page."""
 
     root: Path
     """Folder of its files."""
@@ -86,7 +86,7 @@ class Page:
         self._buttons = 0
         self._held = "none"
         self.mouse_at = (0.0, 0.0)
-        """Where the mouse is, CSS pixels."""
+        """Position of the mouse, CSS pixels."""
 
     @property
     def browser(self) -> Chromium:

@@ -48,7 +48,7 @@ class PageEnv(gymnasium.Env[Any, Any]):
     _enter = "__evopolicy.begin"
     """Begins an episode in the page."""
     _open = _look = "__evopolicy.look"
-    """What there is to see at its beginning, and after a step."""
+    """The observation at the start of an episode, and after a step."""
     metadata = {"render_modes": ["rgb_array"], "render_fps": 5}
 
     def __init__(
@@ -163,10 +163,10 @@ class PageEnv(gymnasium.Env[Any, Any]):
         return self._first(page.tell(f"{begin}.then({self._open})"))
 
     def _scored(self, found: dict[str, Any]) -> tuple[float, bool, dict[str, Any]]:
-        """Reward, whether the episode has ended, and what is told of it, from what the page says."""
+        """Reward, whether the episode has ended, and `info`, from the page's report."""
         done, raw = bool(found["done"]), float(found["raw"])
         if found["left"]:
-            # What MiniWoB++ gives when time runs out.
+            # MiniWoB++'s reward at the timeout.
             done, raw, found = True, -1.0, {**found, "reward": -1.0, "reason": found["left"]}
         reward = {
             "decayed": float(found["reward"]),
@@ -188,7 +188,7 @@ class PageEnv(gymnasium.Env[Any, Any]):
 
     @abstractmethod
     def _first(self, found: dict[str, Any]) -> Any:
-        """The first observation of an episode that has begun. `found`: what there is to see."""
+        """The first observation of an episode. `found`: the page's report."""
 
     @abstractmethod
     def _step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:

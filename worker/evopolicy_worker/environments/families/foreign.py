@@ -17,7 +17,7 @@ from evopolicy_worker.environments.families import miniwob
 from evopolicy_worker.environments.gymnasium_adapter import GymnasiumFamily
 
 _OF_GYMNASIUM = ("mujoco", "box2d", "pygame-ce", "ale-py")
-"""What Gymnasium's own environments are made of, beside Gymnasium."""
+"""Distributions of Gymnasium's own environments, besides Gymnasium."""
 _SOURCES = (".py", ".pyx", ".so", ".xml", ".json", ".toml", ".yaml", ".csv", ".npz", ".npy")
 _MAX_FILES = 5000
 _PAGES = "evopolicy_worker.environments.browser.registered"
@@ -50,13 +50,15 @@ class ForeignFamily(GymnasiumFamily):
         return common | own | (miniwob.FAMILY.packages(entry) if self._module == _PAGES else {})
 
     def version(self, entry: Entry) -> str:
-        packages = ", ".join(f"{name} {each}" for name, each in self.packages(entry).items() if name != "numpy")
+        packages = ", ".join(
+            f"{name} {each}" for name, each in self.packages(entry).items() if name != "numpy"
+        )
         return f"{entry.gymnasium_id} ({packages})"
 
 
 @cache
 def _package(module: str) -> Path | None:
-    """Where a module's top-level package or file is; found without importing it. None when there is none."""
+    """Path of a module's top-level package or file, found without importing it; None if there is none."""
     spec = find_spec(module.partition(".")[0])
     if spec is None:
         return None

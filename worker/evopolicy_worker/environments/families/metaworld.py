@@ -24,7 +24,7 @@ _CAMERA = "corner"
 _SIDE = 320
 """Height and width of a frame, pixels."""
 _GOAL = slice(36, 39)
-"""Where an observation has the goal."""
+"""Indices of the goal in an observation."""
 
 
 class MetaWorldFamily(MujocoFamily):

@@ -64,7 +64,7 @@ class MiniWoBFamily(GymnasiumFamily):
 
 
 def _documentation(name: str) -> str:
-    """What the package says of a page, with examples of its instructions, for the task text."""
+    """The package's documentation of a page, with examples of its instructions, for the task text."""
     page = miniwob_pages.texts().get(name, miniwob_pages.PageText())
     examples = "\n".join(f"* {each}" for each in page.examples)
     parts = [

@@ -66,7 +66,7 @@ class MiniWorldFamily(GymnasiumFamily):
 
         assert entry.gymnasium_id is not None
         _root().switch_to()
-        # The picture for people takes sixty megabytes even where nobody looks at it.
+        # The window for people takes sixty megabytes even when it is not shown.
         width, height = _PICTURE_FOR_PEOPLE if render else (1, 1)
         env = gymnasium.make(
             entry.gymnasium_id,

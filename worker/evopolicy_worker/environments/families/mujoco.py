@@ -40,13 +40,13 @@ class MujocoFamily(GymnasiumFamily):
     }
 
     def make(self, entry: Entry, *, render: bool) -> gymnasium.Env[Any, Any]:
-        """As others; WorkerError where a picture is asked for and the host has no EGL to draw it."""
+        """As in other families. Raises WorkerError when an image is requested and the host has no EGL to render it."""
         check_rendering(entry, render=render)
         return super().make(entry, render=render)
 
 
 def check_rendering(entry: Entry, *, render: bool) -> None:
-    """Raises WorkerError where a picture is asked for and the host has no EGL to draw it."""
+    """Raises WorkerError when an image is requested and the host has no EGL to render it."""
     if render and find_library("EGL") is None:
         raise WorkerError(
             f"{entry.id} renders with EGL, which is not installed: {distribution.install('egl')}"

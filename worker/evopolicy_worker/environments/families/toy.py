@@ -28,7 +28,7 @@ def make(entry: Entry, *, render: bool) -> Environment:
 
 
 class _Toy(Environment):
-    """What both share: their description, and pictures only when asked for."""
+    """The shared part of both environments: their description, and images only on request."""
 
     def __init__(
         self,
@@ -143,7 +143,7 @@ class Line(_Toy):
 
 
 class Maze(_Toy):
-    """A walker in a 9 × 9 grid with random walls looks for the exit; each step costs one."""
+    """A walker in a 9 × 9 grid with random walls searches the exit; each step costs one."""
 
     SIZE = 9
     WALL_SHARE = 0.25

@@ -103,7 +103,7 @@ def needed(folders: list[str]) -> list[str]:
                 try:
                     ctypes.CDLL(name)
                 except OSError:
-                    # Something that it needs is not on this machine: nobody can import it here.
+                    # One of its requirements is missing on this machine, so it cannot be imported here.
                     continue
             with open(write, "w") as file:
                 file.write("\n".join(loaded()))

@@ -33,9 +33,9 @@ REPLY_HEADER = struct.Struct("<IBxxx")
 MAX_ACTION_DEPTH = 16
 MAX_AXES = 16
 VALUE_BYTES = 16
-"""As many bytes as an action may have, so many values may it hold at this size each."""
+"""Bytes per value: an action may contain as many values as its byte limit divided by this."""
 MAX_USED = 1 << 53
-"""So many bytes are told of an action that takes more."""
+"""Largest size that is reported for an action."""
 MAX_TEXT = 16_000
 
 _REHEARSED = 32
@@ -43,12 +43,12 @@ _REHEARSED = 32
 
 libc = ctypes.CDLL(None, use_errno=True)
 reset_floats = functools.partial(libc.fesetenv, ctypes.c_void_p(-1))
-"""To FE_DFL_ENV, whatever an allowed package has set when it was imported."""
+"""Resets to FE_DFL_ENV, since an allowed package may have changed it on import."""
 flush_c = functools.partial(libc.fflush, None)
 action_bytes = 16 << 10
-"""What one action may take, bytes; told with the policy."""
+"""Maximum size of one action, bytes; received with the policy."""
 home = ""
-"""The policy's own folder; told with it."""
+"""The policy's own folder; received with the policy."""
 
 VARYING = ("Sequence", "Graph", "OneOf")
 NONE = 0xFFFFFFFF
@@ -59,7 +59,7 @@ Reader = Callable[[Any, Any], Any]
 
 
 def play(init: dict[str, Any]) -> NoReturn:
-    """Builds the Policy and answers for it until told to end."""
+    """Builds the Policy and serves requests until the end is requested."""
     global action_bytes, home
     action_bytes, home = init["action_bytes"], init["home"]
     reset_floats()
@@ -147,13 +147,13 @@ def seed_generators(seed: bytes) -> None:
     else:
         # Python leaves zeros at the end out.
         np.random.seed(list(struct.unpack("<4I", seed[:16])))
-    # Where numpy would ask the system for entropy: unseeded default_rng(), SeedSequence(), bit generators.
+    # Sources of system entropy in numpy: unseeded default_rng(), SeedSequence(), bit generators.
     entropy = random.Random(seed + b"numpy")
     vars(np.random.bit_generator)["randbits"] = entropy.getrandbits
 
 
 def answer(policy: Any, reader: tuple[Callable[[], Any], Reader]) -> None:
-    """Answers until told to end."""
+    """Serves requests until the end is requested."""
     make_buffer, observation = reader
     header = bytearray(REQUEST_HEADER.size)
     unpack = REQUEST_HEADER.unpack
@@ -485,7 +485,7 @@ def reply(tag: int, payload: bytes) -> None:
 def reply_failure(stage: str, error: BaseException) -> None:
     """Tells what the policy's own code raised. Its text is the policy's to forge; it names its own failure only."""
     kind, text, message, missing = None, "", "an exception that cannot be shown", None
-    # A hostile exception may raise when it is looked at; what is known by then is told.
+    # A hostile exception may raise when it is read; then the parts read so far are reported.
     with contextlib.suppress(BaseException):
         frames = error.__traceback__
         while frames is not None and frames.tb_frame.f_code.co_filename == __file__:

@@ -83,7 +83,7 @@ def main() -> None:
         control.send(json.dumps({"error": f"{type(error).__name__}: {error}"}).encode())
         raise
     worker = zygote(control, config["namespaces"])
-    # Only its forks come here. They must never go on as the zygote, whatever happens.
+    # Only its forks reach this line. They must never continue as the zygote.
     del control
     try:
         policy_process(config, worker, streams)
@@ -92,7 +92,7 @@ def main() -> None:
 
 
 def enter_user_namespace(control: socket.socket) -> None:
-    """Started as root: goes on as an unprivileged user, pid 1 of namespaces that this user owns."""
+    """When started as root: continues as an unprivileged user, as pid 1 of namespaces that this user owns."""
     os.setgroups([])
     wait_if_parent(os.fork(), control)
     check(libc.unshare(CLONE_NEWUSER), "unshare user")
@@ -125,7 +125,7 @@ def protect(device: str) -> None:
 
 
 def module(name: str) -> Any:
-    """One of ours, beside this file. Not by the path: a bundle may have a module of that name."""
+    """Imports one of our modules beside this file. Not by the path, since a bundle may have a module of that name."""
     path = os.path.join(os.path.dirname(__file__), f"{name}.py")
     spec = importlib.util.spec_from_file_location(f"_{name}", path)
     assert spec is not None
@@ -363,7 +363,7 @@ def seal(config: dict[str, Any], init: dict[str, Any]) -> None:
             kind = getattr(resource, name)
             _, most = resource.getrlimit(kind)
             if most != resource.RLIM_INFINITY:
-                # What this machine allows to nobody is not asked for.
+                # Rights that this machine grants to nobody are not requested.
                 value = min(value, most)
             resource.setrlimit(kind, (value, value))
     if config["seals"]:
@@ -383,7 +383,7 @@ def drop_capabilities() -> None:
 
 
 def landlock(rules: dict[str, list[str]], home: str) -> None:
-    """Limits what is opened to the given paths; where the kernel can, also TCP, abstract sockets and signals."""
+    """Restricts opening files to the given paths; if the kernel supports it, also TCP, abstract sockets and signals."""
     abi = libc.syscall(444, None, 0, 1)
     if abi < 1:
         raise OSError("the kernel lost its Landlock")

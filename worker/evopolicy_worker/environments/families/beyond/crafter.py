@@ -97,7 +97,7 @@ def _hasten() -> None:
 
 
 def _choice(name: str) -> str:
-    """What an action does, from its name, such as `place_stone`."""
+    """The effect of an action, from its name, such as `place_stone`."""
     verb, _, what = name.partition("_")
     what = what.replace("_", " ")
     if verb == "move":

@@ -26,7 +26,7 @@ _HEIGHT, _WIDTH = 180, 240
 _SYSTEM_SEED = 0
 """Draws what a task's model has at random (the springs of `lqr`): the same in every episode."""
 _UNLIMITED = 1e10
-"""What the suite says of an action without a limit."""
+"""The suite's value for an action without a limit."""
 _UNITS = "Lengths are in metres, angles in radians, velocities by the second; x points forwards or to the right, z upwards."
 
 

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     import gymnasium
 
 _BIRTHDAY = 1_600_000_000
-"""When every game was begun, seconds since 1970: shopkeepers' names and some prices follow from it."""
+"""Start of every game, seconds since 1970: it determines shopkeepers' names and some prices."""
 _LISTS = ("record", "logfile", "xlogfile", "paniclog")
 """Files with earlier games' scores, of which the game tells at its end."""
 _KEYS = {13: "Enter", 27: "Escape", 32: "Space"}
@@ -122,7 +122,7 @@ class _Game:
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         obs, reward, terminated, truncated, info = self._raw.step(action)
-        # At its step limit a game is given up, and says that it has ended.
+        # At its step limit a game is abandoned and reports that it has ended.
         aborted = info["end_status"].name == "ABORTED"
         return obs, reward, terminated and not aborted, truncated or aborted, _info(info)
 
@@ -159,7 +159,7 @@ def _info(info: dict[str, Any]) -> dict[str, Any]:
 
 
 def _set_birthday(library: str) -> None:
-    """Sets when the running game was begun, which it has taken from the clock. `library`: that plays it."""
+    """Sets the start time of the running game, which it took from the clock. `library`: the game's library."""
     already = os.RTLD_LAZY | os.RTLD_NOLOAD
     loaded = ctypes.CDLL(library, mode=already)
     try:
@@ -180,7 +180,7 @@ def _name(entry: Entry) -> tuple[str, str]:
 
 
 def _choice(action: Any, common: Mapping[str, Any]) -> str:
-    """What an action does."""
+    """The effect of an action."""
     kind, name = type(action).__name__, action.name
     if kind.startswith("Compass"):
         way = common["direction"][name]
@@ -215,7 +215,7 @@ def _picture(chars: NDArray[Any], colours: NDArray[Any], cursor: NDArray[Any]) -
 
 @cache
 def _letters() -> NDArray[np.bool_]:
-    """What is ink in each of the 256 characters, in cells of 11 × 6 pixels."""
+    """The set pixels of each of the 256 characters, in cells of 11 × 6 pixels."""
     from PIL import Image, ImageDraw, ImageFont
 
     font = ImageFont.load_default_imagefont()
