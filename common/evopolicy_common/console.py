@@ -5,14 +5,14 @@ This is a module of its own because rich is large and most commands do not need 
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Sequence
 from typing import Any
 
 import rich.console
 from rich.console import ConsoleOptions, JustifyMethod, RenderableType, RenderResult
 from rich.measure import Measurement
 from rich.segment import Segment
-from rich.table import Table
+from rich.table import Column, Table
 from rich.text import Text
 
 from evopolicy_common.terminal import harmless
@@ -21,8 +21,8 @@ WIDTH = 200
 """Columns without a terminal: a truncated table is worse than a long line."""
 
 
-_LEAST_WIDTH = 6
-"""Least width of a column whose cells may fold, unless all are shorter."""
+_LEAST_WIDTH = 12
+"""Least width of a column whose cells may fold, unless all words are shorter: words up to this length never break."""
 
 
 class Terminal(rich.console.Console):
@@ -56,7 +56,9 @@ class NarrowTable(Table):
             for column in self.columns
         ]
         least = [
-            width if column.no_wrap else max(min(width, _LEAST_WIDTH), *map(len, str(column.header).split()))
+            width
+            if column.no_wrap
+            else max(min(_longest_word(column), _LEAST_WIDTH), _longest_word(column.header))
             for width, column in zip(widths, self.columns, strict=True)
         ]
         gaps = len(widths) - 1
@@ -80,6 +82,20 @@ class NarrowTable(Table):
                     one.add_row(column.header, cell)
             yield from ([""] if number else [])
             yield one
+
+
+def _longest_word(of: Column | RenderableType) -> int:
+    texts = of.cells if isinstance(of, Column) else (of,)
+    return max((len(word) for text in texts for word in str(text).split()), default=0)
+
+
+def filled_table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
+    """A table of these rows without the columns in which every cell is empty."""
+    kept = [index for index in range(len(headings)) if any(row[index] for row in rows)]
+    made = table(*(headings[index] for index in kept))
+    for row in rows:
+        made.add_row(*(row[index] for index in kept))
+    return made
 
 
 def table(*headings: str, right: Collection[str] = (), whole: Collection[str] = ()) -> Table:

@@ -21,7 +21,7 @@ import typer
 from evopolicy_common import catalogue
 from evopolicy_common.cli import fail, fail_on_our_errors, setup_logging
 from evopolicy_common.commands import App, Version, run_app
-from evopolicy_common.console import table, terminal
+from evopolicy_common.console import filled_table, terminal
 from evopolicy_common.errors import ConfigError, MachineError, SandboxError
 from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_common.messages.episode import Tier
@@ -215,10 +215,8 @@ def doctor(
     if as_json:
         say_json({"tier": best, "checks": checks})
     else:
-        shown = table("check", "verdict", "found", "what to do")
-        for check in checks:
-            shown.add_row(check.name, check.verdict, check.found, check.advice)
-        terminal().print(shown)
+        rows = [(each.name, each.verdict, each.found, each.advice) for each in checks]
+        terminal().print(filled_table(("check", "verdict", "found", "remedy"), rows))
         say(
             f"tier: {best or 'none (policies would not be locked in: a worker needs --unsandboxed, a run --tier none)'}"
         )

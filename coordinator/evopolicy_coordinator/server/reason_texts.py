@@ -19,7 +19,7 @@ from evopolicy_coordinator.core.isolation.conflicts import NO_BOOT_ID
 from evopolicy_coordinator.core.reasons import Code, Reason
 
 
-def _workers(env: str, tier: str, same_versions: bool, away: tuple[str, ...]) -> str:
+def _workers(env: str, tier: str, same_versions: bool, away: tuple[str, ...], connected: bool) -> str:
     wanted = f"a worker that offers {env} with sandbox tier {tier}"
     if same_versions:
         wanted += ", of the versions that the run started with"
@@ -27,6 +27,9 @@ def _workers(env: str, tier: str, same_versions: bool, away: tuple[str, ...]) ->
     states = sorted("out of service" if state == "quarantined" else state for state in away)
     if states:
         return f"{wanted}: those that do are {' or '.join(states)}"
+    if not connected:
+        # A worker that is still starting lacks nothing that has to be installed.
+        return f"{wanted}; no worker is connected yet"
     advice = installs.advice(env)
     return f"{wanted} ({advice} on a machine)" if advice else wanted
 

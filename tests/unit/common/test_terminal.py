@@ -12,7 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from evopolicy_common.cli import fail, setup_logging
-from evopolicy_common.console import Terminal, table
+from evopolicy_common.console import Terminal, filled_table, table
 from evopolicy_common.terminal import harmless, one_line, say, say_json, say_lines
 
 STEERING = [
@@ -122,6 +122,18 @@ def test_a_table_cuts_nothing_on_a_narrow_terminal() -> None:
     columns = ["".join(line[a:b].strip() for line in shown.splitlines()[1:]) for a, b in cells(shown)]
     assert "a-worker-with-a-name-of-thirty-eight-l" in columns[0]
     assert names.replace(" ", "") == columns[1].replace(" ", "")
+
+
+def test_a_narrow_table_breaks_no_short_word_and_has_no_empty_column() -> None:
+    out = io.StringIO()
+    rows = [
+        ("extra coordinator", "ok", "cryptography, jinja2, matplotlib", ""),
+        ("disk", "ok", "55 GiB free", ""),
+    ]
+    Terminal(file=out, width=40).print(filled_table(("check", "verdict", "found", "remedy"), rows))
+    shown = out.getvalue()
+    assert "remedy" not in shown
+    assert {"coordinator", "cryptography,", "matplotlib"} <= set(shown.split())
 
 
 def cells(shown: str) -> list[tuple[int, int]]:

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from evopolicy_common.commands import App
-from evopolicy_common.console import table, terminal
+from evopolicy_common.console import filled_table, terminal
 from evopolicy_common.terminal import say, say_json
 from evopolicy_worker.sandbox.doctor import Check, best_tier, examine
 from evopolicy_worker.sandbox.machine import examine_machine
@@ -34,13 +34,11 @@ def doctor(
     if as_json:
         say_json({"plays": plays, "tier": tier, "checks": checks})
     else:
-        shown = table("check", "verdict", "found", "what works without it", "what to do")
-        for check in checks:
-            missing = check.verdict != "ok"
-            shown.add_row(
-                check.name, check.verdict, check.found, check.without if missing else "", check.advice
-            )
-        terminal().print(shown)
+        rows = [
+            (each.name, each.verdict, each.found, "" if each.verdict == "ok" else each.without, each.advice)
+            for each in checks
+        ]
+        terminal().print(filled_table(("check", "verdict", "found", "works without it", "remedy"), rows))
         say(
             "next: evopolicy demo"
             if plays

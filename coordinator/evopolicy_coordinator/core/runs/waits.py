@@ -36,5 +36,10 @@ def waits_for_workers(state: State, flow: Flow) -> Reason | None:
     same = [worker for worker in able if flow.pin in (None, worker.profile.classes[flow.env])]
     away = {worker.state for worker in same if worker.state != "active"}
     return because(
-        "workers", env=flow.env, tier=flow.tier, same_versions=len(same) < len(able), away=tuple(sorted(away))
+        "workers",
+        env=flow.env,
+        tier=flow.tier,
+        same_versions=len(same) < len(able),
+        away=tuple(sorted(away)),
+        connected=any(worker.state != "lost" for worker in state.workers.values()),
     )

@@ -51,10 +51,21 @@ def test_words_name_exactly_what_a_reason_is_about(code: Code, about: set[str]) 
 
 
 def test_a_reason_about_another_is_put_into_one_sentence() -> None:
-    missing = because("workers", env="gym/x", tier="bwrap", same_versions=True, away=("lost", "quarantined"))
+    missing = because(
+        "workers", env="gym/x", tier="bwrap", same_versions=True, away=("lost", "quarantined"), connected=True
+    )
     assert words(because("no_worker_yet", waits_for=missing)) == (
         "the run waits for a worker that offers gym/x with sandbox tier bwrap, of the versions that the run started with:"
         " those that do are lost or out of service"
+    )
+
+
+def test_an_installation_is_advised_only_where_a_worker_is_connected() -> None:
+    """A local worker that is starting lacks none."""
+    missing = {"env": "gym/acrobot", "tier": "bwrap", "same_versions": False, "away": ()}
+    assert "setup gymnasium" in words(because("workers", connected=True, **missing))
+    assert words(because("workers", connected=False, **missing)) == (
+        "a worker that offers gym/acrobot with sandbox tier bwrap; no worker is connected yet"
     )
 
 
