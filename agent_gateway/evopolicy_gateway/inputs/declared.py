@@ -1,7 +1,8 @@
-"""What an agent's file declares: folders of skills, and MCP servers with their files. Read and digested before a run is opened.
+"""The inputs that an agent's file declares: folders of skills, and MCP servers with their files.
 
-The digests are a setting of the run, which its commitment covers. Files are those below the folder in which the command was
-started. No link is followed: what a digest covers must be what the agent gets.
+They are read and digested before a run is opened. The digests are a setting of the run and covered by its commitment.
+Files are those below the folder in which the command was started. Links are not followed, so the agent gets exactly the
+digested files.
 """
 
 from __future__ import annotations

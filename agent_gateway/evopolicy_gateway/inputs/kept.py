@@ -1,7 +1,7 @@
 """A run's own copies of its declared inputs, which the jail shows read-only.
 
-The copies are made at the agent's first start, outside everything that the agent sees, and compared with the run's digests at each
-start: what is declared must not change while a run is open.
+The copies are made at the agent's first start, outside the agent's view, and compared with the run's digests at each
+start: inputs must not change while a run is open.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
-"""What environments need to be installed, and virtual environments that `evopolicy-worker setup` has made for them.
+"""Installation requirements of environments, and the virtual environments that `evopolicy-worker setup` makes for
+them.
 
-Packages of some families exclude those of others. Such a family is played by a worker in a virtual environment of its
-own. `installs.toml` has a row for each family: the extra of this software that installs it, the module that shows that
-it is installed, and the versions in which it differs from `constraints.txt`.
+Packages of some families conflict with those of others. A worker in a separate virtual environment plays such a family.
+`installs.toml` has a row for each family: the extra of this software that installs it, a module that shows that it is
+installed, and its versions that differ from `constraints.txt`.
 
 Each virtual environment has a file `MARK` that names its families. `EVOPOLICY_INSTALLS`, or `evopolicy/installs` in the
 user's data folder, contains one entry for each: the virtual environment, or a link to it.

@@ -1,10 +1,10 @@
-"""The file of published results: a zip archive of the plainest kind, written reproducibly and read as if an enemy had made it.
+"""The file of published results: a zip archive in its simplest form, written reproducibly and read as hostile input.
 
 Rules that this module owns:
-- Files are stored as they are, not compressed, so an archive is never larger inside than outside. Names are plain: lower-case
-  letters, digits, `.`, `-`, `_`, folders by `/`. No links, no comments, no extra fields, no zip64, no duplicates, no gaps.
-- The reader parses the archive itself and refuses whatever the writer would not have made, before it reads any content.
-  What it holds in memory is the names, and one file at a time.
+- Files are stored without compression, so unpacking never increases the size. Names are plain: lower-case letters,
+  digits, `.`, `-`, `_`, folders by `/`. No links, no comments, no extra fields, no zip64, no duplicates, no gaps.
+- The reader parses the archive itself, and refuses every archive that the writer could not have made before it reads
+  content. It holds the names and one file at a time in memory.
 """
 
 from __future__ import annotations

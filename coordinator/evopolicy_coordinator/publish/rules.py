@@ -1,11 +1,11 @@
-"""What `evopolicy check` verifies of published results, without playing anything. Pure: files come in, findings go out.
+"""The checks of `evopolicy check` on published results, without playing episodes. Pure: files in, findings out.
 
 Rules that this module owns:
-- Nothing in a file is believed because another part of it says so: everything is followed back to the journal's entries, whose
-  chain of hashes is in the manifest, which is signed. Who signed is believed only where the caller names the key.
-- A finding names its kind (`KINDS`). `failed`: what is published contradicts itself or the signature. `open`: this check
-  cannot show it, and says why.
-- Whatever a file holds, the check ends with findings; only what is no file of published results at all is an error.
+- No part of a file is trusted because another part confirms it: everything is traced to the journal's entries, whose
+  chain of hashes is in the signed manifest. The signer is trusted only if the caller names the key.
+- A finding has a kind (`KINDS`). `failed`: the published data contradict each other or the signature. `open`: this
+  check cannot decide, and states the reason.
+- For any content of a file, the check ends with findings; only a file without published results is an error.
 """
 
 from __future__ import annotations

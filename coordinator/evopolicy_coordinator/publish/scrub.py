@@ -1,7 +1,7 @@
-"""What must not be published: taken out of records, and searched for in everything else. Pure.
+"""Removes unpublishable data from records, and searches for it in all other files. Pure.
 
-A record keeps the fields that this module lists; whatever else is in it is left out and named. A file that the search finds
-something in is withheld as a whole when it may be (a policy, recorded actions); otherwise nothing is published.
+A record keeps the fields that this module lists; all other fields are removed and named. If the search finds a match in
+a file that may be omitted (a policy, recorded actions), the whole file is omitted; otherwise nothing is published.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""What an operator may do from a page, in which words it is confirmed, and the log of it.
+"""Actions of an operator on a page, the text of their confirmation, and their log.
 
-Off unless the view was started with `--act`, and then for holders of the acting token only. Every act is written to the log
-before it is asked for, and once more with its outcome.
+Off unless the view was started with `--act`, and then only for holders of the acting token. Every action is written to
+the log before it is requested, and again with its outcome.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""What the coordinator tells of the cluster, asked for as often as somebody looks, and its history of a day.
+"""The coordinator's status for the pages, requested while a page is open, and its history of a day.
 
-Rules: at most one question at a time, and after each a pause of `_SHARE` times what the answer cost the coordinator, so that
-any number of browsers costs it a small fixed share of a core. Several views share its answers: each takes one that is at most
-a pause old. Without anybody who looks it is asked every `_IDLE_S` for the history.
+Rules: at most one request at a time, and after each a pause of `_SHARE` times its cost in the coordinator, so any
+number of browsers costs it a small fixed share of a core. Several views share a reply that is at most one pause old.
+Without an open page, a request for the history is sent every `_IDLE_S`.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""What browsers are told as it changes: differences, for all who have the same page open.
+"""Updates of open pages as differences, shared by all browsers with the same page.
 
-A page is made of parts, each an HTML element with an id, and of lists of parts in an order. A feed keeps the latest of each
-part and the version at which it changed. So a browser that slept, or whose network is slow, asks for what has changed since
-the version that it has: it loses nothing, and nothing is queued for it.
+A page consists of parts, each an HTML element with an id, and of ordered lists of parts. A feed keeps the latest
+content of each part and the version at which it changed. A browser that slept, or whose network is slow, requests the
+changes since its own version: it misses nothing, and nothing is queued for it.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""What one run's pages show: code at each submit, episodes, the agent's words, the run's events.
+"""The pages of one run: code at each submit, episodes, the agent's messages, the run's events.
 
-All of it was written by an agent or a policy, or quotes one: it is text, bounded in length, and never markup. Code of an
-open run is in its gateway's folder, found by the gateway's journal; of a finished one in its checkpoints.
+An agent or a policy wrote all of it, or is quoted in it: it is text, bounded in length, and never markup. The code of
+an open run is in its gateway's folder, found by the gateway's journal; that of a finished run is in its checkpoints.
 """
 
 from __future__ import annotations

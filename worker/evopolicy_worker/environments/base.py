@@ -1,13 +1,13 @@
-"""What an environment is to the worker: one interface for all of them, whatever simulator is behind.
+"""The interface to all environments, independent of the simulator.
 
 Rules that this module owns:
-- An environment is used for many episodes, one after another, by one process. `reset(case)` followed by the same
-  actions gives the same episode bit for bit, whatever was played before; where a simulator does not promise that,
-  the adapter rebuilds it.
+- One process uses an environment for many episodes, one after another. `reset(case)` and the same actions give the same
+  episode bit for bit, independent of earlier episodes; where a simulator does not guarantee this, the adapter creates
+  it again.
 - Observations are plain: numpy arrays (C-contiguous, exactly the dtype of the space, never an alias of a buffer that
-  the simulator writes again), ints, strings, dicts in the order of the space, tuples.
+  the simulator reuses), ints, strings, dicts in the order of the space, tuples.
 - `info` is plain too (see `info.py`) and names no seed.
-- `step` trusts its action: what a policy returned goes through `action_codec.repair` first.
+- `step` trusts its action: the caller repairs a policy's actions first (`action_codec.repair`).
 """
 
 from __future__ import annotations

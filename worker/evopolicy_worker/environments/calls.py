@@ -1,6 +1,7 @@
-"""The call into an environment that runs now, so that a hang or an error can be told by name; and forks that come back.
+"""The current call into an environment, so that a hang or an error can name it; and the end of forks that return.
 
-The thread that plays sets `current`, for a few dozen nanoseconds a step. The monitor's thread reads it (`Guard`).
+The thread that plays sets `current`, which takes a few dozen nanoseconds a step. The monitor's thread reads it
+(`Guard`).
 """
 
 from __future__ import annotations

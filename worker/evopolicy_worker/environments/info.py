@@ -1,7 +1,8 @@
-"""What of a simulator's `info` goes into a trajectory: plain scalars, short strings, short lists, one level of dicts.
+"""The part of a simulator's `info` that goes into a trajectory: plain scalars, short strings, short lists, one level
+of dicts.
 
-Nothing that names a seed passes, and nothing of the simulator's own types: the result is JSON and msgpack as it is
-(NaN and infinities are the trajectory codec's to spell).
+Values that name a seed, and values of the simulator's own types, are left out. The result can be encoded as JSON and
+msgpack (the trajectory codec encodes NaN and infinities).
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The process environment in which simulators run: threads, drivers, hash seed, locale, time zone.
 
-A simulator may read these only while it is imported, so a slot process is *started* with them. `apply` is for callers
-that make an environment in a process of another's making (tests, `evopolicy try`): it fills in what is unset.
+A simulator may read these variables only while it is imported, so a slot process is *started* with them. `apply` sets
+missing variables in a process that was started otherwise (tests, `evopolicy try`).
 """
 
 from __future__ import annotations

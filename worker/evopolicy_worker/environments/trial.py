@@ -1,8 +1,8 @@
-"""What an environment that does not ship has to keep, checked in every episode; and a few random steps before it is offered.
+"""Checks of environments that do not ship: in every episode, and in a few random steps before they are offered.
 
-Its spaces stay as they were, its observations have the form of their space, and its rewards are finite. An observation
-beyond the bounds of its space is refused in the trial; in an episode the operator is told of the first one, since a policy can
-drive a sloppy environment there.
+Spaces must not change, observations must have the form of their space, and rewards must be finite. In the trial, an
+observation beyond the bounds of its space is refused. In an episode, the operator gets a report of the first one, since
+a policy can drive an imprecise environment there.
 """
 
 from __future__ import annotations

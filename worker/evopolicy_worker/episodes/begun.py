@@ -1,9 +1,10 @@
-"""What the policy of an unfinished episode has returned: told when a job is given back, so that its next attempt goes on from there.
+"""The policy's actions in an unfinished episode: reported when a job is returned, so that the next attempt continues
+from there.
 
 Rules:
-- Actions are kept as they were played, after repair: what they take follows from the action space and the steps, and a policy
-  cannot make it too much to hand back.
-- A failure stands like an action: who goes on plays random actions from there.
+- Actions are stored as played, after repair. Their size follows from the action space and the number of steps, so a
+  policy cannot make it too large to report.
+- A failure remains valid like an action: the next attempt plays random actions from there.
 """
 
 from __future__ import annotations
@@ -23,23 +24,23 @@ MAX_TRACEBACK = 4000
 
 
 class Returned(NamedTuple):
-    """One answer of the policy's."""
+    """One action of the policy."""
 
     returned: Any
-    """As it came; in an episode that was begun elsewhere, `action`."""
+    """As the policy returned it; in an episode that started elsewhere, `action`."""
     action: Any
-    """After repair, as it was played."""
+    """As played, after repair."""
 
 
 class Begun:
-    """An episode that is being played; the monitor's thread may read it meanwhile."""
+    """A running episode; the monitor's thread may read it meanwhile."""
 
     def __init__(self, taken: list[Returned] | None = None, failure: PolicyFailure | None = None) -> None:
         self.taken: list[Returned] = [] if taken is None else taken
         self.failure = failure
 
     def packed(self) -> PackedBegun:
-        """As it is at this moment, for another process."""
+        """A snapshot, for another process."""
         failure, taken = self.failure, list(self.taken)
         if failure is not None:
             failure = msgspec.structs.replace(failure, traceback=failure.traceback[-MAX_TRACEBACK:])
@@ -57,7 +58,7 @@ class PackedBegun(msgspec.Struct, frozen=True, kw_only=True):
     failure: PolicyFailure | None = None
 
     def unpacked(self) -> Begun:
-        """To go on from; as good as nothing where another worker has told what cannot be read."""
+        """The episode to continue; empty when the bytes of another worker cannot be read."""
         try:
             rows = decode(self.actions).rows() if self.actions else ()
         except ProtocolError:
@@ -66,11 +67,12 @@ class PackedBegun(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class HandedBack(NamedTuple):
-    """What is told of a job that was not finished."""
+    """The report on an unfinished job."""
 
     data: bytes
     limit_verdict: bool
-    """Whether a policy has failed by a limit, which counts from a worker only that was never silent for long."""
+    """Whether a policy has exceeded a limit. The coordinator accepts this only from a worker that was never silent
+    for long."""
 
 
 _Places = dict[int, PackedBegun]
@@ -79,12 +81,12 @@ _decoder = msgspec.msgpack.Decoder(_Places)
 
 
 def is_kept(job: Job) -> bool:
-    """Whether what its policy returns stands: of hidden episodes, whose luck must not be thrown again."""
+    """Whether the policy's actions remain valid: in hidden episodes, where a policy must not get a second attempt."""
     return job.bundle is not None and job.record == "actions"
 
 
 def pack(places: Mapping[int, PackedBegun]) -> HandedBack | None:
-    """The begun episodes of a job, by their place in it; None when there is nothing to tell, or too much."""
+    """The started episodes of a job by their index; None when there are none, or when they are too large."""
     found = {place: each for place, each in places.items() if each.actions or each.failure}
     data = _encoder.encode(found)
     if not found or len(data) > MAX_PACKED_BYTES:
@@ -95,7 +97,7 @@ def pack(places: Mapping[int, PackedBegun]) -> HandedBack | None:
 
 
 def unpack(job: Job) -> _Places:
-    """What an earlier attempt at the job has begun; nothing where that cannot be read."""
+    """The started episodes of an earlier attempt at the job; empty when they cannot be read."""
     data = None if job.begun is None or not is_kept(job) else job.begun.inline
     with contextlib.suppress(*DECODE_ERRORS, ProtocolError):
         return {} if data is None else _decoder.decode(data)

@@ -1,9 +1,10 @@
-"""The environment's process of a slot: `python -m evopolicy_worker.episodes.env_process`, started and told by `slot.Slot`.
+"""The environment's process of a slot: `python -m evopolicy_worker.episodes.env_process`, started by `slot.Slot`.
 
-It owns seeds, rewards and trajectories, imports the simulators it plays and nothing of Zenoh, and ends with its parent.
-It begins inside a jail (`sandbox.env_jail`), starts the policies' sandbox there, and seals itself before it imports a
-simulator: what comes later may be anyone's code. Commands come on standard input, answers go to what was standard output; whatever simulators print goes to standard
-error. The main thread plays; the monitor's thread hears commands meanwhile.
+It owns seeds, rewards, and trajectories, imports its simulators but nothing of Zenoh, and ends with its parent. It
+starts inside a jail (`sandbox.env_jail`), starts the policies' sandbox there, and seals itself before it imports a
+simulator, since later code may be third-party code. Commands arrive on standard input, and replies go to the original
+standard output; output of simulators goes to standard error. The main thread plays, while the monitor's thread receives
+commands.
 """
 
 from __future__ import annotations
@@ -30,11 +31,11 @@ from evopolicy_worker.slots.child_pipes import take_pipes
 
 _PROGRESS_S = 0.25
 ALIVE_S = 5.0
-"""So often the slot is told that this process is alive, also where no step is done."""
+"""Interval of the messages that this process is alive, seconds, also during a long step."""
 
 
 class Channel:
-    """Commands in, answers out."""
+    """Commands in, replies out."""
 
     def __init__(self, commands: int, replies: int) -> None:
         self._commands = commands
@@ -98,7 +99,7 @@ class EnvProcess:
         with env_jail.expendable():
             zygote = Zygote(plan, scratch)
         env_jail.seal(start.tier, scratch, plan.user, draws=start.draws)
-        # Beside the monitor, for what is allocated between two of its looks; so much more than resident memory is often asked for.
+        # In addition to the monitor, for memory allocated between two of its checks; programs often reserve this much more than they use.
         most = 2 * start.limits.memory_bytes
         resource.setrlimit(resource.RLIMIT_DATA, (most, most))
         calls.current.process = os.getpid()

@@ -1,8 +1,8 @@
 """The bytes between an environment's process and a policy's: observations out, actions in.
 
-Rules: a question is written in one piece and answered by exactly one frame. What comes back is hostile: it is bounded,
-parsed as plain values and arrays, and never executed; anything else raises BadReplyError. The other end is
-`sandbox/inside/player.py`, which names the same numbers.
+Rules: a request is written in one piece, and the reply is exactly one frame. Replies are hostile: they are bounded,
+parsed as plain values and arrays, and never executed; any other bytes raise BadReplyError. The other end,
+`sandbox/inside/player.py`, defines the same numbers.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ MAX_AXES = 16
 MAX_USED = 1 << 53
 """No process has more bytes than this; a float still counts them one by one."""
 VALUE_BYTES = 16
-"""An action of so many bytes may hold one value for each such piece of them: Python's objects take more than bytes do."""
+"""Bytes of an action's limit per value that it may contain, since Python's objects take more memory than their bytes."""
 
 Writer = Callable[[Any], list[Any]]
 """From an observation to the buffers of its payload, in order."""
@@ -56,14 +56,14 @@ _DTYPES = {
 
 
 class BadReplyError(Exception):
-    """The policy's process sent what is no reply; the message says what."""
+    """The policy's process sent bytes that are no reply; the message describes them."""
 
 
 _Word = Annotated[str, msgspec.Meta(max_length=200)]
 
 
 class Report(msgspec.Struct, frozen=True):
-    """What the policy's own code raised, as its process tells it: text that the policy may have forged."""
+    """The exception of the policy's own code, as its process reports it; the policy may have forged the text."""
 
     stage: _Word
     kind: _Word | None

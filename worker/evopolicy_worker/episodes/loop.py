@@ -1,17 +1,16 @@
-"""The episode loop: one environment, one policy process, step by step; what the environment's process runs.
+"""The episode loop: one environment and one policy process, step by step, in the environment's process.
 
 Rules:
-- The policy is given observations, and `Policy.__init__` the spaces and `env_meta`; never a seed, a reward, an info.
-- A policy that fails is replaced for the rest of the episode by uniform random actions keyed by the policy seed, and
-  every row with such an action says `policy_failed`. An action outside the space is repaired and its row marked.
-- A recording that is played again takes the policy's place: its actions, to its last step; then the episode stops,
-  whether or not the environment ended it.
-- A video is made of the episode's actions after its end (see `video.py`); playing it never draws.
-- What the policy did is a result, and so is what its actions did to the environment: an environment that breaks down on
-  them plays the episode once more, anew and with random actions alone. What the environment or the sandbox did wrong
-  otherwise is raised.
-- A policy that is ended from outside is started again, and the episode with it; so is a hidden episode whose job was given
-  back. What it had returned stands, and how it had failed: whatever a policy or its agent may do, its dice are thrown once.
+- The policy receives observations, and `Policy.__init__` the spaces and `env_meta`; never a seed, a reward, or an info.
+- After a policy fails, uniform random actions keyed by the policy seed replace its own to the end of the episode, and
+  every row with such an action has `policy_failed`. An action outside the space is repaired, and its row marked.
+- When a recording is replayed, its actions replace the policy's, up to its last step. The episode then stops, even if
+  the environment did not end it.
+- A video is made from the episode's actions after its end (see `video.py`); the episode itself never renders.
+- A policy's failure is a result, and so is the effect of its actions on the environment: if an environment breaks down
+  on them, the episode is repeated once with random actions only. Other failures of environment or sandbox are raised.
+- A policy that was ended from outside is restarted together with its episode, and so is a hidden episode whose job was
+  returned. The actions that it returned remain valid, and so does its failure: no policy gets a second attempt.
 """
 
 from __future__ import annotations
@@ -69,13 +68,15 @@ from evopolicy_worker.slots.endings import EndedFromOutsideError, Ending
 from evopolicy_worker.slots.recording import VideoRecorder
 
 MAX_FAULT = 4000
-"""Characters of an error that are told."""
+"""Characters of an error that are reported."""
 MAX_JOB_OUTPUT_BYTES = 64 << 20
-"""Of what is kept of a job's stdout, stderr and tracebacks, each episode has an equal share: 327 may use their limits up."""
+"""Limit for the stored stdout, stderr, and tracebacks of a job. Each episode has an equal share; 327 episodes can use
+their own limits fully."""
 MAX_ENDS = 5
-"""So often is one episode's policy started again here after an end from outside; then the job is played elsewhere."""
+"""Number of times that one episode's policy is restarted here after an end from outside; then another worker plays
+the job."""
 MAX_WARM_ENVIRONMENTS = 4
-"""Environments that are kept for the jobs to come: all sixteen in one process would take 230 MB."""
+"""Environments kept for later jobs: all sixteen in one process would take 230 MB."""
 
 
 _ACTING = messages.framed(messages.Acting())
@@ -98,11 +99,12 @@ class Progress:
         self._lock = threading.Lock()
 
     def begins(self, place: int, begun: Begun) -> None:
-        """The job's episode at this place is played now; what is in `begun` is told when the job is given up."""
+        """Starts the job's episode at this index; `begun` is reported when the job is stopped."""
         self._begun = place, begun
 
     def give_up(self, send: Callable[[messages.Message], None] | None) -> None:
-        """Tell what was begun, once; it is told when this returns. With None there is nothing to tell any more."""
+        """Reports the started episode, once; the report is sent when this returns. With None, nothing more is
+        reported."""
         with self._lock:
             if self._given_up:
                 return
@@ -143,10 +145,11 @@ class Player:
         first: int = 0,
         failure: PolicyFailure | None = None,
     ) -> None:
-        """Play the job's episodes in order, and `tell` what came of each as a framed `Finished`. `files`: its bundle.
+        """Plays the job's episodes in order, and passes each outcome to `tell` as a framed `Finished`. `files`: its
+        bundle.
 
-        It begins with the `first`, which is played without its policy where that has failed with `failure`.
-        Raises CancelledJobError; WorkerError, SandboxError or SlotDiedError for what is not the policy's fault.
+        Starts at index `first`. If `failure` is given, the policy has failed in that episode, which is played without
+        it. Raises CancelledJobError; WorkerError, SandboxError or SlotDiedError for failures that are not the policy's.
         """
         environment = self._environment(job.env)
         job = msgspec.structs.replace(job, limits=_within_share(job))
@@ -189,7 +192,7 @@ class Player:
         tell: Callable[[bytes], None],
         begun: Begun,
     ) -> tuple[PolicyFailure | None, bytes]:
-        """The failure in one episode, which goes on from what was `begun` of it, and its outcome as it is told."""
+        """The failure in one episode, which continues from `begun`, and its framed outcome."""
         n_ends = 0
         while True:
             environment = self._environment(job.env)
@@ -211,7 +214,7 @@ class Player:
             except (Exception, SystemExit) as error:  # an environment's sys.exit
                 if progress.cancelled or not episode.acted:
                     raise
-                # The same actions would do it again: to play it elsewhere would let a policy throw its dice twice.
+                # The same actions would fail again, and another worker would give the policy a second attempt.
                 note(f"{job.env} broke down on a policy's actions: {fault_of(error)}")
                 begun.failure = begun.failure or endings.broken_down(Ending("environment", "exit"))
                 begun.taken.clear()
@@ -253,7 +256,8 @@ class Player:
         self._zygote.close()
 
     def describe(self, env_id: str) -> EnvironmentDescription:
-        """What an environment is; it is made for that, and kept for the jobs to come. Raises WorkerError as they do."""
+        """An environment's description. The environment is created for it and kept for later jobs. Raises WorkerError
+        when it cannot be created."""
         if not is_shipped(env_id):
             return environments.describe(env_id)
         return environments.measured(self._environment(env_id))
@@ -306,7 +310,7 @@ class _Policies:
         return policy
 
     def release(self) -> Ended:
-        """What the policy leaves of the episode that ended; a policy for one episode ends with it."""
+        """The policy's output in the ended episode; a policy for one episode ends with it."""
         policy = self._policy
         if policy is None:
             return Ended(b"", b"", 0.0)
@@ -331,7 +335,7 @@ class _Policies:
         if self._policy is not None:
             policy, self._policy = self._policy, None
             policy.kill()
-            # What is wrong with the sandbox was told by what the job did with it.
+            # The job itself has already reported a fault of the sandbox.
             with contextlib.suppress(EvopolicyError):
                 policy.end()
 
@@ -578,6 +582,6 @@ def _blob(data: bytes) -> BlobRef:
 
 
 def fault_of(error: BaseException) -> str:
-    """An error of ours in one line, with its kind where it is not one raised on purpose."""
+    """An infrastructure error in one line, with its type unless it is one of our own errors."""
     text = str(error) if isinstance(error, EvopolicyError) else f"{type(error).__name__}: {error}"
     return text.encode("utf-8", "replace").decode()[:MAX_FAULT]

@@ -1,9 +1,12 @@
-"""The environment process's second thread: keeps a policy's output drained and its limits, and hears the supervisor.
+"""The environment process's second thread: drains a policy's output, enforces its limits, and receives the
+supervisor's commands.
 
-Rules: the episode loop never waits for this thread and pays nothing for it per step. Whoever touches a policy's output
-descriptors holds the lock. A limit that is passed ends the policy by SIGKILL; the loop then finds its pipe closed and
-the verdict here. Wall time in which the policy was not let run counts for no limit: it was stopped from outside, it waited for a
-processor that its own threads did not use, or this process stood still itself.
+Rules:
+- The episode loop never waits for this thread, and a step costs nothing for it.
+- A thread that uses a policy's output descriptors holds the lock.
+- A policy that exceeds a limit is ended by SIGKILL; the loop then finds its pipe closed, and the verdict here.
+- Wall time in which the policy could not run counts against no limit: it was stopped from outside, it waited for a core
+  that its own threads did not use, or this process itself was stopped.
 """
 
 from __future__ import annotations
@@ -28,7 +31,7 @@ _SLOW_S = 0.05
 LATE_S = 0.5
 """A look that comes so much later than planned means that this process was not let run, seconds."""
 STOPPED_S = 10.0
-"""A policy that is stopped from outside for so long is ended, and started again."""
+"""Seconds after which a policy that was stopped from outside is ended and restarted."""
 STOPPED = ("T", "t")
 """States of a process that is stopped, or held by a debugger."""
 _PIECE = 65536
@@ -52,7 +55,7 @@ class Output:
         self._open = True
 
     def drain(self, fd: int) -> None:
-        """Read what is there, without waiting."""
+        """Reads available output without waiting."""
         for _ in range(64):
             if not self._open:
                 return
@@ -69,13 +72,13 @@ class Output:
         return self._open
 
     def take(self) -> bytes:
-        """What was kept, and start anew."""
+        """Returns the stored output and clears it."""
         kept, self._kept = bytes(self._kept), bytearray()
         return kept
 
 
 class Watch:
-    """What is watched of one policy process. The episode loop writes the times, the monitor reads them."""
+    """The watched values of one policy process. The episode loop writes the times, the monitor reads them."""
 
     def __init__(
         self, child: Child, limits: ResourceLimits, *, count_threads: bool, held: bool = False
@@ -88,7 +91,7 @@ class Watch:
         self.since = 0.0
         """Since when (monotonic) the policy owes an answer; 0.0 while it owes none."""
         self.what = ""
-        """What it was asked for: `import`, `init`, `reset`, `act`."""
+        """The current request: `import`, `init`, `reset`, `act`."""
         self.answer_limit_s = limits.init_wall_s
         self.spent_s = 0.0
         """Its earlier wall time in this episode."""
@@ -218,7 +221,7 @@ class Watch:
         self._in_answer_s = max(0.0, waited - self._answer_waited)
 
     def _used(self, since: float, now: float) -> tuple[float, float]:
-        """Wall time of the answer that is owed and of the episode, without what is excused, seconds."""
+        """Wall time of the pending reply and of the episode, without excused time, seconds."""
         owed_s = now - since - self._waiting_s
         in_answer = owed_s - self._answer_excused_s - self._in_answer_s
         return in_answer, self.spent_s + owed_s - self._excused_s - self._in_episode_s
@@ -263,10 +266,8 @@ class Monitor(threading.Thread):
         os.eventfd_write(self._wake, 1)
 
     def run(self) -> None:
-        """The thread: judges the watched policy and hears commands, until the process ends.
-
-        Ends the process where it fails itself: a policy that nobody watches has no limits, a slot that hears nothing hangs.
-        """
+        """The thread: checks the watched policy and receives commands until the process ends. If it fails itself, it
+        ends the process: a policy without a monitor has no limits, and a slot without commands hangs."""
         try:
             self._watch_on()
         except BaseException:

@@ -1,8 +1,10 @@
-"""One policy in the sandbox, as the episode loop sees it: init, reset, act, and how it failed.
+"""One policy in the sandbox, as the episode loop uses it: init, reset, act, and its failure.
 
-Rules: whatever the policy does is either an answer or a `PolicyFailedError`; what is the sandbox's own fault, or was done
-to it from outside (`endings`), is a SandboxError and never blamed on the policy. A policy that failed by dying or by breaking the
-pipes' rules is `dead`; one whose code raised lives on. Once an episode is played, no end of its policy voids it.
+Rules:
+- Every behaviour of the policy is either a reply or a `PolicyFailedError`. A fault of the sandbox, or an end from
+  outside (`endings`), is a SandboxError and never attributed to the policy.
+- A policy that died or violated the pipes' protocol is `dead`; a policy whose code raised continues to run.
+- After an episode is played, no end of its policy invalidates it.
 """
 
 from __future__ import annotations
@@ -33,22 +35,23 @@ _DENIED = frozenset(
         *("evopolicy_common", "evopolicy_worker", "evopolicy_coordinator", "evopolicy_gateway", "zenoh"),
     }
 )
-"""What a policy that asks for it is told it may not import: simulators and our own code, which it does not see."""
+"""Modules that a policy may not import: simulators and our own code, which it does not see."""
 _GRACE_S = 1.0
 _SEAL_S = 60.0
-"""For what is our own work before the bundle is imported."""
+"""Time limit for our own work before the bundle is imported."""
 _EXIT_S = 5.0
 """For a process that is ending to be gone."""
 _PF_EXITING = 0x4
 _LARGE_SHARE = 0.125
-"""Where the system has ended processes for want of memory, and this one without a word: it was for its own memory when it held
-more than such a share of its limit."""
+"""Share of its memory limit above which a policy that ended silently, while the system ran out of memory, counts as
+ended for its own memory use."""
 _SHIM_BROKEN = 70
 """The status with which `inside/zygote.py` ends a process that it should never come back from."""
 _ARRAY_HEAD_BYTES = 8 + 4 * 64
 """Before an array's own bytes: its type and its shape, which numpy lets have 64 axes."""
 _USUAL_ACTION_BYTES = 256
-"""An action of so many bytes, beside 16 for each number of the action space, counts for nothing in its episode."""
+"""Size of an action, beyond 16 bytes for each number of the action space, that does not count against the limit of
+its episode."""
 _MAX_MESSAGE = 2000
 _MAX_TRACEBACK = 16_000
 _STAGES: dict[str, FailureCategory] = {
@@ -77,7 +80,7 @@ class BundleFiles(NamedTuple):
 
 
 class Ended(NamedTuple):
-    """What a policy leaves behind."""
+    """The remains of a policy after its end."""
 
     stdout: bytes
     stderr: bytes
@@ -232,7 +235,7 @@ class PolicyProcess:
                 self._expect_ok([frames.REQUEST_HEADER.pack(0, frames.FLUSH, 0)], "act", _GRACE_S)
         if self.dead:
             return self.end()
-        # Under the monitor's lock: nobody else reads meanwhile.
+        # Under the monitor's lock, so no other thread reads.
         self._monitor.watch(None)
         self._watch.drain()
         cpu_s = self._watch.cpu_s() - self._watch.cpu_start_s
@@ -255,7 +258,7 @@ class PolicyProcess:
                 if self._gone:
                     self._child.close()
                 else:
-                    # It has said its last; what a hostile one writes from now on is not read.
+                    # Its last reply has arrived; later output of a hostile policy is not read.
                     self._zygote.bury_later(self._child)
         return self._finished
 
@@ -265,7 +268,7 @@ class PolicyProcess:
             if self._finished is None:
                 self._child.kill()
 
-    # What passes over the pipes.
+    # Requests and replies.
 
     def _expect_ok(self, parts: list[bytes], what: str, limit_s: float) -> None:
         self._watch.what = what
@@ -454,11 +457,11 @@ class PolicyProcess:
         return None
 
     def _fatal(self, category: FailureCategory) -> FailureCategory:
-        """Before there is a Policy, whatever ends the process means that the bundle yields none."""
+        """Before the Policy exists, every end of the process means that the bundle yields none."""
         return "init_error" if self._watch.what == "init" else category
 
     def _bury(self) -> None:
-        """The process is dead when this returns, or was told to die and is buried later; `_exit` says how it ended."""
+        """The process is dead when this returns, or was killed and is reaped later; `_exit` states how it ended."""
         self.dead = True
         self._watch.since = 0.0
         self._child.kill()
@@ -469,7 +472,7 @@ class PolicyProcess:
                 self._exit = self._zygote.wait(self._child)
 
     def _cpu_of_episode(self) -> float:
-        """CPU time that the dead process had used since the episode began, seconds; 0.0 when nobody knows."""
+        """CPU time that the dead process used since the episode began, seconds; 0.0 if unknown."""
         return max(0.0, self._exit.cpu_s - self._watch.cpu_start_s) if self._exit is not None else 0.0
 
     def _memory_used(self) -> float | None:

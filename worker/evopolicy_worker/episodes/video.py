@@ -1,13 +1,13 @@
-"""An episode's video: `python -m evopolicy_worker.episodes.video ENV_ID`, started and told by `recording.VideoRecorder`.
+"""An episode's video: `python -m evopolicy_worker.episodes.video ENV_ID`, started by `recording.VideoRecorder`.
 
 Rules:
-- The episode is played a second time, from its actions, in an environment of this process's own that renders. The
-  episode that counts never draws: with and without a video it is the same bytes, and drawing is charged to no policy.
-- Frame t shows the state in which row t's action was chosen, which the row's observation is of. So the first frame is
-  the first observation's, there are as many frames as rows, and the state after the last step has none.
-- A replay that departs from the episode, in any reward or flag, gives no video: it would show another episode.
-- One episode at a time: a framed `Order` on standard input, a framed `Made` on what was standard output. What
-  simulators and drivers print goes to standard error.
+- The episode is replayed from its actions in a rendering environment of this process. The original episode never
+  renders: its bytes are the same with and without a video, and no policy is charged for rendering.
+- Frame t shows the state in which row t's action was chosen, that of the row's observation. There are as many frames as
+  rows, and the state after the last step has none.
+- A replay that differs from the episode in any reward or flag yields no video, since it would show another episode.
+- One episode at a time: a framed `Order` on standard input, a framed `Made` on the original standard output. Output of
+  simulators and drivers goes to standard error.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ PRESET = "veryfast"
 MIN_RATE, MAX_RATE = 4, 30
 """Frames a second."""
 EPISODE_S = 10
-"""An episode of full length should last about so long, where the rates allow it."""
+"""Target duration of the video of a full-length episode, seconds, if the frame rates allow it."""
 
 
 class Order(msgspec.Struct, frozen=True, kw_only=True):

@@ -1,4 +1,4 @@
-"""Identifies the plant from trajectories: how actions move what is observed, as controllers that move things need it.
+"""Identifies the plant from trajectories: the effect of actions on observations, for controllers that move objects.
 
 An effector's coordinate is a component of `observation` whose step-to-step change follows one output, and whose values
 are near those of the achieved goal on that axis.

@@ -1,8 +1,8 @@
-"""Any agent that speaks the Agent Client Protocol, over the protocol's official Python library.
+"""Any agent that supports the Agent Client Protocol, over the protocol's official Python library.
 
-Its program runs for the whole run, in the agent's jail, and is started again after a crash; then its session is loaded, or, where
-it cannot load sessions, a new one begins. It is offered neither files nor terminals of this side: what it reads and runs, it
-reads and runs in its jail. Its requests for permission are answered by the rules of the run.
+Its program runs in the agent's jail for the whole run, and is restarted after a crash. It then loads its session, or
+begins a new one if it cannot load sessions. This side offers neither files nor terminals: the agent reads files and
+runs commands in its jail. The rules of the run decide its requests for permission.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""MiniWoB++ as BrowserGym plays it: `browsergym/miniwob.click-test` and the like.
+"""MiniWoB++ as in BrowserGym: `browsergym/miniwob.click-test` and the like.
 
-Observation and action are those of BrowserGym's `BrowserEnv` with the action sets `miniwob_all` and `bid` together, its
-zoom and its hidden instruction. The differences: objects come as JSON, since no space has a form for them; an observation has
-a `screenshot` and a `dom_object` only when they are asked for; time is the episode's clock.
+Observation and action are those of BrowserGym's `BrowserEnv` with the action sets `miniwob_all` and `bid`, its zoom,
+and its hidden instruction. The differences: objects are JSON texts, since no space has a form for them; an observation
+has a `screenshot` and a `dom_object` only on request; time is the episode's clock.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """MiniWoB++ with its own spaces: `miniwob/click-test-v1` and the like.
 
-Observation and action are those of the package's `MiniWoBEnvironment` with its action set `all_supported`, but that an
-observation has a `screenshot` only when it is asked for.
+Observation and action are those of the package's `MiniWoBEnvironment` with its action set `all_supported`, except that
+an observation has a `screenshot` only on request.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""What the package `miniwob` ships: pages, what is said of them, and how their instructions are taken apart.
+"""The files of the package `miniwob`: pages, their documentation, and the parsing of their instructions.
 
-Its files are read where they are installed; the package itself, which would import Selenium, is not imported.
+The files are read from the installed package. The package itself is not imported, since it would import Selenium.
 """
 
 from __future__ import annotations

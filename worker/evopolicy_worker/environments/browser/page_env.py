@@ -1,13 +1,14 @@
-"""What both kinds of environments share: an episode in a page of MiniWoB++, its clock, its reward, and what is done when
-the browser is lost.
+"""The shared part of both kinds of environments: an episode in a page of MiniWoB++, its clock, its reward, and a lost
+browser.
 
 Rules:
-- An episode's clock is its own. `STEP_MS` of it pass at each step, however long a policy thinks or a page draws; a page
-  times out by it, and its reward decays by it. With `clock="wall"` time is the wall's, and no episode repeats.
-- A page is loaded once and used for many episodes (`load="once"`), or loaded for each (`load="each"`), in a browser
-  context of its own. The catalogue says which pages need the latter.
-- A page that hangs, crashes, or fails is this software's failure: the browser is started anew, and the episode so far is
-  played again, which gives the same. When that fails too, the error is raised.
+- Each episode has its own clock, which advances by `STEP_MS` per step, independent of the time that a policy or a page
+  takes. The page's timeout and the decay of its reward follow it. With `clock="wall"`, time is the machine's, and
+  episodes are not reproducible.
+- A page is loaded once for many episodes (`load="once"`), or for each (`load="each"`), in a browser context of its own.
+  The catalogue states which pages need the latter.
+- A page that hangs, crashes, or fails is an infrastructure failure: the browser is restarted, and the episode is
+  replayed up to that step, with the same result. If that fails too, the error is raised.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""Environments that do not ship: whatever Gymnasium can make from an environment file or from `module:Id`.
+"""Environments that do not ship: any that Gymnasium can create from an environment file or from `module:Id`.
 
-Nothing is known of them, so nothing is believed: each episode gets a fresh one, and their own source counts in their fingerprint.
+Nothing about them is trusted: each episode gets a fresh environment, and their source is part of their fingerprint.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""The sandbox's files: in a file system of its own, in memory, in place of the machine's folders.
+"""The sandbox's files: in a file system of its own in memory, instead of the machine's folders.
 
-A folder of the machine carries messages between all who see it, also long after. The kernel remembers which names were
-looked for in it, those that are not there too, and which files were read; how long another look takes tells. In a file
-system in memory all that is there is in memory, and names that are not there are not remembered.
+Processes that share a folder of the machine can pass messages through it, even long afterwards: the kernel caches which
+names were looked up in it, including missing ones, and which files were read, and the time of another lookup reveals
+this. In a file system in memory, all content is in memory, and missing names are not cached.
 
 Standard library only: the sandbox shows nothing else.
 """

@@ -1,9 +1,9 @@
 """The zygote inside the sandbox: forks a process per policy, which seals itself before it reads the bundle.
 
-- The zygote never reads a bundle: imported there, hostile code would own every later episode. It has numpy imported.
-- Each policy's process is pid 1 of a pid namespace of its own, with mounts of its own, and then gives up all that it could do:
-  capabilities, new privileges, files outside (Landlock), system calls (the filter), limits.
-- Started as root it first becomes an unprivileged user of a user namespace.
+- The zygote never reads a bundle: hostile code imported there would control every later episode. It has numpy imported.
+- Each policy's process is pid 1 of its own pid namespace, with its own mounts. It then drops all rights: capabilities,
+  new privileges, files outside (Landlock), system calls (the filter), limits.
+- When started as root, it first becomes an unprivileged user of a user namespace.
 
 Standard library and numpy only: the sandbox shows nothing else.
 """
