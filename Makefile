@@ -54,12 +54,14 @@ demo: install
 	@$(BIN)/evopolicy demo
 
 # More processes than cores, since many tests wait for timers and other processes. One by one: make test ARGS="-n 0"
-PROCESSES := $$(( $$(nproc) < 4 ? 3 * $$(nproc) : $$(nproc) + 4 ))
+PROCESSES := $$(( $$(nproc) + 6 ))
 
 # ARGS that name files play those, of whatever layer.
 test: LAYERS = not system and not families
 test-system: LAYERS = system
 test-families: LAYERS = families
+# Here every test starts clusters of its own.
+test-system: PROCESSES = $$(( $$(nproc) + 4 ))
 # These compute without pause, and have limits on time.
 test-families: PROCESSES = $$(nproc)
 # The tests start hundreds of processes: none of them shall compile our modules anew, whatever the shell asks of Python.

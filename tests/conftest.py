@@ -92,27 +92,43 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     )
 
 
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """`make test` does not import the files that it leaves out: each of its processes would."""
+    left_out = config.getoption("markexpr") == "not system and not families"
+    return True if left_out and _in(collection_path, (*_SYSTEM, *_FAMILIES)) else None
+
+
+def _beside_others(config: pytest.Config) -> bool:
+    """Whether this is one of xdist's processes."""
+    return hasattr(config, "workerinput")
+
+
+def _in(path: Path, names: tuple[str, ...]) -> bool:
+    return any(path.is_relative_to(Path(__file__).parent / name) for name in names)
+
+
 @pytest.hookimpl(tryfirst=True)  # before -m selects by marker
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Files with slow tests first, unit tests last, else in the order of their paths.
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Marks the layers, and puts files with slow tests first, unit tests last, others in the order of their paths.
 
     With `--dist loadfile --no-loadscope-reorder` processes take files in this order, so that they end at about the same
     time. By itself xdist begins with the files of most tests, and the longest tests, alone in their files, come last.
+    There unit tests, which compute, stand among the others, which wait for processes and clusters.
     """
-    paths = {item.path for item in items}
+    files = list(dict.fromkeys(item.path for item in items))
     slow = {item.path for item in items if item.get_closest_marker("slow") is not None}
-    tests = Path(__file__).parent
-    system, families = (
-        {path for path in paths if any(path.is_relative_to(tests / name) for name in names)}
-        for names in (_SYSTEM, _FAMILIES)
-    )
-    unit = {path for path in paths if path.is_relative_to(tests / "unit")}
+    unit = {path for path in files if _in(path, ("unit",))}
+    # Where the files of a kind begin and end.
+    spans = ((0.0, 0.0), (1.0, 1.7), (1.0, 2.0)) if _beside_others(config) else ((0, 0), (1, 1), (2, 2))
+    place: dict[Path, float] = {}
+    for (begin, end), kind in zip(spans, (slow, {*files} - slow - unit, unit - slow), strict=True):
+        ordered = [path for path in files if path in kind]
+        place |= {path: begin + (end - begin) * k / len(ordered) for k, path in enumerate(ordered)}
     for item in items:
-        if item.path in system:
-            item.add_marker("system")
-        if item.path in families:
-            item.add_marker("families")
-    items.sort(key=lambda item: (item.path not in slow, item.path in unit))
+        for name, files_of in (("system", _SYSTEM), ("families", _FAMILIES)):
+            if _in(item.path, files_of):
+                item.add_marker(name)
+    items.sort(key=lambda item: place[item.path])
 
 
 def pytest_collection_finish() -> None:

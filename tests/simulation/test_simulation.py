@@ -8,6 +8,8 @@ from sim_faults import RATES, Faults
 from sim_scenario import Simulation
 from simulate import play, replay_command
 
+pytestmark = pytest.mark.slow
+
 SEEDS = 1000
 SEEDS_PER_BUG = 500
 NOTICED_BY = {

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import shlex
 from collections.abc import Iterator
+from functools import cache
 from itertools import takewhile
 from pathlib import Path
 from typing import Any
@@ -32,15 +33,20 @@ def blocks_of_commands(path: Path) -> list[list[list[str]]]:
     return [rows for block in found if (rows := [words for words in block if words])]
 
 
-def commands() -> Iterator[tuple[str, Any]]:
+@cache
+def commands() -> tuple[tuple[str, Any], ...]:
     """Every command of ours that does something, by its whole name."""
-    for name, app in APPS.items():
-        yield from _below(name, typer.main.get_command(app))
+    return tuple(each for name in APPS for each in _below(name, _program(name)))
+
+
+@cache
+def _program(name: str) -> Any:
+    return typer.main.get_command(APPS[name])
 
 
 def parse(words: list[str]) -> None:
     """Fails when the command does not take these words."""
-    command: Any = typer.main.get_command(APPS[words[0]])
+    command = _program(words[0])
     arguments = words[1:]
     name: str | None = words[0]
     while name is not None:

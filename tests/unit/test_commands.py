@@ -10,6 +10,8 @@ from pathlib import Path
 import pytest
 from documents import APPS, commands
 
+pytestmark = pytest.mark.slow
+
 BIN = Path(sys.executable).parent
 PROGRAMS = sorted(APPS)
 GROUPS = [

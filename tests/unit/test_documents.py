@@ -67,6 +67,11 @@ def tree() -> frozenset[str]:
     return frozenset(str(each) for name in files for each in (Path(name), *Path(name).parents))
 
 
+@cache
+def tests_text() -> str:
+    return "".join(path.read_text() for path in (ROOT / "tests").rglob("*.py"))
+
+
 def is_there(name: str) -> bool:
     """A path in the tree, from its root, a room's package, or as the only end of a path that says so."""
     name = name.rstrip("/")
@@ -103,10 +108,9 @@ def test_commands_in_a_documents_blocks_are_taken(document: str) -> None:
 @pytest.mark.parametrize("document", DOCUMENTS)
 def test_options_that_a_document_names_are_ours(document: str) -> None:
     ours = {option for _, command in commands() for each in command.params for option in each.opts}
-    scripts = "".join(path.read_text() for path in (ROOT / "tests").rglob("*.py"))
     code = [word for word in code_in(document) if " pytest " not in word]
     named = {option for word in code for option in re.findall(r"(?<![\w-])--[a-z][\w-]*", word)}
-    assert {option for option in named - ours - {"--help"} if f'"{option}"' not in scripts} == set()
+    assert {option for option in named - ours - {"--help"} if f'"{option}"' not in tests_text()} == set()
 
 
 def test_make_has_the_targets_that_documents_name() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 from collections import Counter
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -20,10 +21,17 @@ ROOMS = {
 }
 
 
+@cache
+def nodes_of(path: Path) -> tuple[ast.Import | ast.ImportFrom | ast.Call, ...]:
+    """All imports and calls of a module, at any depth of its code."""
+    tree = ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+    return tuple(node for node in tree if isinstance(node, ast.Import | ast.ImportFrom | ast.Call))
+
+
 def imports_of(path: Path) -> set[str]:
     """Top-level names of everything that `path` imports, at any depth of its code."""
     found: set[str] = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in nodes_of(path):
         if isinstance(node, ast.Import):
             found.update(alias.name.split(".")[0] for alias in node.names)
         elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
@@ -73,7 +81,7 @@ def imported(name: str, path: Path, known: dict[str, Path]) -> set[str]:
     """Modules of the product that a module imports anywhere in its code, under `TYPE_CHECKING` too."""
     package = name if path.name == "__init__.py" else name.rpartition(".")[0]
     found: set[str] = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in nodes_of(path):
         if isinstance(node, ast.Import):
             found.update(alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -172,9 +180,7 @@ def test_what_commands_print_goes_through_the_terminal_module() -> None:
             name = f"{room}/{path.relative_to(folder).as_posix()}"
             if any(name.startswith(own) for own in OWN_STDOUT):
                 continue
-            calls = [
-                node.func for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Call)
-            ]
+            calls = [node.func for node in nodes_of(path) if isinstance(node, ast.Call)]
             named = {call.id for call in calls if isinstance(call, ast.Name)}
             named |= {call.attr for call in calls if isinstance(call, ast.Attribute)} & {
                 "echo",

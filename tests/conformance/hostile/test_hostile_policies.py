@@ -25,6 +25,8 @@ import evopolicy_worker
 from evopolicy_common.errors import WorkerError
 from evopolicy_common.messages.episode import EpisodeOutcome
 
+pytestmark = pytest.mark.slow
+
 SEED = 1_987_654_321
 PACKAGES = [(), ("scipy",)]
 """What policies may import besides numpy: a run's `--policy-package`."""

@@ -36,6 +36,8 @@ from evopolicy_worker import outbox, supervisor
 from evopolicy_worker.episodes.begun import HandedBack
 from evopolicy_worker.supervisor import Options, Supervisor
 
+pytestmark = pytest.mark.slow
+
 
 class ScriptedSlot:
     """Plays as the harness's `play` does, after what `script` does with the job; `dress` changes each outcome."""

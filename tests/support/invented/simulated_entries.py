@@ -217,9 +217,9 @@ def rank_rates(
         level = g.normal(0, spread, n_entries)
         means = level + g.normal(0, 0.5 * spread, (n_environments, n_entries))
         noise = math.sqrt(1.0 / (n_runs * n_cases) + (0.04 / n_runs if n_runs > 1 else 0.0))
-        average = rank_scores(means + g.normal(0, noise, (2000, n_environments, n_entries))).mean(axis=0)
-        if spread == 0.0:
-            average[:] = 0.5
+        average = np.full(n_entries, 0.5)
+        if spread:
+            average = rank_scores(means + g.normal(0, noise, (2000, n_environments, n_entries))).mean(axis=0)
         samples = suite_samples(g, means, n_runs, n_cases)
         observed = rank_scores(
             np.array(

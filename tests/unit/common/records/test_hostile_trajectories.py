@@ -37,7 +37,7 @@ def framed(*frames: bytes) -> bytes:
 
 
 def block(**changes: Any) -> bytes:
-    return zstandard.ZstdCompressor(level=19).compress(pack(ROW | changes))
+    return zstandard.ZstdCompressor().compress(pack(ROW | changes))
 
 
 def claim(size: int) -> bytes:
@@ -53,7 +53,7 @@ def raw_block(field: str, value: bytes) -> bytes:
     marker = b"\xa7MARKED!"
     packed = pack(ROW | {field: "MARKED!"})
     assert packed.count(marker) == 1
-    return zstandard.ZstdCompressor(level=19).compress(packed.replace(marker, value))
+    return zstandard.ZstdCompressor().compress(packed.replace(marker, value))
 
 
 def listed(n: int, item: bytes) -> bytes:

@@ -13,6 +13,8 @@ from evopolicy_gateway.harnesses.coding_agents import session
 from evopolicy_gateway.harnesses.usage import Prices
 from evopolicy_gateway.operator.child_messages import AgentEnded
 
+pytestmark = pytest.mark.slow
+
 both = pytest.mark.parametrize("harness", ["codex", "claude-code"])
 
 

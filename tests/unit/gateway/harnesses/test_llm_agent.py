@@ -15,6 +15,8 @@ from evopolicy_gateway.agents.llm import apis, shell
 from evopolicy_gateway.harnesses.agent_config import AgentConfig, LlmApi
 from evopolicy_gateway.harnesses.usage import Prices
 
+pytestmark = pytest.mark.slow
+
 Protocol = Literal["openai", "anthropic"]
 PROTOCOLS: list[Protocol] = ["openai", "anthropic"]
 SUBMIT = (

@@ -19,6 +19,8 @@ from evopolicy_worker.environments.families.foreign import ForeignFamily
 from evopolicy_worker.slots import slot as slot_module
 from evopolicy_worker.slots.slot import Slot
 
+pytestmark = pytest.mark.slow
+
 PACKAGE = Path(__file__).parents[3] / "support" / "foreign_package"
 
 

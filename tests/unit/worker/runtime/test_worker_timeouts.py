@@ -67,7 +67,8 @@ def test_a_policys_process_that_survives_being_killed_is_told(
 
 def test_a_child_that_does_not_seal_itself_is_killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(policy_process, "_SEAL_S", SOON_S)
-    commands, never_written = os.pipe()
+    # Nor closed, since the monitor's thread lives on: of a pipe at its end it would read without pause.
+    commands, _never_written = os.pipe()
     monitor = Monitor(commands, lambda: None, lambda: None)
     monitor.start()
     with a_zygote(tmp_path) as found:
@@ -81,7 +82,6 @@ def test_a_child_that_does_not_seal_itself_is_killed(tmp_path: Path, monkeypatch
             policy.init(BundleFiles([], b""), bytes(16), meta, "arrays")
         assert policy.dead
         policy.end()
-    os.close(never_written)
 
 
 @pytest.mark.parametrize("options", [{}, {"policy_scope": "submit", "first": 0, "n": 2}])

@@ -16,6 +16,8 @@ from evopolicy_common.errors import BrokenEnvironmentError, SandboxError, SlotDi
 from evopolicy_common.messages.episode import EpisodeOutcome
 from evopolicy_worker.slots.slot import Slot
 
+pytestmark = pytest.mark.slow
+
 
 def played(
     slots: Slots, slot: Slot, signals: list[int], pause_s: float = 5.0, **options: object

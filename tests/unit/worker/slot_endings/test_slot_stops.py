@@ -20,6 +20,8 @@ from evopolicy_common.messages.episode import EpisodeOutcome
 from evopolicy_worker.episodes import monitor
 from evopolicy_worker.slots.slot import Slot
 
+pytestmark = pytest.mark.slow
+
 LESS_TIGHT = msgspec.structs.replace(QUICK, act_wall_s=3.0, episode_wall_s=4.0)
 TIGHT = msgspec.structs.replace(QUICK, act_wall_s=1.0, episode_wall_s=4.0)
 
