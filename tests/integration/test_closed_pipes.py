@@ -25,10 +25,12 @@ MODULES = {
 }
 TIMEOUT_S = 300
 FORKING = """
-import importlib, json, os, runpy, sys
+import gc, importlib, json, os, runpy, sys
 
 for module in json.loads(sys.argv[1]):
     importlib.import_module(module)
+gc.collect()
+gc.freeze()  # or each child would look through, and so copy, all of it at its end
 for line in sys.stdin:
     module, *words = json.loads(line)
     reader, writer = os.pipe()

@@ -30,6 +30,12 @@ NOTICED_BY = {
     "let an agent start before hidden episodes have stopped": 19,
     "forget permits at a restart": 13,
     "forget what a silent worker may still play": 19,
+    "take a lease on its way for one that was let go of": 200,
+    "take all kernels for free after a restart": 107,
+    "throw the dice of a stopped episode again at once": 68,
+    "play train episodes beside hidden ones": 12,
+    "forget the hidden jobs that train jobs wait behind": 25,
+    "never preempt": 8,
 }
 """Seeds to try first for bugs that few seeds detect. After a change of the core other seeds may: then all are tried."""
 
