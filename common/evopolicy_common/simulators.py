@@ -30,6 +30,7 @@ SIMULATORS = (
         "retro",
         "stable_retro",
         "crafter",
+        "vizdoom",
     ),
 )
 """Import names, or names of their files in a Python installation."""

@@ -48,8 +48,11 @@ SAMPLE = (
     "dm_control/cartpole-swingup-v0",
     "dm_control/manipulator-insert_peg-v0",
     "crafter/CrafterReward-v1",
+    "gymnasium/VizdoomBasicNotifications-v1",
+    "gymnasium/VizdoomDeathmatch-MultiBinary-v1",
+    "gymnasium/VizdoomFreedoom2MAP01-S3-v0",
 )
-BEYOND = {"nethack", "minihack", "stable_retro", "dm_control", "crafter"}
+BEYOND = {"nethack", "minihack", "stable_retro", "dm_control", "crafter", "vizdoom"}
 """Families that the paper does not name."""
 FAMILIES = (
     {"classic_control", "toy_text", "box2d", "mujoco", "minigrid", "babyai", "highway", "robotics"}

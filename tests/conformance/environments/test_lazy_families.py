@@ -36,6 +36,7 @@ SIMULATORS = {
     "stable_retro": {"stable_retro"},
     "dm_control": {"mujoco", "dm_control"},
     "crafter": {"crafter"},
+    "vizdoom": {"vizdoom"},
 }
 """Packages that only these families' environments import."""
 MAKES = """

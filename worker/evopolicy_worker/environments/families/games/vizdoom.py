@@ -1,0 +1,196 @@
+"""ViZDoom: the scenarios of its wheel, and the levels of Freedoom, seen by the player.
+
+The game is a process of its own, which plays one step when it is told to. It shares memory with this process and writes into the
+folder in which it was started; here that is a temporary one, which goes with the environment.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import tomllib
+from functools import cache
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+
+from evopolicy_common.catalogue import Entry
+from evopolicy_common.errors import WorkerError
+from evopolicy_worker.environments import spaces
+from evopolicy_worker.environments.gymnasium_adapter import GymnasiumFamily
+from evopolicy_worker.environments.tasks import template
+
+if TYPE_CHECKING:
+    import gymnasium
+
+MOST_DELTA = 50.0
+"""Most that a step may turn or look, degrees, or move to the side, units of the map. The package has the largest float."""
+_SHARED = "/dev/shm"
+
+
+class VizdoomFamily(GymnasiumFamily):
+    """Scenarios and levels."""
+
+    distributions = ("vizdoom",)
+    modules = ("gymnasium", "vizdoom")
+    extra = "vizdoom"
+    # Its process is a game with a folder of files, which goes on from episode to episode.
+    remembers = True
+
+    def load(self) -> None:
+        import gymnasium
+        from vizdoom import gymnasium_wrapper
+
+        gymnasium.register_envs(gymnasium_wrapper)
+
+    def make(self, entry: Entry, *, render: bool) -> gymnasium.Env[Any, Any]:
+        return cast("gymnasium.Env[Any, Any]", _Game(super().make(entry, render=False).unwrapped))
+
+    def rebuilds(self, entry: Entry) -> bool:
+        # A level goes on with the random numbers of the game before. Scenarios repeat.
+        return _scenario(entry) == "Freedoom"
+
+    def words(self, entry: Entry, env: gymnasium.Env[Any, Any]) -> dict[str, str]:
+        game, told, common = cast(_Game, env), _texts()[_scenario(entry)], _texts()["common"]
+        numbers = [f"`[{k}]` {common['variable'][each]}" for k, each in enumerate(game.variables)]
+        parts = {**common["observation"], **told.get("observation", {}), "gamevariables": "; ".join(numbers)}
+        seen = [
+            f"| `{name}` | {parts[name]} | {_form(name, space)} |"
+            for name, space in game.observation_space.spaces.items()
+        ]
+        return {
+            "": f"{told['about']}{_level(entry)}",
+            "Observation": "\n".join(
+                [
+                    "A dict. The observation after the last step is all zeros.",
+                    "",
+                    "| component | what it is | form |",
+                    "|---|---|---|",
+                    *seen,
+                ]
+            ),
+            "Action": _actions(game, common["button"]),
+            "Reward": told["reward"],
+            "Start": told.get("start", common["start"]),
+            "End": told["end"],
+        }
+
+
+class _Game:
+    """A scenario or level: what the adapter needs of Gymnasium's interface."""
+
+    metadata = {"render_modes": ["rgb_array"]}
+    spec = None
+
+    def __init__(self, raw: Any) -> None:
+        """`raw`: the package's environment, whose game has not begun."""
+        from gymnasium import spaces
+
+        self._raw = raw
+        self._folder = tempfile.TemporaryDirectory(prefix="doom-")
+        self.observation_space, self.action_space = raw.observation_space, raw.action_space
+        self.variables = tuple(each.name for each in raw.game.get_available_game_variables())
+        buttons = tuple(each.name for each in raw.game.get_available_buttons())
+        self.deltas, self.buttons = buttons[: raw.num_delta_buttons], buttons[raw.num_delta_buttons :]
+        self.choices: tuple[tuple[int, ...], ...] | None = None
+        """Which buttons each choice presses; None where each button is chosen by itself."""
+        if raw.max_buttons_pressed:
+            self.choices = tuple(tuple(map(int, row)) for row in raw.button_map)
+        if self.deltas:
+            bounded = spaces.Box(-MOST_DELTA, MOST_DELTA, (len(self.deltas),), np.float32)
+            self.action_space = spaces.Dict([("binary", raw.action_space["binary"]), ("continuous", bounded)])
+
+    @property
+    def unwrapped(self) -> Any:
+        return self
+
+    def reset(self, *, seed: int, options: Any = None) -> Any:
+        if self._raw.game.is_running():
+            return self._raw.reset(seed=seed)
+        _check_shared_memory()
+        before = os.getcwd()
+        os.chdir(self._folder.name)
+        try:
+            return self._raw.reset(seed=seed)
+        finally:
+            os.chdir(before)
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        obs, reward, ended, truncated, info = self._raw.step(action)
+        # A game that its own time limit ends counts as both.
+        return obs, reward, ended and not truncated, truncated, info
+
+    def render(self) -> Any:
+        state = self._raw.state
+        return (
+            np.zeros(self.observation_space["screen"].shape, np.uint8)
+            if state is None
+            else state.screen_buffer
+        )
+
+    def close(self) -> None:
+        self._raw.close()
+        self._folder.cleanup()
+
+
+def _check_shared_memory() -> None:
+    """WorkerError in a jail without shared memory: the package would wait for its game for ever."""
+    try:
+        tempfile.TemporaryFile(dir=_SHARED).close()
+    except OSError as error:
+        raise WorkerError(
+            f"ViZDoom shares memory with its game in {_SHARED}, which sandbox tier landlock hides ({error.strerror}): it is played"
+            " in tier bwrap; `evopolicy-worker doctor` tells how to get it"
+        ) from error
+
+
+def _scenario(entry: Entry) -> str:
+    """Key of the texts, from an id such as `VizdoomBasic-MultiBinary-v1` or `VizdoomFreedoom2MAP01-S3-v0`."""
+    name = str(entry.gymnasium_id).removeprefix("Vizdoom").partition("-")[0]
+    return "Freedoom" if name.startswith("Freedoom") else name
+
+
+def _level(entry: Entry) -> str:
+    """Which level of Freedoom it is, in a sentence; empty for a scenario."""
+    if _scenario(entry) != "Freedoom":
+        return ""
+    name, skill, _ = str(entry.gymnasium_id).removeprefix("VizdoomFreedoom").split("-")
+    return f" This is level {name[1:]} of part {name[0]}, at skill {skill[1]} of 5, where 5 is the hardest."
+
+
+def _form(name: str, space: Any) -> str:
+    # The package's bounds of numbers are those of the type.
+    if name == "gamevariables":
+        return f"an array of shape {space.shape} of float32"
+    return template.words(spaces.to_schema(space))
+
+
+def _actions(game: _Game, effects: dict[str, str]) -> str:
+    """The buttons, as the action space has them."""
+    binary = [effects[name] for name in game.buttons]
+    if game.choices is None:
+        lines = [
+            "For each button, 1 presses it and 0 leaves it.",
+            "",
+            "| component | effect of the button |",
+            "|---|---|",
+        ]
+        lines += [f"| `{k}` | {each} |" for k, each in enumerate(binary)]
+    else:
+        lines = ["One choice a step.", "", "| choice | effect |", "|---|---|"]
+        for k, row in enumerate(game.choices):
+            pressed = [each for each, on in zip(binary, row, strict=True) if on]
+            lines.append(f"| `{k}` | {', and '.join(pressed) or 'none'} |")
+    if game.deltas:
+        lines[0] = f"`binary` is for the buttons. {lines[0]}"
+        lines += ["", "`continuous` is for the rest:", "", "| component | effect |", "|---|---|"]
+        lines += [f"| `{k}` | {effects[name]} |" for k, name in enumerate(game.deltas)]
+    return "\n".join(lines)
+
+
+@cache
+def _texts() -> dict[str, Any]:
+    return tomllib.loads(template.read("vizdoom_scenarios.toml"))
+
+
+FAMILY = VizdoomFamily()
