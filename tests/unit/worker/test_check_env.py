@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+import time
+from collections.abc import Callable
 from pathlib import Path
 
 import msgspec
+import pytest
 
 from evopolicy_common import catalogue
 from evopolicy_worker.check_env import COLUMNS, MOST_MEMORY_MB, Checked, InASlot, page
+from evopolicy_worker.environments.checks import conformance
 from evopolicy_worker.environments.checks.conformance import Played
 
 CARTPOLE, PENDULUM = "gymnasium/CartPole-v1", "gymnasium/Pendulum-v1"
@@ -40,3 +46,51 @@ def test_a_page_keeps_the_rows_of_environments_that_were_not_played_again(tmp_pa
         if line.startswith("| `")
     }
     assert rows == {CARTPOLE: "7", PENDULUM: "600"}
+
+
+MARK = b"of test_check_env"
+BUSY = [sys.executable, "-S", "-c", f"while True: '{MARK.decode()}'"]
+
+
+@pytest.mark.parametrize(
+    ("play", "limit_s", "told"),
+    [
+        (lambda: time.sleep(1000), 0.5, "it hangs: it has used no processor time for 0.5 s"),
+        (lambda: subprocess.run(BUSY, check=False), 2.0, "it was not done within 2 s of processor time"),
+    ],
+    ids=["hangs", "computes in another process"],
+)
+def test_an_environment_that_uses_no_processor_time_or_too_much_is_ended_with_all_its_processes(
+    play: Callable[[], object], limit_s: float, told: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(conformance, "TIMEOUT_S", limit_s)
+    monkeypatch.setattr(conformance, "_LOOK_S", 0.05)
+    monkeypatch.setattr(conformance, "_WORKS_S", 0.0)
+    monkeypatch.setattr(conformance, "play", lambda env_id, steps: play())
+    monkeypatch.setattr(conformance.registry, "load", lambda env_id: None)
+    (played,) = conformance.play_all(["slow"], 1)
+    assert played.faults == [told]
+    assert not [each for each in Path("/proc").glob("[0-9]*") if MARK in _command_line(each)]
+
+
+def _command_line(process: Path) -> bytes:
+    try:
+        return (process / "cmdline").read_bytes()
+    except OSError:
+        return b""
+
+
+def test_an_environment_may_wait_for_the_processor_as_long_as_it_must(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    now, used = [0.0], [0.0]
+    monkeypatch.setattr(conformance, "_processor_s", lambda pid: used[0])
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+    limit = conformance._Limit(1)
+    # A tenth of a processor, for almost an hour.
+    for _ in range(299):
+        now[0] += 10.0
+        used[0] += 1.0
+        assert limit.passed() == ""
+    used[0] += 2.0
+    assert "processor time" in limit.passed()

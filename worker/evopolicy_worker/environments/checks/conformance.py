@@ -19,6 +19,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from ctypes.util import find_library
+from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -35,8 +36,14 @@ from evopolicy_worker.environments.gymnasium_adapter import GymnasiumEnvironment
 SEEDS = (20_011_117, 20_011_229)
 """Large, so that an occurrence in an observation or info is recognisable as a leak."""
 TIMEOUT_S = 300.0
-"""Time limit for one environment."""
-_TIMED_STEPS = 200
+"""Most processor time that one environment may use, all its processes together, and longest time in which it may use none,
+seconds. A limit on time alone would also count what else the machine does."""
+_LOOK_S = 1.0
+_WORKS_S = 0.05
+"""A process that has used so much more processor time since the last look has not hung, seconds."""
+_TICKS = os.sysconf("SC_CLK_TCK")
+_TIMED_STEPS, _TIMED_S = 200, 5.0
+"""How long a step is timed: so many steps, or so many seconds."""
 _RENDERED_STEPS = 30
 """So many steps of an episode are also drawn."""
 _NONSENSE: tuple[Any, ...] = (None, "nonsense", float("nan"), 10**400, [[[]]], {"a": 1}, np.full(3, np.inf))
@@ -246,7 +253,7 @@ def _bare_step(environment: GymnasiumEnvironment, steps: int) -> float:
     bare, n, spent = environment.bare, 0, 0.0
     bare.reset(seed=0)
     most = min(steps, _TIMED_STEPS)
-    while n < most:
+    while n < most and spent < _TIMED_S:
         action = environment.action_codec.sample(rng)
         began = time.perf_counter()
         _, _, terminated, truncated, _ = bare.step(action)
@@ -308,25 +315,64 @@ def _in_child(env_id: str, steps: int) -> Played:
         finally:
             os._exit(0)
     os.close(writing)
-    data, deadline = b"", time.monotonic() + TIMEOUT_S
+    data, why, limit = b"", "", _Limit(pid)
     with os.fdopen(reading, "rb") as answer:
-        while select.select([answer], [], [], max(0.0, deadline - time.monotonic()))[0]:
-            part = os.read(answer.fileno(), 1 << 16)
-            if not part:
-                break
-            data += part
-        else:
-            os.kill(pid, signal.SIGKILL)
-            data = b""
+        while not (why := limit.passed()):
+            if select.select([answer], [], [], _LOOK_S)[0]:
+                part = os.read(answer.fileno(), 1 << 16)
+                if not part:
+                    break
+                data += part
+    if why:
+        for each in _family(pid):
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(each, signal.SIGKILL)
+        data = b""
     status = os.waitpid(pid, 0)[1]
     if data:
         return msgspec.json.decode(data, type=Played)
-    why = (
-        f"it was not done within {TIMEOUT_S:.0f} s"
-        if time.monotonic() >= deadline
-        else f"its process ended with status {status}"
-    )
-    return Played(env=env_id, faults=[why])
+    return Played(env=env_id, faults=[why or f"its process ended with status {status}"])
+
+
+class _Limit:
+    """What a process may use; see `TIMEOUT_S`."""
+
+    def __init__(self, pid: int) -> None:
+        self._pid = pid
+        self._used = 0.0
+        self._worked_at = time.monotonic()
+
+    def passed(self) -> str:
+        """Why the process is to be ended, in words; empty while it may go on."""
+        used, now = _processor_s(self._pid), time.monotonic()
+        if used > self._used + _WORKS_S:
+            self._used, self._worked_at = used, now
+        if self._used > TIMEOUT_S:
+            return f"it was not done within {TIMEOUT_S:g} s of processor time"
+        if now - self._worked_at > TIMEOUT_S:
+            return f"it hangs: it has used no processor time for {TIMEOUT_S:g} s"
+        return ""
+
+
+def _processor_s(pid: int) -> float:
+    """Processor time of a process and of those that it has started, seconds."""
+    found = 0.0
+    for each in _family(pid):
+        with contextlib.suppress(OSError):
+            fields = Path(f"/proc/{each}/stat").read_text().rpartition(")")[2].split()
+            # User and system time, its own and that of children that have ended.
+            found += sum(map(int, fields[11:15])) / _TICKS
+    return found
+
+
+def _family(pid: int) -> list[int]:
+    """A process and all that it has started, as far as they run."""
+    found = [pid]
+    with contextlib.suppress(OSError):
+        for thread in Path(f"/proc/{pid}/task").iterdir():
+            for child in (thread / "children").read_text().split():
+                found += _family(int(child))
+    return found
 
 
 def main() -> None:
