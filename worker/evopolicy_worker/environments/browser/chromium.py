@@ -43,7 +43,9 @@ MAX_MB = 600
 """A browser that has more than this resident after an episode, all its processes together, is started anew, MiB."""
 _DATA_LIMIT = 4 << 30
 """Bytes of writable memory of each of its processes, which the kernel enforces."""
-_START_S = 60.0
+START_S = 60.0
+"""How long a browser may take to answer first, seconds."""
+REMEDY = "name the program of a Chromium that works with --browser PATH"
 _FOLDER = 5
 """The browser's descriptor of its profile."""
 
@@ -114,7 +116,7 @@ def program() -> str:
     if named:
         if os.access(named, os.X_OK) and not os.path.isdir(named):
             return os.path.abspath(named)
-        raise WorkerError(f"Chromium, and {named!r} is no program: name Chromium's own with --browser PATH")
+        raise WorkerError(f"Chromium, and {named!r} is no program: {REMEDY}")
     for path in (*_PROGRAMS, *filter(None, map(shutil.which, _NAMES))):
         if os.access(path, os.X_OK):
             return path
@@ -141,8 +143,31 @@ class Chromium:
         folder = _high(os.open(self.profile, os.O_PATH | os.O_DIRECTORY))
         theirs_in, self._ours_out = _high_pipe()
         self._ours_in, theirs_out = _high_pipe()
+        self.devtools = DevTools(self._ours_out, self._ours_in, on_event)
+        try:
+            self.pid = self._spawn(path, theirs_in, theirs_out, folder)
+        except OSError as error:
+            self.devtools.close()
+            shutil.rmtree(self.profile, ignore_errors=True)
+            raise WorkerError(f"{path} cannot be started: {error.strerror}; {REMEDY}") from error
+        finally:
+            for descriptor in (theirs_in, theirs_out, folder):
+                os.close(descriptor)
+        self._closed = False
+        try:
+            self.version = str(self.devtools.call("Browser.getVersion", timeout_s=START_S)["product"])
+        except (WorkerError, KeyError) as error:
+            said = (self.profile / "stderr").read_text(errors="replace").strip().splitlines()[-3:]
+            self.close()
+            why = error if isinstance(error, WorkerError) else "it does not tell its version"
+            raise WorkerError(
+                f"{path} does not start as a browser: {why}; it said: {' | '.join(said)[:500] or 'nothing'}; {REMEDY}"
+            ) from error
+
+    def _spawn(self, path: str, theirs_in: int, theirs_out: int, folder: int) -> int:
+        """Starts the program and returns its pid. OSError when it is none."""
         with _limited_data():
-            self.pid = os.posix_spawn(
+            return os.posix_spawn(
                 path,
                 [path, *_FLAGS, f"--user-data-dir={self.profile}", "about:blank"],
                 _variables(self.profile),
@@ -156,18 +181,6 @@ class Chromium:
                 ],
                 setsid=True,
             )
-        for descriptor in (theirs_in, theirs_out, folder):
-            os.close(descriptor)
-        self.devtools = DevTools(self._ours_out, self._ours_in, on_event)
-        self._closed = False
-        try:
-            self.version = str(self.devtools.call("Browser.getVersion", timeout_s=_START_S)["product"])
-        except WorkerError as error:
-            stderr = (self.profile / "stderr").read_text(errors="replace").strip().splitlines()[-3:]
-            self.close()
-            raise WorkerError(
-                f"{path} does not start: {error}; it said: {' | '.join(stderr) or 'nothing'}"
-            ) from error
 
     def megabytes(self) -> int:
         """Resident memory of all its processes together, MiB; what several processes share is divided among them."""

@@ -98,7 +98,7 @@ class DevTools:
         """Reads once, and takes every whole message."""
         left = deadline - time.monotonic()
         if left <= 0 or not select.select([self._replies], [], [], left)[0]:
-            raise BrowserLostError("the page does not answer: it hangs")
+            raise BrowserLostError("the browser or its page does not answer: it hangs")
         data = os.read(self._replies, _READ)
         if not data:
             raise BrowserLostError("the browser has ended")

@@ -21,7 +21,7 @@ from typing import Any, Literal
 
 import msgspec
 
-from evopolicy_worker.environments.browser.chromium import MAX_MB, Chromium
+from evopolicy_worker.environments.browser.chromium import MAX_MB, REMEDY, Chromium, program
 from evopolicy_worker.environments.browser.devtools import BrowserLostError
 from evopolicy_worker.environments.browser.keys import MODIFIERS, NAMED, SHIFT, Key, typed
 
@@ -127,7 +127,11 @@ class Page:
         if self._context:
             devtools.send("Target.disposeBrowserContext", wanted=False, browserContextId=self._context)
             self._context = self._session = ""
-        made = devtools.call("Target.createBrowserContext", timeout_s=CALL_S)
+        try:
+            made = devtools.call("Target.createBrowserContext", timeout_s=CALL_S)
+        except BrowserLostError as error:
+            self.lose()
+            raise BrowserLostError(f"{program()} opens no page: {error}; {REMEDY}") from error
         self._context = str(made["browserContextId"])
         devtools.send(
             "Browser.setDownloadBehavior", wanted=False, behavior="deny", browserContextId=self._context
