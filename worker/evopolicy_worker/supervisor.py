@@ -25,6 +25,7 @@ from typing import Protocol
 import msgspec
 import structlog
 
+from evopolicy_common.catalogue import installs
 from evopolicy_common.errors import (
     BrokenEnvironmentError,
     EvopolicyError,
@@ -251,6 +252,7 @@ class Supervisor:
                 host=options.host,
                 boot_id=options.boot_id,
                 machine_id=options.machine_id,
+                installation=installs.own(),
             )
             reply = await self._ask.until_answered("register", message, Registered)
             self._session, self._lease_ttl_s = reply.session, reply.lease_ttl_s

@@ -254,6 +254,7 @@ def _versions(finished: RunFinished, staged: Staged | None) -> Versions:
         cases_hashes=cases,
         fingerprint={} if fingerprint is None else fingerprint.flat(),
         fingerprint_overrides=finished.fingerprint_overrides,
+        installations=finished.installations,
         data_secret=finished.split_secret,
         initial_policy_hash=sha256_text(staged.initial_policy_hash) if staged else None,
         env_deterministic=finished.deterministic,

@@ -12,6 +12,7 @@ user's data folder, contains one entry for each: the virtual environment, or a l
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import os
 import sys
 import tomllib
@@ -97,6 +98,20 @@ def apart(families: Iterable[str] = ()) -> list[str]:
 def is_here(family: str) -> bool:
     """Whether this interpreter has the family's packages; found without importing them."""
     return all(find_spec(module) is not None for module in installs()[family].modules)
+
+
+@cache
+def own() -> str:
+    """This interpreter's installation as `NAME@DIGEST`: the families for which `setup` made it, joined with `+`, or else
+    `base`; and 12 hex digits of the SHA-256 of the names and versions of all packages in it. Tells no path."""
+    here = read(Path(sys.prefix))
+    found = {
+        each.name.removesuffix(".dist-info")
+        for path in map(Path, sys.path)
+        for each in (path.glob("*.dist-info") if path.is_dir() else ())
+    }
+    digest = hashlib.sha256("\n".join(sorted(found)).encode()).hexdigest()
+    return f"{'+'.join(here.families) if here is not None else 'base'}@{digest[:12]}"
 
 
 def setup_line(family: str) -> str:

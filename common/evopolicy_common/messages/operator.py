@@ -193,6 +193,8 @@ class RunFinished(msgspec.Struct, frozen=True, kw_only=True):
     """None for runs opened by an earlier version, which have no commitment."""
     heldout_successes: Many[bool] = ()
     """Whether each held-out episode solved the task; empty where the environment does not report it."""
+    installations: Many[Word] = ()
+    """Installations of the workers that played its episodes, in the order of their first ones."""
 
 
 class SubmitRecord(msgspec.Struct, frozen=True, kw_only=True):
@@ -566,6 +568,8 @@ class WorkerStatus(msgspec.Struct, frozen=True, kw_only=True):
     """Environment to its fingerprint class on this worker: only workers of one class share a run of it."""
     playing: Named[Int] = {}
     """Episode jobs that it plays now, by run or evaluation."""
+    installation: Word = ""
+    """Its Python installation, as in `versions.installations` of `run.json`."""
 
 
 class RetriedJobs(msgspec.Struct, frozen=True, kw_only=True):

@@ -98,6 +98,8 @@ class Register(Message, frozen=True, kw_only=True, tag="register"):
     """Id of the worker's machine (`host.machine_id`)."""
     undescribed: Many[Word] = ()
     """Ids of shipped environments that it offers, too, and describes once a reply to a heartbeat asks for them."""
+    installation: Word = ""
+    """The worker's Python installation (`installs.own`); empty from workers of earlier versions."""
 
 
 class Registered(Message, frozen=True, kw_only=True, tag="registered"):

@@ -36,6 +36,7 @@ EXCLUDED_FIELDS: Mapping[str, Mapping[str, str]] = {
         "committed": "the run's own place in the journal, and a random salt",
         "audit": "which workers played, and played again",
         "versions.agents_md_hash": "of a file that names the gateway's port",
+        "versions.installations": "which workers played; what decides their numbers is in versions.fingerprint",
     },
     "summary.json": {
         "submit_started_at": "a time",

@@ -273,6 +273,10 @@ class Versions(msgspec.Struct, frozen=True, kw_only=True):
     """Hashes of the run's cases as canonical JSON, by split."""
     fingerprint: dict[str, str] = {}
     """Library to version, as reported by the workers with which the run started."""
+    installations: tuple[str, ...] = ()
+    """Python installations of the workers that played the run's episodes, in the order of their first ones: `NAME@DIGEST`, with
+    the families for which `evopolicy-worker setup` made it, or `base`, and 12 hex digits of a SHA-256 over the names and
+    versions of its packages. Empty in older files."""
     fingerprint_overrides: tuple[str, ...] = ()
     """`CLASS → CLASS: why` for each time an operator let the run continue with other versions; empty with one class."""
     data_secret: bool = True

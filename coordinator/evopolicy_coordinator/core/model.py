@@ -572,6 +572,8 @@ class Worker:
     """Machine whose credentials it joined with; empty for the state folder's own credentials."""
     cpu: str = ""
     """Its processor's features."""
+    installation: str = ""
+    """Its Python installation; empty for workers of earlier versions."""
     state: Literal["active", "paused", "draining", "lost", "quarantined"] = "active"
     leases: dict[str, Lease] = field(default_factory=dict)
     """By id, oldest first; also given-up ones until the worker no longer names them."""

@@ -83,6 +83,8 @@ class RunStateRow(msgspec.Struct, frozen=True, kw_only=True, tag="run_state"):
     """That worker's."""
     overrides: tuple[str, ...] = ()
     """An operator's changes of the pin, in words, oldest first."""
+    installations: tuple[str, ...] = ()
+    """Of the workers that have played its episodes, in the order of their first ones."""
     closed_at: float | None = None
     close_reason: str = ""
     agent: dict[str, Any] = {}

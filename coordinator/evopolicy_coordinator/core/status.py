@@ -134,6 +134,7 @@ def _worker(state: State, worker: Worker, now: float, refused: dict[str, str]) -
         boot_id=worker.kernel.boot_id,
         hidden_bar=conflicts.conflict_of_worker(state, worker),
         playing=_playing(live),
+        installation=worker.installation,
     )
 
 

@@ -256,6 +256,7 @@ class Rig:
                 boot_id=more.get("boot_id", f"kernel-of-{worker}"),
                 machine_id=more.get("machine_id", ""),
                 undescribed=more.get("undescribed", ()),
+                installation=more.get("installation", ""),
             )
         )
         assert isinstance(reply, wire.Registered)

@@ -55,6 +55,7 @@ def register(state: State, event: WorkerRegistered, kernel: Kernel, step: Step) 
         machine_id=message.machine_id,
         machine=event.machine,
         cpu=message.fingerprint.cpu,
+        installation=message.installation,
         state="lost",
         undescribed=frozenset(message.undescribed),
     )

@@ -35,6 +35,8 @@ from . import templates
 
 NOT_REPEATABLE = "the environment is marked as not deterministic"
 NO_STEPS = "no step was played"
+MOST_INSTALLATIONS = 64
+"""A run's record names no more: a worker may register as often as it wants, each time with another one."""
 
 
 def drawn(secret: bytes, group: str, index: int, share: float) -> bool:
@@ -52,12 +54,15 @@ def audit_id(group: str, index: int) -> str:
 
 
 def sample(state: State, news: EpisodesDone, step: Step) -> None:
-    """Draw audits from the episodes that a worker has reported."""
+    """Note who played the episodes that a worker has reported, and draw audits from them."""
     group, worker = news.group, news.worker
     run, kind = state.runs.get(group.run), group.kind
     if run is None or worker is None or kind == "evaluation" or kind == "audit":
         return
     run.played[worker.name] = run.played.get(worker.name, 0) + len(news.outcomes)
+    known = run.state.installations
+    if worker.installation and worker.installation not in known and len(known) < MOST_INSTALLATIONS:
+        step.change_run(run, installations=(*known, worker.installation))
     if not run.row.audit_share:
         return
     description = run.state.description

@@ -121,6 +121,7 @@ def result(
         audit=audit_end.record(state, run),
         hidden_isolation=stored.isolation,
         fingerprint_overrides=stored.overrides,
+        installations=stored.installations,
         committed=row.committed,
     )
 

@@ -275,6 +275,26 @@ def test_a_run_stays_with_its_fingerprint_class_until_an_operator_says_otherwise
     assert override.endswith(f" → {named}: the old host is gone")
 
 
+def test_a_run_names_the_installations_that_played_it_and_only_those() -> None:
+    rig = Rig()
+    workers = [
+        rig.register(f"w{k}", slots=1, installation=name) for k, name in enumerate(("base@1", "atari@2"))
+    ]
+    rig.register("idle", installation="unused@3")
+    rig.create()
+    rig.submit(0, 1)
+    for worker in workers:
+        rig.play(worker, *rig.poll(worker, 1))
+    rig.load()
+    again = rig.register("w1", installation="atari@2")
+    rig.close()
+    for _ in range(90):
+        rig.pass_time(1.0)
+        rig.beat(again)
+        rig.work_off(again)
+    assert rig.finished().installations == ("base@1", "atari@2")
+
+
 def pinned_versions(file: str) -> dict[str, str]:
     text = (Path(__file__).parents[4] / file).read_text()
     return dict(re.findall(r"^([\w-]+)==([\w.]+)$", text.lower(), re.MULTILINE))
