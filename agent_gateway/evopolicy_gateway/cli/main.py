@@ -38,6 +38,11 @@ GROUPS = {
         "local": Place(_PLAY, "Play runs on this machine."),
         "run": Place(_PLAY, "Play one run on a cluster."),
         "finish": Place(_PLAY, "Close the run of a remote agent."),
+        "harbor": Place(
+            "evopolicy_gateway.cli.harbor:app",
+            "Write a Harbor task for each open run of a remote agent, and serve the runs' scores to Harbor's verifiers until"
+            " Ctrl-C.",
+        ),
         "suite": Place("evopolicy_gateway.cli.suite:app", "Play a sweep: agents × environments × repeats."),
     },
     "Results": {

@@ -59,14 +59,14 @@ async def bind(folder: RunFolder) -> tuple[socket.socket, Address]:
     token = secrets.token_hex(16)
     if not folder.listener.exists():
         try:
-            sock = _bound(LOOPBACK, 0)
+            sock = bound(LOOPBACK, 0)
         except OSError as error:
             raise ConfigError(no_loopback(error)) from error
         address = Address(host=LOOPBACK, port=sock.getsockname()[1], token=token)
     else:
         listener = saved(folder.listener, Listener)
         try:
-            sock = _bound(listener.host, listener.port)
+            sock = bound(listener.host, listener.port)
         except OSError as error:
             where = f"{listener.host}:{listener.port}"
             raise ConfigError(f"--http {where}: cannot listen there: {error.strerror or error}") from error
@@ -119,7 +119,7 @@ class _Server(uvicorn.Server):
 async def _rebind(address: Address) -> socket.socket:
     for _ in range(_REBIND_TRIES):
         try:
-            return _bound(address.host, address.port)
+            return bound(address.host, address.port)
         except OSError as error:
             reason = error
         await asyncio.sleep(_REBIND_PAUSE_S)
@@ -129,7 +129,8 @@ async def _rebind(address: Address) -> socket.socket:
     )
 
 
-def _bound(host: str, port: int) -> socket.socket:
+def bound(host: str, port: int) -> socket.socket:
+    """A bound socket. Raises OSError when the address is not available."""
     family, kind, _, _, where = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
     sock = socket.socket(family, kind)
     # Allows binding while old connections to the address are in TIME_WAIT.

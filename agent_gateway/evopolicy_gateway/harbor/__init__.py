@@ -1,0 +1,1 @@
+"""Runs of remote agents as tasks for Harbor, which get their reward from the cluster."""

@@ -1,0 +1,99 @@
+"""Writes Harbor tasks of open runs, and answers their verifiers with the runs' scores.
+
+- A verifier's request reports the end of its run's agent, as `evopolicy finish` does, and gets the score once it is there.
+- Every request needs the token, which only the tasks' `tests/` have: Harbor's verifier gets them, its agent does not.
+- Nothing but a run's score is told, and only after the run is finished.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hmac
+import secrets
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+
+from starlette.applications import Starlette
+from starlette.requests import Request
+from starlette.responses import PlainTextResponse, Response
+from starlette.routing import Route
+
+from evopolicy_common.errors import ConfigError, EvopolicyError
+from evopolicy_common.records.blobs import write_atomically
+from evopolicy_common.records.run_record import decode_run_record
+from evopolicy_gateway.harbor.task import task_files, task_name
+from evopolicy_gateway.http.listener import finish
+from evopolicy_gateway.run.layout import IntendedRun, RunFolder, folder_of, saved
+
+_TOKEN = ".token"
+
+
+def write_task(tasks: Path, run: Path, url: str, agent_s: float) -> Path:
+    """Writes the task of an open run; `url`: of the scores. Raises ConfigError for any other folder."""
+    folder = folder_of(run)
+    if not folder.bearer.exists():
+        raise ConfigError(
+            f"{folder.root} is no open run of a remote agent; start one with `evopolicy run --agent remote --http HOST:PORT`"
+        )
+    place = tasks / task_name(folder)
+    env = saved(folder.intended, IntendedRun).settings.env
+    files = task_files(folder, env=env, url=f"{url}/{place.name}", token=token_of(tasks), agent_s=agent_s)
+    for name, text in files.items():
+        path = place / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        # With the tokens of agent and verifier.
+        write_atomically(path, text.encode(), mode=0o700 if path.suffix == ".sh" else 0o600)
+    return place
+
+
+def token_of(tasks: Path) -> str:
+    """The token of all tasks in a folder, which stays the same when they are served again."""
+    path = tasks / _TOKEN
+    with contextlib.suppress(FileNotFoundError):
+        return path.read_text().strip()
+    tasks.mkdir(parents=True, exist_ok=True)
+    write_atomically(path, f"{secrets.token_hex(32)}\n".encode(), mode=0o600)
+    return path.read_text().strip()
+
+
+def tasks_in(tasks: Path) -> dict[str, RunFolder]:
+    """The run of each task in a folder. Raises ConfigError when a task cannot be read."""
+    found = {}
+    for path in sorted(tasks.glob("*/task.toml")):
+        try:
+            found[path.parent.name] = RunFolder(Path(tomllib.loads(path.read_text())["metadata"]["run"]))
+        except (KeyError, TypeError, ValueError) as error:
+            raise ConfigError(
+                f"{path}: not a task of `evopolicy harbor`: {error}; choose another folder with --tasks"
+            ) from error
+    return found
+
+
+def make_app(runs: Mapping[str, RunFolder], token: str) -> Starlette:
+    """The service of the scores: `POST /TASK`."""
+
+    async def score(request: Request) -> Response:
+        given = request.headers.get("authorization", "")
+        if not hmac.compare_digest(given.encode(), f"Bearer {token}".encode()):
+            return PlainTextResponse("wrong or missing token\n", 401)
+        folder = runs.get(request.path_params["task"])
+        if folder is None:
+            return PlainTextResponse("no such task\n", 404)
+        try:
+            return _score(folder)
+        except (EvopolicyError, OSError) as error:
+            return PlainTextResponse(f"{error}\n", 409)
+
+    return Starlette(routes=[Route("/{task}", score, methods=["POST"])])
+
+
+def _score(folder: RunFolder) -> Response:
+    if not folder.run_json.exists():
+        finish(folder)
+        return PlainTextResponse("the run is being scored\n", 202)
+    outcome = decode_run_record(folder.run_json.read_bytes()).outcome
+    if outcome.score is None:
+        why = outcome.error or outcome.status
+        return PlainTextResponse(f"the run {folder.root} has no score: {why}\n", 409)
+    return PlainTextResponse(f"{outcome.score!r}\n")

@@ -1,0 +1,110 @@
+"""Harbor tasks of open runs, and the scores that their verifiers get."""
+
+from __future__ import annotations
+
+import json
+import stat
+import subprocess
+import tomllib
+from pathlib import Path
+
+import pytest
+from invented.policies import Version
+from invented.run_dirs import write_run
+from starlette.testclient import TestClient
+
+from evopolicy_common.errors import ConfigError
+from evopolicy_common.messages.operator import RunSettings
+from evopolicy_gateway.harbor.scores import make_app, tasks_in, token_of, write_task
+from evopolicy_gateway.http.listener import Listener
+from evopolicy_gateway.run.layout import IntendedRun, RunFolder, save
+
+URL = "http://10.0.0.5:8090"
+TOKEN = {"Authorization": "Bearer t"}
+
+
+def open_run(tmp_path: Path) -> RunFolder:
+    """A run of a remote agent, as `evopolicy run` leaves it while the agent plays."""
+    folder = RunFolder(tmp_path / "runs" / "GPT 5.5 (Codex)" / "gym_acrobot" / "first")
+    folder.state.mkdir(parents=True)
+    save(folder.listener, Listener(host="10.0.0.5", port=0))
+    save(
+        folder.intended,
+        IntendedRun(key="k", settings=RunSettings(env="gym/acrobot", entry="e", model="m", exp_id="first")),
+    )
+    folder.bearer.write_text("b" * 64 + "\n")
+    return folder
+
+
+def test_a_task_is_private_and_its_agent_cannot_ask_for_the_score(tmp_path: Path) -> None:
+    tasks = tmp_path / "tasks"
+    folder = open_run(tmp_path)
+    place = write_task(tasks, folder.root, URL, 60.0)
+    assert place == tasks / "gpt-5.5-codex-gym_acrobot-first"
+    files = [path for path in place.rglob("*") if path.is_file()]
+    assert {stat.S_IMODE(path.stat().st_mode) & 0o077 for path in files} == {0}
+    token = token_of(tasks)
+    assert [path.name for path in files if token in path.read_text()] == ["test.sh"]
+    assert f"{URL}/{place.name}" in (place / "tests/test.sh").read_text()
+    assert subprocess.run(["sh", "-n", place / "tests/test.sh"], check=False).returncode == 0
+    task = tomllib.loads((place / "task.toml").read_text())
+    assert task["environment"]["env"] == {"EVOPOLICYGYM_TOKEN": "b" * 64}
+    # Harbor stops the agent's container before it starts another for the verifier.
+    assert task["verifier"]["environment_mode"] == "separate"
+    volumes = json.loads((place / "environment/docker-compose.yaml").read_text())["services"]["main"][
+        "volumes"
+    ]
+    assert [(each["source"], each["target"], each["read_only"]) for each in volumes] == [
+        (str(folder.workspace), "/work", False),
+        (str(folder.workspace / "feedback"), "/work/feedback", True),
+        (str(folder.workspace / "AGENTS.md"), "/work/AGENTS.md", True),
+    ]
+
+
+def test_tasks_are_served_again_with_the_same_token(tmp_path: Path) -> None:
+    tasks = tmp_path / "tasks"
+    folder = open_run(tmp_path)
+    place = write_task(tasks, folder.root, URL, 60.0)
+    before = (place / "tests/test.sh").read_text()
+    write_task(tasks, folder.root, URL, 60.0)
+    assert (place / "tests/test.sh").read_text() == before
+    assert tasks_in(tasks) == {place.name: folder}
+    (tasks / "other").mkdir()
+    (tasks / "other/task.toml").write_text("[task]\n")
+    with pytest.raises(ConfigError, match="not a task of"):
+        tasks_in(tasks)
+
+
+def test_a_run_that_no_remote_agent_plays_has_no_task(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="no open run of a remote agent"):
+        write_task(tmp_path / "tasks", tmp_path, URL, 60.0)
+    assert not (tmp_path / "tasks").exists()
+
+
+def test_a_verifier_ends_the_run_and_gets_its_score_when_it_is_there(tmp_path: Path) -> None:
+    folder = open_run(tmp_path)
+    client = TestClient(make_app({"t": folder}, "t"))
+    for headers in ({}, {"Authorization": "Bearer u"}, {b"Authorization": b"Bearer \xe9"}):
+        assert client.post("/t", headers=headers).status_code == 401
+    assert not folder.finish.exists()
+    assert client.post("/other", headers=TOKEN).status_code == 404
+    assert client.get("/t", headers=TOKEN).status_code == 405
+    assert client.post("/t", headers=TOKEN).status_code == 202
+    assert folder.finish.exists()
+    versions = [Version({"policy.py": "x = 1"}, (1.0, 2.0), 0.5)]
+    scored = RunFolder(write_run(tmp_path / "scored", versions, heldout=(0.1, 0.2)))
+    answer = TestClient(make_app({"t": scored}, "t")).post("/t", headers=TOKEN)
+    assert (answer.status_code, float(answer.text)) == (200, (0.1 + 0.2) / 2)
+
+
+def test_a_run_without_a_score_has_no_reward(tmp_path: Path) -> None:
+    folder = open_run(tmp_path)
+    whole = RunFolder(write_run(tmp_path / "scored", [Version({"policy.py": "x = 1"}, (1.0, 2.0), 0.5)]))
+    record = json.loads(whole.run_json.read_text())
+    record["outcome"] |= {"status": "no_ok_submit", "final_score": 0.0}
+    folder.run_json.write_text(json.dumps(record))
+    client = TestClient(make_app({"t": folder, "gone": RunFolder(tmp_path / "gone")}, "t"))
+    answer = client.post("/t", headers=TOKEN)
+    assert answer.status_code == 409
+    assert "has no score: no_ok_submit" in answer.text
+    assert client.post("/gone", headers=TOKEN).status_code == 409
