@@ -2,7 +2,8 @@
 Google's generateContent for the real CLIs.
 
 Each request with tools is answered by the next step of the script: a shell command to run, or a text that ends the turn.
-Requests without tools (titles, token counts) get a short text and move nothing.
+Requests without tools (titles, token counts) get a short text and move nothing. Codex lists the tools of MCP servers only when
+its model searches for them: the script's model then searches first, which moves nothing either.
 """
 
 from __future__ import annotations
@@ -96,6 +97,10 @@ class ModelApi:
         if path.endswith("/count_tokens"):
             handler._send(200, b'{"input_tokens": 10}', "application/json")
             return
+        if path.endswith("/responses") and (search := self._search(request)):
+            events = "".join(f"event: {one['type']}\ndata: {json.dumps(one)}\n\n" for one in search)
+            handler._send(200, events.encode(), "text/event-stream")
+            return
         step = self._next(request)
         if step.status != 200:
             error = {"type": "error", "error": {"type": "overloaded_error", "message": step.text or "busy"}}
@@ -111,6 +116,16 @@ class ModelApi:
         )
         done = "data: [DONE]\n\n" if path.endswith("/completions") else ""
         handler._send(200, (stream + done).encode(), "text/event-stream")
+
+    def _search(self, request: dict[str, Any]) -> list[dict[str, Any]]:
+        """A search for the tool of the next step where Codex offers that and does not list the tool yet."""
+        step = self.script[self.played] if self.played < len(self.script) else Step()
+        offers = any(tool.get("type") == "tool_search" for tool in request.get("tools", ()))
+        if step.tool is None or not offers or _codex_tool(step.tool, request):
+            return []
+        item = {"type": "tool_search_call", "call_id": f"search_{id(step)}", "status": "completed"}
+        item |= {"execution": "client", "arguments": {"query": step.tool, "limit": 8}}  # type: ignore[dict-item]
+        return list(_responses_with(f"resp_search_{id(step)}", item))
 
     def _next(self, request: dict[str, Any]) -> Step:
         with self._lock:
@@ -177,6 +192,16 @@ def _shell_arguments(command: str) -> dict[str, Any]:
 
 
 def _responses(step: Step, request: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    if not step.calls:
+        content = [{"type": "output_text", "text": step.text, "annotations": []}]
+        item: dict[str, Any] = {"type": "message", "id": "m1", "role": "assistant", "content": content}
+    else:
+        item = {"type": "function_call", "id": "f1", "call_id": f"call_{id(step)}"}
+        item |= _codex_call(step, request)
+    yield from _responses_with(f"resp_{id(step)}", item)
+
+
+def _responses_with(identity: str, item: dict[str, Any]) -> Iterator[dict[str, Any]]:
     usage = {
         "input_tokens": INPUT,
         "input_tokens_details": {"cached_tokens": CACHED},
@@ -184,30 +209,34 @@ def _responses(step: Step, request: dict[str, Any]) -> Iterator[dict[str, Any]]:
         "output_tokens_details": {"reasoning_tokens": REASONING},
         "total_tokens": INPUT + OUTPUT,
     }
-    identity = f"resp_{id(step)}"
     yield {"type": "response.created", "response": {"id": identity}}
-    if not step.calls:
-        content = [{"type": "output_text", "text": step.text, "annotations": []}]
-        item: dict[str, Any] = {"type": "message", "id": "m1", "role": "assistant", "content": content}
-    else:
-        item = {"type": "function_call", "id": "f1", "call_id": f"call_{id(step)}"}
-        item |= _codex_call(step, request)
     yield {"type": "response.output_item.done", "output_index": 0, "item": item}
     yield {"type": "response.completed", "response": {"id": identity, "output": [item], "usage": usage}}
 
 
 def _codex_call(step: Step, request: dict[str, Any]) -> dict[str, Any]:
-    """Name and arguments of the call; a tool of an MCP server is offered in a namespace of the server."""
+    """Name and arguments of the call."""
     if step.tool is None:
         name, arguments = _shell_call(step.command or "", request)
         return {"name": name, "arguments": json.dumps(arguments)}
-    for tool in request["tools"]:
-        inner = [one["name"] for one in tool.get("tools", ()) if one["name"].endswith(step.tool)]
+    found = _codex_tool(step.tool, request)
+    if found is None:
+        raise AssertionError(f"no {step.tool} among the offered tools: {request['tools']}")
+    return {**found, "arguments": "{}"}
+
+
+def _codex_tool(name: str, request: dict[str, Any]) -> dict[str, str] | None:
+    """A tool by the end of its name, listed or found by a search; one of an MCP server is in the server's namespace."""
+    found = [
+        tool for one in request["input"] if one.get("type") == "tool_search_output" for tool in one["tools"]
+    ]
+    for tool in [*request["tools"], *found]:
+        inner = [one["name"] for one in tool.get("tools", ()) if one["name"].endswith(name)]
         if inner:
-            return {"namespace": tool["name"], "name": inner[0], "arguments": "{}"}
-        if str(tool.get("name")).endswith(step.tool):
-            return {"name": tool["name"], "arguments": "{}"}
-    raise AssertionError(f"no {step.tool} among the offered tools: {request['tools']}")
+            return {"namespace": tool["name"], "name": inner[0]}
+        if str(tool.get("name")).endswith(name):
+            return {"name": tool["name"]}
+    return None
 
 
 def _shell_call(command: str, request: dict[str, Any]) -> tuple[str, dict[str, Any]]:

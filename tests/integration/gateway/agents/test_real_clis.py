@@ -242,7 +242,9 @@ def test_a_real_agent_behind_the_protocol_plays_a_whole_run_in_its_jail(
 LOOK = "echo '# better' >> system/policy.py; ls -d ~/.*/skills/lamps/SKILL.md; echo x >> $(ls -d ~/.*/skills/lamps/SKILL.md) || echo shut"
 
 
-@pytest.mark.parametrize("name", ["claude-code", "acp-gemini", "acp-opencode", "acp-claude"])
+@pytest.mark.parametrize(
+    "name", ["claude-code", "codex", "gemini", "acp-gemini", "acp-opencode", "acp-claude"]
+)
 def test_a_real_agent_has_the_runs_skills_and_mcp_servers_in_its_jail(
     tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
