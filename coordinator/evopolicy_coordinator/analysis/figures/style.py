@@ -92,7 +92,8 @@ def _settle(figure: Figure) -> None:
     if isinstance(engine, ConstrainedLayoutEngine):
         for _ in range(2):
             engine.execute(figure)
-        figure.set_layout_engine("none")
+        # With "none", a placeholder stays, for which `savefig` draws everything twice.
+        figure.set_layout_engine(None)
 
 
 def svg_text(figure: Figure, name: str) -> str:
