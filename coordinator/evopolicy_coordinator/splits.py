@@ -380,6 +380,6 @@ def _cut(folder: Path, split: Split, cases: Sequence[Case], count: int | None) -
         return tuple(cases)
     if count > len(cases):
         raise ConfigError(
-            f"{folder / FILE_STEMS[split]}.json has {len(cases)} cases, {count} are asked for; make it longer or ask for fewer"
+            f"{folder / FILE_STEMS[split]}.json has {len(cases)} cases, and {count} are requested; extend the file or request fewer"
         )
     return tuple(cases[:count])

@@ -96,7 +96,7 @@ def read(path: Path) -> Credentials:
     )
     for name in (tls.root_ca, tls.certificate):
         if not Path(name).is_file():
-            raise ConfigError(f"{name}, which {path} names, is not there: copy the whole folder")
+            raise ConfigError(f"{name}, which {path} names, is missing: copy the whole folder")
     _read_private(Path(tls.private_key))
     return msgspec.structs.replace(found, tls=tls)
 

@@ -153,7 +153,7 @@ def _set_worker(
             if worker not in known:
                 raise ConfigError(
                     f"no worker {worker!r} is connected; there are: {', '.join(sorted(known)) or 'none'}."
-                    " For one that is to come back, add --absent"
+                    " For a worker that will return, add --absent"
                 )
         await operator.set_worker(worker, state)
 

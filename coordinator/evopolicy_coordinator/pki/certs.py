@@ -77,7 +77,7 @@ def issue(
     parent = x509.load_pem_x509_certificate(authority.certificate)
     if now + dt.timedelta(days=days) > parent.not_valid_after_utc:
         raise ConfigError(
-            f"{days} days is longer than the authority itself lives (until {parent.not_valid_after_utc:%Y-%m-%d});"
+            f"{days} days exceed the validity of the authority (until {parent.not_valid_after_utc:%Y-%m-%d});"
             " ask for fewer with --days, or make a new authority with `certs init --force`"
         )
     if serves and not hosts:

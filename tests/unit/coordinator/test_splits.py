@@ -103,7 +103,7 @@ def test_files_are_read_and_cut_to_what_is_asked_for(folder: Path) -> None:
     whole = source.splits("toy", "toy/line", {})
     assert [case.seed for case in whole.train] == [1, 2, 3]
     assert [case.seed for case in source.splits("toy", "toy/line", {"heldout": 1}).heldout] == [6]
-    with pytest.raises(ConfigError, match="has 2 cases, 9 are asked for"):
+    with pytest.raises(ConfigError, match="has 2 cases, and 9 are requested"):
         source.splits("toy", "toy/line", {"validation": 9})
     with pytest.raises(ConfigError, match="toy_maze"):
         source.splits("toy", "toy/maze", {})

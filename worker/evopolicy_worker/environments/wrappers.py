@@ -24,7 +24,7 @@ def wrapped(env_id: str, env: gymnasium.Env[Any, Any], wrapper: Wrapper) -> gymn
     except (ImportError, AttributeError, ValueError) as error:
         near = [] if colon else difflib.get_close_matches(name, dir(found), n=3)
         hint = f"near: {', '.join(near)}" if near else "say a class of gymnasium.wrappers, or module:Class"
-        raise WorkerError(f"{where}: there is none of that name; {hint}") from error
+        raise WorkerError(f"{where}: no wrapper has this name; {hint}") from error
     except Exception as error:
         raise WorkerError(
             f"{where}: its module {module!r} raised {type(error).__name__}: {error} on import; correct the module"

@@ -280,7 +280,7 @@ def action(tag: int, payload: bytes, max_values: int = 1024) -> Any:
                 raise ValueError(f"it holds {n:,} values; {max_values:,} are the limit")
             return value
     except (struct.error, msgspec.DecodeError, ValueError, TypeError, RecursionError, OverflowError) as error:
-        raise BadReplyError(f"what it sent as an action cannot be read: {error}") from error
+        raise BadReplyError(f"its action cannot be read: {error}") from error
     raise BadReplyError(f"it answered with frame {tag}, which is no action")
 
 

@@ -185,7 +185,7 @@ class AcpAgent(CliAgent):
                 if not update.done():
                     update.cancel()
                 if not done:
-                    raise TimeoutError(f"the agent's program said nothing for {self._config.silence_s:g} s")
+                    raise TimeoutError(f"the agent's program had no output for {self._config.silence_s:g} s")
                 if update in done:
                     self._read(stage, reader, update.result())
                 if (why := capped(reader)) is not None:

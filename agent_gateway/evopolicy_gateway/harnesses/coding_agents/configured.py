@@ -39,7 +39,7 @@ class ConfiguredCli(Dialect):
         self.prompt_on_stdin = self._cli.prompt == "stdin"
         if config.mcp and not (self._cli.mcp or self._cli.mcp_environment):
             raise ConfigError(
-                f"harness {config.harness}: say in cli.mcp how the program is told of MCP servers, such as"
+                f"harness {config.harness}: mcp needs the program's option for MCP servers: set cli.mcp, such as"
                 ' mcp = ["--mcp-config", "{mcp_config}"], or in cli.mcp_environment'
             )
 

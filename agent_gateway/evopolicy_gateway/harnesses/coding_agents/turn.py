@@ -78,7 +78,7 @@ async def _read(
             return False
         except TimeoutError:
             if not reader.done:
-                why = f"the agent's program said nothing for {silence_s:g} s"
+                why = f"the agent's program had no output for {silence_s:g} s"
                 reader.failure = TurnFailure(kind="passing", message=why)
             return True
         if not line.lstrip().startswith(b"{"):

@@ -107,7 +107,7 @@ def test_who_listens_needs_a_host() -> None:
 
 
 def test_a_certificate_does_not_outlive_its_authority() -> None:
-    with pytest.raises(ConfigError, match="longer than the authority itself lives"):
+    with pytest.raises(ConfigError, match="exceed the validity of the authority"):
         certs.issue(AUTHORITY, "a", NOW, certs.AUTHORITY_DAYS + 1, serves=False)
 
 

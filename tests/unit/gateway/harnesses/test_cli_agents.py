@@ -151,7 +151,7 @@ def test_a_silent_cli_is_ended_and_its_session_resumed(tmp_path: Path, harness: 
     played = play(tmp_path, settings(harness, silence_s=1.0), "silent,work", budget=2)
     assert (ended(played).reason, ended(played).turns, ended(played).retries) == ("agent_stopped", 1, 1)
     (failed,) = [line for line in played.log if line.get("type") == "turn_failed"]
-    assert "said nothing" in failed["message"]
+    assert "no output" in failed["message"]
     assert "resume" in " ".join(played.starts[1])
 
 

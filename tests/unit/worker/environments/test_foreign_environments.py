@@ -83,7 +83,7 @@ def test_a_definition_sets_arguments_wrappers_limit_text_and_success() -> None:
     [
         (
             Wrapper(wrapper="ClipActions"),
-            "wrapper 'ClipActions': there is none of that name; near: ClipAction",
+            "wrapper 'ClipActions': no wrapper has this name; near: ClipAction",
         ),
         (Wrapper(wrapper="no_such:Thing"), "wrapper 'no_such:Thing': there is none"),
         (Wrapper(wrapper="TransformReward"), "kwargs {}: it cannot be put around the environment: TypeError"),

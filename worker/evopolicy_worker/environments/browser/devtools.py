@@ -116,7 +116,7 @@ class DevTools:
         try:
             answer = self._decode(message)
         except msgspec.MsgspecError as error:
-            raise BrowserLostError(f"the browser sends what is no answer: {error}") from error
+            raise BrowserLostError(f"the browser sent an invalid reply: {error}") from error
         if answer.method:
             self._on_event(answer.method, answer.params, answer.session)
         elif answer.id in self._wanted:

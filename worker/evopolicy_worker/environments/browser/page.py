@@ -172,7 +172,7 @@ class Page:
             # Whole pairs are not escaped.
             return msgspec.json.decode(_HALF_PAIR.sub(r"\1\\ufffd", found) if "\\ud" in found else found)
         except (TypeError, msgspec.MsgspecError) as error:
-            raise BrowserLostError(f"the page tells what is no JSON: {error}") from error
+            raise BrowserLostError(f"the page sent invalid JSON: {error}") from error
 
     def send(self, method: str, **params: Any) -> dict[str, Any]:
         """One command of the DevTools protocol to the page, and its result."""
