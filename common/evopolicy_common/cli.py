@@ -6,7 +6,6 @@ Help and completion import this module, so large modules are imported where they
 from __future__ import annotations
 
 import contextlib
-import logging
 import signal
 import sys
 from collections.abc import Coroutine, Iterator, MutableMapping
@@ -76,6 +75,8 @@ def _harmless_values(_: Any, __: str, event: MutableMapping[str, Any]) -> Mutabl
 
 def setup_logging(level: str = "info") -> None:
     """Configures structured logs on stderr: readable on a terminal, JSON lines otherwise."""
+    import logging
+
     import structlog
 
     terminal = sys.stderr.isatty()
@@ -96,6 +97,8 @@ def setup_logging(level: str = "info") -> None:
 
 def setup_notices() -> None:
     """For interactive commands and scripts: prints warnings as plain lines on stderr; stdout holds results only."""
+    import logging
+
     import structlog
 
     def plain(_: Any, __: str, event: Any) -> str:

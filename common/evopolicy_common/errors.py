@@ -6,12 +6,25 @@ operators and never reach an agent.
 
 from __future__ import annotations
 
-import msgspec
+from typing import TYPE_CHECKING, Any
 
 from evopolicy_common.wire.refusals import Refusal
 
-DECODE_ERRORS = (msgspec.DecodeError, UnicodeDecodeError, RecursionError)
-"""Errors of msgspec for input that is malformed, of another shape, not UTF-8, or nested without end."""
+if TYPE_CHECKING:
+    import msgspec
+
+    DECODE_ERRORS: tuple[type[msgspec.DecodeError], type[UnicodeDecodeError], type[RecursionError]]
+    """Errors of msgspec for input that is malformed, of another shape, not UTF-8, or nested without end."""
+
+
+def __getattr__(name: str) -> Any:
+    """`DECODE_ERRORS`, on first use: a command's help imports this module, and needs no msgspec."""
+    if name != "DECODE_ERRORS":
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    import msgspec
+
+    found = globals()[name] = (msgspec.DecodeError, UnicodeDecodeError, RecursionError)
+    return found
 
 
 class EvopolicyError(Exception):

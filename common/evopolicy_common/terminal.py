@@ -9,8 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import io
-import json
-import logging
 import os
 import re
 import signal
@@ -19,6 +17,8 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    import logging
+
     from typing_extensions import Buffer
 
 _ODD = re.compile(r"[^\n\t -~]")
@@ -60,6 +60,8 @@ def say_lines(lines: Iterable[str], *, err: bool = False) -> None:
 
 def say_json(value: Any, *, indent: bool = True) -> None:
     """Prints `value` as JSON on stdout, indented or on one line. Unprintable characters are escaped."""
+    import json
+
     import msgspec
 
     try:
@@ -72,6 +74,8 @@ def say_json(value: Any, *, indent: bool = True) -> None:
 
 
 def _escaped(found: re.Match[str]) -> str:
+    import json
+
     return found[0] if found[0].isprintable() else json.dumps(found[0])[1:-1]
 
 
@@ -82,8 +86,12 @@ class _WatchedStdout(io.FileIO):
         try:
             return super().write(data)
         except BrokenPipeError:
+            import logging
+
             with open(os.devnull, "wb") as nowhere:
                 os.dup2(nowhere.fileno(), self.fileno())
+            # SystemExit ends the loop, so asyncio must not report an unretrieved exception of the task.
+            logging.getLogger("asyncio").addFilter(_is_no_exit)
             raise SystemExit(READER_GONE) from None
 
 
@@ -105,8 +113,6 @@ def end_without_reader() -> None:
     stream = sys.stdout
     if not isinstance(stream, io.TextIOWrapper):
         return  # closed, or replaced by someone else
-    # SystemExit ends the loop, so asyncio must not report an unretrieved exception of the task.
-    logging.getLogger("asyncio").addFilter(_is_no_exit)
     raw = _WatchedStdout(stream.fileno(), "wb", closefd=False)
     sys.stdout = io.TextIOWrapper(
         io.BufferedWriter(raw),

@@ -1,12 +1,13 @@
-"""Checks of the machine before a command starts: writable folders, valid path names, a port to bind."""
+"""Checks of the machine before a command starts: writable folders, valid path names, a port to bind.
+
+Help and completion import this module, so what only a check needs is imported there.
+"""
 
 from __future__ import annotations
 
 import errno
 import importlib.util
 import os
-import socket
-import tempfile
 from pathlib import Path
 
 from evopolicy_common.errors import ConfigError, EvopolicyError, MachineError
@@ -84,6 +85,8 @@ def check_writable(
     `choose`: the option or variable that names another folder. `may_be_full`: for callers that wait for space or free
     it.
     """
+    import tempfile
+
     folder = Path(os.path.abspath(folder))
     check_text(folder, choose)
     there = folder
@@ -111,6 +114,8 @@ def check_writable(
 
 def check_scratch() -> None:
     """Raises MachineError when the system's temporary folder is full, read-only or missing."""
+    import tempfile
+
     try:
         folder = Path(tempfile.gettempdir())
     except FileNotFoundError as error:
@@ -122,6 +127,8 @@ def check_scratch() -> None:
 
 def check_loopback() -> None:
     """Raises ConfigError when nothing can listen on the loopback address."""
+    import socket
+
     try:
         with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as sock:
             sock.bind((LOOPBACK, 0))
