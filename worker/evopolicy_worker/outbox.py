@@ -49,8 +49,9 @@ MAX_LOST = 5
 UNPACK_S = 30.0
 """How long the coordinator may take to read outcomes from a blob before the report is sent again."""
 PAUSE_S = 1.0
-LINGER_S = 0.02
-"""Longest wait of a result for others, seconds."""
+LINGER_S = 0.05
+"""Longest wait of a result for others, seconds. A report and the leases that follow it cost all processes together as
+much as a short episode's simulation."""
 
 
 class Outbox:

@@ -114,30 +114,28 @@ class EnvProcess:
             if isinstance(work, messages.Describe):
                 self._channel.send(self._described(player, work.environments))
                 continue
-            self._channel.send(self._play(player, *work))
+            self._channel.send_frame(self._play(player, *work))
             # A sandbox that has ended meanwhile is the next job's to find.
             with contextlib.suppress(SandboxError, SlotDiedError):
                 player.prepare()
 
-    def _play(self, player: Player, command: messages.Play, progress: Progress) -> messages.Reply:
-        self._monitor.ticking = True
-        self._monitor.wake()
+    def _play(self, player: Player, command: messages.Play, progress: Progress) -> bytes:
+        """Plays a job and returns its last frames, which wake the supervisor only once."""
         try:
             files = self._files(command.bundle)
-            player.play(
+            last = player.play(
                 command.job, files, progress, self._channel.send_frame, command.first, command.failure
             )
             progress.give_up(None)
-            return messages.Played()
+            return last + messages.framed(messages.Played())
         except CancelledJobError:
             progress.give_up(self._channel.send)
-            return messages.Played(cancelled=True)
+            return messages.framed(messages.Played(cancelled=True))
         except (Exception, SystemExit) as error:  # an environment's sys.exit
             progress.give_up(self._channel.send)
-            if progress.cancelled:
-                # Whatever it met on its way out.
-                return messages.Played(cancelled=True)
-            return self._fault(error)
+            # With a cancellation: whatever it met on its way out.
+            answer = messages.Played(cancelled=True) if progress.cancelled else self._fault(error)
+            return messages.framed(answer)
         finally:
             self._progress = None
             self._monitor.ticking = False
@@ -180,6 +178,8 @@ class EnvProcess:
             # From now on it can be cancelled, also before it is taken up.
             self._last_report = 0.0, 0
             self._progress = Progress()
+            # This is the monitor's own thread, which need not be woken for it.
+            self._monitor.ticking = True
             self._jobs.put((command, self._progress))
         elif isinstance(command, messages.Cancel):
             progress = self._progress

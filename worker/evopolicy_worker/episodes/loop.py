@@ -144,9 +144,9 @@ class Player:
         tell: Callable[[bytes], None],
         first: int = 0,
         failure: PolicyFailure | None = None,
-    ) -> None:
-        """Plays the job's episodes in order, and passes each outcome to `tell` as a framed `Finished`. `files`: its
-        bundle.
+    ) -> bytes:
+        """Plays the job's episodes in order, and passes each outcome to `tell` as a framed `Finished`, except for the
+        last, which is returned. `files`: its bundle.
 
         Starts at index `first`. If `failure` is given, the policy has failed in that episode, which is played without
         it. Raises CancelledJobError; WorkerError, SandboxError or SlotDiedError for failures that are not the policy's.
@@ -159,9 +159,12 @@ class Player:
         before = unpack(job)
         if not job.video:
             self._videos.close()
+        frame = b""
         try:
             progress.episodes_done = first
             for k in range(first, len(job.episodes)):
+                if frame:
+                    tell(frame)
                 spec = job.episodes[k]
                 if progress.cancelled:
                     raise CancelledJobError
@@ -171,14 +174,14 @@ class Player:
                 if is_kept(job):
                     progress.begins(k, begun)
                 failure, frame = self._play(k, job, spec, policies, progress, tell, begun)
-                tell(frame)
                 progress.episodes_done += 1
                 if failure is not None and _verdict_of_submit(job, spec, failure):
                     for other in job.episodes[k + 1 :]:
                         unplayed = _brief(_unplayed(other.index, failure), _share(job))
-                        tell(messages.framed(messages.Finished(outcome=unplayed)))
+                        frame += messages.framed(messages.Finished(outcome=unplayed))
                     break
                 failure = None
+            return frame
         finally:
             policies.close(progress)
 
