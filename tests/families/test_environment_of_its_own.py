@@ -1,22 +1,26 @@
 """A family whose packages exclude those installed here: `setup` installs it for real, `check-env` finds nothing, a policy
-beats random, and `evolve` plays a whole run with a worker from its virtual environment."""
+beats random, and `evolve` plays a whole run with a worker from its virtual environment. Three workers of different
+installations play a mixed suite together."""
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import site
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
 import pytest
 from commands import command, record_in, run_dir
+from coordinator_harness import Coordinator
 
 from evopolicy_common.catalogue import installs
 from evopolicy_common.catalogue.installs import Made
+from evopolicy_common.records.run_record import decode_run_record
 from evopolicy_coordinator.analysis.statistics.intervals import over_cases
 
 FAMILY, ENV = "mo_gymnasium", "gymnasium/deep-sea-treasure-v0"
@@ -72,24 +76,33 @@ def from_a_wheel(folder: Path) -> Path:
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Made]:
-    """The virtual environment that `setup` makes, found by local commands."""
-    program = from_a_wheel(tmp_path_factory.mktemp("wheel"))
+def program(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """`evopolicy-worker` of a wheel; what it sets up is found by local commands."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv(installs.FOLDER_VARIABLE, str(tmp_path_factory.mktemp("installs")))
-        done = subprocess.run(
-            [str(program), "setup", FAMILY],
-            capture_output=True,
-            text=True,
-            check=False,
-            cwd=program.parent,
-            env=dict(os.environ),
-        )
-        assert done.returncode == 0, done.stderr
-        (found,) = installs.made()
-        assert "next: " in done.stdout
-        assert found.families == (FAMILY,)
-        yield found
+        yield from_a_wheel(tmp_path_factory.mktemp("wheel"))
+
+
+def set_up(program: Path, family: str) -> Made:
+    """The virtual environment that `setup` makes."""
+    done = subprocess.run(
+        [str(program), "setup", family],
+        capture_output=True,
+        text=True,
+        check=False,
+        cwd=program.parent,
+        env=dict(os.environ),
+    )
+    assert done.returncode == 0, done.stderr
+    assert "next: " in done.stdout
+    (found,) = (each for each in installs.made() if each.families == (family,))
+    return found
+
+
+@pytest.fixture(scope="module")
+def made(program: Path) -> Made:
+    """The virtual environment of the family that excludes others."""
+    return set_up(program, FAMILY)
 
 
 @pytest.mark.slow
@@ -151,3 +164,80 @@ def test_evolve_plays_a_whole_run_with_a_worker_from_it(tmp_path: Path, made: Ma
         info = json.loads(row)["info"]
         assert set(info["rewards"]) == {"treasure", "time"}
         assert info["reward_vector"] == list(info["rewards"].values())
+
+
+MIXED = """
+name = "mixed"
+environments = [{ids}]
+[defaults]
+budget = 4
+validation = 2
+heldout = 2
+[parallel]
+machine = 1
+[[agents]]
+name = "evolve"
+agent = "evolve"
+"""
+
+
+@contextlib.contextmanager
+def workers(coordinator: Coordinator, offered: Mapping[str, str]) -> Iterator[None]:
+    """A worker of each interpreter, which offers one environment."""
+    options = ["--slots", "1", "--grace", "1", "--credentials", coordinator.ready["credentials"]["worker"]]
+    started = []
+    with coordinator.log.open("ab") as log:
+        for python, env_id in offered.items():
+            program = [python, "-P", "-m", "evopolicy_worker.cli", "--env", env_id, *options]
+            started.append(subprocess.Popen(program, stdout=log, stderr=log))
+    try:
+        yield
+    finally:
+        for each in started:
+            each.terminate()
+        for each in started:
+            each.wait(timeout=60)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_three_differently_installed_workers_play_a_suite_and_each_run_names_its_own(
+    tmp_path: Path, program: Path, made: Made
+) -> None:
+    third = set_up(program, "minigrid")
+    offered = {
+        sys.executable: "gymnasium/CartPole-v1",
+        made.python: ENV,
+        third.python: "gymnasium/MiniGrid-Empty-5x5-v0",
+    }
+    asks = "from evopolicy_common.catalogue import installs; print(installs.own())"
+    names = {
+        env_id: subprocess.run(
+            [python, "-P", "-c", asks], capture_output=True, text=True, check=True
+        ).stdout.strip()
+        for python, env_id in offered.items()
+    }
+    assert [name.partition("@")[0] for name in names.values()] == ["base", FAMILY, "minigrid"]
+    assert len({name.partition("@")[2] for name in names.values()}) == 3
+    (tmp_path / "mixed.toml").write_text(
+        MIXED.format(ids=", ".join(f'"{each}"' for each in offered.values()))
+    )
+    # Runs of one machine wait for each other's agents otherwise.
+    coordinator = Coordinator(tmp_path / "state", "--hidden-isolation", "off")
+    try:
+        with (
+            workers(coordinator, offered),
+            command(
+                tmp_path, "suite", "mixed.toml", "--credentials", coordinator.ready["credentials"]["operator"]
+            ) as running,
+        ):
+            code, _, err = running.finish(600)
+    finally:
+        coordinator.stop()
+    assert code == 0, err + coordinator.log.read_text()
+    records = [decode_run_record(each.read_bytes()) for each in (tmp_path / "runs").rglob("run.json")]
+    assert {each.env: each.versions.installations for each in records} == {
+        env_id: (name,) for env_id, name in names.items()
+    }
+    assert all(each.outcome.status == "completed" for each in records)
+    assert "mo-gymnasium" in next(each for each in records if each.env == ENV).versions.fingerprint
