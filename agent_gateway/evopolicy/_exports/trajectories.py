@@ -46,9 +46,9 @@ def write_minari(runs: Runs, out: Path) -> list[Path]:
         buffers: list[Any] = []
         about: list[dict[str, Any]] = []
         for run in members:
-            for buffer, told in _episodes(run):
+            for buffer, metadata in _episodes(run):
                 buffers.append(buffer)
-                about.append(told)
+                about.append(metadata)
         if not buffers:
             continue
         buffers, about = _of_one_form(buffers, about)

@@ -157,11 +157,11 @@ class Chromium:
         try:
             self.version = str(self.devtools.call("Browser.getVersion", timeout_s=START_S)["product"])
         except (WorkerError, KeyError) as error:
-            said = (self.profile / "stderr").read_text(errors="replace").strip().splitlines()[-3:]
+            stderr = (self.profile / "stderr").read_text(errors="replace").strip().splitlines()[-3:]
             self.close()
             why = error if isinstance(error, WorkerError) else "it does not tell its version"
             raise WorkerError(
-                f"{path} does not start as a browser: {why}; it said: {' | '.join(said)[:500] or 'nothing'}; {REMEDY}"
+                f"{path} does not start as a browser: {why}; its stderr: {' | '.join(stderr)[:500] or 'empty'}; {REMEDY}"
             ) from error
 
     def _spawn(self, path: str, theirs_in: int, theirs_out: int, folder: int) -> int:

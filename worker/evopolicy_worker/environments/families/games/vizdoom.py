@@ -51,15 +51,15 @@ class VizdoomFamily(GymnasiumFamily):
         return _scenario(entry) == "Freedoom"
 
     def words(self, entry: Entry, env: gymnasium.Env[Any, Any]) -> dict[str, str]:
-        game, told, common = cast(_Game, env), _texts()[_scenario(entry)], _texts()["common"]
+        game, texts, common = cast(_Game, env), _texts()[_scenario(entry)], _texts()["common"]
         numbers = [f"`[{k}]` {common['variable'][each]}" for k, each in enumerate(game.variables)]
-        parts = {**common["observation"], **told.get("observation", {}), "gamevariables": "; ".join(numbers)}
+        parts = {**common["observation"], **texts.get("observation", {}), "gamevariables": "; ".join(numbers)}
         seen = [
             f"| `{name}` | {parts[name]} | {_form(name, space)} |"
             for name, space in game.observation_space.spaces.items()
         ]
         return {
-            "": f"{told['about']}{_level(entry)}",
+            "": f"{texts['about']}{_level(entry)}",
             "Observation": "\n".join(
                 [
                     "A dict. The observation after the last step is all zeros.",
@@ -70,9 +70,9 @@ class VizdoomFamily(GymnasiumFamily):
                 ]
             ),
             "Action": _actions(game, common["button"]),
-            "Reward": told["reward"],
-            "Start": told.get("start", common["start"]),
-            "End": told["end"],
+            "Reward": texts["reward"],
+            "Start": texts.get("start", common["start"]),
+            "End": texts["end"],
         }
 
 
