@@ -35,7 +35,7 @@ class ClaudeCode(Dialect):
 
     name = "claude-code"
     program = ("claude",)
-    tested_version = "2.1.197"
+    tested_version = "2.1.330"
     install = "npm install -g @anthropic-ai/claude-code"
     help_args = ("--help",)
     makes_session_id = True

@@ -1,6 +1,6 @@
 """The real CLIs against a model API on loopback that makes them edit a file and submit. Opt-in, since they are large:
 
-    npm install --prefix ~/clis @openai/codex@0.169.0 @anthropic-ai/claude-code@2.1.197 \\
+    npm install --prefix ~/clis @openai/codex@0.169.0 @anthropic-ai/claude-code@2.1.330 \\
         @google/gemini-cli@0.61.0 @qwen-code/qwen-code@0.15.10 opencode-ai@1.18.33 @zed-industries/claude-agent-acp@0.23.1
     EVOPOLICY_REAL_CLIS=~/clis/node_modules/.bin python -m pytest tests/integration/gateway/agents/test_real_clis.py
 
