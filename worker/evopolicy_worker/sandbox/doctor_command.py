@@ -39,12 +39,17 @@ def doctor(
             for each in checks
         ]
         terminal().print(filled_table(("check", "verdict", "found", "works without it", "remedy"), rows))
-        say(
-            "next: evopolicy demo"
-            if plays
-            else "runs cannot be played here yet: see the rows that say missing"
-        )
+        say(_next(tier) if plays else "runs cannot be played here yet: see the rows that say missing")
     raise typer.Exit(0 if plays else 1)
+
+
+def _next(tier: str | None) -> str:
+    if tier == "bwrap":
+        return "next: evopolicy demo"
+    return (
+        "next: mend the row tier bwrap, which agents' jails need too; or give up the jail by name:"
+        f" evopolicy local --env gym/continuouscar --agent evolve --tier {tier} --jail none"
+    )
 
 
 def _no_worker() -> Check:

@@ -1,0 +1,27 @@
+"""What `evopolicy doctor` advises at its end."""
+
+from __future__ import annotations
+
+import pytest
+from typer.testing import CliRunner
+
+from evopolicy_worker.sandbox import doctor_command
+from evopolicy_worker.sandbox.doctor import Check
+
+
+@pytest.mark.parametrize(
+    ("verdict", "told"), [("ok", "next: evopolicy demo"), ("missing", "--tier landlock --jail none")]
+)
+def test_the_demo_is_advised_only_where_its_jail_starts(
+    monkeypatch: pytest.MonkeyPatch, verdict: str, told: str
+) -> None:
+    def check(name: str, verdict: str) -> Check:
+        return Check(name=name, verdict=verdict, found="x", without="x", advice="x")  # type: ignore[arg-type]
+
+    monkeypatch.setattr(doctor_command, "examine_machine", list)
+    found = (check("tier bwrap", verdict), check("tier landlock", "ok"))
+    monkeypatch.setattr(doctor_command, "examine", lambda: found)
+    done = CliRunner().invoke(doctor_command.app, [])
+    assert done.exit_code == 0
+    assert told in done.stdout
+    assert ("evopolicy demo" in done.stdout) == (verdict == "ok")
