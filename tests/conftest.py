@@ -55,6 +55,7 @@ _FAMILIES = (
     "conformance/environments/test_crafter_worlds.py",
     "conformance/environments/test_families.py",
     "conformance/environments/test_lazy_families.py",
+    "conformance/environments/test_vizdoom_slots.py",
     "families",
 )
 """Files and folders that play environments of families beyond Core16's."""

@@ -1,0 +1,40 @@
+"""ViZDoom's game is a process in the slot's jail: it plays there, and is gone with its slot."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from slots import Slots, family, pid_of, runs
+from waiting import wait_until
+
+from evopolicy_common.errors import WorkerError
+from evopolicy_worker.environments import missing
+
+ENV = "gymnasium/VizdoomPredictPosition-v1"
+
+pytestmark = pytest.mark.skipif(bool(missing(ENV)), reason=f"{ENV} needs {missing(ENV)}")
+
+
+@pytest.fixture
+def slots(tmp_path: Path) -> Iterator[Slots]:
+    found = Slots(tmp_path)
+    yield found
+    found.close()
+
+
+def test_a_tier_without_shared_memory_says_so(slots: Slots) -> None:
+    with pytest.raises(WorkerError, match="tier bwrap"):
+        slots.play_all(None, tier="landlock", env=ENV)
+
+
+def test_a_closed_slot_leaves_no_game(slots: Slots) -> None:
+    slot = slots.new()
+    slots.run(slot.start())
+    slots.play_all(None, slot=slot, env=ENV)
+    processes = family(pid_of(slot))
+    names = [Path(f"/proc/{pid}/comm").read_text().strip() for pid in processes]
+    assert "vizdoom" in names
+    slots.run(slot.close())
+    wait_until(lambda: not [pid for pid in processes if runs(pid)])
