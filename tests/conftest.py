@@ -27,6 +27,7 @@ _SYSTEM = (
     "integration/coordinator/test_published_results.py",
     "integration/coordinator/test_rescore_command.py",
     "integration/coordinator/test_verify_command.py",
+    "integration/deploy/test_kubernetes.py",
     "integration/deploy/test_slurm.py",
     "integration/gateway/command_line/test_cancelled_run.py",
     "integration/gateway/test_elastic_workers.py",

@@ -32,6 +32,7 @@ from evopolicy_gateway import shipped
 from evopolicy_gateway.agents.function import Workspace
 from evopolicy_gateway.cli.options import default_exp_id, limits_of, one_environment, packages_for
 from evopolicy_gateway.cli.run_options import RunOptions
+from evopolicy_gateway.http.listener import Listener
 from evopolicy_gateway.jail.settings import JailSettings
 from evopolicy_gateway.operator import cluster as operator
 from evopolicy_gateway.operator.trials import policy_bundle
@@ -270,22 +271,27 @@ class Cluster:
                 options["entry"] = options.get("entry") or _name_of(agent)
                 folder = stack.enter_context(scratch_folder("function"))
                 agent = await asyncio.to_thread(_pickled, agent, folder / "function.pickle")
-            plan = _plan(env, agent, **options)
+            plan = plan_of(env, agent, **options)
             await asyncio.to_thread(plan.check)
             return await self._play(plan, progress)
 
-    async def _play(self, plan: Plan, progress: bool) -> Run:
+    async def _play(
+        self, plan: Plan, progress: bool, started: Callable[[RunLifecycle], None] = lambda _: None
+    ) -> Run:
+        """Plays a run; `started` is called before its first step."""
         self._where.check_cases([plan.settings])
 
         async def work(reached: operator.Reached) -> Run:
             with RunView(terminal(stderr=True) if progress else None).shown() as watch:
-                await RunLifecycle(plan, reached.operations, reached.gateway, watch).play()
+                lifecycle = RunLifecycle(plan, reached.operations, reached.gateway, watch)
+                started(lifecycle)
+                await lifecycle.play()
             return await asyncio.to_thread(read_run, plan.folder.root)
 
         return await self._on(plan.settings.env, plan.settings.sandbox_tier, work)
 
 
-def _plan(
+def plan_of(
     env: str,
     agent: str,
     *,
@@ -305,8 +311,10 @@ def _plan(
     agents_md: str | os.PathLike[str] | None = None,
     agent_wall_s: float = WALL_S,
     overwrite: bool = False,
+    listener: Listener | None = None,
+    agent_host: str = "",
 ) -> Plan:
-    """The plan of a run; arguments as for `run`. Raises ConfigError."""
+    """The plan of a run; arguments as for `run`, and for an agent that is started elsewhere as in `Plan`. Raises ConfigError."""
     env = one_environment(env)
     given = RunOptions(
         agent=agent,
@@ -327,7 +335,7 @@ def _plan(
     )
     texts = given.texts(Path.cwd())
     return Plan(
-        settings=given.settings(env, given.exp_id or "", texts=texts),
+        settings=given.settings(env, given.exp_id or "", agent_host, texts),
         texts=texts,
         agent=agent,
         runs=given.runs,
@@ -335,7 +343,8 @@ def _plan(
         wall_limit_s=agent_wall_s,
         silence_s=given.agent_silence_s,
         overwrite=overwrite,
-        jail=JailSettings(),
+        jail=JailSettings() if listener is None else JailSettings(mode="none"),
+        listener=listener,
     )
 
 

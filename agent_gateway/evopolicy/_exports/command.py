@@ -31,6 +31,7 @@ class Format(StrEnum):
     WANDB = "wandb"
     MINARI = "minari"
     ATIF = "atif"
+    INSPECT = "inspect"
 
 
 @app.command("export", epilog="Example: evopolicy export runs/ --to parquet --out tables")
@@ -40,7 +41,7 @@ def export(
         Format,
         typer.Option(
             help="csv and parquet: tables of runs, submits and episodes. tensorboard, mlflow, wandb: returns over the budget."
-            " minari: train episodes as datasets. atif: agents' logs."
+            " minari: train episodes as datasets. atif, inspect: agents' logs."
         ),
     ],
     out: Annotated[
@@ -91,6 +92,7 @@ def _write(runs: list[Path], to: Format, out: Path) -> None:
         Format.PARQUET: tables.write_parquet,
         Format.MINARI: trajectories.write_minari,
         Format.ATIF: transcripts.write_atif,
+        Format.INSPECT: transcripts.write_inspect,
     }
     found = load_runs(*runs)
     for folder, why in found.left_out:

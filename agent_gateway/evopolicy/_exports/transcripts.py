@@ -1,10 +1,12 @@
-"""Agents' logs in Harbor's Agent Trajectory Interchange Format (ATIF)."""
+"""Agents' logs in Harbor's Agent Trajectory Interchange Format (ATIF), and as logs of Inspect. Neither tool is needed."""
 
 from __future__ import annotations
 
 import hashlib
 import json
+import re
 from collections.abc import Callable, Iterator
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -15,23 +17,40 @@ from evopolicy._runs import Run, Runs
 
 ATIF = "ATIF-v1.7"
 """The version of the format that is written."""
+INSPECT = 2
+"""The version of Inspect's log format that is written, as JSON."""
+_STATES = {"cancelled": "cancelled", "error": "error"}
+"""Inspect's state of a log by the run's status; any other is a success."""
+_MAX_ERROR = 500
+"""Characters of a failed call's result that Inspect shows as its error; the whole result is the message's content."""
 
 
 def write_atif(runs: Runs, out: Path) -> list[Path]:
     """Writes `<entry>/<env>/<experiment>/trajectory.json` for each run, over existing files."""
-
-    def write(run: Run, steps: list[Step]) -> Path:
-        path = out / _name(run) / "trajectory.json"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(_atif(run, steps), ensure_ascii=True, indent=1), encoding="utf-8")
-        return path
-
-    return [*_each(runs, write)]
+    return [*_each(runs, _atif, lambda run: out / _name(run) / "trajectory.json")]
 
 
-def _each(runs: Runs, write: Callable[[Run, list[Step]], Path]) -> Iterator[Path]:
+def write_inspect(runs: Runs, out: Path) -> list[Path]:
+    """Writes a log with one sample for each run, over existing files."""
+
+    def path(run: Run) -> Path:
+        # Inspect lists the JSON files whose names begin with a time, and shows the next parts as task and id.
+        begun = _utc(run._record.timing.start_time).strftime("%Y-%m-%dT%H-%M-%S+00-00")
+        task = re.sub(r"[^A-Za-z0-9]+", "-", run.summary.env)
+        return out / f"{begun}_{task}_{_id(run)}.json"
+
+    return [*_each(runs, _inspect, path)]
+
+
+def _each(
+    runs: Runs, made: Callable[[Run, list[Step]], dict[str, Any]], path_of: Callable[[Run], Path]
+) -> Iterator[Path]:
     for run in runs:
-        yield write(run, read_steps(run.folder / "logs" / "agent.jsonl") or [_nothing()])
+        steps = read_steps(run.folder / "logs" / "agent.jsonl") or [_nothing()]
+        path = path_of(run)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(made(run, steps), ensure_ascii=True, indent=1), encoding="utf-8")
+        yield path
 
 
 def _nothing() -> Step:
@@ -47,6 +66,10 @@ def _id(run: Run) -> str:
     """22 hexadecimal digits; equal in every export of this run."""
     identity = f"{run.folder.absolute()} {run._record.timing.start_time}"
     return hashlib.sha256(identity.encode("utf-8", "surrogateescape")).hexdigest()[:22]
+
+
+def _utc(text: str) -> datetime:
+    return datetime.fromisoformat(text).astimezone(UTC)
 
 
 def _about(run: Run) -> dict[str, Any]:
@@ -103,3 +126,100 @@ def _atif_step(number: int, step: Step) -> dict[str, Any]:
         observation={"results": results} if results else None,
     )
     return {"step_id": number, "source": step.source, "message": step.text, **optional}
+
+
+def _inspect(run: Run, steps: list[Step]) -> dict[str, Any]:
+    record, summary = run._record, run.summary
+    model = record.agent.model_string or record.model
+    begun, ended = (_utc(text).isoformat() for text in (record.timing.start_time, record.timing.end_time))
+    messages = [message for step in steps for message in _inspect_messages(step, model)]
+    last = next((each for each in reversed(messages) if each["role"] == "assistant"), None)
+    usage = {}
+    if (tokens := record.agent.tokens) is not None:
+        read, written = tokens.cache_read, tokens.cache_creation
+        usage[model] = _without_none(
+            input_tokens=tokens.input_noncached,
+            output_tokens=tokens.output,
+            total_tokens=tokens.input_noncached + read + written + tokens.output,
+            input_tokens_cache_read=read,
+            input_tokens_cache_write=written,
+            reasoning_tokens=tokens.reasoning,
+            total_cost=tokens.cost,
+        )
+    scores = {"heldout": summary.score, "random": summary.random_score}
+    known = {name: value for name, value in scores.items() if value is not None}
+    sample = {
+        "id": summary.env,
+        "epoch": record.repeat + 1,
+        "input": next((step.text for step in steps if step.source == "user"), ""),
+        "target": "",
+        "messages": messages,
+        "output": {
+            "model": model,
+            "choices": [] if last is None else [{"message": last, "stop_reason": "stop"}],
+        },
+        "scores": {name: {"value": value} for name, value in known.items()},
+        "metadata": _about(run),
+        "model_usage": usage,
+        "started_at": begun,
+        "completed_at": ended,
+        "total_time": record.timing.wall_time_seconds,
+        "uuid": _id(run),
+    }
+    state = _STATES.get(summary.status, "success")
+    reason = f"run.json: {summary.closed_reason or summary.status}"
+    return {
+        "version": INSPECT,
+        "status": state,
+        "eval": {
+            "eval_id": _id(run),
+            "run_id": _id(run),
+            "task_id": _id(run),
+            "created": begun,
+            "task": f"evopolicy/{summary.env}",
+            "task_args": {"budget": summary.budget},
+            "dataset": {"name": summary.env, "samples": 1, "sample_ids": [summary.env]},
+            "model": model,
+            "config": {},
+            "packages": {"evopolicy": record.versions.harness},
+            "metadata": {
+                "entry": summary.entry,
+                "harness": record.agent.harness,
+                "exp_id": record.exp_id,
+            },
+        },
+        "plan": {"steps": [{"solver": record.agent.harness, "params": {}}]},
+        "results": {
+            "total_samples": 1,
+            "completed_samples": 1,
+            "scores": [
+                {"name": name, "scorer": name, "metrics": {"mean": {"name": "mean", "value": value}}}
+                for name, value in known.items()
+            ],
+        },
+        "stats": {"started_at": begun, "completed_at": ended, "model_usage": usage},
+        "samples": [sample],
+    } | ({"error": {"message": reason, "traceback": "", "traceback_ansi": ""}} if state == "error" else {})
+
+
+def _inspect_messages(step: Step, model: str) -> Iterator[dict[str, Any]]:
+    """The step as messages of a chat."""
+    if step.source == "user":
+        yield {"role": "user", "content": step.text}
+    elif step.source == "agent":
+        reasoning = [{"type": "reasoning", "reasoning": text} for text in step.reasoning]
+        calls = [
+            {"id": call.id, "function": call.name, "arguments": call.arguments, "type": "function"}
+            for call in step.calls
+        ]
+        yield _without_none(tool_calls=calls) | {
+            "role": "assistant",
+            "content": [*reasoning, {"type": "text", "text": step.text}] if reasoning else step.text,
+            "model": model,
+        }
+    elif step.texts:
+        yield {"role": "system", "content": step.text}
+    for each in step.results:
+        call = {} if each.call is None else {"tool_call_id": each.call.id, "function": each.call.name}
+        error = {"error": {"type": "unknown", "message": each.text[:_MAX_ERROR]}} if each.failed else {}
+        yield {"role": "tool", "content": each.text} | call | error

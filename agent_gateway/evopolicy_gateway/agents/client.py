@@ -1,7 +1,7 @@
 """A client of the HTTP protocol for agents: `/info`, `/task` and `/submit`, with retries while the gateway is busy or
 away.
 
-It knows the three URLs and nothing else. It sends a submit with an idempotency key and `?wait=false`, then polls until
+It knows the three URLs, and a remote agent's token. It sends a submit with an idempotency key and `?wait=false`, then polls until
 the submit is done. So no single request lasts long, and a lost reply loses nothing.
 """
 
@@ -55,6 +55,8 @@ class Client:
     info_url: str
     task_url: str
     submit_url: str
+    token: str = ""
+    """Bearer token of a remote agent; empty: none is sent."""
     answer_s: float = 60.0
     """Timeout of one request, seconds; after it the request is sent again."""
     timeout_s: float = 300.0
@@ -71,6 +73,7 @@ class Client:
             info_url=os.environ["EVOPOLICYGYM_INFO_URL"],
             task_url=os.environ["EVOPOLICYGYM_TASK_URL"],
             submit_url=os.environ["EVOPOLICYGYM_SUBMIT_URL"],
+            token=os.environ.get("EVOPOLICYGYM_TOKEN", ""),
         )
 
     def info(self) -> dict[str, Any]:
@@ -134,9 +137,10 @@ class Client:
     ) -> tuple[int, bytes]:
         """Status and body of one request, retried while the gateway is away or restarting."""
         give_up_at = self.clock() + self.timeout_s
+        bearer = {"Authorization": f"Bearer {self.token}"} if self.token else {}
         while True:
             try:
-                request = urllib.request.Request(url, data=body, headers=headers or {})
+                request = urllib.request.Request(url, data=body, headers=bearer | (headers or {}))
                 with _OPENER.open(request, timeout=self.answer_s) as response:
                     return response.status, response.read()
             except urllib.error.HTTPError as error:

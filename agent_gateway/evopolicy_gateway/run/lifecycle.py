@@ -121,6 +121,11 @@ class RunLifecycle:
         """Set when the run is played: the folder is new then, or holds the times of earlier commands."""
 
     @property
+    def served(self) -> asyncio.Future[Ready]:
+        """Done when the gateway serves the agent for the first time."""
+        return self._ready
+
+    @property
     def agent_at_work(self) -> bool:
         """Whether the agent's side is open and its closing was not requested yet."""
         return self._supervisor is not None and self._order is None and not self._closed.is_set()

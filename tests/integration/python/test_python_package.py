@@ -1,4 +1,4 @@
-"""The public package at work: a policy, a run with a function as agent, the page and the notebook as they are written."""
+"""The public package at work: a policy, a run with a function as agent, the page as it is written."""
 
 from __future__ import annotations
 
@@ -18,7 +18,6 @@ import evopolicy as evp
 
 ROOT = Path(__file__).parents[3]
 PAGE = ROOT / "docs" / "how-to" / "python.md"
-NOTEBOOK = ROOT / "examples" / "notebooks" / "tutorial.ipynb"
 POLICY = """
 class Policy:
     def __init__(self, obs_space, action_space, env_meta):
@@ -29,24 +28,6 @@ class Policy:
 
     def act(self, obs):
         return [{gain} * (obs[2] - obs[0])]
-"""
-CELLS = """
-import ast, asyncio, json, sys
-
-async def main():  # as in a notebook, the main thread has a running loop
-    names = {"__name__": "__main__"}
-    for cell in json.load(open(sys.argv[1]))["cells"]:
-        if cell["cell_type"] != "code":
-            continue
-        tree = ast.parse("".join(cell["source"]))
-        last = ast.Expression(tree.body.pop().value) if isinstance(tree.body[-1], ast.Expr) else None
-        exec(compile(tree, "cell", "exec"), names)
-        if last is not None:
-            value = eval(compile(last, "cell", "eval"), names)
-            shown = value._repr_html_() if hasattr(value, "_repr_html_") else repr(value)
-            print(shown)
-
-asyncio.run(main())
 """
 
 
@@ -184,17 +165,6 @@ def test_the_page_does_what_it_says(tmp_path: Path) -> None:
     (tmp_path / "page.py").write_text("\n".join(blocks))
     output = run_here([sys.executable, "page.py"], tmp_path)
     assert "my_function gym/continuouscar completed" in output
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(600)
-def test_the_notebook_runs_from_its_first_cell_to_its_last(tmp_path: Path) -> None:
-    notebook = json.loads(NOTEBOOK.read_text())
-    assert (notebook["nbformat"], notebook["nbformat_minor"]) == (4, 4)
-    output = run_here([sys.executable, "-c", CELLS, str(NOTEBOOK)], tmp_path)
-    assert output.count("<svg") == 2
-    assert "((60, 3), " in output
-    assert (tmp_path / "runs/climb/toy_line/notebook/run.json").is_file()
 
 
 def run_here(command: list[str], folder: Path) -> str:

@@ -1,0 +1,102 @@
+"""The pages about other tools and about schemas, executed as they stand."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import jsonschema
+import pytest
+from invented.policies import Version
+from invented.run_dirs import write_run
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
+
+DOCS = Path(__file__).parents[3] / "docs"
+FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
+SUITE = """
+name = "smoke"
+environments = ["toy/line"]
+[defaults]
+budget = 4
+validation = 1
+heldout = 1
+[[agents]]
+name = "evolve"
+agent = "evolve"
+"""
+
+
+def blocks(page: str, language: str) -> list[str]:
+    return [code for found, code in FENCE.findall((DOCS / page).read_text()) if found == language]
+
+
+def bash(code: str, folder: Path, **more: str) -> str:
+    own = {
+        "XDG_STATE_HOME": str(folder / "state"),
+        "WANDB_MODE": "offline",
+        "MLFLOW_DISABLE_TELEMETRY": "true",
+    }
+    path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
+    done = subprocess.run(
+        ["bash", "-euo", "pipefail", "-c", code],
+        cwd=folder,
+        env=os.environ | own | {"PATH": path} | more,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=500,
+    )
+    assert done.returncode == 0, (code, done.stdout, done.stderr)
+    return done.stdout
+
+
+def test_the_page_about_other_tools_does_what_it_says(tmp_path: Path) -> None:
+    versions = [Version({"policy.py": "x = 1"}, (1.0,), 0.5, says="I begin.")]
+    run = write_run(tmp_path / "runs", versions, entry="evolve")
+    episode = run / "workspace/feedback/submit_000/episodes/ep_000"
+    episode.mkdir(parents=True)
+    row = {
+        "t": 0,
+        "obs": [1.0],
+        "action": 1,
+        "reward": 1.0,
+        "terminated": True,
+        "truncated": False,
+        "info": {},
+    }
+    (episode / "trajectory.jsonl").write_text(json.dumps(row) + "\n")
+
+    at_once, live = blocks("how-to/export.md", "sh")
+    wanted = {word for line in at_once.splitlines() for word in re.findall(r"--to (\w+)", line)}
+    assert wanted == {"csv", "parquet", "tensorboard", "mlflow", "wandb", "minari", "atif", "inspect"}
+    bash(at_once, tmp_path)
+    (tmp_path / "tables/runs.csv").unlink()
+    for made in ("tables/runs.parquet", "events", "mlflow.db", "wandb", "datasets", "trajectories", "logs"):
+        assert (tmp_path / made).exists(), made
+    (reads,) = blocks("how-to/export.md", "python")
+    check = f"python - <<'END'\n{reads}\nassert dataset.total_episodes == 1\nEND"
+    bash(check, tmp_path, MINARI_DATASETS_PATH="datasets")
+    # This suite file replaces the shipped one, which plays sixteen environments.
+    (tmp_path / "smoke.toml").write_text(SUITE)
+    assert "evolve/toy_line/smoke-0" in bash(f"{live}\nwait", tmp_path)
+
+
+def test_the_command_that_two_pages_name_prints_a_schema_that_accepts_the_pages_suite_file(
+    tmp_path: Path,
+) -> None:
+    pages = ("how-to/sweeps.md", "reference/files.md")
+    found = [re.findall(r"`(evopolicy schema [^`]*>[^`]*)`", (DOCS / page).read_text()) for page in pages]
+    ((line,), (same,)) = found
+    assert line == same
+    bash(line, tmp_path)
+    validator = jsonschema.Draft202012Validator(json.loads((tmp_path / "suite.schema.json").read_text()))
+    (example,) = [block for block in blocks("how-to/sweeps.md", "toml") if "[[agents]]" in block]
+    validator.validate(tomllib.loads(example))
+    with pytest.raises(jsonschema.ValidationError):
+        validator.validate(tomllib.loads(example) | {"environment": []})
