@@ -22,6 +22,7 @@ from evopolicy_common.processes.local_cluster import unless_failed
 from evopolicy_common.processes.preflight import check_installed, check_loopback, check_writable
 from evopolicy_common.records.run_record import decode_run_record
 from evopolicy_common.records.suite_folder import INDEX
+from evopolicy_common.wire.credentials import SWEEP_STATE
 from evopolicy_gateway.cli import options
 from evopolicy_gateway.operator.cluster import Cluster, connected
 from evopolicy_gateway.operator.locks import alone
@@ -124,7 +125,7 @@ def suite(
         if local:
             where = Cluster(
                 local_slots=slots,
-                state=state or root / ".cluster",
+                state=state or root / SWEEP_STATE,
                 data=data,
                 audit=audit,
                 hidden_isolation=hidden_isolation,

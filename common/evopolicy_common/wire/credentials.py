@@ -64,6 +64,10 @@ def local_state_dir() -> Path:
     return state_home() / "local"
 
 
+SWEEP_STATE = ".cluster"
+"""The state folder of `evopolicy suite --local`, in the sweep's folder."""
+
+
 def registry_dir() -> Path:
     """Folder in which this user's commands find this machine's clusters by endpoint."""
     return state_home() / "clusters"

@@ -97,14 +97,30 @@ def where_of(
     local: bool,
     state: Path | None,
     data: Path | None = None,
+    *,
+    runs: Sequence[Path],
 ) -> Where:
-    """The cluster of these options. Ends the command if they contradict each other."""
+    """The cluster of these options, for these runs' folders. Ends the command if they contradict each other."""
     for option, value in (("--state", state), ("--data", data)):
         if value is not None and not local:
             fail(f"{option} applies only with --local")
     if local and (connect or file is not None):
         fail("--local starts a cluster of its own; it cannot be combined with --connect or --credentials")
+    if local and state is None and (states := _sweeps_states(runs)):
+        # Named, not taken: a folder of runs may be another's, and its state would decide what counts as right.
+        several = "; the sweeps one by one" if len(states) > 1 else ""
+        fail(f"{states[0].parent} is a sweep with a cluster of its own: add --state {states[0]}{several}")
     return Where(connect=tuple(connect or ()), file=file, local=local, state=state, data=data)
+
+
+def _sweeps_states(runs: Sequence[Path]) -> list[Path]:
+    """State folders of `evopolicy suite --local` above these folders of runs, or one below them."""
+    roots = [root.resolve() for root in runs]
+    folders = [
+        each for root in roots for each in (root, *root.parents, *(root.glob("*/") if root.is_dir() else ()))
+    ]
+    states = [folder / credentials.SWEEP_STATE for folder in folders]
+    return list(dict.fromkeys(state for state in states if (state / "coordinator.sqlite").is_file()))
 
 
 class Playing:

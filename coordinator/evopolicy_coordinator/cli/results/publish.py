@@ -63,7 +63,7 @@ def publish(
     This cannot be undone: no new run plays cases of the same epoch (see `evopolicy-coordinator epoch`). Paths, host names, users,
     variables and tokens are removed; removed.json in the file lists them.
     """
-    where = where_of(connect, file, local, state)
+    where = where_of(connect, file, local, state, runs=runs)
     if out.exists():
         fail(f"--out {out} is there already; name a new file")
     if not out.absolute().parent.is_dir():

@@ -88,7 +88,7 @@ def rescore(
         fail("name the new cases: --cases 256 for their number, or --data FOLDER for split files")
     if data is not None and not data.is_dir():
         fail(f"--data {data} is not a folder")
-    where = where_of(connect, file, local, state)
+    where = where_of(connect, file, local, state, runs=runs)
     chosen = name or (f"cases-{cases}" if data is None else re.sub(r"[^A-Za-z0-9._-]+", "-", data.name))
     if not is_name(chosen):
         fail(f"--name {chosen!r}: letters, digits, '.', '_' and '-', at most 64, the first a letter or digit")

@@ -111,7 +111,7 @@ def verify(
         tier=tier,
         policy=policy,
     )
-    where = where_of(connect, file, local, state, data)
+    where = where_of(connect, file, local, state, data, runs=[run])
     console = terminal(stderr=as_json)
     with fail_on_our_errors():
         try:

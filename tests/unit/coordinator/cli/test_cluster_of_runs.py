@@ -1,0 +1,38 @@
+"""Commands on finished runs: which local cluster they start."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from evopolicy_coordinator.cli.results.cluster import where_of
+
+
+def _sweep(folder: Path, name: str) -> Path:
+    state = folder / name / ".cluster"
+    state.mkdir(parents=True)
+    (state / "coordinator.sqlite").touch()
+    return folder / name
+
+
+@pytest.mark.parametrize("given", [".", "agent/gym_acrobot/0", ".."])
+def test_a_sweep_with_a_cluster_of_its_own_is_named_with_the_option(
+    tmp_path: Path, given: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sweep = _sweep(tmp_path, "sweep")
+    (sweep / "agent/gym_acrobot/0").mkdir(parents=True)
+    with pytest.raises(SystemExit):
+        where_of(None, None, True, None, runs=[sweep / given])
+    assert f"add --state {sweep}/.cluster\n" in capsys.readouterr().err
+
+
+def test_runs_of_no_sweep_a_state_that_is_named_and_a_running_cluster_are_taken_as_they_are(
+    tmp_path: Path,
+) -> None:
+    sweep = _sweep(tmp_path, "sweep")
+    alone = tmp_path / "runs" / "evolve"
+    alone.mkdir(parents=True)
+    assert where_of(None, None, True, None, runs=[alone]).state is None
+    assert where_of(None, None, True, sweep / ".cluster", runs=[sweep]).state == sweep / ".cluster"
+    assert not where_of(["tls/host:7447"], None, False, None, runs=[sweep]).local
