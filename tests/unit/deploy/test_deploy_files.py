@@ -292,3 +292,10 @@ def test_dockerignore_lets_no_caches_through() -> None:
     assert any(fnmatch.fnmatchcase("common/evopolicy_common/__pycache__", line) for line in lines)
     # README.md has the machines' keys there, and the last match wins.
     assert lines.index("deploy/machines") > lines.index("!deploy")
+
+
+def test_the_wheel_takes_every_file_here_and_not_the_folder_of_the_machines_keys() -> None:
+    wheel = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["hatch"]["build"]["targets"]["wheel"]
+    taken = {Path(path) for path in wheel["force-include"] if path.split("/")[0] == "deploy"}
+    assert taken == {Path("deploy", path.name) for path in DEPLOY.iterdir() if path.name != "machines"}
+    assert "/deploy/machines/" in (ROOT / ".gitignore").read_text().splitlines()
