@@ -71,7 +71,7 @@ def test_the_version_and_a_completed_name_import_nothing_large_either() -> None:
 def test_commands_are_found_by_the_table_alone() -> None:
     """An entry point of the group that there once was would be a command that nobody finds."""
     project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"]
-    assert "entry-points" not in project
+    assert project.get("entry-points", {}).keys() <= {"inspect_ai"}
 
 
 @pytest.mark.parametrize("name", PLACES)

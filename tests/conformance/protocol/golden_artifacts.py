@@ -65,6 +65,7 @@ _MACHINE = {
     "committed",
     "fingerprint",
     "harness_version",
+    "installations",
     "program",
     "agents_md_hash",
     "rules_hash",

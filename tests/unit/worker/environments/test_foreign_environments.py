@@ -85,7 +85,10 @@ def test_a_definition_sets_arguments_wrappers_limit_text_and_success() -> None:
             Wrapper(wrapper="ClipActions"),
             "wrapper 'ClipActions': no wrapper has this name; near: ClipAction",
         ),
-        (Wrapper(wrapper="no_such:Thing"), "wrapper 'no_such:Thing': there is none"),
+        (
+            Wrapper(wrapper="no_such:Thing"),
+            "wrapper 'no_such:Thing': no wrapper has this name; say a class of gymnasium.wrappers, or module:Class",
+        ),
         (Wrapper(wrapper="TransformReward"), "kwargs {}: it cannot be put around the environment: TypeError"),
         (
             Wrapper(wrapper="broken_on_import:Thing"),
