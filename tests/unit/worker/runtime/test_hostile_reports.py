@@ -294,7 +294,8 @@ def play(player: Player, slots: Slots, source: str, n: int = 1, **options: Any) 
     files = bundle_files(slots.bundle(source))
     assert files.names is not None
     bundle = BundleFiles(files.names, files.data)
-    player.play(job, bundle, Progress(), lambda frame: outcomes.extend(finished(frame)))
+    last = player.play(job, bundle, Progress(), lambda frame: outcomes.extend(finished(frame)))
+    outcomes.extend(finished(last))
     return outcomes
 
 
