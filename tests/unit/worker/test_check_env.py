@@ -94,3 +94,17 @@ def test_an_environment_may_wait_for_the_processor_as_long_as_it_must(
         assert limit.passed() == ""
     used[0] += 2.0
     assert "processor time" in limit.passed()
+
+
+def test_an_environment_that_only_polls_ends_within_an_hour(monkeypatch: pytest.MonkeyPatch) -> None:
+    now, used = [0.0], [0.0]
+    monkeypatch.setattr(conformance, "_processor_s", lambda pid: used[0])
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+    limit = conformance._Limit(1)
+    for _ in range(3600):
+        now[0] += 1.0
+        # As much as `while True: time.sleep(0.01)` uses.
+        used[0] += 0.01
+        assert limit.passed() == ""
+    now[0] += 1.0
+    assert "not done within 3600 s" in limit.passed()

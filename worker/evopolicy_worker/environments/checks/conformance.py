@@ -37,7 +37,9 @@ SEEDS = (20_011_117, 20_011_229)
 """Large, so that an occurrence in an observation or info is recognisable as a leak."""
 TIMEOUT_S = 300.0
 """Most processor time that one environment may use, all its processes together, and longest time in which it may use none,
-seconds. A limit on time alone would also count what else the machine does."""
+seconds. A short limit on time alone would also count what else the machine does."""
+LONGEST_S = 3600.0
+"""Longest time for one environment, seconds: one that polls for what never comes uses a little processor time for days."""
 _LOOK_S = 1.0
 _WORKS_S = 0.05
 """A process that has used so much more processor time since the last look has not hung, seconds."""
@@ -335,12 +337,12 @@ def _in_child(env_id: str, steps: int) -> Played:
 
 
 class _Limit:
-    """What a process may use; see `TIMEOUT_S`."""
+    """What a process may use; see `TIMEOUT_S` and `LONGEST_S`."""
 
     def __init__(self, pid: int) -> None:
         self._pid = pid
         self._used = 0.0
-        self._worked_at = time.monotonic()
+        self._began = self._worked_at = time.monotonic()
 
     def passed(self) -> str:
         """Why the process is to be ended, in words; empty while it may go on."""
@@ -351,6 +353,11 @@ class _Limit:
             return f"it was not done within {TIMEOUT_S:g} s of processor time"
         if now - self._worked_at > TIMEOUT_S:
             return f"it hangs: it has used no processor time for {TIMEOUT_S:g} s"
+        if now - self._began > LONGEST_S:
+            return (
+                f"it was not done within {LONGEST_S:g} s, of which it computed for {used:.0f} s: it waits, or the machine is too"
+                " busy; correct the environment, or play it on an idle machine"
+            )
         return ""
 
 
