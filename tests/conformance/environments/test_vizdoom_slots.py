@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import signal
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -34,7 +36,22 @@ def test_a_closed_slot_leaves_no_game(slots: Slots) -> None:
     slots.run(slot.start())
     slots.play_all(None, slot=slot, env=ENV)
     processes = family(pid_of(slot))
-    names = [Path(f"/proc/{pid}/comm").read_text().strip() for pid in processes]
-    assert "vizdoom" in names
+    assert "vizdoom" in map(_name, processes)
     slots.run(slot.close())
     wait_until(lambda: not [pid for pid in processes if runs(pid)])
+
+
+def test_a_killed_process_leaves_no_game_where_no_jail_ends_it(slots: Slots) -> None:
+    slot = slots.new("none")
+    slots.run(slot.start())
+    try:
+        slots.play_all(None, slot=slot, tier="none", env=ENV)
+        (game,) = [pid for pid in family(pid_of(slot)) if _name(pid) == "vizdoom"]
+        os.kill(pid_of(slot), signal.SIGKILL)
+        wait_until(lambda: not runs(game))
+    finally:
+        slots.run(slot.close())
+
+
+def _name(pid: int) -> str:
+    return Path(f"/proc/{pid}/comm").read_text().strip()

@@ -1,21 +1,26 @@
 """ViZDoom: the scenarios of its wheel, and the levels of Freedoom, seen by the player.
 
 The game is a process of its own, which plays one step when it is told to. It shares memory with this process and writes into the
-folder in which it was started; here that is a temporary one, which goes with the environment.
+folder in which it was started; here that is a temporary one, which goes with the environment. It waits for its next step for ever,
+so the kernel ends it with this process, which may be killed.
 """
 
 from __future__ import annotations
 
 import os
+import shlex
+import signal
 import tempfile
 import tomllib
 from functools import cache
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
 from evopolicy_common.catalogue import Entry
 from evopolicy_common.errors import WorkerError
+from evopolicy_common.processes.parent_death import ending_with_parent
 from evopolicy_worker.environments import spaces
 from evopolicy_worker.environments.gymnasium_adapter import GymnasiumFamily
 from evopolicy_worker.environments.tasks import template
@@ -108,6 +113,7 @@ class _Game:
         if self._raw.game.is_running():
             return self._raw.reset(seed=seed)
         _check_shared_memory()
+        self._raw.game.set_vizdoom_path(_program(Path(self._folder.name)))
         before = os.getcwd()
         os.chdir(self._folder.name)
         try:
@@ -131,6 +137,19 @@ class _Game:
     def close(self) -> None:
         self._raw.close()
         self._folder.cleanup()
+
+
+def _program(folder: Path) -> str:
+    """The game's program, which ends with this process: a script in the folder, since the package starts it itself."""
+    import vizdoom
+
+    game = str(Path(vizdoom.__file__).with_name("vizdoom"))
+    script = folder / "vizdoom.sh"
+    command = shlex.join(ending_with_parent([game], signal.SIGKILL))
+    script.write_text(f'#!/bin/sh\nexec {command} "$@"\n')
+    script.chmod(0o700)
+    # A folder may be on a file system from which nothing is executed.
+    return str(script) if os.access(script, os.X_OK) else game
 
 
 def _check_shared_memory() -> None:
