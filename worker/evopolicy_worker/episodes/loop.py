@@ -176,9 +176,10 @@ class Player:
                 failure, frame = self._play(k, job, spec, policies, progress, tell, begun)
                 progress.episodes_done += 1
                 if failure is not None and _verdict_of_submit(job, spec, failure):
-                    for other in job.episodes[k + 1 :]:
-                        unplayed = _brief(_unplayed(other.index, failure), _share(job))
-                        frame += messages.framed(messages.Finished(outcome=unplayed))
+                    others = (_unplayed(each.index, failure) for each in job.episodes[k + 1 :])
+                    finished = (messages.Finished(outcome=_brief(each, _share(job))) for each in others)
+                    # Joined once: there may be thousands, each with a traceback.
+                    frame = b"".join((frame, *map(messages.framed, finished)))
                     break
                 failure = None
             return frame
