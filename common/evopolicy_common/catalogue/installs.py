@@ -107,8 +107,9 @@ def own() -> str:
     here = read(Path(sys.prefix))
     found = {
         each.name.removesuffix(".dist-info")
-        for path in map(Path, sys.path)
-        for each in (path.glob("*.dist-info") if path.is_dir() else ())
+        # Unlike `Path.is_dir`, this raises nothing for a folder of PYTHONPATH that may not be looked at.
+        for path in filter(os.path.isdir, sys.path)
+        for each in Path(path).glob("*.dist-info")
     }
     digest = hashlib.sha256("\n".join(sorted(found)).encode()).hexdigest()
     return f"{'+'.join(here.families) if here is not None else 'base'}@{digest[:12]}"

@@ -275,3 +275,19 @@ def test_an_installation_that_is_elsewhere_is_made_anew_there(
     assert done.exit_code == 0, done.output
     assert written == [folder]
     assert (tmp_path / "installs" / "robotics").resolve() == folder
+
+
+def test_an_installation_is_named_by_its_packages_whatever_else_is_in_the_search_path(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    installs.own.cache_clear()
+    before = installs.own()
+    # The system refuses to look at a name of this length, as at a folder without permission.
+    monkeypatch.setattr(sys, "path", [*sys.path, f"/{'x' * 5000}", str(tmp_path)])
+    installs.own.cache_clear()
+    assert installs.own() == before
+    (tmp_path / "acme-1.0.dist-info").mkdir()
+    installs.own.cache_clear()
+    assert installs.own() != before
+    assert str(tmp_path) not in installs.own()
+    installs.own.cache_clear()
