@@ -98,9 +98,11 @@ class _Child:
                     pipe.close()
 
     def _started(self) -> subprocess.Popen[bytes]:
+        # Not `-m`: this module may be imported with its package before, and runpy would warn of that on the terminal.
+        main = f"from {__name__} import main; main()"
         # A session of its own, so that Ctrl-C reaches only the command.
         return subprocess.Popen(
-            ending_with_parent([sys.executable, "-P", "-m", __name__], signal.SIGKILL),
+            ending_with_parent([sys.executable, "-P", "-c", main], signal.SIGKILL),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             start_new_session=True,
@@ -127,7 +129,3 @@ def main() -> None:
             return
         pickle.dump([function(item) for item in items], results)
         results.flush()
-
-
-if __name__ == "__main__":
-    main()

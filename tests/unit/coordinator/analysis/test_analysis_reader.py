@@ -222,11 +222,14 @@ def test_a_run_inside_a_run_is_not_searched_for(tmp_path: Path) -> None:
     assert find_run_dirs([tmp_path])[0] == [outer]
 
 
-def test_reading_in_several_processes_gives_the_same_runs(tmp_path: Path) -> None:
+def test_reading_in_several_processes_gives_the_same_runs_and_prints_nothing(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
     for number in range(45):
         write_run(tmp_path, VERSIONS[:1], exp_id=f"e{number:02d}")
     (tmp_path / "Agent-A" / "gym_acrobot" / "e07" / "run.json").write_text("{")
     assert load_runs([tmp_path], jobs=2) == load_runs([tmp_path], jobs=1)
+    assert capfd.readouterr() == ("", "")
 
 
 def test_an_item_over_which_its_process_ends_costs_that_item_alone() -> None:
