@@ -13,6 +13,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import itertools
+import os
 import threading
 from collections.abc import Awaitable, Callable, Iterator
 from pathlib import Path
@@ -47,6 +48,8 @@ _REMINDERS = 8
 _MAX_READ = 20_000
 _MAX_WRITTEN = 1 << 20
 _MAX_LISTED = 500
+_MAX_PATH = 500
+"""Characters. Python makes nested folders recursively."""
 _PROMPT = """\
 Improve a policy. The rules below describe files and HTTP requests; you have tools instead: list_files and read_file for the
 workspace, write_file for files below system/, and submit_episodes for POST /submit. There is no shell.
@@ -239,12 +242,13 @@ def read_file() -> Tool:
             offset: Bytes to skip.
         """
         place = _inside(path, ".")
-        begin = max(0, offset)
         try:
             with place.open("rb") as file:
+                size = file.seek(0, os.SEEK_END)
+                begin = min(max(0, offset), size)
                 file.seek(begin)
                 data = file.read(_MAX_READ)
-                left = place.stat().st_size - begin - len(data)
+                left = size - begin - len(data)
         except OSError as error:
             raise ToolError(f"{path}: {error.strerror}") from error
         text = data.decode("utf-8", "replace")
@@ -312,6 +316,8 @@ def _of_sample() -> _Live:
 def _inside(path: str, below: str) -> Path:
     """The file of the workspace, with links resolved. Raises ToolError for one that is not below that folder."""
     workspace = _of_sample().folder.workspace.resolve()
+    if len(path) > _MAX_PATH:
+        raise ToolError(f"the path has {len(path)} characters; at most {_MAX_PATH}")
     try:
         place = (workspace / path).resolve()
     except (OSError, ValueError) as error:

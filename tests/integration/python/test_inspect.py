@@ -60,6 +60,8 @@ outputs = [
     call("list_files"),
     call("read_file", path="../.gateway/bearer"),
     call("write_file", path="system/../AGENTS.md", content="no rules"),
+    call("read_file", path="AGENTS.md", offset=1 << 70),
+    call("write_file", path="system/" + "a/" * 1500 + "x", content=""),
     call("submit_episodes", env_instances=[0] * 9),
     call("write_file", path="system/policy.py", content={POLICY!r}),
     call("submit_episodes", env_instances=[0, 1]),
@@ -135,8 +137,11 @@ def test_a_model_of_inspect_plays_a_run_and_gets_its_score(inspect: Path, tmp_pa
 
     messages = sample["messages"]
     answers = [one for one in messages if one["role"] == "tool"]
-    assert ["error" in one for one in answers] == [False, True, True, True, False, False, False, False]
-    assert "budget_invalid" in answers[3]["error"]["message"]
+    assert ["error" in one for one in answers] == [
+        *(False, True, True, False, True),
+        *(True, False, False, False, False),
+    ]
+    assert "budget_invalid" in answers[5]["error"]["message"]
     assert "no rules" not in (folder / "workspace" / "AGENTS.md").read_text()
     asked = [one["content"] for one in messages if one["role"] == "user"]
     assert len(asked) == 2
