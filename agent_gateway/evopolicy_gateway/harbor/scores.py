@@ -37,12 +37,16 @@ def write_task(tasks: Path, run: Path, url: str, agent_s: float) -> Path:
             f"{folder.root} is no open run of a remote agent; start one with `evopolicy run --agent remote --http HOST:PORT`"
         )
     place = tasks / task_name(folder)
+    if (place / "task.toml").exists():
+        other = _run_of(place / "task.toml").root
+        if other.resolve() != folder.root.resolve():
+            raise ConfigError(f"{place} is already the task of {other}; name another folder with --tasks")
     env = saved(folder.intended, IntendedRun).settings.env
     files = task_files(folder, env=env, url=f"{url}/{place.name}", token=token_of(tasks), agent_s=agent_s)
     for name, text in files.items():
         path = place / name
         path.parent.mkdir(parents=True, exist_ok=True)
-        # With the tokens of agent and verifier.
+        # The files hold the tokens of agent and verifier.
         write_atomically(path, text.encode(), mode=0o700 if path.suffix == ".sh" else 0o600)
     return place
 
@@ -59,15 +63,17 @@ def token_of(tasks: Path) -> str:
 
 def tasks_in(tasks: Path) -> dict[str, RunFolder]:
     """The run of each task in a folder. Raises ConfigError when a task cannot be read."""
-    found = {}
-    for path in sorted(tasks.glob("*/task.toml")):
-        try:
-            found[path.parent.name] = RunFolder(Path(tomllib.loads(path.read_text())["metadata"]["run"]))
-        except (KeyError, TypeError, ValueError) as error:
-            raise ConfigError(
-                f"{path}: not a task of `evopolicy harbor`: {error}; choose another folder with --tasks"
-            ) from error
-    return found
+    return {path.parent.name: _run_of(path) for path in sorted(tasks.glob("*/task.toml"))}
+
+
+def _run_of(path: Path) -> RunFolder:
+    """The run of a `task.toml`."""
+    try:
+        return RunFolder(Path(tomllib.loads(path.read_text("utf-8"))["metadata"]["run"]))
+    except (KeyError, TypeError, ValueError) as error:
+        raise ConfigError(
+            f"{path}: not a task of `evopolicy harbor`: {error}; choose another folder with --tasks"
+        ) from error
 
 
 def make_app(runs: Mapping[str, RunFolder], token: str) -> Starlette:
@@ -90,7 +96,12 @@ def make_app(runs: Mapping[str, RunFolder], token: str) -> Starlette:
 
 def _score(folder: RunFolder) -> Response:
     if not folder.run_json.exists():
-        finish(folder)
+        try:
+            finish(folder)
+        except (ConfigError, OSError):
+            # The run may have ended since: its gateway's files are removed after run.json is written.
+            if not folder.run_json.exists():
+                raise
         return PlainTextResponse("the run is being scored\n", 202)
     outcome = decode_run_record(folder.run_json.read_bytes()).outcome
     if outcome.score is None:

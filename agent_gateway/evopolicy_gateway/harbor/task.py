@@ -34,10 +34,11 @@ _TEST = """\
 #!/bin/sh
 # Ends the run, and waits for its score, which is the reward.
 while :; do
-    status=$(curl -sS -X POST -H 'Authorization: Bearer {token}' -o /tmp/score -w '%{{http_code}}' '{url}')
+    status=$(curl -sS -m 60 -X POST -H 'Authorization: Bearer {token}' -o /tmp/score -w '%{{http_code}}' '{url}')
     case "$status" in
         200) mkdir -p /logs/verifier && cp /tmp/score /logs/verifier/reward.txt && exit ;;
-        202 | 000) sleep 2 ;;
+        # A busy service answers 503, and other agents can reach it: their requests must not cost this run its reward.
+        202 | 000 | 502 | 503 | 504) sleep 2 ;;
         *) cat /tmp/score >&2; exit 1 ;;
     esac
 done
@@ -48,7 +49,12 @@ def task_name(folder: RunFolder) -> str:
     """The name of a run's task, from the path of its folder."""
     root = folder.root
     words = (root.parent.parent.name, root.parent.name, root.name)
-    return "-".join(_ODD.sub("-", word).strip("-._") for word in words).lower()
+    return "-".join(filter(None, (_ODD.sub("-", word).strip("-._") for word in words))).lower()
+
+
+def _toml(text: str) -> str:
+    """As a TOML string, which differs from JSON's: it has no surrogates, and DEL is escaped."""
+    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
 def task_files(folder: RunFolder, *, env: str, url: str, token: str, agent_s: float) -> Mapping[str, str]:
@@ -72,11 +78,11 @@ schema_version = "1.4"
 
 [task]
 name = "evopolicy/{name}"
-description = {json.dumps(f"Improve a policy for {env}; the reward is its mean return on hidden cases.")}
+description = {_toml(f"Improve a policy for {env}; the reward is its mean return on hidden cases.")}
 
 [metadata]
-env = {json.dumps(env)}
-run = {json.dumps(str(folder.root))}
+env = {_toml(env)}
+run = {_toml(str(folder.root))}
 
 [environment]
 env = {{ {TOKEN_VARIABLE} = "{bearer}" }}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import stat
 import subprocess
 import tomllib
@@ -15,17 +16,18 @@ from starlette.testclient import TestClient
 
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.operator import RunSettings
+from evopolicy_gateway.harbor import scores
 from evopolicy_gateway.harbor.scores import make_app, tasks_in, token_of, write_task
-from evopolicy_gateway.http.listener import Listener
+from evopolicy_gateway.http.listener import Listener, finish
 from evopolicy_gateway.run.layout import IntendedRun, RunFolder, save
 
 URL = "http://10.0.0.5:8090"
 TOKEN = {"Authorization": "Bearer t"}
 
 
-def open_run(tmp_path: Path) -> RunFolder:
+def open_run(tmp_path: Path, entry: str = "GPT 5.5 (Codex)") -> RunFolder:
     """A run of a remote agent, as `evopolicy run` leaves it while the agent plays."""
-    folder = RunFolder(tmp_path / "runs" / "GPT 5.5 (Codex)" / "gym_acrobot" / "first")
+    folder = RunFolder(tmp_path / "runs" / entry / "gym_acrobot" / "first")
     folder.state.mkdir(parents=True)
     save(folder.listener, Listener(host="10.0.0.5", port=0))
     save(
@@ -73,6 +75,53 @@ def test_tasks_are_served_again_with_the_same_token(tmp_path: Path) -> None:
     (tasks / "other/task.toml").write_text("[task]\n")
     with pytest.raises(ConfigError, match="not a task of"):
         tasks_in(tasks)
+
+
+def test_two_runs_never_share_a_task(tmp_path: Path) -> None:
+    tasks = tmp_path / "tasks"
+    first, second = open_run(tmp_path), open_run(tmp_path, "GPT-5.5-Codex")
+    place = write_task(tasks, first.root, URL, 60.0)
+    with pytest.raises(ConfigError, match="already the task of"):
+        write_task(tasks, second.root, URL, 60.0)
+    assert tasks_in(tasks) == {place.name: first}
+
+
+def test_any_path_of_a_run_is_read_from_its_task_again(tmp_path: Path) -> None:
+    folder = open_run(tmp_path / 'a "b" \\ ä 🚀 \x7f \n $', "(+)")
+    place = write_task(tmp_path / "tasks", folder.root, URL, 60.0)
+    assert place.name == "gym_acrobot-first"
+    assert tasks_in(tmp_path / "tasks") == {place.name: folder}
+
+
+def test_a_verifier_waits_for_a_service_that_is_busy(tmp_path: Path) -> None:
+    test = write_task(tmp_path / "tasks", open_run(tmp_path).root, URL, 60.0) / "tests" / "test.sh"
+    programs = tmp_path / "programs"
+    programs.mkdir()
+    answers = tmp_path / "answers"
+    answers.write_text("000\n503\n202\n409\n")
+    for name, text in {"curl": f"sed -n 1p {answers}; sed -i 1d {answers}", "sleep": ":", "cat": ":"}.items():
+        (programs / name).write_text(f"#!/bin/sh\n{text}\n")
+        (programs / name).chmod(0o700)
+    path = f"{programs}:{os.environ['PATH']}"
+    done = subprocess.run(["sh", test], env={"PATH": path}, timeout=60, check=False)
+    assert (done.returncode, answers.read_text()) == (1, "")
+
+
+def test_a_run_that_ends_during_a_request_keeps_its_score(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = RunFolder(write_run(tmp_path, [Version({"policy.py": "x = 1"}, (1.0, 2.0), 0.5)]))
+    record = folder.run_json.read_bytes()
+    folder.run_json.unlink()
+
+    def end(folder: RunFolder) -> None:
+        # The gateway's files are gone already, as a run's end removes them.
+        folder.run_json.write_bytes(record)
+        finish(folder)
+
+    monkeypatch.setattr(scores, "finish", end)
+    client = TestClient(make_app({"t": folder}, "t"))
+    assert [client.post("/t", headers=TOKEN).status_code for _ in range(2)] == [202, 200]
 
 
 def test_a_run_that_no_remote_agent_plays_has_no_task(tmp_path: Path) -> None:
