@@ -299,3 +299,9 @@ def test_the_wheel_takes_every_file_here_and_not_the_folder_of_the_machines_keys
     taken = {Path(path) for path in wheel["force-include"] if path.split("/")[0] == "deploy"}
     assert taken == {Path("deploy", path.name) for path in DEPLOY.iterdir() if path.name != "machines"}
     assert "/deploy/machines/" in (ROOT / ".gitignore").read_text().splitlines()
+
+
+def test_no_command_of_the_readme_puts_pods_keys_into_the_image() -> None:
+    copied = re.findall(r"^kubectl cp \S+ (\S+)", (DEPLOY / "README.md").read_text(), re.MULTILINE)
+    assert copied
+    assert all(path.startswith("~/") for path in copied)
