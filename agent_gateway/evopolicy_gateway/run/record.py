@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import math
+import os
 from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
@@ -16,7 +17,7 @@ from typing import Any, cast, get_args
 import msgspec
 
 from evopolicy_common import catalogue
-from evopolicy_common.errors import StorageError
+from evopolicy_common.errors import ConfigError, StorageError
 from evopolicy_common.messages.environment import Split
 from evopolicy_common.messages.gateway import CANCELLED
 from evopolicy_common.messages.operator import RunFinished, SubmitRecord
@@ -357,11 +358,16 @@ def _env_log(finished: RunFinished) -> bytes:
 
 
 def _put_in_place(system: Path, bundle: Bundle) -> None:
-    """Replaces `system/` by the bundle, whatever it contains."""
+    """Replaces `system/` by the bundle, whatever it contains. Raises ConfigError when it cannot be removed."""
     give_back_rights(system.parent)
     # Only a real folder is removed recursively; opening a pipe would block until its other end opens.
     if system.is_dir() and not system.is_symlink():
         remove_tree(system)
+        if system.exists():
+            raise ConfigError(
+                f"{system} cannot be removed: another user owns folders in it, such as the root of the agent's container;"
+                f" make them yours (chown -R {os.getuid()} {system.parent}), then go on with --resume"
+            )
     else:
         system.unlink(missing_ok=True)
     bundles.unpack(bundle, system)
