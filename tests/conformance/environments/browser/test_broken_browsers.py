@@ -25,7 +25,7 @@ BROKEN = {
     ),
     "it hangs": (b"#!/bin/sh\nexec sleep 1000\n", "it hangs"),
     "it is of another machine": (b"\x7fELF\x02\x01\x01" + bytes(100), "Exec format error"),
-    "it says something else": (b"#!/bin/sh\nprintf 'hello\\0' >&4\nexec sleep 1000\n", "what is no answer"),
+    "it says something else": (b"#!/bin/sh\nprintf 'hello\\0' >&4\nexec sleep 1000\n", "an invalid reply"),
     "it has no version": (b"#!/bin/sh\nprintf '{\"id\":1}\\0' >&4\nexec sleep 1000\n", "version"),
     "it dies after its first answer": (
         b"""#!/bin/sh\nhead -c 1 <&3 > /dev/null\nprintf '{"id":1,"result":{"product":"a"}}\\0' >&4\n""",

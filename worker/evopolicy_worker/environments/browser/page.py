@@ -120,18 +120,21 @@ class Page:
         self.run("__evopolicy.preload().then(__evopolicy.settle)")
 
     def _begin_context(self) -> None:
-        """An empty page in a new context."""
+        """An empty page in a new context. BrowserLostError, which names the program and the remedy, when there is none."""
+        try:
+            self._open_context()
+        except BrowserLostError as error:
+            self.lose()
+            raise BrowserLostError(f"{program()} opens no page: {error}; {REMEDY}") from error
+
+    def _open_context(self) -> None:
         self.opened = None
         self._script = ""
         devtools = self.browser.devtools
         if self._context:
             devtools.send("Target.disposeBrowserContext", wanted=False, browserContextId=self._context)
             self._context = self._session = ""
-        try:
-            made = devtools.call("Target.createBrowserContext", timeout_s=CALL_S)
-        except BrowserLostError as error:
-            self.lose()
-            raise BrowserLostError(f"{program()} opens no page: {error}; {REMEDY}") from error
+        made = devtools.call("Target.createBrowserContext", timeout_s=CALL_S)
         self._context = str(made["browserContextId"])
         devtools.send(
             "Browser.setDownloadBehavior", wanted=False, behavior="deny", browserContextId=self._context
