@@ -361,7 +361,7 @@ def test_texts_that_no_observation_can_have_are_told_in_others(browser: Page, tm
         f'["{pair}", "{pair}".slice(0, 1), "{half}{half}a", "{pair}".slice(1), "\\{half}", "\\\\{half}"]'
     )
     assert texts == ["😀", "�", "��a", "�", "\\ud83d", "\\�"]
-    with pytest.raises(BrowserLostError, match="no JSON"):
+    with pytest.raises(BrowserLostError, match="invalid JSON"):
         browser.tell("undefined")
 
 
