@@ -15,7 +15,8 @@ from invented.run_dirs import write_run
 
 from evopolicy import load_runs
 from evopolicy._exports.steps import read_steps
-from evopolicy._exports.transcripts import write_atif
+from evopolicy._exports.tracking import Curve, Point, track
+from evopolicy._exports.transcripts import write_atif, write_inspect
 from evopolicy_common.records.run_record import Tokens
 
 VERSIONS = [
@@ -216,3 +217,29 @@ def check(found: dict[str, Any]) -> None:
     except ModuleNotFoundError:
         return
     Trajectory.model_validate(found)
+
+
+def test_a_run_whose_times_are_none_is_exported_with_the_others(tmp_path: Path) -> None:
+    folders = [write_run(tmp_path / "runs", VERSIONS, entry=f"agent {n}") for n in range(2)]
+    for folder, time in zip(folders, ("yesterday", "0001-01-01T00:00:00+23:00"), strict=True):
+        record = json.loads((folder / "run.json").read_text())
+        record["timing"] |= {"start_time": time, "end_time": time}
+        (folder / "run.json").write_text(json.dumps(record))
+    written = write_inspect(load_runs(tmp_path / "runs"), tmp_path / "out")
+    assert [path.name[:10] for path in written] == ["1970-01-01"] * 2
+    times: list[float] = []
+
+    class Times:
+        """A tracker that keeps the points' times."""
+
+        def n_known(self, curve: Curve) -> int:
+            return 0
+
+        def add(self, curve: Curve, points: list[Point], n_submits: int, *, finished: bool) -> None:
+            times.extend(point.time_s for point in points)
+
+        def close(self) -> None:
+            pass
+
+    list(track([tmp_path / "runs"], Times(), follow=False))
+    assert min(times) <= 0.0

@@ -28,6 +28,7 @@ import numpy as np
 from evopolicy_common.catalogue import Entry
 from evopolicy_common.errors import EvopolicyError
 from evopolicy_common.messages.environment import Case
+from evopolicy_common.processes.parent_death import end_with_parent
 from evopolicy_common.records.episodes.rendered import Renderer, decode
 from evopolicy_worker.environments import registry, spaces
 from evopolicy_worker.environments.base import Environment
@@ -308,6 +309,7 @@ def _in_child(env_id: str, steps: int) -> Played:
     pid = os.fork()
     if pid == 0:
         try:
+            end_with_parent(signal.SIGKILL)
             os.close(reading)
             with os.fdopen(writing, "wb") as out:
                 null = os.open(os.devnull, os.O_WRONLY)
@@ -384,6 +386,7 @@ def _family(pid: int) -> list[int]:
 
 def main() -> None:
     """The program. Reads definitions of environments that do not ship from standard input, as JSON."""
+    end_with_parent(signal.SIGKILL)
     registry.define(msgspec.json.decode(sys.stdin.buffer.read() or b"[]", type=list[Entry]))
     for played in play_all(sys.argv[2:], int(sys.argv[1])):
         sys.stdout.buffer.write(msgspec.json.encode(played) + b"\n")
