@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import os
 from collections.abc import AsyncIterator, Callable, Coroutine, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -120,7 +121,8 @@ def _sweeps_states(runs: Sequence[Path]) -> list[Path]:
         each for root in roots for each in (root, *root.parents, *(root.glob("*/") if root.is_dir() else ()))
     ]
     states = [folder / credentials.SWEEP_STATE for folder in folders]
-    return list(dict.fromkeys(state for state in states if (state / "coordinator.sqlite").is_file()))
+    # Not `Path.is_file`, which raises for folders that this user may not look into.
+    return list(dict.fromkeys(state for state in states if os.path.isfile(state / "coordinator.sqlite")))
 
 
 class Playing:

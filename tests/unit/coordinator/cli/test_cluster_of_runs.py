@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -36,3 +39,22 @@ def test_runs_of_no_sweep_a_state_that_is_named_and_a_running_cluster_are_taken_
     assert where_of(None, None, True, None, runs=[alone]).state is None
     assert where_of(None, None, True, sweep / ".cluster", runs=[sweep]).state == sweep / ".cluster"
     assert not where_of(["tls/host:7447"], None, False, None, runs=[sweep]).local
+
+
+def test_another_users_folder_beside_the_runs_does_not_end_the_command() -> None:
+    program = """
+import os, sys
+from pathlib import Path
+from evopolicy_coordinator.cli.results.cluster import where_of
+
+if os.getuid() == 0:
+    os.setuid(65534)
+where_of(None, None, True, None, runs=[Path(sys.argv[1])])
+"""
+    with tempfile.TemporaryDirectory() as folder:
+        Path(folder).chmod(0o755)
+        Path(folder, "others").mkdir(mode=0)
+        done = subprocess.run(
+            [sys.executable, "-c", program, folder], capture_output=True, text=True, check=False
+        )
+    assert done.returncode == 0, done.stderr
