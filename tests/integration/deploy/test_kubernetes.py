@@ -78,6 +78,13 @@ def test_only_the_pod_with_a_sandbox_inside_is_let_out_of_filters() -> None:
         assert (pod.get("hostUsers") is False) == (name == "workers")
 
 
+def test_a_restart_leaves_the_state_folder_private() -> None:
+    """By default, a pod's start gives its group all files of a volume, and a state folder must be its owner's alone."""
+    security = pods()["evopolicy-coordinator"]["securityContext"]
+    assert security["fsGroup"] == security["runAsGroup"]
+    assert security["fsGroupChangePolicy"] == "OnRootMismatch"
+
+
 def test_the_copy_of_a_secret_is_a_folder_that_a_worker_accepts(tmp_path: Path) -> None:
     """A Secret's files are links, which its group may read."""
     secret, own = tmp_path / "secret", tmp_path / "own"
