@@ -196,7 +196,11 @@ def _finite(metrics: dict[str, Any]) -> dict[str, float]:
 
 
 def _unix(text: str) -> float:
-    return datetime.fromisoformat(text).timestamp()
+    """0 for a text that is no time: one damaged file must not end the export of all other runs."""
+    try:
+        return datetime.fromisoformat(text).timestamp()
+    except (ValueError, OverflowError):
+        return 0.0
 
 
 def _record(folder: Path) -> RunRecord | None:

@@ -69,7 +69,11 @@ def _id(run: Run) -> str:
 
 
 def _utc(text: str) -> datetime:
-    return datetime.fromisoformat(text).astimezone(UTC)
+    """1970 for a text that is no time: one damaged run.json must not end the export of all others."""
+    try:
+        return datetime.fromisoformat(text).astimezone(UTC)
+    except (ValueError, OverflowError):
+        return datetime.fromtimestamp(0, UTC)
 
 
 def _about(run: Run) -> dict[str, Any]:
