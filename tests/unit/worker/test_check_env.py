@@ -108,3 +108,25 @@ def test_an_environment_that_only_polls_ends_within_an_hour(monkeypatch: pytest.
         assert limit.passed() == ""
     now[0] += 1.0
     assert "not done within 3600 s" in limit.passed()
+
+
+def test_a_killed_check_leaves_no_environment() -> None:
+    program = """
+import sys, time
+from evopolicy_worker.environments.checks import conformance
+conformance.play = lambda env_id, steps: (sys.__stderr__.write("plays\\n"), time.sleep(1000))
+conformance.registry.load = lambda env_id: None
+conformance.os.dup2 = lambda old, new: None
+print(list(conformance.play_all(["slow"], 1)))
+"""
+    mark = b"left by test_check_env"
+    command = [sys.executable, "-c", program, mark.decode()]
+    started = subprocess.Popen(command, stderr=subprocess.PIPE)
+    assert started.stderr is not None
+    assert started.stderr.readline() == b"plays\n"
+    started.kill()
+    started.wait()
+    # Closed by the last process that has it.
+    assert started.stderr.read() == b""
+    started.stderr.close()
+    assert not [each for each in Path("/proc").glob("[0-9]*") if mark in _command_line(each)]
