@@ -199,3 +199,9 @@ def test_every_package_is_where_it_should_be() -> None:
     for name, folder in ROOMS.items():
         assert (folder / "__init__.py").is_file(), name
         assert (folder / "py.typed").is_file(), name
+
+
+def test_no_two_test_files_have_the_same_name() -> None:
+    """pytest collects one of two such files alone, and then only where a layer has both."""
+    names = Counter(path.name for path in (ROOT / "tests").rglob("test_*.py"))
+    assert [name for name, n in names.items() if n > 1] == []

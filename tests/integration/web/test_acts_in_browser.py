@@ -50,7 +50,7 @@ for number in range(1, 6):
     submit(str(number))
 wait_for("the end")
 """
-TEXT = "document.body.innerText"
+TEXT = "(document.body?.innerText ?? '')"
 
 
 @pytest.mark.slow

@@ -32,7 +32,7 @@ def test_a_worker_is_paused_and_resumed_and_a_refusal_is_told(tmp_path: Path) ->
         with command(tmp_path, *arguments) as view:
             wait_until(address.exists, lambda: view.text)
             base = address.read_text().partition("/login")[0]
-            assert f"{base}/login#token={tokens.act}" in view.out
+            wait_until(lambda: f"{base}/login#token={tokens.act}" in view.out, lambda: view.text)
             with httpx.Client(
                 base_url=base, headers={"authorization": f"Bearer {tokens.act}"}, timeout=60
             ) as client:

@@ -43,7 +43,7 @@ print("<i>I saw</i> the first return", flush=True)
 wait_for("go")
 submit("1-2")
 """
-TEXT = "document.body.innerText"
+TEXT = "(document.body?.innerText ?? '')"
 
 
 @pytest.mark.slow
