@@ -178,10 +178,14 @@ class InstantWorker:
 
     async def work(self) -> None:
         """Works until cancelled."""
-        await self.register()
+        registered = False
         leases: tuple[worker.Lease, ...] = ()
         while True:
             try:
+                if not registered:
+                    # The coordinator may end between the registration and its first heartbeat.
+                    await self.register()
+                    registered = True
                 if not leases:
                     leases = await self.lease(self.slots)
                     self.jobs.extend(lease.job for lease in leases)
@@ -194,7 +198,7 @@ class InstantWorker:
             except RefusedError as error:
                 if error.status != "unknown_worker":
                     raise
-                await self.register()
+                registered = False
 
 
 class GatewayClient:
