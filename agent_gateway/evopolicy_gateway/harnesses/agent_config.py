@@ -83,7 +83,8 @@ class AcpTable(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     auth: str = ""
     """Id of the login method to choose, where the agent wants one."""
     mode: str = ""
-    """Id of the session mode to choose, such as one in which the agent asks for no permission."""
+    """Id of the session mode to choose. Empty: the agent's own, or `default` where that is `auto`: then the rules of the run decide
+    what the agent may do, and no model of the agent's."""
     counts: Literal["turn", "session"] = "turn"
     """Whether the tokens that end a turn are those of the turn, or of the session so far."""
 

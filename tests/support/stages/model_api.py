@@ -2,13 +2,14 @@
 Google's generateContent for the real CLIs.
 
 Each request with tools is answered by the next step of the script: a shell command to run, or a text that ends the turn.
-Requests without tools (titles, token counts) get a short text and move nothing. Codex lists the tools of MCP servers only when
-its model searches for them: the script's model then searches first, which moves nothing either.
+Requests beside the conversation (titles, token counts, suggestions, an agent's notes) get a short text and move nothing. Codex and Qwen Code list the tools of MCP servers only
+when their model searches for them: the script's model then searches first, which moves nothing either.
 """
 
 from __future__ import annotations
 
 import json
+import re
 import threading
 from collections.abc import Iterator, Sequence
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -16,6 +17,10 @@ from typing import Any
 
 INPUT, CACHED, CREATED, OUTPUT, REASONING = 1000, 700, 50, 20, 5
 """Tokens that every answer claims. OpenAI counts the cached ones into its input, Anthropic apart."""
+
+
+BESIDE = ("[SUGGESTION MODE", "Managed memory has")
+"""What the last message of a request with tools says that Claude Code or Qwen Code makes beside the conversation, after a turn."""
 
 
 class Step:
@@ -97,16 +102,13 @@ class ModelApi:
         if path.endswith("/count_tokens"):
             handler._send(200, b'{"input_tokens": 10}', "application/json")
             return
-        if path.endswith("/responses") and (search := self._search(request)):
-            events = "".join(f"event: {one['type']}\ndata: {json.dumps(one)}\n\n" for one in search)
-            handler._send(200, events.encode(), "text/event-stream")
-            return
-        step = self._next(request)
+        search = self._search(path, request)
+        step = Step() if search else self._next(request)
         if step.status != 200:
             error = {"type": "error", "error": {"type": "overloaded_error", "message": step.text or "busy"}}
             handler._send(step.status, json.dumps(error).encode(), "application/json")
             return
-        events = _speech(path)(step, request)
+        events = search or _speech(path)(step, request)
         if path.endswith((":generateContent", ":countTokens")):
             handler._send(200, json.dumps(next(iter(events))).encode(), "application/json")
             return
@@ -117,11 +119,18 @@ class ModelApi:
         done = "data: [DONE]\n\n" if path.endswith("/completions") else ""
         handler._send(200, (stream + done).encode(), "text/event-stream")
 
-    def _search(self, request: dict[str, Any]) -> list[dict[str, Any]]:
-        """A search for the tool of the next step where Codex offers that and does not list the tool yet."""
+    def _search(self, path: str, request: dict[str, Any]) -> list[dict[str, Any]]:
+        """A search for the tool of the next step where the agent offers that and does not list the tool yet."""
         step = self.script[self.played] if self.played < len(self.script) else Step()
+        if step.tool is None:
+            return []
+        if path.endswith("/completions"):
+            names = [tool["function"]["name"] for tool in request.get("tools", ())]
+            if "tool_search" not in names or _qwen_tool(step.tool, request):
+                return []
+            return list(_chat_call("tool_search", {"query": step.tool}, request, f"search_{id(step)}"))
         offers = any(tool.get("type") == "tool_search" for tool in request.get("tools", ()))
-        if step.tool is None or not offers or _codex_tool(step.tool, request):
+        if not path.endswith("/responses") or not offers or _codex_tool(step.tool, request):
             return []
         item = {"type": "tool_search_call", "call_id": f"search_{id(step)}", "status": "completed"}
         item |= {"execution": "client", "arguments": {"query": step.tool, "limit": 8}}  # type: ignore[dict-item]
@@ -129,7 +138,8 @@ class ModelApi:
 
     def _next(self, request: dict[str, Any]) -> Step:
         with self._lock:
-            if not request.get("tools"):
+            last = json.dumps((request.get("messages") or [""])[-1])
+            if not request.get("tools") or any(words in last for words in BESIDE):
                 return Step(text="ok")
             self.requests.append(request)
             self.played += 1
@@ -146,15 +156,35 @@ def _speech(path: str) -> Any:
 
 
 def _chat(step: Step, request: dict[str, Any]) -> Iterator[dict[str, Any]]:
-    delta: dict[str, Any] = {"role": "assistant", "content": step.text}
-    if step.calls:
-        name, arguments = step.call([tool["function"]["name"] for tool in request["tools"]])
-        function = {"name": name, "arguments": json.dumps(arguments)}
-        call = {"index": 0, "id": f"call_{id(step)}", "type": "function", "function": function}
-        delta = {"role": "assistant", "content": None, "tool_calls": [call]}
-    whole = {"id": f"chat_{id(step)}", "object": "chat.completion.chunk", "model": request["model"]}
+    if not step.calls:
+        delta = {"role": "assistant", "content": step.text}
+        yield from _chat_with(delta, "stop", request, f"chat_{id(step)}")
+        return
+    found = _qwen_tool(step.tool, request) if step.tool else None
+    names = [tool["function"]["name"] for tool in request["tools"]]
+    if found is not None and found not in names and "tool_call" in names:
+        name, arguments = "tool_call", {"name": found, "arguments": {}}
+    else:
+        name, arguments = step.call(names)
+    yield from _chat_call(name, arguments, request, f"call_{id(step)}")
+
+
+def _chat_call(
+    name: str, arguments: dict[str, Any], request: dict[str, Any], identity: str
+) -> Iterator[dict[str, Any]]:
+    function = {"name": name, "arguments": json.dumps(arguments)}
+    # A tool may be searched for again and again: each call has an id of its own.
+    identity = f"{identity}_{len(request['messages'])}"
+    call = {"index": 0, "id": identity, "type": "function", "function": function}
+    delta = {"role": "assistant", "content": None, "tool_calls": [call]}
+    yield from _chat_with(delta, "tool_calls", request, identity)
+
+
+def _chat_with(
+    delta: dict[str, Any], reason: str, request: dict[str, Any], identity: str
+) -> Iterator[dict[str, Any]]:
+    whole = {"id": identity, "object": "chat.completion.chunk", "model": request["model"]}
     yield whole | {"choices": [{"index": 0, "delta": delta, "finish_reason": None}]}
-    reason = "tool_calls" if step.calls else "stop"
     yield whole | {"choices": [{"index": 0, "delta": {}, "finish_reason": reason}]}
     usage = {
         "prompt_tokens": INPUT,
@@ -163,6 +193,14 @@ def _chat(step: Step, request: dict[str, Any]) -> Iterator[dict[str, Any]]:
         "prompt_tokens_details": {"cached_tokens": CACHED},
     }
     yield whole | {"choices": [], "usage": usage}
+
+
+def _qwen_tool(name: str, request: dict[str, Any]) -> str | None:
+    """The whole name of a tool by its end, listed or found by a search."""
+    names = [tool["function"]["name"] for tool in request.get("tools", ())]
+    texts = [json.dumps(one.get("content")) for one in request["messages"] if one.get("role") == "tool"]
+    names += [found for text in texts for found in re.findall(r'\\"name\\": ?\\"([\w-]+)', text)]
+    return next((each for each in names if each.endswith(name)), None)
 
 
 def _contents(step: Step, request: dict[str, Any]) -> Iterator[dict[str, Any]]:

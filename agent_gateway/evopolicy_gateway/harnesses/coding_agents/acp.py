@@ -19,7 +19,16 @@ import orjson
 from evopolicy_common.errors import ConfigError
 from evopolicy_gateway.agent_supervisor.agent_process import AgentProcess
 from evopolicy_gateway.harnesses.base import AgentError, Stage
-from evopolicy_gateway.harnesses.coding_agents.acp_stream import Acp, AcpReader, permission
+from evopolicy_gateway.harnesses.coding_agents.acp_stream import (
+    MODE_THAT_ASKS,
+    Acp,
+    AcpReader,
+    Choice,
+    judges_itself,
+    offered_choice,
+    offered_modes,
+    permission,
+)
 from evopolicy_gateway.harnesses.coding_agents.cli_agent import CliAgent
 from evopolicy_gateway.harnesses.coding_agents.dialect import TurnReader, mapping, string
 from evopolicy_gateway.harnesses.coding_agents.turn import Capped
@@ -140,31 +149,33 @@ class AcpAgent(CliAgent):
         Raises AgentError when the agent offers no choice of models and is not started with this one: `run.json` would name a
         model that did not play. Likewise for the effort.
         """
-        table, model = self._acp.table, self._config.model
-        if table.mode:
-            await link.request("session_set_mode", {"sessionId": link.session, "modeId": table.mode})
+        modes = offered_modes(answer)
+        mode = self._acp.table.mode or (MODE_THAT_ASKS if judges_itself(modes) else "")
+        if mode and (modes is None or not modes.option):
+            await link.request("session_set_mode", {"sessionId": link.session, "modeId": mode})
+        elif mode and modes is not None:
+            await self._choose(link, modes, mode)
         for name, category, value in (
-            ("model", "model", model),
+            ("model", "model", self._config.model),
             ("effort", "thought_level", self._config.effort),
         ):
-            if value is not None:
-                await self._choose(link, answer, name, category, value)
+            if value is None:
+                continue
+            choice = offered_choice(answer, category)
+            words = (*self._program, *self._config.extra_args, *self._config.environment.values())
+            started_with_it = any(value in word for word in words)
+            if choice is not None and (value in choice.values or not started_with_it):
+                await self._choose(link, choice, value)
+            elif not started_with_it:
+                raise AgentError(
+                    f"{name} = {value!r}: the agent offers no choice of it in a session; put the {name} into `program`, such"
+                    f' as ["{self._program[0]}", "--{name}", "{value}"], or remove `{name}`'
+                )
 
-    async def _choose(
-        self, link: _Link, answer: dict[str, Any], name: str, category: str, value: str
-    ) -> None:
-        options = answer.get("configOptions")
-        for option in map(mapping, options if isinstance(options, list) else ()):
-            if category in (option.get("category"), option.get("id")):
-                chosen = {"sessionId": link.session, "configId": option.get("id"), "value": value}
-                await link.request("session_set_config_option", chosen)
-                return
-        started_with = (*self._program, *self._config.extra_args, *self._config.environment.values())
-        if not any(value in word for word in started_with):
-            raise AgentError(
-                f"{name} = {value!r}: the agent offers no choice of it in a session; put the {name} into `program`, such as"
-                f' ["{self._program[0]}", "--{name}", "{value}"], or remove `{name}`'
-            )
+    async def _choose(self, link: _Link, choice: Choice, value: str) -> None:
+        # The agent may know values that it does not list, such as aliases of models.
+        chosen = {"configId": choice.option, "value": choice.values.get(value, value)}
+        await link.request("session_set_config_option", {"sessionId": link.session, **chosen})
 
     async def _prompted(
         self, stage: Stage, link: _Link, prompt: str, reader: AcpReader, capped: Capped

@@ -9,16 +9,25 @@ https://agentclientprotocol.com
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import PurePosixPath
-from typing import Any
+from typing import Any, NamedTuple
 
 from evopolicy_gateway.harnesses.agent_config import AcpTable, AgentConfig
-from evopolicy_gateway.harnesses.coding_agents.dialect import Dialect, TurnReader, first_line, mapping, string
+from evopolicy_gateway.harnesses.coding_agents.dialect import (
+    Dialect,
+    TurnReader,
+    first_line,
+    mapping,
+    mappings,
+    string,
+)
 from evopolicy_gateway.harnesses.usage import Usage, count
 
 _ENDED = ("end_turn", "max_tokens", "max_turn_requests", "refusal")
 """Reasons to stop after which the agent may be prompted again."""
+MODE_THAT_ASKS = "default"
+"""The mode in which agents ask the client for permission: the rules of the run decide."""
 _CHANGES = ("edit", "delete", "move")
 """Kinds of tools that change files."""
 _MAX_TEXT_CHARS = 1 << 20
@@ -63,6 +72,8 @@ class AcpReader(TurnReader):
             if sum(map(len, self._text)) < _MAX_TEXT_CHARS:
                 self._text.append(string(content.get("text")))
             self.action = first_line("".join(self._text)) or self.action
+            # Qwen Code's own field: the tokens of one request to its model.
+            self.usage += usage_of(mapping(mapping(event.get("_meta")).get("usage")))
             return
         if kind in ("tool_call", "tool_call_update"):
             self._tool(event)
@@ -119,6 +130,47 @@ class AcpReader(TurnReader):
         self._entries.append({"type": kind, "message": {"role": kind, "content": [block]}})
 
 
+class Choice(NamedTuple):
+    """A setting that a session offers."""
+
+    option: str
+    """Its id; empty for the modes of agents that offer them apart from other settings."""
+    current: str
+    values: dict[str, str]
+    """The values that can be chosen, by themselves and by their names."""
+
+
+def offered_choice(answer: Mapping[str, Any], category: str) -> Choice | None:
+    """The setting of a category, such as `model`, in the answer that begins a session."""
+    for option in mappings(answer.get("configOptions")):
+        if category in (option.get("category"), option.get("id")):
+            listed = [
+                inner
+                for one in mappings(option.get("options"))
+                for inner in mappings(one.get("options")) or [one]
+            ]
+            values = {string(one.get("name")): string(one.get("value")) for one in listed}
+            values |= {value: value for value in values.values()}
+            return Choice(string(option.get("id")), string(option.get("currentValue")), values)
+    return None
+
+
+def offered_modes(answer: Mapping[str, Any]) -> Choice | None:
+    """The session's modes, which some agents list as one of the settings only."""
+    modes = mapping(answer.get("modes"))
+    if not modes:
+        return offered_choice(answer, "mode")
+    ids = [string(mode.get("id")) for mode in mappings(modes.get("availableModes"))]
+    return Choice("", string(modes.get("currentModeId")), {each: each for each in ids})
+
+
+def judges_itself(modes: Choice | None) -> bool:
+    """Whether a session began in the mode in which a model of the agent's own decides what is allowed, and could ask instead.
+
+    That model costs tokens and may refuse what the rules of the run allow. Qwen Code and Claude Code begin in it."""
+    return modes is not None and modes.current == "auto" and MODE_THAT_ASKS in modes.values
+
+
 def usage_of(usage: Mapping[str, Any]) -> Usage:
     """The paper's token counts from the protocol's `usage`. Its total tells what an agent counts into what."""
     given, output, thought = (count(usage.get(f"{name}Tokens")) for name in ("input", "output", "thought"))
@@ -140,14 +192,11 @@ def permission(request: Mapping[str, Any], workspace: PurePosixPath) -> dict[str
     """The answer to `session/request_permission`: the jail confines an agent, so everything is allowed but to change what the
     rules protect, the feedback and `AGENTS.md`."""
     call = mapping(request.get("toolCall"))
-    places = call.get("locations")
-    paths = [string(mapping(place).get("path")) for place in (places if isinstance(places, list) else ())]
+    paths = [string(place.get("path")) for place in mappings(call.get("locations"))]
     forbidden = call.get("kind") in _CHANGES and any(_is_protected(path, workspace) for path in paths)
     wanted = ("reject_once", "reject_always") if forbidden else ("allow_once", "allow_always")
-    offered = request.get("options")
-    options: Sequence[Any] = offered if isinstance(offered, list) else ()
     for kind in wanted:
-        for option in map(mapping, options):
+        for option in mappings(request.get("options")):
             if option.get("kind") == kind and isinstance(option.get("optionId"), str):
                 return {"outcome": {"outcome": "selected", "optionId": option["optionId"]}}
     return {"outcome": {"outcome": "cancelled"}}

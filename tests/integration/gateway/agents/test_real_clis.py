@@ -1,7 +1,8 @@
 """The real CLIs against a model API on loopback that makes them edit a file and submit. Opt-in, since they are large:
 
     npm install --prefix ~/clis @openai/codex@0.169.0 @anthropic-ai/claude-code@2.1.330 \\
-        @google/gemini-cli@0.61.0 @qwen-code/qwen-code@0.15.10 opencode-ai@1.18.33 @zed-industries/claude-agent-acp@0.23.1
+        @google/gemini-cli@0.61.0 @qwen-code/qwen-code@0.24.4 opencode-ai@1.18.33 \\
+        @agentclientprotocol/claude-agent-acp@0.101.0
     EVOPOLICY_REAL_CLIS=~/clis/node_modules/.bin python -m pytest tests/integration/gateway/agents/test_real_clis.py
 
 Nothing leaves the machine: the keys are made up, and the settings folders are the test's own.
@@ -204,8 +205,8 @@ def test_a_real_agent_behind_the_protocol_edits_submits_and_goes_on(tmp_path: Pa
     assert [text for _, text in played.turns] == ["first", "second"]
     assert (tmp_path / "workspace/system/policy.py").read_text() == "# better\n# better\n"
     assert "first" in str(api.requests[-1])
-    # Qwen Code tells no tokens, OpenCode those of a turn's last request.
-    usage = {"gemini": 4 * INPUT, "opencode": 2 * INPUT, "claude": 4 * (INPUT + CREATED), "qwen": 0}
+    # OpenCode tells those of a turn's last request.
+    usage = {"gemini": 4 * INPUT, "opencode": 2 * INPUT, "claude": 4 * (INPUT + CREATED), "qwen": 4 * INPUT}
     tokens = played.ending.facts.get("tokens", {})
     assert (
         sum(tokens.get(kind, 0) for kind in ("input_noncached", "cache_read", "cache_creation"))
@@ -214,11 +215,12 @@ def test_a_real_agent_behind_the_protocol_edits_submits_and_goes_on(tmp_path: Pa
     assert KEY not in played.text
 
 
-@pytest.mark.parametrize("name", ["gemini", "opencode"])
+@pytest.mark.parametrize("name", ACP)
 def test_a_real_agent_behind_the_protocol_plays_a_whole_run_in_its_jail(
     tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     home = tmp_path / "home"
+    home.mkdir()
     with ModelApi(SCRIPT) as api:
         monkeypatch.setenv("HOME", str(home))
         variables = acp_settings(name, api, home)
@@ -229,8 +231,9 @@ def test_a_real_agent_behind_the_protocol_plays_a_whole_run_in_its_jail(
         )
         arguments = ("--env", "toy/line", "--agent", "file:agent.toml", "--exp-id", "t", "--budget", "4")
         reaches = api.base_url.removeprefix("http://")
-        files = next(path for path in home.iterdir())
-        more = ("--allow-host", reaches, "--jail-bind-rw", str(files))
+        more = ["--allow-host", reaches]
+        for path in home.iterdir():
+            more += ["--jail-bind-rw", str(path)]
         with command(tmp_path, "local", *arguments, *SMALL_HIDDEN, *more) as running:
             assert running.wait() == 0, running.text
     record = record_in(run_dir(tmp_path))
@@ -243,7 +246,7 @@ LOOK = "echo '# better' >> system/policy.py; ls -d ~/.*/skills/lamps/SKILL.md; e
 
 
 @pytest.mark.parametrize(
-    "name", ["claude-code", "codex", "gemini", "acp-gemini", "acp-opencode", "acp-claude"]
+    "name", ["claude-code", "codex", "gemini", "qwen", "acp-gemini", "acp-qwen", "acp-opencode", "acp-claude"]
 )
 def test_a_real_agent_has_the_runs_skills_and_mcp_servers_in_its_jail(
     tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch

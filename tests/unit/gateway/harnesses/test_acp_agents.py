@@ -96,6 +96,28 @@ def test_an_effort_that_cannot_be_chosen_ends_the_run(tmp_path: Path) -> None:
     assert found.ending.reason == "agent_stopped"
 
 
+def test_a_session_plays_in_the_mode_in_which_the_agent_asks_for_permission(tmp_path: Path) -> None:
+    """Others let a model of the agent's own decide what it may do, or refuse what the run's rules allow."""
+    played(tmp_path / "modes", "work,crash,work,modes")
+    # Also in a session that is loaded after a crash.
+    assert kept(Played(tmp_path / "modes"), "chosen") == ["default", "default"]
+    played(tmp_path / "options", "work,options")
+    assert kept(Played(tmp_path / "options"), "chosen") == ["mode default"]
+    named = settings("acp", program=PROGRAM, acp=AcpTable(mode="plan"))
+    assert kept(play(tmp_path / "named", named, "work,modes"), "chosen") == ["plan"]
+
+
+def test_a_model_is_chosen_by_its_id_or_its_name(tmp_path: Path) -> None:
+    for model in ("small-1", "SMALL-1"):
+        found = played(tmp_path / model.swapcase()[:3], "work,options", model=model)
+        assert kept(found, "chosen") == ["mode default", "model small-1"]
+
+
+def test_a_model_that_is_offered_under_no_name_is_that_of_the_program(tmp_path: Path) -> None:
+    found = played(tmp_path, "work,options", model="huge", extra_args=("--model=huge",))
+    assert kept(found, "chosen") == ["mode default"]
+
+
 def test_a_failing_provider_is_asked_again_over_the_same_connection(tmp_path: Path) -> None:
     found = played(tmp_path, "busy,work")
     assert found.ending is not None
@@ -161,6 +183,26 @@ def test_tokens_are_counted_whatever_an_agent_counts_into_its_input(
     reported: dict[str, Any], usage: Usage
 ) -> None:
     assert usage_of(reported) == usage
+
+
+def test_tokens_that_come_with_each_request_are_added_up_where_the_answer_has_none() -> None:
+    chunk = {"sessionUpdate": "agent_message_chunk", "content": {"type": "text", "text": ""}}
+    counts = {
+        "inputTokens": 100,
+        "outputTokens": 5,
+        "totalTokens": 105,
+        "cachedReadTokens": 70,
+        "thoughtTokens": 0,
+    }
+    reader = AcpReader()
+    for _ in range(2):
+        reader.read({**chunk, "_meta": {"usage": counts}})
+    # A turn that fails has spent them too.
+    assert reader.usage == Usage(input_noncached=60, cache_read=140, output=10)
+    reader.ended({"stopReason": "end_turn"})
+    assert reader.usage == Usage(input_noncached=60, cache_read=140, output=10)
+    reader.ended({"stopReason": "end_turn", "usage": counts})
+    assert reader.usage == Usage(input_noncached=30, cache_read=70, output=5)
 
 
 def test_odd_updates_are_skipped() -> None:
