@@ -98,27 +98,38 @@ def check(env_ids: Sequence[str], steps: int, definitions: Iterable[Entry]) -> I
     definitions = tuple(definitions)
     encoded = msgspec.json.encode(definitions)
     processes = []
-    for seed in HASH_SEEDS:
-        program = [sys.executable, "-P", "-m", "evopolicy_worker.environments.checks.conformance", str(steps)]
-        variables = os.environ | environments.process_environment(render=True) | {"PYTHONHASHSEED": seed}
-        started = subprocess.Popen(
-            [*program, *env_ids], stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=variables
-        )
-        assert started.stdin is not None
-        started.stdin.write(encoded)
-        started.stdin.close()
-        processes.append(started)
-    try:
-        for env_id in env_ids:
-            here, there = (_next(started, env_id) for started in processes)
-            own = tuple(each for each in definitions if each.id == env_id)
-            yield Checked(here, there, InASlot() if here.faults else asyncio.run(in_a_slot(env_id, own)))
-    finally:
-        for started in processes:
-            started.kill()
-            started.wait()
-            assert started.stdout is not None
-            started.stdout.close()
+    with scratch_folder("check") as scratch:
+        for seed in HASH_SEEDS:
+            program = [
+                sys.executable,
+                "-P",
+                "-m",
+                "evopolicy_worker.environments.checks.conformance",
+                str(steps),
+            ]
+            # In a folder that is removed even if this process is killed.
+            variables = {"PYTHONHASHSEED": seed, "TMPDIR": str(scratch)}
+            started = subprocess.Popen(
+                [*program, *env_ids],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                env=os.environ | environments.process_environment(render=True) | variables,
+            )
+            assert started.stdin is not None
+            started.stdin.write(encoded)
+            started.stdin.close()
+            processes.append(started)
+        try:
+            for env_id in env_ids:
+                here, there = (_next(started, env_id) for started in processes)
+                own = tuple(each for each in definitions if each.id == env_id)
+                yield Checked(here, there, InASlot() if here.faults else asyncio.run(in_a_slot(env_id, own)))
+        finally:
+            for started in processes:
+                started.kill()
+                started.wait()
+                assert started.stdout is not None
+                started.stdout.close()
 
 
 _SLOT_STEPS = 100

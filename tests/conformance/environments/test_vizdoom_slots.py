@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 from collections.abc import Iterator
 from pathlib import Path
@@ -41,14 +42,18 @@ def test_a_closed_slot_leaves_no_game(slots: Slots) -> None:
     wait_until(lambda: not [pid for pid in processes if runs(pid)])
 
 
-def test_a_killed_process_leaves_no_game_where_no_jail_ends_it(slots: Slots) -> None:
+def test_a_killed_process_leaves_no_game_and_no_shared_memory_without_a_jail(slots: Slots) -> None:
     slot = slots.new("none")
     slots.run(slot.start())
     try:
         slots.play_all(None, slot=slot, tier="none", env=ENV)
         (game,) = [pid for pid in family(pid_of(slot)) if _name(pid) == "vizdoom"]
+        maps = Path(f"/proc/{game}/maps").read_text()
+        shared = set(re.findall(r"/dev/shm/ViZDoom\w+", maps))
+        assert len(shared) == 3
         os.kill(pid_of(slot), signal.SIGKILL)
         wait_until(lambda: not runs(game))
+        assert not [path for path in shared if os.path.exists(path)]
     finally:
         slots.run(slot.close())
 

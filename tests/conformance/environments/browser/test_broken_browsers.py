@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import subprocess
 import sys
 import tempfile
@@ -10,10 +11,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from waiting import wait_until
 
 from evopolicy_common.errors import WorkerError
 from evopolicy_worker.environments import make, missing
 from evopolicy_worker.environments.browser import chromium, page
+from evopolicy_worker.environments.checks import conformance
 from evopolicy_worker.environments.settings import BROWSER
 
 ENV = "miniwob/click-test-v1"
@@ -99,3 +102,29 @@ def test_a_command_says_it_too(program: str, code: int, told: str) -> None:
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
     assert done.returncode == code, done.stderr
     assert told in done.stdout + done.stderr
+
+
+ENDING = f"""
+import tempfile
+from evopolicy_worker.environments import make
+make({ENV!r})
+assert any(name.startswith("browser-") for name in os.listdir(tempfile.gettempdir()))
+"""
+
+
+@pytest.mark.parametrize("end", ["", "if os.fork() == 0: sys.exit()\nos.wait()", "raise SystemExit(3)"])
+def test_a_process_that_ends_removes_its_browser_and_the_profile(end: str, tmp_path: Path) -> None:
+    program = f"import os, sys\n{ENDING}\n{end}"
+    variables = {**os.environ, "TMPDIR": str(tmp_path)}
+    done = subprocess.run([sys.executable, "-P", "-c", program], env=variables, check=False, timeout=120)
+    assert done.returncode == (3 if "3" in end else 0)
+    assert not list(tmp_path.iterdir())
+    assert not running_in(tmp_path)
+
+
+def test_a_check_leaves_no_profile(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    (played,) = conformance.play_all([ENV], 2)
+    assert played.verdict(None) == "ok"
+    assert not list(tmp_path.iterdir())
+    wait_until(lambda: not running_in(tmp_path))

@@ -83,6 +83,13 @@ def test_a_click_by_place_is_a_click_on_what_is_there(warm: Warm) -> None:
     assert environment.step(f"mouse_click({x + width / 2}, {y + height / 2})").reward == 1.0
 
 
+def test_a_drawing_that_the_page_fills_later_is_an_image(warm: Warm) -> None:
+    obs = warm("browsergym/miniwob.stock-market").reset(Case(seed=1))
+    (drawing,) = nodes(obs, "image")
+    children = [each for each in nodes(obs, "graphics-symbol") if each["parentId"] == drawing["nodeId"]]
+    assert children
+
+
 @pytest.mark.parametrize(
     ("action", "error"),
     [

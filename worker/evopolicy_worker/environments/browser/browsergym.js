@@ -177,10 +177,19 @@
     return { nodes };
   };
 
+  // The browser keeps its accessibility tree, and does not see that a drawing's role changes with what is drawn in it.
+  const redraw = () => {
+    for (const drawing of document.querySelectorAll("svg:not([role])")) {
+      drawing.setAttribute("role", "none");
+      drawing.removeAttribute("role");
+    }
+  };
+
   const look = () => {
     const found = state();
     if (found.left) return found;
     mark();
+    redraw();
     found.tree = tree();
     found.properties = properties();
     const focused = document.activeElement;

@@ -4,13 +4,15 @@ Rules:
 - The process that starts it is an environment process in its jail; the browser is inside that jail too, where there is
   no network and no file of the machine's but installed programs. The browser's own sandbox is off: it needs namespaces,
   which the jail refuses.
-- Its profile is a folder in the process's temporary folder and goes with it. Pages run in a browser context that keeps
-  everything in memory.
+- Its profile is a folder in the process's temporary folder, and is removed when the process ends. A killed process leaves
+  it to the owner of that temporary folder: a slot, or `check-env`. Pages run in a browser context that keeps everything in
+  memory.
 - It ends with the process that started it: it ends when the debugging pipe closes.
 """
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import fcntl
 import os
@@ -19,6 +21,7 @@ import shutil
 import signal
 import socket
 import tempfile
+import time
 from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
@@ -46,6 +49,9 @@ _DATA_LIMIT = 4 << 30
 START_S = 60.0
 """How long a browser may take to answer first, seconds."""
 REMEDY = "name the program of a Chromium that works with --browser PATH"
+_END_S = 10.0
+"""How long its killed processes may take to end before the profile is removed all the same, seconds."""
+_LOOK_S = 0.005
 _FOLDER = 5
 """The browser's descriptor of its profile."""
 
@@ -101,6 +107,8 @@ _FLAGS = (
     "--disk-cache-size=1",
     "--media-cache-size=1",
     "--enable-blink-features=ComputedAccessibilityInfo",
+    # Keeps the accessibility tree between two questions. Without it, each element's role and name builds a tree anew.
+    "--force-renderer-accessibility",
     "--disable-features=AutofillServerCommunication,BackForwardCache,CertificateTransparencyComponentUpdater,DialMediaRouteProvider,"
     "GlobalMediaControls,HttpsUpgrades,InterestFeedContentSuggestions,IsolateOrigins,MediaRouter,OptimizationHints,OverlayScrollbar,"
     "PaintHolding,Prerender2,RenderDocument,SpareRendererForSitePerProcess,Translate,site-per-process",
@@ -153,7 +161,9 @@ class Chromium:
         finally:
             for descriptor in (theirs_in, theirs_out, folder):
                 os.close(descriptor)
+        self._owner = os.getpid()
         self._closed = False
+        atexit.register(self.close)
         try:
             self.version = str(self.devtools.call("Browser.getVersion", timeout_s=START_S)["product"])
         except (WorkerError, KeyError) as error:
@@ -187,13 +197,20 @@ class Chromium:
         return sum(map(_resident, _session(self.pid))) >> 20
 
     def close(self) -> None:
-        """Ends all its processes and removes its profile. A second close does nothing."""
-        if self._closed:
+        """Ends all its processes and removes its profile. A second close, or one in a fork of its process, does nothing."""
+        if self._closed or os.getpid() != self._owner:
             return
         self._closed = True
-        for pid in _session(self.pid):
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(pid, signal.SIGKILL)
+        atexit.unregister(self.close)
+        # More than once: a process may start another meanwhile, and writes into the profile until it has ended.
+        deadline = time.monotonic() + _END_S
+        while (left := _session(self.pid)) and time.monotonic() < deadline:
+            for pid in left:
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(pid, signal.SIGKILL)
+            with contextlib.suppress(ChildProcessError):
+                os.waitpid(self.pid, os.WNOHANG)
+            time.sleep(_LOOK_S)
         self.devtools.close()
         with contextlib.suppress(ChildProcessError):
             os.waitpid(self.pid, 0)
@@ -255,8 +272,8 @@ def _session(leader: int) -> list[int]:
     for entry in os.listdir("/proc"):
         if entry.isdigit():
             with contextlib.suppress(OSError):
-                stat = Path("/proc", entry, "stat").read_text()
-                if int(stat.rpartition(")")[2].split()[3]) == leader:
+                fields = Path("/proc", entry, "stat").read_text().rpartition(")")[2].split()
+                if int(fields[3]) == leader and fields[0] not in "ZX":
                     found.append(int(entry))
     return found
 

@@ -16,6 +16,7 @@ import resource
 import select
 import signal
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from ctypes.util import find_library
@@ -29,6 +30,7 @@ from evopolicy_common.catalogue import Entry
 from evopolicy_common.errors import EvopolicyError
 from evopolicy_common.messages.environment import Case
 from evopolicy_common.processes.parent_death import end_with_parent
+from evopolicy_common.processes.scratch import remove_tree
 from evopolicy_common.records.episodes.rendered import Renderer, decode
 from evopolicy_worker.environments import registry, spaces
 from evopolicy_worker.environments.base import Environment
@@ -47,6 +49,8 @@ _WORKS_S = 0.05
 _TICKS = os.sysconf("SC_CLK_TCK")
 _TIMED_STEPS, _TIMED_S = 200, 5.0
 """How long a step is timed: so many steps, or so many seconds."""
+_REMOVALS, _REMOVAL_S = 20, 0.1
+"""How often the removal of a process's temporary files is tried, and the pause between, seconds."""
 _RENDERED_STEPS = 30
 """So many steps of an episode are also drawn."""
 _NONSENSE: tuple[Any, ...] = (None, "nonsense", float("nan"), 10**400, [[[]]], {"a": 1}, np.full(3, np.inf))
@@ -305,11 +309,25 @@ def play_all(env_ids: list[str], steps: int) -> Iterator[Played]:
 
 
 def _in_child(env_id: str, steps: int) -> Played:
+    temporary = Path(tempfile.mkdtemp(prefix="check-"))
+    try:
+        return _in_child_with(temporary, env_id, steps)
+    finally:
+        # The process never gets to tidy up, and a program that it has started may write until it has ended.
+        for _ in range(_REMOVALS):
+            remove_tree(temporary)
+            if not temporary.exists():
+                break
+            time.sleep(_REMOVAL_S)
+
+
+def _in_child_with(temporary: Path, env_id: str, steps: int) -> Played:
     reading, writing = os.pipe()
     pid = os.fork()
     if pid == 0:
         try:
             end_with_parent(signal.SIGKILL)
+            os.environ["TMPDIR"] = tempfile.tempdir = str(temporary)
             os.close(reading)
             with os.fdopen(writing, "wb") as out:
                 null = os.open(os.devnull, os.O_WRONLY)
@@ -317,6 +335,7 @@ def _in_child(env_id: str, steps: int) -> Played:
                 os.dup2(null, 2)
                 out.write(msgspec.json.encode(play(env_id, steps)))
         finally:
+            _kill(_family(os.getpid())[1:])
             os._exit(0)
     os.close(writing)
     data, why, limit = b"", "", _Limit(pid)
@@ -328,9 +347,7 @@ def _in_child(env_id: str, steps: int) -> Played:
                     break
                 data += part
     if why:
-        for each in _family(pid):
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(each, signal.SIGKILL)
+        _kill(_family(pid))
         data = b""
     status = os.waitpid(pid, 0)[1]
     if data:
@@ -382,6 +399,12 @@ def _family(pid: int) -> list[int]:
             for child in (thread / "children").read_text().split():
                 found += _family(int(child))
     return found
+
+
+def _kill(pids: list[int]) -> None:
+    for pid in pids:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
 
 
 def main() -> None:

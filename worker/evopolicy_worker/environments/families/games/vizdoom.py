@@ -2,11 +2,13 @@
 
 The game is a process of its own, which plays one step when it is told to. It shares memory with this process and writes into the
 folder in which it was started; here that is a temporary one, which goes with the environment. It waits for its next step for ever,
-so the kernel ends it with this process, which may be killed.
+so the kernel ends it with this process, which may be killed. The names of the shared memory are removed once both have it, so that
+nothing of it outlasts them.
 """
 
 from __future__ import annotations
 
+import contextlib
 import os
 import shlex
 import signal
@@ -120,6 +122,7 @@ class _Game:
             return self._raw.reset(seed=seed)
         finally:
             os.chdir(before)
+            _remove_names()
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         obs, reward, ended, truncated, info = self._raw.step(action)
@@ -161,6 +164,16 @@ def _check_shared_memory() -> None:
             f"ViZDoom shares memory with its game in {_SHARED}, which sandbox tier landlock hides ({error.strerror}): it is played"
             " in tier bwrap; `evopolicy-worker doctor` tells how to get it"
         ) from error
+
+
+def _remove_names() -> None:
+    """Removes the names of the shared memory of this process's games. They opened it when they began, and need them no more."""
+    with open("/proc/self/maps", encoding="utf-8", errors="surrogateescape") as maps:
+        shared = {line.split(maxsplit=5)[-1].rstrip("\n") for line in maps if f" {_SHARED}/ViZDoom" in line}
+    for path in shared:
+        # Of a game that began before, only the deleted name is listed.
+        with contextlib.suppress(OSError):
+            os.unlink(path)
 
 
 def _scenario(entry: Entry) -> str:
