@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import gc
 import os
 import shutil
@@ -105,8 +106,10 @@ def _beside_others(config: pytest.Config) -> bool:
     return hasattr(config, "workerinput")
 
 
+@functools.cache
 def _in(path: Path, names: tuple[str, ...]) -> bool:
-    return any(path.is_relative_to(Path(__file__).parent / name) for name in names)
+    """Whether it is one of these files, or in one of these folders. Every process asks for each file of thousands of tests."""
+    return f"{path}/".startswith(tuple(f"{Path(__file__).parent}/{name}/" for name in names))
 
 
 @pytest.hookimpl(tryfirst=True)  # before -m selects by marker
@@ -126,8 +129,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     for (begin, end), kind in zip(spans, (slow, {*files} - slow - unit, unit - slow), strict=True):
         ordered = [path for path in files if path in kind]
         place |= {path: begin + (end - begin) * k / len(ordered) for k, path in enumerate(ordered)}
-    for item in items:
-        for name, files_of in (("system", _SYSTEM), ("families", _FAMILIES)):
+    for name, files_of in (("system", _SYSTEM), ("families", _FAMILIES)):
+        for item in items:
             if _in(item.path, files_of):
                 item.add_marker(name)
     items.sort(key=lambda item: place[item.path])
