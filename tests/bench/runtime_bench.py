@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import contextlib
 import json
 import math
 import os
@@ -33,6 +34,7 @@ from evopolicy_common.catalogue import installs
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.environment import Case
 from evopolicy_common.messages.episode import EpisodeSpec, Job
+from evopolicy_common.processes import proc
 from evopolicy_worker.slots.slot import Slot
 
 HERE = Path(__file__).parent
@@ -121,24 +123,10 @@ def fsync_s(n: int = 50) -> float:
 
 def peak_memory_mb() -> float:
     """The peaks of this process's descendants (a slot's environment process, its zygote, its sandbox), added up."""
-    children: dict[int, list[int]] = {}
-    peaks: dict[int, float] = {}
-    for folder in Path("/proc").iterdir():
-        if folder.name.isdecimal():
-            try:
-                fields = (folder / "stat").read_text().rpartition(")")[2].split()
-                status = (folder / "status").read_text()
-            except OSError:
-                continue
-            children.setdefault(int(fields[1]), []).append(int(folder.name))
-            peaks[int(folder.name)] = sum(
-                int(line.split()[1]) / 1024 for line in status.splitlines() if line.startswith("VmHWM:")
-            )
-    found, queue = 0.0, [os.getpid()]
-    while queue:
-        for child in children.get(queue.pop(), []):
-            found += peaks[child]
-            queue.append(child)
+    found = 0.0
+    for pid in proc.descendants(os.getpid()):
+        with contextlib.suppress(OSError), open(f"/proc/{pid}/status") as lines:
+            found += sum(int(line.split()[1]) / 1024 for line in lines if line.startswith("VmHWM:"))
     return found
 
 

@@ -26,9 +26,8 @@ from unittest.mock import patch
 
 from fault_cluster import EPISODES, HIDDEN, SUBMITS, FaultCluster, command_line, fault_cluster, record
 
-from evopolicy_common.processes import scratch
+from evopolicy_common.processes import proc, scratch
 from evopolicy_common.records.run_difference import differences
-from evopolicy_gateway.run import processes
 
 EVERY_S = 2.5
 """Mean time between two strikes, on a machine that does nothing else."""
@@ -181,7 +180,7 @@ def chaos(seconds: float, seed: int, root: Path, tell: Tell) -> bool:
         for folder in temporary.glob("evopolicy-*"):
             os.utime(folder, (0, 0))
             scratch.clear_stale(folder.name.split("-")[1])
-    left = processes.descendants(os.getpid())
+    left = proc.descendants(os.getpid())
     wrong += [f"left over: {pid} {command_line(pid)[:120]}" for pid in left]
     wrong += [
         f"left over: {path}" for path in sorted(temporary.glob("evopolicy-*")) if "-cores-" not in path.name

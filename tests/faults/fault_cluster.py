@@ -25,6 +25,7 @@ from machines.own_processes import only_what_starts_inside
 from weak_link import WeakLink
 
 from evopolicy_common.messages import operator
+from evopolicy_common.processes import proc
 from evopolicy_common.wire import codec, credentials, keys
 from evopolicy_common.wire.requests import Requester
 from evopolicy_common.wire.transport import connect
@@ -241,7 +242,7 @@ class FaultCluster:
         if kind == "run":
             return [] if self.run.poll() is not None else [self.run.pid]
         program, wanted = KINDS[kind]
-        lines = {pid: command_line(pid) for pid in processes.descendants(os.getpid())}
+        lines = {pid: command_line(pid) for pid in proc.descendants(os.getpid())}
         found = [pid for pid, line in lines.items() if wanted in line and program in line.partition(" ")[0]]
         if kind in ("zygote", "policy"):
             # As root the zygote has two processes above it that wait for it; a policy's is one of its own, below it.
@@ -255,8 +256,8 @@ class FaultCluster:
         kept = {self.coordinator.process.pid, *self.find("worker")}
         if self.cable is not None:
             kept.add(self.cable.holder.pid)
-        of_workers = {pid for worker in self.find("worker") for pid in processes.descendants(worker)}
-        found = [pid for pid in processes.descendants(here) if pid not in kept | of_workers]
+        of_workers = {pid for worker in self.find("worker") for pid in proc.descendants(worker)}
+        found = [pid for pid in proc.descendants(here) if pid not in kept | of_workers]
         slots = self.find("slot")
         words = [f"{pid}: {command_line(pid)[:120]}" for pid in found if command_line(pid)]
         return words + ([f"{len(slots)} slot processes"] if len(slots) > 2 * len(self.workers) else [])

@@ -33,11 +33,11 @@ from host_faults import enter_namespaces, full_file_system
 
 from evopolicy_common.errors import RefusedError, TransportError
 from evopolicy_common.messages import operator
+from evopolicy_common.processes import proc
 from evopolicy_common.records.run_difference import differences
 from evopolicy_common.wire import codec, keys
 from evopolicy_common.wire.requests import Requester
 from evopolicy_common.wire.transport import connect
-from evopolicy_gateway.run import processes
 
 FREEZE_S = 0.7
 LONG_FREEZE_S = 4.0
@@ -199,7 +199,7 @@ def strike(cluster: FaultCluster, case: Case, row: Row) -> bool:
         else:
             # The whole machine stands still, as far as the coordinator can tell.
             before = times_frozen(cluster)
-            with stopped([pid, *processes.descendants(pid)]):
+            with stopped([pid, *proc.descendants(pid)]):
                 time.sleep(LONG_FREEZE_S)
             deadline = time.monotonic() + TIMEOUT_S
             while times_frozen(cluster) == before and time.monotonic() < deadline:
@@ -344,7 +344,7 @@ def play_all(wanted: list[Case], on_row: Callable[[Row], None], root: Path) -> b
         if of_site:
             with fault_cluster(root / f"{number}", site) as cluster:
                 well = play_at(cluster, site, of_site, on_row) and well
-    left = processes.descendants(os.getpid())
+    left = proc.descendants(os.getpid())
     if left:
         on_row(Row("cluster", "ended", 0, 0, wrong=[f"processes are left: {left}"]))
     return well and not left

@@ -13,6 +13,7 @@ from typing import Any, TypeVar
 
 from evopolicy_common.messages.environment import Case
 from evopolicy_common.messages.episode import EpisodeOutcome, EpisodeSpec, Job, ResourceLimits, Tier
+from evopolicy_common.processes import proc
 from evopolicy_common.records.episodes.trajectory import Row, decode
 from evopolicy_worker.slots.slot import Slot
 
@@ -188,16 +189,14 @@ def children(pid: int) -> list[int]:
 
 
 def family(pid: int) -> list[int]:
-    """The process and all its descendants, outermost first."""
+    """The process and all its descendants, outermost first; a process's children in the order of their starts."""
     return [pid, *(member for child in children(pid) for member in family(child))]
 
 
 def runs(pid: int) -> bool:
     """Whether the process is there and not just waiting for its parent to take note of its end."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
-    except OSError:
-        return False
+    found = proc.stat(pid)
+    return found is not None and found.state not in "ZX"
 
 
 def pid_of(slot: Slot) -> int:

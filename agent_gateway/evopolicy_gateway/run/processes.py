@@ -9,6 +9,8 @@ import signal
 import time
 from collections.abc import Collection
 
+from evopolicy_common.processes import proc
+
 _PR_SET_CHILD_SUBREAPER = 36
 _KEYCTL_JOIN_SESSION_KEYRING = 1
 _PAUSE_S = 0.01
@@ -38,31 +40,9 @@ def leave_session_keyring() -> None:
         ctypes.CDLL(None, use_errno=True).syscall(number, _KEYCTL_JOIN_SESSION_KEYRING, None)
 
 
-def descendants(root: int, *, spare: Collection[int] = ()) -> list[int]:
-    """Returns the ids of the live processes below `root`, parents before children, without zombies.
-
-    Leaves out `spare` and everything below it. Reads the process table only once: with two reads, a process started by
-    a spared one in between would look like an orphan.
-    """
-    children: dict[int, list[int]] = {}
-    for pid, parent, state in _table():
-        if state != b"Z":
-            children.setdefault(parent, []).append(pid)
-    found: list[int] = []
-    level = [root]
-    while level:
-        level = [child for parent in level for child in children.get(parent, ()) if child not in spare]
-        found += level
-    return found
-
-
 def cpu_below() -> float:
-    """CPU seconds of all live processes below this one, and of the dead children that these have waited for."""
-    total = 0
-    for pid in descendants(os.getpid()):
-        with contextlib.suppress(OSError, IndexError, ValueError), open(f"/proc/{pid}/stat", "rb") as file:
-            total += sum(map(int, file.read().rpartition(b")")[2].split()[11:15]))
-    return total / os.sysconf("SC_CLK_TCK")
+    """CPU seconds of all processes below this one, and of the dead children that these have waited for."""
+    return sum(each.cpu_s for each in proc.family(os.getpid())[1:])
 
 
 def end_descendants(
@@ -99,23 +79,8 @@ def end_orphans(known: Collection[int]) -> list[int]:
     return end_descendants(0.0, spare=known) if _reaps else []
 
 
-def _table() -> list[tuple[int, int, bytes]]:
-    """Id, parent and state of every process."""
-    rows = []
-    for name in os.listdir("/proc"):
-        if name.isdecimal():
-            with (
-                contextlib.suppress(OSError, IndexError, ValueError),
-                open(f"/proc/{name}/stat", "rb") as file,
-            ):
-                # The command's name is in parentheses and may contain spaces and parentheses itself.
-                fields = file.read().rpartition(b")")[2].split()
-                rows.append((int(name), int(fields[1]), fields[0]))
-    return rows
-
-
 def _below(spare: Collection[int]) -> list[int]:
-    return descendants(os.getpid(), spare=spare)
+    return proc.descendants(os.getpid(), spare=spare)
 
 
 def _signal_all(pids: list[int], number: signal.Signals) -> None:
@@ -127,7 +92,7 @@ def _signal_all(pids: list[int], number: signal.Signals) -> None:
 def _reap(kept: Collection[int]) -> None:
     """Collects the exit status of dead children, so that no zombies accumulate."""
     me = os.getpid()
-    for pid, parent, state in _table():
-        if parent == me and state == b"Z" and pid not in kept:
+    for each in proc.table():
+        if each.parent == me and each.state == "Z" and each.pid not in kept:
             with contextlib.suppress(ChildProcessError):
-                os.waitpid(pid, os.WNOHANG)
+                os.waitpid(each.pid, os.WNOHANG)

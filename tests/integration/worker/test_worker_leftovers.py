@@ -15,7 +15,7 @@ from machines.own_processes import alive
 
 from evopolicy_common.errors import WorkerError
 from evopolicy_common.messages.environment import EnvironmentDescription
-from evopolicy_gateway.run import processes
+from evopolicy_common.processes import proc
 from evopolicy_worker import descriptions
 from evopolicy_worker.slots.slot import Slot
 
@@ -73,9 +73,9 @@ def test_a_worker_that_is_killed_at_any_moment_of_its_start_leaves_nothing(tmp_p
         assert worker.stdout.readline() == b"begun\n"
         end = time.monotonic() + 0.3 * k
         while worker.poll() is None and time.monotonic() < end:
-            seen.update(processes.descendants(worker.pid))
+            seen.update(proc.descendants(worker.pid))
             time.sleep(0.005)
-        seen.update(processes.descendants(worker.pid))
+        seen.update(proc.descendants(worker.pid))
         worker.kill()
         worker.communicate()
     deadline = time.monotonic() + 30
@@ -105,7 +105,7 @@ def test_a_describing_process_that_is_killed_is_started_again(
         if left:
             left -= 1
             assert self._process is not None
-            inside = processes.descendants(self._process.pid)
+            inside = proc.descendants(self._process.pid)
             os.kill(inside[1], signal.SIGKILL)
         return await describe(self, env_ids)
 

@@ -11,7 +11,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,7 @@ from evopolicy_common.messages import gateway, worker
 from evopolicy_common.messages.environment import Split
 from evopolicy_common.messages.episode import EpisodeOutcome, Job
 from evopolicy_common.messages.operator import EvaluationPage, RecordedRequest, RunFinished
+from evopolicy_common.processes import proc
 from evopolicy_common.wire import codec, credentials
 from evopolicy_common.wire.transport import connect
 
@@ -272,7 +273,9 @@ class GoldenRun:
         return {one.bundle for one in found if isinstance(one, gateway.Submit) and one.bundle is not None}
 
     def _process_of(self, parent: int, module: bytes) -> int:
-        (found,) = [pid for pid in _children(parent) if module in Path(f"/proc/{pid}/cmdline").read_bytes()]
+        (found,) = [
+            pid for pid in proc.descendants(parent) if module in Path(f"/proc/{pid}/cmdline").read_bytes()
+        ]
         return found
 
     def _stop_at_close(self, data: bytes) -> None:
@@ -311,13 +314,3 @@ def _write_cases(folder: Path) -> dict[str, tuple[Case, ...]]:
         (folder / f"{split}.json").write_text(json.dumps(document))
         found[split] = cases
     return found
-
-
-def _children(parent: int) -> Iterator[int]:
-    for path in Path("/proc").glob("[0-9]*/stat"):
-        try:
-            fields = path.read_text().rpartition(")")[2].split()
-        except OSError:
-            continue
-        if int(fields[1]) == parent:
-            yield int(path.parent.name)

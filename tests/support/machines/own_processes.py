@@ -7,24 +7,22 @@ import ctypes
 import functools
 import os
 from collections.abc import Iterator
-from pathlib import Path
 from unittest.mock import patch
 
+from evopolicy_common.processes import proc
 from evopolicy_gateway.run import processes
 
 
 def alive(pid: int) -> bool:
     """Whether there is such a process; a zombie is none."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except OSError:
-        return False
+    found = proc.stat(pid)
+    return found is not None and found.state != "Z"
 
 
 @contextlib.contextmanager
 def only_what_starts_inside() -> Iterator[None]:
     """`processes.end_descendants` spares what ran before the `with`; a subreaper made inside is none after it."""
-    spare = frozenset(processes.descendants(os.getpid()))
+    spare = frozenset(proc.descendants(os.getpid()))
     bounded = functools.partial(processes.end_descendants, spare=spare)
     reaped = processes._reaps
     try:

@@ -21,6 +21,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from evopolicy_common.messages.episode import FailureCategory, ResourceLimits
+from evopolicy_common.processes import proc
 from evopolicy_worker.sandbox.zygote import Child
 
 TICK_S = 0.1
@@ -202,7 +203,8 @@ class Watch:
             self._excused_s += now - looked
             self._answer_excused_s += owed_s
         elif owed_s and now - since > _SLOW_S:
-            cpu_s, state = self.cpu_s(), _state(self.child.host_pid)
+            cpu_s, found = self.cpu_s(), proc.stat(self.child.host_pid)
+            state = "" if found is None else found.state
             if self._held and state in STOPPED:
                 self._stood_s += owed_s
                 self._excused_s += owed_s
@@ -304,16 +306,8 @@ class Monitor(threading.Thread):
 
 def is_stopped(pid: int) -> bool:
     """Whether the process is stopped, or held by a debugger."""
-    return _state(pid) in STOPPED
-
-
-def _state(pid: int) -> str:
-    """The letter of the state of the process's first thread; empty when there is none."""
-    try:
-        with open(f"/proc/{pid}/stat") as file:
-            return file.read().rpartition(")")[2].split()[0]
-    except (OSError, IndexError):
-        return ""
+    found = proc.stat(pid)
+    return found is not None and found.state in STOPPED
 
 
 def _threads(pid: int) -> int:

@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 
 from evopolicy_common.errors import SandboxError, SlotDiedError
 from evopolicy_common.messages.episode import FailureCategory, PolicyFailure, ResourceLimits
+from evopolicy_common.processes import proc
 from evopolicy_common.simulators import SIMULATORS
 from evopolicy_worker.episodes import frames
 from evopolicy_worker.episodes.monitor import STOPPED_S, Monitor, Verdict, Watch
@@ -41,7 +42,6 @@ _SEAL_S = 60.0
 """Time limit for our own work before the bundle is imported."""
 _EXIT_S = 5.0
 """For a process that is ending to be gone."""
-_PF_EXITING = 0x4
 _LARGE_SHARE = 0.125
 """Share of its memory limit above which a policy that ended silently, while the system ran out of memory, counts as
 ended for its own memory use."""
@@ -523,19 +523,10 @@ def oom_kills() -> int | None:
 
 def _memory(pid: int) -> tuple[int, int]:
     """Bytes of address space and of memory that the process has; what Python with numpy has when that cannot be read."""
-    try:
-        with open(f"/proc/{pid}/statm") as file:
-            space, resident = file.read().split()[:2]
-    except (OSError, ValueError):
-        return 1 << 29, 1 << 25
-    page = os.sysconf("SC_PAGE_SIZE")
-    return int(space) * page, int(resident) * page
+    return proc.sizes(pid) or (1 << 29, 1 << 25)
 
 
 def _exiting(pid: int) -> bool:
     """Whether the process is on its way out."""
-    try:
-        with open(f"/proc/{pid}/stat") as file:
-            return bool(int(file.read().rpartition(")")[2].split()[6]) & _PF_EXITING)
-    except (OSError, ValueError, IndexError):
-        return True
+    found = proc.stat(pid)
+    return found is None or found.exiting

@@ -13,7 +13,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import os
-import resource
 import signal
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -33,6 +32,7 @@ from evopolicy_common.errors import (
 )
 from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_common.messages.episode import EpisodeOutcome, Job, PolicyFailure, Tier
+from evopolicy_common.processes import proc
 from evopolicy_common.processes.scratch import remove_tree
 from evopolicy_worker.environments.calls import NOTE, USUAL, Limits, hung
 from evopolicy_worker.environments.registry import remembers
@@ -403,17 +403,12 @@ def _children(pid: int, tier: Tier) -> list[int]:
 
 def _memory(pid: int) -> int:
     found = 0
-    with contextlib.suppress(OSError, ValueError):
-        try:
-            rollup = Path(f"/proc/{pid}/smaps_rollup").read_text()
-            found = next(
-                int(line.split()[1]) << 10 for line in rollup.splitlines() if line.startswith("Pss:")
-            )
-        except (OSError, StopIteration):
+    for each in proc.family(pid):
+        size = proc.proportional_bytes(each.pid)
+        if size is None:
             # The kernel shows it of fewer processes: where not, what is shared counts for each.
-            found = int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * resource.getpagesize()
-        for thread in Path(f"/proc/{pid}/task").iterdir():
-            found += sum(map(_memory, map(int, (thread / "children").read_text().split())))
+            _, size = proc.sizes(each.pid) or (0, 0)
+        found += size
     return found
 
 

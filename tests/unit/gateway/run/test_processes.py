@@ -9,10 +9,12 @@ from pathlib import Path
 
 from machines.own_processes import alive
 
-from evopolicy_gateway.run.processes import descendants, end_orphans
+from evopolicy_common.processes.proc import descendants
+from evopolicy_gateway.run.processes import end_orphans
 
 SUPERVISOR = """
 import os, subprocess, sys, time
+from evopolicy_common.processes import proc
 from evopolicy_gateway.run import processes
 processes.become_subreaper()
 stubborn = "import os, signal, time; signal.signal(15, signal.SIG_IGN); {} open(os.environ['N'] + str(os.getpid()), 'w'); time.sleep(1000)"
@@ -25,7 +27,7 @@ while len(os.listdir(os.environ["N"])) < wanted:
     time.sleep(0.01)
 left = processes.end_descendants(0.05, spare={spared.pid})
 assert left == [], left
-assert processes.descendants(os.getpid()) == [spared.pid]
+assert proc.descendants(os.getpid()) == [spared.pid]
 spared.kill()
 spared.wait()
 assert processes.end_descendants(0.0) == []

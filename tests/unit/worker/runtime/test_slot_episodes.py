@@ -12,7 +12,7 @@ import pytest
 from slots import HONEST, Slots, make_job, rows
 
 from evopolicy_common.messages.environment import Case
-from evopolicy_gateway.run.processes import descendants
+from evopolicy_common.processes.proc import descendants
 from evopolicy_worker import environments
 from evopolicy_worker.episodes import float_environment
 from evopolicy_worker.episodes.loop import random_actions

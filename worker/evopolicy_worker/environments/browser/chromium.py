@@ -28,7 +28,7 @@ from pathlib import Path
 from typing import Any
 
 from evopolicy_common.errors import WorkerError
-from evopolicy_common.processes import distribution
+from evopolicy_common.processes import distribution, proc
 from evopolicy_worker.environments.browser.devtools import DevTools
 from evopolicy_worker.environments.settings import BROWSER
 
@@ -194,7 +194,7 @@ class Chromium:
 
     def megabytes(self) -> int:
         """Resident memory of all its processes together, MiB; what several processes share is divided among them."""
-        return sum(map(_resident, _session(self.pid))) >> 20
+        return sum(proc.proportional_bytes(pid) or 0 for pid in _session(self.pid)) >> 20
 
     def close(self) -> None:
         """Ends all its processes and removes its profile. A second close, or one in a fork of its process, does nothing."""
@@ -268,22 +268,4 @@ def _limited_data() -> Iterator[None]:
 
 def _session(leader: int) -> list[int]:
     """Pids of the living processes of a session."""
-    found = []
-    for entry in os.listdir("/proc"):
-        if entry.isdigit():
-            with contextlib.suppress(OSError):
-                fields = Path("/proc", entry, "stat").read_text().rpartition(")")[2].split()
-                if int(fields[3]) == leader and fields[0] not in "ZX":
-                    found.append(int(entry))
-    return found
-
-
-def _resident(pid: int) -> int:
-    """Proportional set size of a process, bytes; 0 when it has gone."""
-    try:
-        for line in Path("/proc", str(pid), "smaps_rollup").read_text().splitlines():
-            if line.startswith("Pss:"):
-                return int(line.split()[1]) << 10
-    except OSError:
-        pass
-    return 0
+    return [each.pid for each in proc.table() if each.session == leader and each.state not in "ZX"]

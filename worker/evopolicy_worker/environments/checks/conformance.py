@@ -29,6 +29,7 @@ import numpy as np
 from evopolicy_common.catalogue import Entry
 from evopolicy_common.errors import EvopolicyError
 from evopolicy_common.messages.environment import Case
+from evopolicy_common.processes import proc
 from evopolicy_common.processes.parent_death import end_with_parent
 from evopolicy_common.processes.scratch import remove_tree
 from evopolicy_common.records.episodes.rendered import Renderer, decode
@@ -46,7 +47,6 @@ LONGEST_S = 3600.0
 _LOOK_S = 1.0
 _WORKS_S = 0.05
 """A process that has used so much more processor time since the last look has not hung, seconds."""
-_TICKS = os.sysconf("SC_CLK_TCK")
 _TIMED_STEPS, _TIMED_S = 200, 5.0
 """How long a step is timed: so many steps, or so many seconds."""
 _REMOVALS, _REMOVAL_S = 20, 0.1
@@ -335,7 +335,7 @@ def _in_child_with(temporary: Path, env_id: str, steps: int) -> Played:
                 os.dup2(null, 2)
                 out.write(msgspec.json.encode(play(env_id, steps)))
         finally:
-            _kill(_family(os.getpid())[1:])
+            _kill(proc.descendants(os.getpid()))
             os._exit(0)
     os.close(writing)
     data, why, limit = b"", "", _Limit(pid)
@@ -347,7 +347,7 @@ def _in_child_with(temporary: Path, env_id: str, steps: int) -> Played:
                     break
                 data += part
     if why:
-        _kill(_family(pid))
+        _kill([each.pid for each in proc.family(pid)])
         data = b""
     status = os.waitpid(pid, 0)[1]
     if data:
@@ -382,23 +382,7 @@ class _Limit:
 
 def _processor_s(pid: int) -> float:
     """Processor time of a process and of those that it has started, seconds."""
-    found = 0.0
-    for each in _family(pid):
-        with contextlib.suppress(OSError):
-            fields = Path(f"/proc/{each}/stat").read_text().rpartition(")")[2].split()
-            # User and system time, its own and that of children that have ended.
-            found += sum(map(int, fields[11:15])) / _TICKS
-    return found
-
-
-def _family(pid: int) -> list[int]:
-    """A process and all that it has started, as far as they run."""
-    found = [pid]
-    with contextlib.suppress(OSError):
-        for thread in Path(f"/proc/{pid}/task").iterdir():
-            for child in (thread / "children").read_text().split():
-                found += _family(int(child))
-    return found
+    return sum(each.cpu_s for each in proc.family(pid))
 
 
 def _kill(pids: list[int]) -> None:

@@ -1,0 +1,100 @@
+"""What /proc says of this machine's processes: state, tree, processor time and memory. Linux only."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Collection
+from pathlib import Path
+from typing import NamedTuple
+
+_TICKS = os.sysconf("SC_CLK_TCK")
+_PF_EXITING = 0x4
+
+
+class Stat(NamedTuple):
+    """A process, from /proc/PID/stat."""
+
+    pid: int
+    state: str
+    """One letter, such as R (runs), S (sleeps), T (stopped), t (held by a debugger) or Z (a zombie)."""
+    parent: int
+    session: int
+    exiting: bool
+    """Whether it is on its way out."""
+    cpu_s: float
+    """Processor time of all its threads, and of the children that it has waited for, seconds."""
+
+
+def parse_stat(line: bytes) -> Stat:
+    """The content of /proc/PID/stat. Raises ValueError when it is none."""
+    # The command's name is in parentheses, and may itself contain spaces and parentheses.
+    head, _, tail = line.rpartition(b")")
+    fields = tail.split()
+    if len(fields) < 15:
+        raise ValueError(f"not the stat of a process: {line[:200]!r}")
+    return Stat(
+        pid=int(head.partition(b" ")[0]),
+        state=fields[0].decode("ascii"),
+        parent=int(fields[1]),
+        session=int(fields[3]),
+        exiting=bool(int(fields[6]) & _PF_EXITING),
+        cpu_s=sum(map(int, fields[11:15])) / _TICKS,
+    )
+
+
+def stat(pid: int | str) -> Stat | None:
+    """The process; None when there is no such process."""
+    with contextlib.suppress(OSError, ValueError), open(f"/proc/{pid}/stat", "rb") as file:
+        return parse_stat(file.read())
+    return None
+
+
+def table() -> list[Stat]:
+    """All processes, zombies included."""
+    found = [stat(name) for name in os.listdir("/proc") if name.isdecimal()]
+    return [each for each in found if each is not None]
+
+
+def family(root: int, *, spare: Collection[int] = ()) -> list[Stat]:
+    """The process `root` and all below it, parents before children, zombies included.
+
+    Leaves out `spare` and everything below it. Reads the process table only once: with two reads, a process started by
+    a spared one in between would look like an orphan.
+    """
+    children: dict[int, list[Stat]] = {}
+    stack: list[Stat] = []
+    for each in table():
+        children.setdefault(each.parent, []).append(each)
+        if each.pid == root:
+            stack.append(each)
+    found: list[Stat] = []
+    while stack:
+        each = stack.pop()
+        found.append(each)
+        stack += [child for child in reversed(children.get(each.pid, [])) if child.pid not in spare]
+    return found
+
+
+def descendants(root: int, *, spare: Collection[int] = ()) -> list[int]:
+    """The ids of the live processes below `root`, as `family` has them, without zombies."""
+    return [each.pid for each in family(root, spare=spare)[1:] if each.state != "Z"]
+
+
+def sizes(pid: int) -> tuple[int, int] | None:
+    """Address space and resident memory of a process, bytes; None when it cannot be read."""
+    with contextlib.suppress(OSError, ValueError):
+        space, resident = Path(f"/proc/{pid}/statm").read_text().split()[:2]
+        page = os.sysconf("SC_PAGE_SIZE")
+        return int(space) * page, int(resident) * page
+    return None
+
+
+def proportional_bytes(pid: int) -> int | None:
+    """Proportional set size of a process: its resident memory, in which memory that several processes share is divided
+    among them. Bytes; None where the kernel does not show it."""
+    with contextlib.suppress(OSError, ValueError, IndexError):
+        for line in Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines():
+            if line.startswith("Pss:"):
+                return int(line.split()[1]) << 10
+    return None
