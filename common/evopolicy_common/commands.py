@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import platform
 import re
+import sys
 from collections.abc import Callable, Iterator
 from typing import Annotated, Any, NoReturn, TypeVar
 
@@ -28,8 +29,12 @@ _METAVARS = {"str": "TEXT", "int": "N", "float": "X", "path": "PATH", "file": "P
 
 def _show_version(wanted: bool) -> None:
     if wanted:
-        say(f"evopolicy {evopolicy_common.__version__} (Python {platform.python_version()})")
+        _say_version()
         raise typer.Exit
+
+
+def _say_version() -> None:
+    say(f"evopolicy {evopolicy_common.__version__} (Python {platform.python_version()})")
 
 
 Version = Annotated[
@@ -116,12 +121,12 @@ class App(typer.Typer):
         return super().command(name, **(usual | options))
 
 
-def run_app(app: typer.Typer) -> NoReturn:
-    """Runs the command that `sys.argv` names, and exits."""
+def run_app(app: typer.Typer, extra: str | None = None) -> NoReturn:
+    """Runs the command that `sys.argv` names, and exits. `extra`: what it needs; None for that of a missing module."""
     open_streams()
     end_without_reader()
     try:
-        with needed_extras(), fail_on_our_errors():
+        with needed_extras(extra), fail_on_our_errors():
             code = typer.main.get_command(app).main(standalone_mode=False)
     except _ClickError as error:
         fail(_usage_text(error), USAGE_ERROR)
@@ -131,15 +136,24 @@ def run_app(app: typer.Typer) -> NoReturn:
 
 
 @contextlib.contextmanager
-def needed_extras() -> Iterator[None]:
-    """Ends the command, and names the extra to install, when the body misses a module of an extra."""
+def needed_extras(needed: str | None = None) -> Iterator[None]:
+    """Ends the command, and names the extra to install, when the body misses a module of an extra.
+
+    `needed`: the extra to name; None for that of the module. Version and help are answered as far as possible.
+    """
     try:
         yield
     except ModuleNotFoundError as error:
         extra = EXTRAS.get((error.name or "").partition(".")[0])
         if extra is None:
             raise
-        fail(missing(extra, error.name or ""))
+        if sys.argv[1:] == ["--version"]:
+            _say_version()
+            raise SystemExit(0) from None
+        advice = missing(needed or extra, error.name or "")
+        if {"-h", "--help"} & set(sys.argv):
+            advice += "; until then, `evopolicy files docs/reference/cli.md` names a page with all commands and options"
+        fail(advice)
 
 
 def _value_names(text: str) -> str:

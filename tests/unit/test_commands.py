@@ -149,7 +149,11 @@ def test_a_mistyped_command_is_answered_with_the_nearest() -> None:
             ["evopolicy", "run", "--env", "gym/acrobot", "--agent", "evolve"],
             "gateway",
         ),
-        ("starlette,uvicorn,h11", ["evopolicy", "local", "--env", "toy", "--agent", "evolve"], "gateway"),
+        ("starlette,uvicorn,h11", ["evopolicy", "local", "--env", "toy", "--agent", "evolve"], "local"),
+        ("starlette,uvicorn,h11", ["evopolicy", "demo"], "local"),
+        ("cryptography", ["evopolicy", "demo"], "local"),
+        ("cryptography", ["evopolicy", "random", "--env", "toy/line"], "local"),
+        ("starlette,uvicorn,h11", ["evopolicy", "web"], "coordinator"),
         ("starlette,uvicorn,h11", ["evopolicy", "suite", "smoke.toml", "--local"], "gateway"),
         ("cryptography", ["evopolicy-coordinator"], "coordinator"),
         ("cryptography", ["evopolicy-coordinator", "certs", "init"], "coordinator"),
@@ -166,6 +170,15 @@ def test_a_command_without_its_extra_names_it(
     assert done.stderr.strip().splitlines()[-1].startswith("error: ")
     assert f"pip install 'evopolicy[{extra}]'" in done.stderr
     assert "Traceback" not in done.stderr
+
+
+def test_a_program_without_its_extra_tells_its_version_and_where_its_options_are(tmp_path: Path) -> None:
+    for program in ("evopolicy-coordinator", "evopolicy-gateway"):
+        done = without("cryptography,uvicorn", [program, "--version"], tmp_path)
+        assert (done.returncode, done.stdout.partition(" ")[0]) == (0, "evopolicy"), done.stderr
+        done = without("cryptography,uvicorn", [program, "--help"], tmp_path)
+        assert done.returncode == 2
+        assert "`evopolicy files docs/reference/cli.md`" in done.stderr
 
 
 @pytest.mark.parametrize("words", [["status"], ["verify", "x"], ["data", "check", "x"], ["gc", "--dry-run"]])

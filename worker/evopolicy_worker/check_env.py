@@ -18,7 +18,7 @@ from evopolicy_common import catalogue
 from evopolicy_common.catalogue import Entry, installs
 from evopolicy_common.cli import fail_on_our_errors
 from evopolicy_common.console import table, terminal
-from evopolicy_common.errors import ConfigError, EvopolicyError, WorkerError
+from evopolicy_common.errors import EvopolicyError, WorkerError
 from evopolicy_common.messages.environment import Case, EnvironmentDescription
 from evopolicy_common.messages.episode import EpisodeSpec, Job, Tier
 from evopolicy_common.processes.scratch import scratch_folder
@@ -242,9 +242,7 @@ def command(
         todo = [each for each in wanted if each not in known]
         divided = installs.divided(todo)
         here = divided.pop(sys.executable, [])
-        lacking = [f"{each} needs {what}" for each in here if (what := environments.missing(each))]
-        if lacking:
-            raise ConfigError(f"not installed: {'; '.join(lacking[:8])}")
+        environments.check_played(here)
         foreign = tuple(catalogue.entry(each) for each in here if not catalogue.is_shipped(each))
         for done, checked in enumerate(check(here, steps, foreign), 1):
             known[checked.here.env] = checked

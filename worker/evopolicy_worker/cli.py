@@ -148,9 +148,7 @@ def work(
         if name is not None and not keys.valid_name(name):
             raise ConfigError(f"--name {name!r}: letters, digits, '.', '_' and '-' only, 63 at most")
         wanted = catalogue.resolve(env)
-        lacking = [f"{env_id} needs {what}" for env_id in wanted if (what := environments.missing(env_id))]
-        if lacking:
-            raise ConfigError(f"not installed: {'; '.join(lacking[:8])}")
+        environments.check_played(wanted)
         # Until the worker can drain, SIGTERM raises SystemExit, so that processes and temporary folders are cleaned up.
         signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
         check_scratch()

@@ -7,6 +7,7 @@ compares the table with the commands' own help.
 from __future__ import annotations
 
 import importlib
+import sys
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
@@ -23,6 +24,8 @@ class Place(NamedTuple):
     """`module:name` of a `typer.Typer`, which holds the command or is it."""
     help: str
     """First sentence of its own help."""
+    extra: str | None = None
+    """Extra to name where a module is missing; None for that of the module."""
 
 
 _PLAY = "evopolicy_gateway.cli.play:app"
@@ -80,7 +83,9 @@ GROUPS = {
         "status": Place(
             f"{_COORDINATOR}.status:status_app", "Show workers, runs, and the reasons why runs wait."
         ),
-        "web": Place(f"{_COORDINATOR}.web:app", "Show sweeps, runs and the cluster in a browser, live."),
+        "web": Place(
+            f"{_COORDINATOR}.web:app", "Show sweeps, runs and the cluster in a browser, live.", "coordinator"
+        ),
         "workers": Place(f"{_COORDINATOR}.status:workers_app", "List, drain, pause and resume workers."),
         "runs": Place(f"{_COORDINATOR}.status:runs_app", "List, cancel and repin runs."),
         "envs": Place(
@@ -179,4 +184,5 @@ def evopolicy(_: Version = False) -> None:
 def main() -> None:
     """The console script."""
     processes.become_subreaper()
-    run_app(app)
+    command = PLACES.get(next((word for word in sys.argv[1:] if not word.startswith("-")), ""))
+    run_app(app, command and command.extra)

@@ -14,6 +14,7 @@ from evopolicy_common.commands import App
 from evopolicy_common.console import terminal
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.environment import Split
+from evopolicy_common.processes.preflight import LOCAL, check_installed
 from evopolicy_common.records.run_difference import differences, left_out, shortened
 from evopolicy_common.terminal import say_json, say_lines
 from evopolicy_gateway import shipped
@@ -76,6 +77,8 @@ def run(
                 "--data, --state and --fresh apply only with --local; otherwise set them at the coordinator: evopolicy-coordinator"
                 " --data, --state"
             )
+        if local:
+            check_installed(LOCAL)
         options.check_isolation(hidden_isolation, local=local)
         options.check_packages(policy_package, local=local)
         options.check_browser(browser, local=local)
@@ -127,6 +130,7 @@ def local(
     Starts a coordinator and a worker, plays one run for each environment, and stops everything at the end.
     """
     with fail_on_our_errors():
+        check_installed(LOCAL)
         plans = _plans(given, catalogue.resolve(env), jail.settings())
         where = Cluster(
             local_slots=slots,
@@ -152,6 +156,7 @@ def demo(
     The run directory is runs/evolve/gym_continuouscar/demo; the next demo replaces it.
     """
     with fail_on_our_errors():
+        check_installed(LOCAL)
         given = RunOptions(agent="evolve", budget=32, exp_id="demo", overwrite=True, runs=runs)
         plans = _plans(given, ["gym/continuouscar"], JailOptions().settings())
         where = Cluster(local_slots=slots, state=options.state_of(None, fresh=False))

@@ -23,7 +23,7 @@ from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.episode import Tier
 from evopolicy_common.processes.child_process import ChildProcess, last_words
 from evopolicy_common.processes.notices import notify_if_slow
-from evopolicy_common.processes.preflight import check_scratch, check_writable
+from evopolicy_common.processes.preflight import LOCAL, check_installed, check_scratch, check_writable
 from evopolicy_common.processes.scratch import scratch_folder
 from evopolicy_common.records.blobs import write_atomically
 from evopolicy_common.wire import credentials, transport
@@ -147,6 +147,7 @@ async def local_cluster(
     """
     with contextlib.ExitStack() as folders:
         root = folders.enter_context(scratch_folder(kind)) if state is None else state
+        check_installed(LOCAL)
         if workers is not None:
             installs.divided(workers.env_ids)  # what nothing here can play is told before anything starts
         check_scratch()  # workers keep their sandboxes there

@@ -160,18 +160,26 @@ EXTRAS = {
     "av": "worker",
 }
 """Modules that the base package lacks, with the extra that installs them."""
+LOCAL = "local"
+"""The extra of commands that start a cluster on this machine."""
 
 
 def check_installed(extra: str) -> None:
-    """Raises ConfigError, with the install command, when a module of the package's extra is missing."""
+    """Raises ConfigError, with the install command, when a module of the package's extra is missing.
+
+    `LOCAL`: the coordinator's and the gateway's. The environments may be in another installation.
+    """
+    parts = ("coordinator", "gateway") if extra == LOCAL else (extra,)
     for module, its in EXTRAS.items():
-        if its == extra and importlib.util.find_spec(module) is None:
+        if its in parts and importlib.util.find_spec(module) is None:
             raise ConfigError(missing(extra, module))
 
 
 def missing(extra: str, module: str) -> str:
     """The error text for a missing module of an extra, with the remedy."""
+    if extra == LOCAL:
+        return f"nothing can be played on this machine alone (no module {module!r}): pip install 'evopolicy[{LOCAL}]'"
     return (
         f"the {extra} part of evopolicy is not installed here (no module {module!r}):"
-        f" pip install 'evopolicy[{extra}]'"
+        f" pip install 'evopolicy[{extra}]', or 'evopolicy[{LOCAL}]' for a cluster on this machine"
     )

@@ -18,12 +18,17 @@ import tempfile
 import zipfile
 from collections.abc import Iterator
 from email.parser import HeaderParser
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import PackageNotFoundError, distribution, requires, version
 from pathlib import Path
 from typing import NamedTuple
 
 import pytest
+from commands import toy_cluster
 from packaging.requirements import Requirement
+from stages.cli_stage import FAKES
+from stages.model_api import ModelApi, Step
+
+from evopolicy_common.records.run_record import decode_run_record
 
 ROOT = Path(__file__).parents[3]
 NAMED = re.compile(r"\b(?:(?:examples|deploy|docs)/[\w.@/-]*\w|constraints\.txt|\w[\w-]*\.toml)")
@@ -217,6 +222,101 @@ def test_commands_complete_and_the_agents_of_the_extras_start(place: Place) -> N
     )
     start = ["env", "OPENAI_API_KEY=none", str(place.bin / "python"), "-c", agent]
     assert place.run(start).split() == ["acp", "llm"]
+
+
+class ExtraAlone:
+    """A virtual environment with the wheel, what one extra of it requires, and nothing else."""
+
+    def __init__(self, root: Path, wheel: Path, extra: str) -> None:
+        self.root = root
+        self.bin = root / "venv" / "bin"
+        python = os.path.realpath(sys.executable)
+        subprocess.run([python, "-m", "venv", "--without-pip", str(root / "venv")], check=True)
+        (packages,) = (root / "venv" / "lib").glob("python3*/site-packages")
+        with zipfile.ZipFile(wheel) as archive:
+            archive.extractall(packages)
+        (metadata,) = packages.glob("evopolicy-*.dist-info")
+        own = HeaderParser().parsestr((metadata / "METADATA").read_text()).get_all("Requires-Dist", [])
+        self.installed = {"evopolicy"}
+        for name in _required(own, extra, own):
+            self.installed.add(name)
+            for file in distribution(name).files or ():
+                source, target = Path(str(file.locate())), packages / file
+                if ".." not in file.parts and source.suffix not in (".pyc", ".pth"):
+                    target.parent.mkdir(parents=True, exist_ok=True)
+                    shutil.copyfile(source, target)
+
+    def run(self, *words: str, code: int = 0, **environment: str) -> str:
+        """Its stdout and stderr."""
+        main = "import sys; from evopolicy_gateway.cli.main import main; sys.argv[0] = 'evopolicy'; main()"
+        done = subprocess.run(
+            [str(self.bin / "python"), "-P", "-c", main, *words],
+            cwd=self.root,
+            env={"PATH": f"{self.bin}:/usr/bin:/bin", "HOME": str(self.root), "LANG": "C.UTF-8"}
+            | environment,
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=600,
+        )
+        text = done.stdout + done.stderr
+        assert done.returncode == code, f"{words}\n{text[-4000:]}"
+        return text
+
+
+def _required(texts: list[str], extra: str, own: list[str]) -> set[str]:
+    """Names of the distributions that the requirements of an extra come to, through all of theirs."""
+    found: set[str] = set()
+    asked = [(requirement, extra) for requirement in map(Requirement, texts)]
+    seen: set[tuple[str, str]] = set()
+    while asked:
+        one, given = asked.pop()
+        if one.marker is not None and not one.marker.evaluate({"extra": given}):
+            continue
+        for its in one.extras or {""}:
+            if (one.name, its) in seen:
+                continue
+            seen.add((one.name, its))
+            if one.name != "evopolicy":
+                found.add(one.name)
+            further = own if one.name == "evopolicy" else requires(one.name) or []
+            asked += [(requirement, its) for requirement in map(Requirement, further)]
+    return found
+
+
+KEY = "sk-stub-0123456789abcdef"
+SUBMIT = (
+    "echo '# better' >> system/policy.py; curl -s --noproxy '*' -X POST"
+    " -d '{\"env_instances\": [0, 1]}' $EVOPOLICYGYM_SUBMIT_URL"
+)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+@pytest.mark.parametrize("extra", ["llm", "acp"])
+def test_an_agent_plays_where_its_extra_alone_is_installed(built: Built, tmp_path: Path, extra: str) -> None:
+    """On a cluster elsewhere; what needs another extra names it."""
+    place = ExtraAlone(tmp_path, built.wheel, extra)
+    assert {"starlette", "numpy"} < place.installed
+    assert not place.installed & {"cryptography", "gymnasium", "matplotlib"}
+    size = ("--env", "toy/line", "--budget", "2", "--validation", "1", "--heldout", "1", "--exp-id", "t")
+    (tmp_path / "c").mkdir()
+    with toy_cluster(tmp_path / "c") as operator, ModelApi([Step(command=SUBMIT)]) as api:
+        api_table = f'protocol = "openai"\nbase_url = "{api.base_url}/v1"\nkey = "API_KEY"\n'
+        (tmp_path / "llm.toml").write_text(f'harness = "llm"\nmodel = "m"\n[api]\n{api_table}')
+        agents = {"llm": "file:llm.toml", "acp": f"acp:{FAKES}/acp-agent"}
+        given = {"API_KEY": KEY, "FAKE_SCENARIO": "work", "FAKE_STATE": "fake"}
+        shown = ("--jail-env", "FAKE_SCENARIO", "--jail-env", "FAKE_STATE") if extra == "acp" else ()
+        played = ("run", *size, "--credentials", str(operator))
+        place.run(*played, "--agent", agents.pop(extra), *shown, **given)
+        ((other, agent),) = agents.items()
+        told = place.run(*played, "--agent", agent, "--overwrite", code=2, **given)
+        assert f"pip install 'evopolicy[{other}]'" in told
+    (run,) = (tmp_path / "runs").glob("*/toy_line/t")
+    record = decode_run_record((run / "run.json").read_bytes())
+    assert (record.outcome.status, record.outcome.budget_used) == ("completed", 2)
+    assert "pip install 'evopolicy[local]'" in place.run("demo", code=2)
+    assert "pip install 'evopolicy[coordinator]'" in place.run("report", str(run), "--out", "x", code=2)
 
 
 @pytest.mark.slow

@@ -5,6 +5,7 @@ from __future__ import annotations
 from evopolicy_worker.environments.actions import ActionCodec, compile_actions
 from evopolicy_worker.environments.base import Environment, Frame, Observation, Step
 from evopolicy_worker.environments.registry import (
+    check_played,
     define,
     definition,
     describe,
@@ -21,6 +22,7 @@ __all__ = [
     "Frame",
     "Observation",
     "Step",
+    "check_played",
     "compile_actions",
     "define",
     "definition",

@@ -144,8 +144,23 @@ def missing(env_id: str) -> str:
     return f"{family.needs()}; or {advice} in an environment of its own" if advice else family.needs()
 
 
+def check_played(env_ids: Iterable[str]) -> None:
+    """Raises ConfigError that names environments which cannot be played here, eight at most, each with the remedy."""
+    lacking = {env_id: what for env_id in env_ids if (what := missing(env_id))}
+    known = [f"{env_id} needs {what}" for env_id, what in lacking.items() if _known(env_id)]
+    texts = [what for env_id, what in lacking.items() if not _known(env_id)]
+    if known:
+        texts.append(f"not installed: {'; '.join(known[:8])}")
+    if texts:
+        raise ConfigError("; ".join(texts[:8]))
+
+
+def _known(env_id: str) -> Entry | None:
+    return _defined.get(env_id) or catalogue.known(env_id)
+
+
 def _entry(env_id: str) -> Entry:
-    found = _defined.get(env_id) or catalogue.known(env_id)
+    found = _known(env_id)
     if found is None:
         raise ConfigError(
             f"environment {env_id!r} is not installed{catalogue.near(env_id)}; name its file, or install the package that ships it"

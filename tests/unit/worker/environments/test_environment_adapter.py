@@ -151,6 +151,12 @@ def test_every_environment_that_ships_has_an_adapter_and_is_offered_where_its_pa
     assert set(core16) <= set(registry.offered()) <= set(catalogue.entries())
     assert not any(registry.missing(env_id) for env_id in core16)
     assert "environment 'gym/none' is not installed" in registry.missing("gym/none")
+    with pytest.raises(ConfigError) as told:
+        registry.check_played(["toy/line", "vizdoom/VizdoomBasic-v1"])
+    assert str(told.value).startswith(
+        "environment 'vizdoom/VizdoomBasic-v1' is not installed; near: gymnasium/Viz"
+    )
+    assert str(told.value).count("vizdoom/VizdoomBasic-v1") == 1
 
 
 def test_an_environment_that_does_not_repeat_itself_is_marked(monkeypatch: pytest.MonkeyPatch) -> None:
