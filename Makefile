@@ -68,6 +68,8 @@ test-families: PROCESSES = $$(nproc)
 test test-system test-families: export PYTHONDONTWRITEBYTECODE :=
 test test-system test-families: install
 	@bash deploy/setup-host.sh --tests
+# In a fresh checkout one process compiles the tests, not each of them at the same time.
+	@test -e tests/unit/__pycache__ || $(BIN)/python -m pytest -q --collect-only -m "$(LAYERS)" >/dev/null 2>&1 || true
 	@short="$$(mktemp -d /tmp/evp-XXXXXX)"; $(BIN)/python -m pytest -n $(PROCESSES) --dist loadfile --no-loadscope-reorder --basetemp="$$short/t" \
 	$(if $(findstring tests/,$(ARGS)),,-m "$(LAYERS)") $(ARGS); status=$$?; \
 	if [ $$status = 0 ]; then rm -rf "$$short"; else echo "the failed tests' files are in $$short"; fi; exit $$status
