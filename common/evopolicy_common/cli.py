@@ -77,7 +77,7 @@ def setup_logging(level: str = "info") -> None:
     """Configures structured logs on stderr: readable on a terminal, JSON lines otherwise."""
     import logging
 
-    import structlog
+    from evopolicy_common.logs import structlog
 
     terminal = sys.stderr.isatty()
     structlog.configure(
@@ -99,7 +99,7 @@ def setup_notices() -> None:
     """For interactive commands and scripts: prints warnings as plain lines on stderr; stdout holds results only."""
     import logging
 
-    import structlog
+    from evopolicy_common.logs import structlog
 
     def plain(_: Any, __: str, event: Any) -> str:
         text, error = str(event.pop("event")), event.pop("exc_info", None)

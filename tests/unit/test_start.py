@@ -68,6 +68,18 @@ def test_the_version_and_a_completed_name_import_nothing_large_either() -> None:
     assert not imported(FRONT, **asked) & LARGE - ASYNCIO
 
 
+def test_processes_log_without_importing_rich() -> None:
+    names = (
+        "evopolicy_coordinator.server.service",
+        "evopolicy_gateway.cli.serve",
+        "evopolicy_worker.supervisor",
+    )
+    more = "evopolicy_gateway.agent_supervisor.supervisor"
+    found = imported(f"{LISTED}import {', '.join((*names, more))}; print('imported')")
+    assert {"structlog", *names, more} <= found
+    assert "rich" not in found
+
+
 def test_commands_are_found_by_the_table_alone() -> None:
     """An entry point of the group that there once was would be a command that nobody finds."""
     project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"]

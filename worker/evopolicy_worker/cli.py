@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Annotated, cast
 
 import msgspec
-import structlog
 import typer
 
 from evopolicy_common import catalogue
@@ -23,6 +22,7 @@ from evopolicy_common.cli import fail, fail_on_our_errors, setup_logging
 from evopolicy_common.commands import App, Version, run_app
 from evopolicy_common.console import filled_table, terminal
 from evopolicy_common.errors import ConfigError, MachineError, SandboxError
+from evopolicy_common.logs import structlog
 from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_common.messages.episode import Tier
 from evopolicy_common.processes import host

@@ -21,10 +21,10 @@ from pathlib import Path
 from typing import Protocol
 
 import msgspec
-import structlog
 
 from evopolicy_common import catalogue
 from evopolicy_common.errors import DECODE_ERRORS, SlotDiedError, StorageError, WorkerError
+from evopolicy_common.logs import structlog
 from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_common.records.blobs import write_atomically
 from evopolicy_worker.environments import registry

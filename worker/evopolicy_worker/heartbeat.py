@@ -8,9 +8,8 @@ import threading
 import time
 from collections.abc import Callable
 
-import structlog
-
 from evopolicy_common.errors import ProtocolError, TransportError
+from evopolicy_common.logs import structlog
 from evopolicy_common.messages.worker import Heartbeat, HeartbeatReply, HeldLease, Refused
 from evopolicy_common.wire import codec, keys
 from evopolicy_common.wire.transport import Link

@@ -19,9 +19,9 @@ from collections import deque
 from collections.abc import Awaitable, Callable
 
 import msgspec
-import structlog
 
 from evopolicy_common.errors import ProtocolError, RefusedError
+from evopolicy_common.logs import structlog
 from evopolicy_common.messages.episode import BlobRef
 from evopolicy_common.messages.worker import JobResult, ReportResults, ResultsReported, WorkerReply
 from evopolicy_common.records.blobs import digest_of

@@ -23,7 +23,6 @@ from pathlib import Path
 from typing import Protocol
 
 import msgspec
-import structlog
 
 from evopolicy_common.catalogue import installs
 from evopolicy_common.errors import (
@@ -33,6 +32,7 @@ from evopolicy_common.errors import (
     RefusedError,
     TransportError,
 )
+from evopolicy_common.logs import structlog
 from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome, Job, Tier
 from evopolicy_common.messages.worker import (

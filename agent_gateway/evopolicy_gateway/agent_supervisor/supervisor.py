@@ -15,10 +15,10 @@ from collections.abc import Collection, Mapping
 from pathlib import Path
 
 import msgspec
-import structlog
 
 from evopolicy_common.cli import setup_logging
 from evopolicy_common.errors import ConfigError, EvopolicyError
+from evopolicy_common.logs import structlog
 from evopolicy_gateway.agent_supervisor.agent_log import AgentLog
 from evopolicy_gateway.agent_supervisor.agent_process import environment_of
 from evopolicy_gateway.agent_supervisor.clock import Activity, AgentClock

@@ -12,12 +12,12 @@ from pathlib import Path
 from typing import Annotated
 
 import orjson
-import structlog
 import typer
 
 from evopolicy_common.cli import FAILURE, code_of, fail_on_our_errors, setup_logging
 from evopolicy_common.commands import App, Version, run_app
 from evopolicy_common.errors import ConfigError
+from evopolicy_common.logs import structlog
 from evopolicy_common.processes.preflight import foreseen
 from evopolicy_gateway.http.listener import AgentPlace, place_of
 from evopolicy_gateway.operator import child_messages

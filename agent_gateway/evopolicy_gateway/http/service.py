@@ -15,7 +15,6 @@ import hmac
 from typing import Any
 
 import orjson
-import structlog
 from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect, Request
@@ -24,6 +23,7 @@ from starlette.routing import Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from evopolicy_common.errors import RequestError
+from evopolicy_common.logs import structlog
 from evopolicy_common.messages.gateway import CANCELLED
 from evopolicy_gateway.http.info import info_document, progress_document
 from evopolicy_gateway.http.submit_request import MAX_BODY_BYTES, refuse_size

@@ -11,8 +11,7 @@ import contextlib
 import socket
 from collections.abc import Mapping
 
-import structlog
-
+from evopolicy_common.logs import structlog
 from evopolicy_gateway.jail.settings import Host
 
 PROXY_PORT = 3128

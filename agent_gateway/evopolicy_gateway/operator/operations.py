@@ -8,9 +8,8 @@ from collections.abc import AsyncGenerator, AsyncIterator, Callable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
-import structlog
-
 from evopolicy_common.errors import ConfigError, EvopolicyError, RefusedError
+from evopolicy_common.logs import structlog
 from evopolicy_common.messages.episode import EpisodeOutcome
 from evopolicy_common.messages.operator import (
     Claim,

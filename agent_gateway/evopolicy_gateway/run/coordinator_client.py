@@ -12,9 +12,8 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, TypeVar
 
-import structlog
-
 from evopolicy_common.errors import ConfigError, RefusedError, TransportError
+from evopolicy_common.logs import structlog
 from evopolicy_common.messages.episode import BlobRef
 from evopolicy_common.messages.gateway import (
     CloseRun,

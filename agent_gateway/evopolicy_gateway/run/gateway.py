@@ -21,9 +21,9 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
-import structlog
 
 from evopolicy_common.errors import ConfigError, RefusedError
+from evopolicy_common.logs import structlog
 from evopolicy_common.records.blobs import BlobStore
 from evopolicy_common.wire import credentials, transport
 from evopolicy_common.wire.refusals import RUN_OVER

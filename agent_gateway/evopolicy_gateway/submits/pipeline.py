@@ -18,9 +18,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 import msgspec
-import structlog
 
 from evopolicy_common.errors import ProtocolError, RefusedError, RequestError, StorageError
+from evopolicy_common.logs import structlog
 from evopolicy_common.messages.gateway import (
     CANCELLED,
     EpisodeFeedback,

@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 from collections.abc import Iterator
 
-import structlog
+from evopolicy_common.logs import structlog
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
 

@@ -14,9 +14,9 @@ from functools import partial
 from typing import Generic, TypeVar
 
 import msgspec
-import structlog
 
 from evopolicy_common.errors import ProtocolError, RefusedError, TransportError
+from evopolicy_common.logs import structlog
 from evopolicy_common.messages.episode import BlobRef
 from evopolicy_common.messages.operator import OperatorReply
 from evopolicy_common.messages.worker import BlobAck, BlobChunk, BlobGet, BlobPut, Message, Refused

@@ -25,10 +25,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import structlog
 import zenoh
 
 from evopolicy_common.errors import TransportError
+from evopolicy_common.logs import structlog
 from evopolicy_common.processes.notices import notify_if_slow
 from evopolicy_common.wire import keys
 from evopolicy_common.wire.credentials import Credentials, MachineRole, Role, TlsFiles, check_endpoints

@@ -27,9 +27,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import msgspec
-import structlog
 
 from evopolicy_common.errors import DECODE_ERRORS, ConfigError
+from evopolicy_common.logs import structlog
 from evopolicy_common.records.blobs import write_atomically
 from evopolicy_common.wire import credentials, keys
 from evopolicy_common.wire.credentials import Credentials, MachineRole, Role, TlsFiles

@@ -11,10 +11,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 import msgspec
-import structlog
 
 from evopolicy_common import catalogue
 from evopolicy_common.errors import ConfigError
+from evopolicy_common.logs import structlog
 from evopolicy_common.processes import host
 from evopolicy_common.processes.local_cluster import WORKERS_ENDED
 from evopolicy_common.records.blobs import BlobStore

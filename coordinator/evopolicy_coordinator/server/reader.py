@@ -16,9 +16,8 @@ from functools import partial
 from pathlib import Path
 from zlib import crc32
 
-import structlog
-
 from evopolicy_common.errors import DamagedStoreError, ProtocolError, RefusedError, StorageError
+from evopolicy_common.logs import structlog
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome
 from evopolicy_common.messages.gateway import EpisodeFeedback, ResultsPage
 from evopolicy_common.messages.operator import (

@@ -15,9 +15,8 @@ import asyncio
 import contextlib
 from collections.abc import AsyncIterator, Callable
 
-import structlog
-
 from evopolicy_common.errors import ConfigError, TransportError
+from evopolicy_common.logs import structlog
 from evopolicy_common.wire import keys, transport
 from evopolicy_common.wire.transport import IncomingQuery, Server
 from evopolicy_coordinator.pki.machines import Machines

@@ -27,7 +27,6 @@ from importlib import metadata
 from typing import TYPE_CHECKING
 
 import msgspec
-import structlog
 from msgspec.structs import replace
 
 from evopolicy_common.errors import (
@@ -37,6 +36,7 @@ from evopolicy_common.errors import (
     RefusedError,
     StorageError,
 )
+from evopolicy_common.logs import structlog
 from evopolicy_common.messages import operator
 from evopolicy_common.messages.worker import BlobGet, BlobPut, Fingerprint, LeaseRequest, Message, Refused
 from evopolicy_common.records.policies import bundles

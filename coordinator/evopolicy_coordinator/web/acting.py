@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
-import structlog
 
 from evopolicy_common.errors import ConfigError, EvopolicyError
+from evopolicy_common.logs import structlog
 from evopolicy_common.records.suite_folder import PAUSED
 from evopolicy_common.records.summary import utc_text
 from evopolicy_common.wire.operator_client import OperatorClient

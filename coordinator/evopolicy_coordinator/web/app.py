@@ -16,7 +16,6 @@ from typing import Any
 from urllib.parse import parse_qsl, urlencode
 
 import msgspec
-import structlog
 import uvicorn
 from prometheus_client import CollectorRegistry, Gauge, ProcessCollector, generate_latest
 from starlette.applications import Starlette
@@ -27,6 +26,7 @@ from starlette.routing import Route
 from starlette.types import ASGIApp
 
 from evopolicy_common.errors import ConfigError, EvopolicyError
+from evopolicy_common.logs import structlog
 from evopolicy_common.messages.operator import StatusReply
 from evopolicy_common.wire.credentials import Credentials
 from evopolicy_coordinator.server.monitoring.metrics import CONTENT_TYPE, StatusCollector

@@ -14,9 +14,9 @@ from collections import OrderedDict, deque
 from collections.abc import Callable
 
 import msgspec
-import structlog
 
 from evopolicy_common.errors import EvopolicyError
+from evopolicy_common.logs import structlog
 from evopolicy_common.messages.operator import RetriedJobs, StatusReply
 from evopolicy_common.wire import transport
 from evopolicy_common.wire.credentials import Credentials

@@ -19,7 +19,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import msgspec
-import structlog
 
 from evopolicy_common.catalogue import Entry
 from evopolicy_common.errors import (
@@ -30,6 +29,7 @@ from evopolicy_common.errors import (
     SlotDiedError,
     WorkerError,
 )
+from evopolicy_common.logs import structlog
 from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_common.messages.episode import EpisodeOutcome, Job, PolicyFailure, Tier
 from evopolicy_common.processes import proc

@@ -19,9 +19,8 @@ import uuid
 from collections.abc import Mapping
 from typing import Any, Literal
 
-import structlog
-
 from evopolicy_common.errors import ConfigError
+from evopolicy_common.logs import structlog
 from evopolicy_gateway.harnesses.base import AgentError, Harness, Stage
 from evopolicy_gateway.harnesses.coding_agents import session
 from evopolicy_gateway.harnesses.coding_agents.dialect import Dialect, TurnReader, first_line

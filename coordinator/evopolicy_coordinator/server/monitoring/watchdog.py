@@ -12,7 +12,7 @@ import threading
 import time
 import traceback
 
-import structlog
+from evopolicy_common.logs import structlog
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
 

@@ -115,7 +115,7 @@ def usable(acceleration: Acceleration) -> bool:
 
 def _warn(why: str, **about: Any) -> None:
     # Imported late: every slot's process imports this module, and structlog would be a fifth of its imports.
-    import structlog
+    from evopolicy_common.logs import structlog
 
     structlog.get_logger(__name__).warning(f"acceleration is off: {why}", **about)
 

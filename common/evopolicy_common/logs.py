@@ -1,0 +1,19 @@
+"""structlog as all modules import it: without rich, on which every process of ours would spend a fifth of its start.
+
+structlog takes rich, where it is installed, to draw tracebacks; ours are text before its renderers see them.
+"""
+
+from __future__ import annotations
+
+import sys
+
+if "rich" in sys.modules:
+    import structlog
+else:
+    sys.modules["rich"] = None  # type: ignore[assignment]  # an import of it fails
+    try:
+        import structlog
+    finally:
+        del sys.modules["rich"]
+
+__all__ = ["structlog"]
