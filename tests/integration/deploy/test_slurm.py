@@ -21,13 +21,14 @@ from waiting import wait_until
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
 
 SCRIPT = Path(__file__).parents[3] / "deploy" / "slurm" / "worker.sbatch"
+PAGE = Path(__file__).parents[3] / "docs" / "how-to" / "slurm.md"
 PROGRAMS = ("slurmctld", "slurmd", "munged", "mungekey", "sbatch")
 
 
 class Slurm:
-    """One node with two CPUs; jobs of the partition `high` pre-empt and requeue those of `low`."""
+    """One node, with two CPUs as a rule; jobs of the partition `high` pre-empt and requeue those of `low`."""
 
-    def __init__(self, root: Path) -> None:
+    def __init__(self, root: Path, cpus: int = 2) -> None:
         self.root = root
         self.processes: list[subprocess.Popen[bytes]] = []
         self.environment = {**os.environ, "SLURM_CONF": str(root / "slurm.conf")}
@@ -61,7 +62,7 @@ SlurmdParameters=config_overrides
 PreemptType=preempt/partition_prio
 PreemptMode=REQUEUE
 KillWait=20
-NodeName={name} NodeAddr=127.0.0.1 CPUs=2 RealMemory=1000 State=UNKNOWN
+NodeName={name} NodeAddr=127.0.0.1 CPUs={cpus} RealMemory={cpus * 2048} State=UNKNOWN
 PartitionName=low Nodes={name} Default=YES PriorityTier=1 MaxTime=INFINITE State=UP
 PartitionName=high Nodes={name} PriorityTier=10 PreemptMode=OFF MaxTime=INFINITE State=UP
 """)
@@ -118,13 +119,13 @@ PartitionName=high Nodes={name} PriorityTier=10 PreemptMode=OFF MaxTime=INFINITE
 
 
 @pytest.fixture
-def slurm(tmp_path: Path) -> Iterator[Slurm]:
+def slurm(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Slurm]:
     missing = [name for name in PROGRAMS if shutil.which(name) is None]
     if missing:
         pytest.skip(f"{', '.join(missing)} not found: apt-get install slurmctld slurmd slurm-client munge")
     if os.geteuid() != 0:
         pytest.skip("slurmd starts jobs of other users: run this as root")
-    slurm = Slurm(tmp_path)
+    slurm = Slurm(tmp_path, getattr(request, "param", 2))
     try:
         yield slurm
     finally:
@@ -173,6 +174,55 @@ def test_workers_of_an_array_are_preempted_and_the_run_comes_to_the_same(
         wait_until(lambda: not slurm.running(workers))
         coordinator.stop()
     assert_same(tmp_path, "restless", "calm")
+
+
+@pytest.mark.parametrize("slurm", [8], indirect=True)
+def test_the_page_runs_as_written(slurm: Slurm, tmp_path: Path) -> None:
+    """Its two blocks of commands; FIRST is this machine, and the port is a free one."""
+    serving, using = [
+        [line.partition(" #")[0].strip() for line in block.splitlines()]
+        for block in re.findall(r"^```\n(.*?)^```$", PAGE.read_text(), re.DOTALL | re.MULTILINE)
+    ]
+    home, port = tmp_path / "home", str(free_port())
+    home.mkdir(mode=0o700)
+    (home / "deploy").symlink_to(SCRIPT.parents[1])
+    shown = {"HOME": str(home), "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
+    shown |= {"EVOPOLICY_WORKER_OPTIONS": "--env toy", "XDG_STATE_HOME": str(home / "state")}
+
+    def words(line: str) -> list[str]:
+        return ["bash", "-c", f"cd {home} && {line.replace('7447', port).replace('FIRST', '127.0.0.1')}"]
+
+    def says(line: str) -> str:
+        done = subprocess.run(
+            words(line),
+            env=slurm.environment | shown,
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=300,
+        )
+        assert done.returncode == 0, (line, done.stdout, done.stderr, slurm.diagnostics())
+        return done.stdout
+
+    init, serve, issue = serving
+    doctor, submit, status = using
+    says(init)
+    with (tmp_path / "coordinator.out").open("wb") as out:
+        line = words(f"exec {serve}")
+        coordinator = subprocess.Popen(line, env=slurm.environment | shown, stdout=out, stderr=out)
+    try:
+        wait_until((home / "state/evopolicy/coordinator/credentials/operator.json").exists, slurm.diagnostics)
+        says(issue)
+        assert "tier" in says(doctor)
+        assert "Submitted batch job" in says(submit)
+        # Two of the array's tasks fit on this node.
+        wait_until(lambda: says(f"{status} --json").count('"evopolicy-worker-') >= 2, slurm.diagnostics)
+        assert "evopolicy-worker-" in says(status)
+    finally:
+        slurm.says("scancel", "--user=root")
+        wait_until(lambda: not slurm.says("squeue", "--noheader"))
+        coordinator.terminate()
+        coordinator.wait(timeout=60)
 
 
 def pair(tasks: list[str]) -> list[str]:
