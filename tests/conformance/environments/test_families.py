@@ -132,6 +132,18 @@ def test_documentation_is_told_in_words() -> None:
         assert gone not in text
 
 
+@pytest.mark.parametrize(("env_id", "last"), [("gymnasium/Humanoid-v5", 44), ("gymnasium/FetchSlide-v4", 24)])
+def test_a_long_table_of_an_observation_is_shown_whole(env_id: str, last: int, warm: Warm) -> None:
+    observation = warm(env_id).description.task_text.partition("## Action")[0]
+    first = re.search(r"(?:^\| *\d+ *\|.*\n)+", observation, re.MULTILINE)
+    assert first is not None
+    assert re.findall(r"^\| *(\d+)", first[0], re.MULTILINE) == [str(k) for k in range(last + 1)]
+
+
+def test_no_text_announces_a_program_that_is_left_out() -> None:
+    assert template.in_words("It lands.\n\nTo see it, run:\n```\npython it.py\n```\n") == "It lands."
+
+
 def test_one_environment_under_two_ids_has_the_text_that_is_written_for_it(warm: Warm) -> None:
     assert warm("gymnasium/Acrobot-v1").description.task_text == warm("gym/acrobot").description.task_text
 

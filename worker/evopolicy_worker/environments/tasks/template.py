@@ -19,8 +19,10 @@ if TYPE_CHECKING:
 
 MAX_DOCUMENTATION = 12_000
 """Maximum characters of an environment's documentation that are shown."""
-MAX_SECTION = 6_000
+MAX_SECTION = 12_500
 """The same for one of its sections, for shipped environments."""
+_WIDE = 6_000
+"""In a longer section, tables lose the spaces that align their columns."""
 _MAX_ROWS = 64
 _HEADING = re.compile(r"^\s*(#+)\s+(.+?)\s*$")
 _PLACES = {
@@ -40,13 +42,14 @@ _SIGNS = re.compile(
             r"\b(cos|sin|tan|atan|exp|sqrt|log|norm)\b ?[(\w]|\\\w",
             r"\d\.\d+ ?[·*×]|\d\.\d+ (?![msN]\b)[a-zA-Zθωφ][ᵢⱼ\d]?\b|\w \* \w|\w = -?[\d.(\w]",
             r"\bkg\b|N m s|\bg = |inertia \d|damping \d|gravity \d|m/s²|weight.{0,40}\d",
-            r"Runge|Euler(?! angles)|\d\.\d+ s\)|\d+ × \d\.\d+ s|\d/\d+ s|frame_skip|\bdt\b|time ?step of|Hz",
+            r"Runge|Euler(?! angles| frame)|\d\.\d+ s\)|\d+ × \d\.\d+ s|\d/\d+ s|frame_skip|\bdt\b|time ?step of|Hz",
             r"standard deviation|[Nn]ormal(ly)? with|uniform (in|over)",
+            r"^To (see|play|run)\b.*:$",
             r"gymnasium\.make|kwarg|arXiv|arxiv|http|[Ss]eed|reward threshold|initialized as|must be specified|argument|`options`|_reward=|naming convention|[Ii]f `",
         )
     )
 )
-"""Matches sentences with equations of motion, reward formulas or constants, or about options."""
+"""Matches sentences with equations of motion, reward formulas or constants, about options, or before a program to run."""
 _IN_CODE = re.compile(r"[\w)\]] [+*/×÷−<>-] [\w(]|\w[*/+]\w|\|.+ − .+\||=")
 _INCLUDE = re.compile(r"^<!-- include: ([\w.-]+) -->$", re.MULTILINE)
 _UNSEEN = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff]")
@@ -189,6 +192,8 @@ def in_words(documentation: str) -> str:
     text = re.sub(r",? by default,?", "", text)
     blocks = [_block_in_words(block) for block in re.split(r"\n\s*\n", text)]
     found = "\n\n".join(block for block in blocks if block)
+    if len(found) > _WIDE:
+        found = re.sub(r"-{4,}", "---", re.sub(r" {2,}", " ", found))
     if len(found) > MAX_SECTION:
         found = found[:MAX_SECTION].rpartition("\n")[0]
     return found
