@@ -34,7 +34,9 @@ class Policy:
                     found.append((address, 0 if wanted else zlib.crc32(content)))
         # In the few bytes that are kept of what it says: one of each digest, and the pages packed.
         digests = bytes(crc & 0xFF for _, crc in found)
-        shown = {k: packed(page(found[k][0])) for k in wanted}
+        # All before the first is packed: how long a packed page is depends on the times in it, and so does what is where.
+        pages = [(k, page(found[k][0])) for k in wanted]
+        shown = {k: packed(content) for k, content in pages}
         print(json.dumps([packed(digests), shown]))
 
     def reset(self, episode_index):

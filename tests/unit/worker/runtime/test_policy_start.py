@@ -24,7 +24,9 @@ SEES = """
             first = next(iter(sys.path))
             print(json.dumps([streams, first == os.getcwd(), os.environ["HOME"], os.environ["TMPDIR"],
                 "LD_BIND_NOW" in os.environ, "PWD" in os.environ, random.random(), np.random.rand(),
-                sorted(name for name in sys.modules if name.startswith("policy"))]))
+                sorted(name for name in sys.modules if name.startswith("policy")),
+                [sum(each.__name__ == "Policy" for each in object.__subclasses__()),
+                    sorted(os.listdir(os.environ["HOME"])), os.listdir("."), os.listdir(os.environ["TMPDIR"])]]))
 
         def reset(self, episode_index):
             pass
@@ -74,9 +76,13 @@ def test_a_policys_generators_begin_as_numpy_seeds_them(player: ModuleType, seed
 def test_a_policy_finds_its_own_process_as_if_it_had_been_made_for_it(slots: Slots, tier: str) -> None:
     outcome = slots.play(SEES, tier=tier)
     assert outcome.failure is None
-    streams, is_first, home, temporary, binds, has_pwd, drawn, numpys, modules = json.loads(outcome.stdout)
+    streams, is_first, home, temporary, binds, has_pwd, drawn, numpys, modules, left = json.loads(
+        outcome.stdout
+    )
     assert streams == [[False, True, "utf-8"]] * 2
     assert (is_first, temporary, binds, has_pwd) == (True, f"{home}/tmp", False, False)
     assert modules == ["policy"]
+    # Nothing of the policy that the zygote imported.
+    assert left == [1, ["system", "tmp"], ["policy.py"], []]
     again = json.loads(slots.play(SEES, tier=tier).stdout)
     assert (drawn, numpys) == (again[6], again[7])

@@ -25,8 +25,8 @@ import socket
 import struct
 import sys
 import traceback
-from collections.abc import Iterable
-from typing import Any
+from collections.abc import Callable, Iterable
+from typing import Any, NoReturn
 
 CLONE_NEWNS, CLONE_NEWIPC, CLONE_NEWUSER, CLONE_NEWPID = 0x00020000, 0x08000000, 0x10000000, 0x20000000
 MS_RDONLY, MS_NOSUID, MS_NODEV, MS_REMOUNT, MS_NOATIME, MS_BIND, MS_REC = 1, 2, 4, 32, 1024, 4096, 16384
@@ -41,7 +41,19 @@ NOBODY = 65534
 PID_MARK = 0x7FFFABCD
 MAX_TEXT = 16_000
 
+RIGHTS = struct.Struct(f"@Nii{N_PIPES + 1}i")
+"""`struct cmsghdr` with descriptors."""
+
 libc = ctypes.CDLL(None, use_errno=True)
+for _name in ("capset", "mount", "prctl", "sendmsg", "syscall", "unshare"):
+    getattr(libc, _name)  # looked up here, once for all policies
+ENVELOPE = ctypes.create_string_buffer(-(-RIGHTS.size // 8) * 8)
+_WORD = ctypes.create_string_buffer(b" ", 1)
+_PIECES = (ctypes.c_size_t * 2)(ctypes.addressof(_WORD), len(_WORD))
+LETTER = (ctypes.c_size_t * 7)(
+    0, 0, ctypes.addressof(_PIECES), 1, ctypes.addressof(ENVELOPE), len(ENVELOPE), 0
+)
+"""`struct msghdr` of one byte with the envelope. A `socket` asks the kernel for its kind first, which touches many objects."""
 player: Any = None
 """The module `player`: imports numpy, so not before the path to it is known."""
 scan_json = vars(json.JSONDecoder())["scan_once"]
@@ -82,13 +94,8 @@ def main() -> None:
     except BaseException as error:
         control.send(json.dumps({"error": f"{type(error).__name__}: {error}"}).encode())
         raise
-    worker = zygote(control, config["namespaces"])
-    # Only its forks reach this line. They must never continue as the zygote.
-    del control
-    try:
-        policy_process(config, worker, streams)
-    finally:
-        os._exit(70)
+    # Without the object, for which Python warns in each policy's process that nobody has closed it.
+    zygote(control.detach(), config["namespaces"], lambda worker: policy_process(config, worker, streams))
 
 
 def enter_user_namespace(control: socket.socket) -> None:
@@ -159,8 +166,9 @@ def warm(modules: list[str]) -> None:
     player.rehearse()
 
 
-def zygote(control: socket.socket, namespaces: bool) -> int:
-    """Serves the worker until it is told to end; returns in a fork for each policy, with a socket to the worker.
+def zygote(control: int, namespaces: bool, then: Callable[[int], None]) -> NoReturn:
+    """Serves the worker, on the socket `control`, until it is told to end. In a fork for each policy it calls `then` with
+    a socket to the worker.
 
     A policy can read all memory that it was forked with. So this process must learn nothing of the policies before, nor
     count them. It runs no Python between two forks, whose interpreter counts what it does: the same calls in a circle,
@@ -193,7 +201,7 @@ def zygote(control: socket.socket, namespaces: bool) -> int:
     ends = around(
         (
             # It begins again after a request for a process too. Then these descriptors are closed, and nothing happens.
-            step("recvmsg", ctypes.c_ssize_t, control.fileno(), message, 0),
+            step("recvmsg", ctypes.c_ssize_t, control, message, 0),
             step("syscall", None, WAITID, P_PIDFD, first, how, WEXITED, usage),
             step("send", None, second, how, ctypes.c_size_t(REPORT_BYTES), 0),
             step("close", None, first),
@@ -216,11 +224,17 @@ def zygote(control: socket.socket, namespaces: bool) -> int:
         # A number in place of the child's, which counts the policies.
         step("labs", ctypes.c_long, ctypes.c_long(1 << 40)),
     )
-    control.send(b'{"ready": true}')
-    collections.deque(iter(around(circle), 0), maxlen=0)
+    os.write(control, b'{"ready": true}')
+    rounds = around(circle)
+    collections.deque(iter(rounds, 0), maxlen=0)
     if asked.raw[:1] == b"q":
         os._exit(0)
-    return first
+    # Only its forks reach this line. They must never continue as the zygote. They do not return from here, because
+    # releasing the objects of this function would copy their memory in each of them.
+    try:
+        then(first)
+    finally:
+        os._exit(70)
 
 
 def unshared_page() -> int:
@@ -281,9 +295,9 @@ def hand_out_pipes(worker: int, home: str | None) -> None:
     """
     pipes = [os.pipe() if home is None else private_pipe(f"{home}/pipe") for _ in range(N_PIPES)]
     (requests, to_requests), (from_replies, replies), (from_stdout, stdout), (from_stderr, stderr) = pipes
-    with socket.socket(fileno=worker) as sock:
-        others = [os.pidfd_open(os.getpid()), to_requests, from_replies, from_stdout, from_stderr]
-        socket.send_fds(sock, [b" "], others)
+    others = os.pidfd_open(os.getpid()), to_requests, from_replies, from_stdout, from_stderr
+    RIGHTS.pack_into(ENVELOPE, 0, RIGHTS.size, socket.SOL_SOCKET, socket.SCM_RIGHTS, *others)
+    check(libc.sendmsg(worker, LETTER, 0), "sendmsg")
     high = [os.dup2(fd, 100 + k) for k, fd in enumerate((requests, replies, stdout, stderr))]
     # Not the zygote's: the flags of an open file are the same for all who share it, and would outlive the episode.
     os.dup2(os.open("/dev/null", os.O_RDWR), 0)
