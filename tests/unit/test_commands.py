@@ -116,7 +116,7 @@ def test_every_command_knows_h_and_shows_no_python_types() -> None:
             assert kind not in output, (name, kind)
 
 
-def test_choices_are_shown_and_a_wrong_one_is_told_with_those_that_are() -> None:
+def test_choices_are_shown_and_a_wrong_one_is_reported_with_those_that_are() -> None:
     output = started(["evopolicy", "local", "--help"]).stdout
     for choices in ("<bwrap|landlock|none>", "<bwrap|open-network|none>", "<off|first|all>"):
         assert choices in output

@@ -262,7 +262,7 @@ def test_one_request_with_two_keys_is_one_submit(tmp_path: Path) -> None:
     play(tmp_path, script)
 
 
-def test_a_fault_of_ours_is_told_without_a_word_of_it(
+def test_a_fault_of_ours_is_reported_without_a_word_of_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     async def script(w: Wire) -> None:
@@ -281,7 +281,7 @@ def test_a_fault_of_ours_is_told_without_a_word_of_it(
     play(tmp_path, script)
 
 
-def test_feedback_that_cannot_be_written_is_told_without_the_machines_paths(
+def test_feedback_that_cannot_be_written_is_reported_without_the_machines_paths(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(submits, "DISK_PAUSE_S", 0.1)

@@ -120,7 +120,7 @@ def test_a_text_made_by_the_template_has_all_sections_and_no_equations(env_id: s
     assert flags(text) == []
 
 
-def test_documentation_is_told_in_words() -> None:
+def test_documentation_is_put_in_words() -> None:
     text = template.in_words(
         "The pole stands on a cart. The velocity is `v = v + 0.1 * a` each step (default is `2`). Links: see [a page](x.md).\n\n"
         "```python\nenv.step(0)\n```\n\n| Num | Meaning |\n|---|---|\n| 0 | position |\n| 1 | `a * sin(b)` |"

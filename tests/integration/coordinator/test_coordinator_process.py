@@ -133,7 +133,7 @@ def test_second_coordinator_on_one_state_folder_is_refused(coordinator: Coordina
     assert coordinator.stop() == 0
 
 
-def test_port_that_is_taken_is_told(tmp_path: Path) -> None:
+def test_port_that_is_taken_is_reported(tmp_path: Path) -> None:
     first = Coordinator(tmp_path / "first", "--listen", "tcp/127.0.0.1:0")
     try:
         second = command("--state", tmp_path / "second", "--listen", first.ready["endpoints"][1])
@@ -153,7 +153,7 @@ def test_port_that_is_taken_is_told(tmp_path: Path) -> None:
         (("--no-such-option",), "--no-such-option"),
     ],
 )
-def test_wrong_option_is_told_in_a_line_and_exits_2(
+def test_wrong_option_is_reported_in_a_line_and_exits_2(
     tmp_path: Path, args: tuple[str, ...], message: str
 ) -> None:
     ended = command("--state", tmp_path / "state", *args)
@@ -167,7 +167,7 @@ def test_help_has_an_example() -> None:
     assert "Example: evopolicy-coordinator --listen" in ended.stdout
 
 
-def test_damaged_database_is_told_and_not_overwritten(tmp_path: Path) -> None:
+def test_damaged_database_is_reported_and_not_overwritten(tmp_path: Path) -> None:
     state = tmp_path / "state"
     state.mkdir(mode=0o700)
     damaged = b"not a database at all, really" * 100

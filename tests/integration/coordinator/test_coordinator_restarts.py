@@ -135,7 +135,7 @@ def test_results_handed_in_twice_over_a_restart_are_taken_once(tmp_path: Path) -
         holder[0].kill()
 
 
-def test_finished_run_is_told_after_a_restart(tmp_path: Path) -> None:
+def test_finished_run_is_reported_after_a_restart(tmp_path: Path) -> None:
     holder = [Coordinator(tmp_path / "state")]
 
     async def scenario() -> None:

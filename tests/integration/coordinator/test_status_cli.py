@@ -173,7 +173,7 @@ async def worker_shown(operator: OperatorClient, name: str) -> WorkerStatus:
         await asyncio.sleep(0.02)
 
 
-def test_refusals_are_told_in_a_line_and_exit_1(coordinator: Coordinator) -> None:
+def test_refusals_are_reported_in_a_line_and_exit_1(coordinator: Coordinator) -> None:
     result = call(coordinator, "runs", "cancel", "r-nowhere")
     assert result.exit_code == 1
     assert "r-nowhere" in result.stderr

@@ -230,7 +230,7 @@ def test_closing_finishes_the_submit_in_flight_first(tmp_path: Path) -> None:
     asyncio.run(main())
 
 
-def test_a_port_that_somebody_else_has_taken_is_told(tmp_path: Path, monkeypatch: Any) -> None:
+def test_a_port_that_somebody_else_has_taken_is_reported(tmp_path: Path, monkeypatch: Any) -> None:
     monkeypatch.setattr(server, "_REBIND_TRIES", 2)
     monkeypatch.setattr(server, "_REBIND_PAUSE_S", 0.01)
 

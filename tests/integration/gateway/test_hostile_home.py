@@ -93,7 +93,7 @@ def refused(where: str, command: str, folder: Path, *namespaces: str, code: int 
 
 
 @pytest.mark.parametrize("name", [name for name in COMMANDS if name not in ("random", "worker")])
-def test_a_read_only_home_is_told_before_anything_is_begun(home: Path, name: str) -> None:
+def test_a_read_only_home_is_reported_before_anything_is_begun(home: Path, name: str) -> None:
     StateFolder.open(home / "old").close()
     where = f"mount --bind {home} {home}; mount -o remount,ro,bind {home}; cd {home}"
     output = refused(where, COMMANDS[name], home, code=1)
@@ -104,7 +104,9 @@ def test_a_read_only_home_is_told_before_anything_is_begun(home: Path, name: str
 
 @pytest.mark.parametrize("name", ["try", "local", "suite", "random", "worker"])
 @pytest.mark.parametrize("limit", ["size=1m", "nr_inodes=20"])
-def test_a_full_temporary_folder_is_told_before_anything_is_begun(home: Path, name: str, limit: str) -> None:
+def test_a_full_temporary_folder_is_reported_before_anything_is_begun(
+    home: Path, name: str, limit: str
+) -> None:
     full = home / "tmp"
     full.mkdir()
     where = f"mount -t tmpfs -o {limit} none {full}; export TMPDIR={full}"
@@ -117,7 +119,7 @@ def test_a_full_temporary_folder_is_told_before_anything_is_begun(home: Path, na
 @pytest.mark.parametrize(
     "how", ["true", "ip link set lo up; ip addr del 127.0.0.1/8 dev lo"], ids=["down", "ipv6 only"]
 )
-def test_a_machine_without_ipv4_loopback_is_told_before_anything_is_begun(
+def test_a_machine_without_ipv4_loopback_is_reported_before_anything_is_begun(
     home: Path, name: str, how: str
 ) -> None:
     output = refused(how, COMMANDS[name], home, "--net")
@@ -137,7 +139,7 @@ def test_a_machine_without_ipv4_loopback_is_told_before_anything_is_begun(
         f"mkdir $ODD && cd $ODD && {EVOPOLICY} local {PLAYED} --runs {{home}}/runs",
     ],
 )
-def test_a_path_that_is_not_utf_8_is_told_before_anything_is_begun(home: Path, command: str) -> None:
+def test_a_path_that_is_not_utf_8_is_reported_before_anything_is_begun(home: Path, command: str) -> None:
     output = refused("export ODD=$(printf 'odd-\\377')", command.replace("{home}", str(home)), home)
     assert r"odd-\xff" in output
     assert "not UTF-8" in output

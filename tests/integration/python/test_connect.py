@@ -97,7 +97,7 @@ def test_a_run_on_it_takes_prompts_rules_and_the_detail_of_feedback(
     assert record["agent"]["prompts"]
 
 
-def test_a_wrong_text_is_told_before_anything_starts(cluster: evp.Cluster, tmp_path: Path) -> None:
+def test_a_wrong_text_is_reported_before_anything_starts(cluster: evp.Cluster, tmp_path: Path) -> None:
     with pytest.raises(evp.ConfigError, match=r"none\.md"):
         cluster.run(env="toy/line", agent="random", runs=tmp_path / "runs", agents_md=tmp_path / "none.md")
 

@@ -210,7 +210,7 @@ def test_tls_without_certificates_is_refused_with_the_remedy(tmp_path: Path) -> 
     )
 
 
-def test_insecure_tcp_has_to_be_asked_for_and_is_told_to_this_clusters_machines(tmp_path: Path) -> None:
+def test_insecure_tcp_has_to_be_asked_for_and_is_announced_to_this_clusters_machines(tmp_path: Path) -> None:
     coordinator = Coordinator(tmp_path / "state", "--listen", "tcp/0.0.0.0:0", "--insecure-tcp")
     try:
         found = coordinator.credentials("worker")

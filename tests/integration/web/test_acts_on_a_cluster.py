@@ -14,7 +14,7 @@ from waiting import wait_until
 from evopolicy_coordinator.web.access import kept_tokens
 
 
-def test_a_worker_is_paused_and_resumed_and_a_refusal_is_told(tmp_path: Path) -> None:
+def test_a_worker_is_paused_and_resumed_and_a_refusal_is_reported(tmp_path: Path) -> None:
     (tmp_path / "runs").mkdir()
     tokens, log, address = kept_tokens(tmp_path / "tokens"), tmp_path / "acts.jsonl", tmp_path / "address"
     with toy_cluster(tmp_path) as operator:

@@ -68,7 +68,7 @@ def worker(
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("worker", "how"), [(how, how) for how in PROBLEMS], indirect=["worker"])
-def test_a_broken_environment_is_told_and_charges_nothing(
+def test_a_broken_environment_is_reported_and_charges_nothing(
     tmp_path: Path, coordinator: Coordinator, worker: subprocess.Popen[bytes], how: str
 ) -> None:
     log = tmp_path / "worker" / "log"

@@ -119,6 +119,6 @@ def test_a_describing_process_that_is_killed_is_started_again(
         asyncio.run(described(["toy/line"], tmp_path))
 
 
-def test_what_cannot_be_described_is_told_at_once(tmp_path: Path) -> None:
+def test_what_cannot_be_described_is_reported_at_once(tmp_path: Path) -> None:
     with pytest.raises(WorkerError, match="no/such"):
         asyncio.run(described(["no/such"], tmp_path))

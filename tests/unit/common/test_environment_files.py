@@ -30,7 +30,7 @@ wrapper = "ClipAction"
 """
 
 
-def test_a_file_defines_an_environment_with_all_that_is_told_of_it(tmp_path: Path) -> None:
+def test_a_file_defines_an_environment_with_all_that_is_stated_of_it(tmp_path: Path) -> None:
     (tmp_path / "glider.toml").write_text(GOOD)
     (tmp_path / "glider.md").write_text("# Glide")
     (entry,) = read_file(tmp_path / "glider.toml")

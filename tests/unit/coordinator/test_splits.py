@@ -156,7 +156,7 @@ def test_same_seed_with_other_options_is_another_case(folder: Path) -> None:
     assert load(folder)[1] == []
 
 
-def test_missing_file_and_missing_folder_are_told(folder: Path, tmp_path: Path) -> None:
+def test_missing_file_and_missing_folder_are_reported(folder: Path, tmp_path: Path) -> None:
     (folder / "valid.json").unlink()
     splits_, findings = load(folder)
     assert splits_ is None

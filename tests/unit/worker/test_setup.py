@@ -85,7 +85,7 @@ def test_a_python_that_is_too_old_or_missing_is_named(tmp_path: Path) -> None:
     assert "cannot be started" in refused("minigrid", "--python", str(tmp_path / "nowhere"))
 
 
-def test_a_disk_that_is_too_small_is_told_before_anything_is_written(
+def test_a_disk_that_is_too_small_is_reported_before_anything_is_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     row = msgspec.structs.replace(installs.installs()["minigrid"], megabytes=1 << 40)
@@ -128,7 +128,7 @@ def test_root_gets_the_browser_installed(machine: Path) -> None:
     assert (machine / "asked").read_text().splitlines() == asked
 
 
-def test_a_browser_that_setup_may_not_or_cannot_install_is_told(
+def test_a_browser_that_setup_may_not_or_cannot_install_is_reported(
     machine: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (machine / "refuses").touch()
@@ -143,7 +143,7 @@ def test_a_browser_that_setup_may_not_or_cannot_install_is_told(
 
 
 @pytest.mark.slow
-def test_a_package_index_that_cannot_be_reached_is_told(
+def test_a_package_index_that_cannot_be_reached_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name, value in {

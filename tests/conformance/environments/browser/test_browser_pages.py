@@ -323,7 +323,7 @@ def test_a_place_within_a_page_is_no_leaving(browser: Page, tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("script", ["for (;;) {}", "const a = []; for (;;) a.push(new Array(1e6).fill(1.5))"])
-def test_a_page_that_hangs_or_needs_too_much_memory_is_told(
+def test_a_page_that_hangs_or_needs_too_much_memory_is_reported(
     browser: Page, tmp_path: Path, script: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(page_module, "CALL_S", 5.0)
@@ -354,7 +354,7 @@ def test_a_browser_s_memory_is_limited_and_it_is_replaced_when_it_has_grown(
     assert browser.run("window.here") == 1
 
 
-def test_texts_that_no_observation_can_have_are_told_in_others(browser: Page, tmp_path: Path) -> None:
+def test_texts_that_no_observation_can_have_become_others(browser: Page, tmp_path: Path) -> None:
     browser.open(address(tmp_path, ""), "")
     pair, half = r"\ud83d\ude00", r"\ud83d"
     texts = browser.tell(

@@ -112,7 +112,7 @@ def test_a_drawing_that_the_page_fills_later_is_an_image(warm: Warm) -> None:
         ("(" * 4000, "no function call"),
     ],
 )
-def test_what_cannot_be_done_is_told_and_the_episode_goes_on(warm: Warm, action: str, error: str) -> None:
+def test_what_cannot_be_done_is_reported_and_the_episode_goes_on(warm: Warm, action: str, error: str) -> None:
     environment = warm("browsergym/miniwob.enter-text")
     environment.reset(Case(seed=1))
     step = environment.step(action)

@@ -84,7 +84,7 @@ def test_an_agent_whose_supervisor_dies_again_and_again_has_failed(
     )
 
 
-def test_a_run_whose_command_was_killed_is_gone_on_with_and_a_finished_one_is_told(
+def test_a_run_whose_command_was_killed_is_gone_on_with_and_a_finished_one_is_reported(
     operator_file: Path, tmp_path: Path
 ) -> None:
     code = """

@@ -342,7 +342,7 @@ def test_ctrl_c_leaves_runs_open_and_the_exit_code_tells(tmp_path: Path, operato
         assert "goes on in its session" in second.text
 
 
-def test_a_changed_file_is_refused_with_what_has_changed_and_a_run_without_ok_submit_is_told(
+def test_a_changed_file_is_refused_with_what_has_changed_and_a_run_without_ok_submit_is_reported(
     tmp_path: Path, operator_file: Path
 ) -> None:
     broken = tmp_path / "bundles" / "0"

@@ -61,7 +61,7 @@ def bring_up(state: Path) -> str:
     return str(raised.value)
 
 
-def test_a_local_coordinator_that_does_not_start_is_told_and_killed(
+def test_a_local_coordinator_that_does_not_start_is_reported_and_killed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     programs(monkeypatch, STUBBORN)

@@ -44,7 +44,7 @@ def test_a_program_whose_parent_is_gone_does_not_start() -> None:
     assert (done.returncode, done.stdout) == (1, b"")
 
 
-def test_a_program_that_is_not_there_is_told_in_one_line() -> None:
+def test_a_program_that_is_not_there_is_reported_in_one_line() -> None:
     done = subprocess.run(
         parent_death.ending_with_parent(["/no/such/program"]), capture_output=True, text=True, check=False
     )

@@ -16,7 +16,7 @@ from evopolicy_common.errors import ConfigError, DamagedStoreError
 from evopolicy_common.processes.preflight import check_text, check_writable, explained
 
 
-def test_a_full_disk_is_told_unless_who_asks_waits_for_room(
+def test_a_full_disk_is_reported_unless_who_asks_waits_for_room(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def full(**_: Any) -> None:
@@ -50,7 +50,7 @@ def test_a_damaged_store_is_no_reason_to_start_a_program_again() -> None:
     assert ended.value.code == 2
 
 
-def test_an_argument_that_is_not_utf_8_is_told_and_any_other_such_text_is_a_bug(
+def test_an_argument_that_is_not_utf_8_is_reported_and_any_other_such_text_is_a_bug(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(sys, "argv", ["evopolicy", "status", "--connect", "tcp/odd-\udcff:1"])
@@ -67,13 +67,13 @@ def test_what_is_checked_leaves_nothing_behind(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_part_of_the_path_that_is_a_file_is_told(tmp_path: Path) -> None:
+def test_a_part_of_the_path_that_is_a_file_is_reported(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(ConfigError, match=r"no folder.*--runs"):
         check_writable(tmp_path / "file" / "runs", "--runs")
 
 
-def test_a_path_that_is_not_utf_8_is_told_in_letters_that_can_be_printed(tmp_path: Path) -> None:
+def test_a_path_that_is_not_utf_8_is_reported_in_letters_that_can_be_printed(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"odd-\\xff: this path is not UTF-8; choose another with --state"):
         check_text(Path(os.fsdecode(b"/odd-\xff")), "--state")
 

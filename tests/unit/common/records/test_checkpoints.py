@@ -81,7 +81,7 @@ def test_a_checkpoint_of_an_earlier_version_is_read(tmp_path: Path) -> None:
     assert checkpoints.bundle_of(tmp_path) == bundles.snapshot(tmp_path / "system")
 
 
-def test_damaged_metadata_are_told(tmp_path: Path) -> None:
+def test_damaged_metadata_are_reported(tmp_path: Path) -> None:
     assert checkpoints.read_meta(tmp_path, 8) is None
     checkpoints.write(tmp_path / "c", META, None)
     (tmp_path / "c" / "_meta.json").write_text("{}")

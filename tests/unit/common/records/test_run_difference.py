@@ -102,7 +102,9 @@ def test_file_names_neither_steer_the_terminal_nor_forge_lines(tmp_path: Path) -
     assert len(json.loads(invoked.output)) == 3
 
 
-def test_the_list_of_what_is_left_out_is_told_with_reasons_and_covers_what_differs(tmp_path: Path) -> None:
+def test_the_list_of_what_is_left_out_is_reported_with_reasons_and_covers_what_differs(
+    tmp_path: Path,
+) -> None:
     done = CliRunner().invoke(app, ["diff", "--left-out"])
     assert done.exit_code == 0, done.output
     lines = done.output.splitlines()

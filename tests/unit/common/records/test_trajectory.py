@@ -83,7 +83,7 @@ def test_whatever_is_appended_comes_back(steps: list[tuple[Any, Any, float, bool
 
 @settings(max_examples=30, deadline=None)
 @given(st.binary(max_size=40), st.integers(0, 200))
-def test_damaged_bytes_are_told_and_nothing_else_happens(noise: bytes, at: int) -> None:
+def test_damaged_bytes_are_reported_and_nothing_else_happens(noise: bytes, at: int) -> None:
     whole = packed([(np.zeros(3), 1, 0.5, False, False, {})] * 5)
     for damaged in (
         noise,

@@ -100,7 +100,7 @@ def test_plain_tcp_goes_where_the_coordinator_was_told_to_speak_it(tmp_path: Pat
     assert credentials.find("worker", ("tcp/10.0.0.5:1",), path).endpoints == ("tcp/10.0.0.5:1",)
 
 
-def test_tls_without_a_certificate_is_told(tmp_path: Path) -> None:
+def test_tls_without_a_certificate_is_reported(tmp_path: Path) -> None:
     path = tmp_path / "worker.json"
     credentials.write(worker(), path)
     with pytest.raises(ConfigError, match="certs issue worker NAME"):
@@ -141,7 +141,7 @@ def test_a_private_key_that_others_may_read_is_refused(tmp_path: Path) -> None:
         credentials.find("worker", (), folder)
 
 
-def test_a_certificate_that_was_not_copied_is_told(tmp_path: Path) -> None:
+def test_a_certificate_that_was_not_copied_is_reported(tmp_path: Path) -> None:
     folder = machines_folder(tmp_path / "made")
     (folder / "ca.pem").unlink()
     with pytest.raises(ConfigError, match="copy the whole folder"):

@@ -119,7 +119,7 @@ def test_list_tells_names_roles_expiry_and_revocation_and_no_secret(
         (lambda state: certs_cli.init(state=state, renew=True, cluster="a b"), "--cluster 'a b'"),
     ],
 )
-def test_what_is_wrong_is_told_in_a_line(
+def test_what_is_wrong_is_reported_in_a_line(
     state: Path, capsys: pytest.CaptureFixture[str], call: object, message: str
 ) -> None:
     assert callable(call)

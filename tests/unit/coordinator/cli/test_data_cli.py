@@ -87,7 +87,7 @@ def test_check_reads_the_published_tree(tmp_path: Path) -> None:
         (("check", "."), "no train.json"),
     ],
 )
-def test_wrong_usage_is_told_and_exits_2(
+def test_wrong_usage_is_reported_and_exits_2(
     args: tuple[str, ...], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)

@@ -160,7 +160,7 @@ def test_what_is_revealed_already_gets_no_second_entry() -> None:
     assert entries(rig) == before
 
 
-def test_epochs_are_told_with_their_runs() -> None:
+def test_epochs_are_listed_with_their_runs() -> None:
     rig = Rig()
     session = rig.register()
     rig.create(epoch="a")

@@ -67,7 +67,7 @@ def test_an_operator_sees_which_worker_was_lost_with_how_many_jobs() -> None:
     assert rig.now - 18.0 <= retry.at <= rig.now
 
 
-def test_the_queue_is_told_by_priority_with_what_it_waits_for() -> None:
+def test_the_queue_is_listed_by_priority_with_what_it_waits_for() -> None:
     rig = Rig()
     session = rig.register("w1", slots=1)
     rig.create()

@@ -96,7 +96,7 @@ def test_clocks_may_differ_a_little() -> None:
 @pytest.mark.parametrize(
     "host", ["", "tls/lab:7447", "lab:7447", "a b", "-lab", "lab-", "*.lab", "x" * 64, "999.1.1.1", "a..b"]
 )
-def test_a_host_that_is_none_is_told(host: str) -> None:
+def test_a_host_that_is_none_is_reported(host: str) -> None:
     with pytest.raises(ConfigError, match="--host"):
         certs.issue(AUTHORITY, "a", NOW, 1, hosts=(host,), serves=True)
 
@@ -111,6 +111,6 @@ def test_a_certificate_does_not_outlive_its_authority() -> None:
         certs.issue(AUTHORITY, "a", NOW, certs.AUTHORITY_DAYS + 1, serves=False)
 
 
-def test_what_is_no_certificate_is_told() -> None:
+def test_what_is_no_certificate_is_reported() -> None:
     with pytest.raises(ConfigError, match="not a certificate"):
         certs.describe(b"hello")

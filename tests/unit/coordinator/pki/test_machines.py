@@ -145,7 +145,7 @@ def test_a_folder_with_files_is_not_written_into(own: OwnCerts) -> None:
 
 
 @pytest.mark.parametrize("name", ["", "a/b", "a b", "../x", "x" * 64, "a:b"])
-def test_a_wrong_name_is_told(own: OwnCerts, name: str) -> None:
+def test_a_wrong_name_is_reported(own: OwnCerts, name: str) -> None:
     with pytest.raises(ConfigError, match="NAME"):
         own.issue("worker", name)
 

@@ -126,7 +126,7 @@ def test_what_the_store_has_lost_is_nobodys_fault(shelf: Shelf) -> None:
         (played(b"nonsense"), "cannot be read"),
     ],
 )
-def test_whatever_differs_is_told(shelf: Shelf, forged: EpisodeOutcome, difference: str | None) -> None:
+def test_whatever_differs_is_reported(shelf: Shelf, forged: EpisodeOutcome, difference: str | None) -> None:
     shelf.put(GROUP, forged)
     shelf.put("replay.1", played(recording(1.0, 2.0)))
     compared = shelf.compare("replay.1")

@@ -33,7 +33,7 @@ def test_a_query_that_nobody_waits_for_any_more_is_let_go(
     play(tmp_path, scenario)
 
 
-def test_a_database_that_another_keeps_locked_is_told(
+def test_a_database_that_another_keeps_locked_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(store, "BUSY_TIMEOUT_S", SOON_S)

@@ -25,7 +25,7 @@ def register(name: str) -> bytes:
     )
 
 
-def test_a_refused_worker_is_told_with_the_reason_until_it_is_taken() -> None:
+def test_a_refused_worker_is_reported_with_the_reason_until_it_is_taken() -> None:
     workers = RefusedWorkers()
     workers.answered(KEY, register("old"), REFUSED, 100.0)
     (entry,) = workers.recent(103.0)

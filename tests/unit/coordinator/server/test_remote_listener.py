@@ -17,7 +17,7 @@ class Unreadable:
         raise PermissionError("certs/machines.json")
 
 
-def test_a_list_of_machines_that_cannot_be_read_is_told_at_once() -> None:
+def test_a_list_of_machines_that_cannot_be_read_is_reported_at_once() -> None:
     async def scenario() -> None:
         listener = remote_listener("c", ("tls/h:1",), Unreadable(), print, print)  # type: ignore[arg-type]
         async with asyncio.timeout(20), listener:

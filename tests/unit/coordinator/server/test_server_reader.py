@@ -200,6 +200,6 @@ def test_run_gets_only_the_blobs_that_its_train_feedback_names(rig: Rig) -> None
     assert rig.get(None, "no digest").status == "unknown_blob"
 
 
-def test_a_row_that_cannot_be_read_is_told_as_damaged(rig: Rig) -> None:
+def test_a_row_that_cannot_be_read_is_reported_as_damaged(rig: Rig) -> None:
     rig.store._db.execute("UPDATE submits SET data = x'00'")
     assert rig.results(0, 1).status == Refusal.DAMAGED

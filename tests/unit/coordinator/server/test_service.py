@@ -288,7 +288,7 @@ def test_a_state_that_cannot_be_loaded_again_ends_the_service_with_the_reason(
     play(tmp_path, scenario)
 
 
-def test_a_state_that_cannot_be_loaded_at_the_start_is_told(
+def test_a_state_that_cannot_be_loaded_at_the_start_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def broken(*_: Any) -> Any:

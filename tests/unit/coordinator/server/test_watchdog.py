@@ -12,7 +12,7 @@ from structlog.testing import capture_logs
 from evopolicy_coordinator.server.monitoring import watchdog
 
 
-def test_gap_is_told_and_its_place_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_gap_is_reported_and_its_place_named(monkeypatch: pytest.MonkeyPatch) -> None:
     async def scenario() -> None:
         watching = watchdog.LoopWatchdog(gap_s=0.1)
         await asyncio.sleep(0.3)

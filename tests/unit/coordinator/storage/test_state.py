@@ -130,7 +130,7 @@ def test_port_0_becomes_a_free_port() -> None:
         "tcp/no.such.host.invalid:0",
     ],
 )
-def test_endpoint_that_cannot_be_listened_on_is_told(endpoint: str) -> None:
+def test_endpoint_that_cannot_be_listened_on_is_reported(endpoint: str) -> None:
     with pytest.raises(ConfigError, match="--listen"):
         resolve_listen([endpoint])
 

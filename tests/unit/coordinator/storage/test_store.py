@@ -167,7 +167,7 @@ def test_write_that_fails_leaves_nothing_behind(store: Store) -> None:
     store.write([state_row()])
 
 
-def test_full_disk_is_told_and_writing_goes_on_when_there_is_room(store: Store) -> None:
+def test_full_disk_is_reported_and_writing_goes_on_when_there_is_room(store: Store) -> None:
     store.write([run_row(), state_row(), submit_row()])
     pages = store._db.execute("PRAGMA page_count").fetchone()[0]
     store._db.execute(f"PRAGMA max_page_count={pages + 2}")
@@ -291,13 +291,13 @@ def test_file_of_a_newer_version_is_refused(path: Path) -> None:
         Store(path)
 
 
-def test_file_that_is_no_database_is_told(path: Path) -> None:
+def test_file_that_is_no_database_is_reported(path: Path) -> None:
     path.write_bytes(b"this is no database, whatever its name says" * 100)
     with pytest.raises(StorageError, match="restore it from a backup"):
         Store(path)
 
 
-def test_row_that_cannot_be_read_is_told(store: Store, path: Path) -> None:
+def test_row_that_cannot_be_read_is_reported(store: Store, path: Path) -> None:
     store.write([run_row(), state_row(), submit_row()])
     store._db.execute("UPDATE submits SET data = x'00'")
     with pytest.raises(DamagedStoreError) as caught:

@@ -121,7 +121,7 @@ def test_failed_write_stops_everything_behind_it(tmp_path: Path) -> None:
     play(tmp_path / "db", scenario)
 
 
-def test_a_bug_in_a_write_is_told_and_the_thread_goes_on(tmp_path: Path) -> None:
+def test_a_bug_in_a_write_is_reported_and_the_thread_goes_on(tmp_path: Path) -> None:
     def breaks(store: Store) -> None:
         raise LookupError("a bug")
 

@@ -48,7 +48,7 @@ def test_a_rendered_episode_and_its_replay_are_the_same(kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_what_differs_in_a_replay_is_told(kind: str) -> None:
+def test_what_differs_in_a_replay_is_reported(kind: str) -> None:
     obs, storage = KINDS[kind]
     recorded = episode(Renderer("arrays", storage), obs)
     other = {**obs, "n": 4} if isinstance(obs, dict) else obs + obs.dtype.type(1)
@@ -60,7 +60,7 @@ def test_what_differs_in_a_replay_is_told(kind: str) -> None:
     assert first_difference(recorded, episode(Recorder(), obs, n=5)) is not None
 
 
-def test_a_number_that_is_one_bit_away_is_told() -> None:
+def test_a_number_that_is_one_bit_away_is_reported() -> None:
     obs = np.array([0.1, 1.0], dtype=np.float32)
     recorded = episode(Renderer("arrays", "inline"), obs)
     near = np.nextafter(obs, np.float32(2))

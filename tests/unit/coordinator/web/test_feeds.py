@@ -13,7 +13,7 @@ def view(rows: dict[str, str], **parts: str) -> View:
     return View(parts={**parts, **rows}, lists={"rows": tuple(rows)})
 
 
-def test_only_what_changed_is_told() -> None:
+def test_only_what_changed_is_sent() -> None:
     feed = Feed()
     feed.update(view({"a": "<i>1</i>", "b": "<i>1</i>"}, facts="<p>1</p>"))
     known = feed.cursor

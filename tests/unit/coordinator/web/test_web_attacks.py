@@ -50,7 +50,7 @@ def key(folder: Path) -> str:
         "/metrics",
     ],
 )
-def test_nothing_is_told_without_a_token_on_loopback_either(tmp_path: Path, path: str) -> None:
+def test_nothing_is_disclosed_without_a_token_on_loopback_either(tmp_path: Path, path: str) -> None:
     with client(site_of(tmp_path, acting=True), None) as stranger:
         assert stranger.get(path).status_code == 401
         assert stranger.get(path, headers={"accept": "text/html"}).headers["location"] == "/login"

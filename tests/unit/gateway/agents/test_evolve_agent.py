@@ -112,7 +112,7 @@ def test_agent_gives_up_when_it_is_refused_again_and_again(tmp_path: Path) -> No
         assert not gateway.submits
 
 
-def test_each_submit_is_told_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_each_submit_is_reported_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with serving(a_run(tmp_path, 16)) as gateway:
         run_agent(gateway)
         lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("submit_")]
@@ -120,7 +120,7 @@ def test_each_submit_is_told_in_one_line(tmp_path: Path, capsys: pytest.CaptureF
         assert "0 episodes left" in lines[-1]
 
 
-def test_missing_urls_are_told_and_exit_with_one(
+def test_missing_urls_are_reported_and_exit_with_one(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for name in ("INFO", "TASK", "SUBMIT"):

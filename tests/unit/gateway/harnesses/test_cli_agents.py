@@ -222,7 +222,7 @@ def test_what_was_killed_goes_on_in_its_session(tmp_path: Path, harness: str) ->
 
 
 @both
-def test_versions_are_told_and_lacking_options_named(tmp_path: Path, harness: str) -> None:
+def test_versions_are_shown_and_lacking_options_named(tmp_path: Path, harness: str) -> None:
     played = play(tmp_path / "newer", settings(harness), "work", 2, FAKE_VERSION="99.1.0")
     assert ended(played).facts["cli_version"] == "99.1.0"
     tested = ended(played).facts["settings"]["tested_version"]

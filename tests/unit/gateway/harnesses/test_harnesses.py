@@ -26,7 +26,7 @@ def test_a_program_that_never_reads_plays_until_it_exits(tmp_path: Path) -> None
     assert turns == []
 
 
-def test_a_program_that_fails_is_told_with_its_status(tmp_path: Path) -> None:
+def test_a_program_that_fails_is_reported_with_its_status(tmp_path: Path) -> None:
     ending, log, _ = play(tmp_path, "import sys; sys.exit('out of luck')")
     assert ending.reason == "agent_failed"
     assert ending.detail.endswith("exit status 1")
@@ -165,7 +165,7 @@ def test_an_agent_sees_the_urls_and_nothing_of_this_projects_variables(
     assert "EVOPOLICY_STATE" not in environment
 
 
-def test_a_program_that_cannot_be_started_is_told(tmp_path: Path) -> None:
+def test_a_program_that_cannot_be_started_is_reported(tmp_path: Path) -> None:
     log = AgentLog(tmp_path / "agent.jsonl")
     stage = Stage(
         workspace=tmp_path / "missing", urls={}, environment={}, log=log, on_turn=lambda turn, text: None

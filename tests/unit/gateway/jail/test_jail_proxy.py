@@ -69,7 +69,7 @@ def test_a_named_host_gets_the_bytes_and_answers() -> None:
     assert answer.endswith(b"\r\n\r\nPSST")
 
 
-def test_a_named_host_that_is_away_is_told() -> None:
+def test_a_named_host_that_is_away_is_reported() -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
     answer = asyncio.run(
@@ -115,7 +115,7 @@ def test_a_jailed_program_that_asks_for_nothing_is_hung_up_on(monkeypatch: pytes
     assert asyncio.run(main()) == b""
 
 
-def test_a_named_host_that_does_not_answer_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_named_host_that_does_not_answer_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(proxy, "_CONNECT_TIMEOUT_S", 0.2)
     connect = asyncio.open_connection
 

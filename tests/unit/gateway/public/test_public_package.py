@@ -146,7 +146,7 @@ def test_a_functions_own_module_goes_with_it_to_the_jail(tmp_path: Path) -> None
     assert done.stdout == "42\n", done.stderr
 
 
-def test_what_cannot_be_sent_is_told(tmp_path: Path) -> None:
+def test_what_cannot_be_sent_is_reported(tmp_path: Path) -> None:
     lock = threading.Lock()
 
     def agent(workspace: evp.Workspace) -> None:
@@ -156,7 +156,7 @@ def test_what_cannot_be_sent_is_told(tmp_path: Path) -> None:
         _cluster._pickled(agent, tmp_path / "function.pickle")
 
 
-def test_wrong_arguments_are_told_before_anything_starts(tmp_path: Path) -> None:
+def test_wrong_arguments_are_reported_before_anything_starts(tmp_path: Path) -> None:
     with pytest.raises(evp.ConfigError, match="slots is 0"):
         evp.Cluster.local(slots=0)
     with pytest.raises(evp.ConfigError, match="give only one"):

@@ -334,6 +334,6 @@ child.wait()
 """
 
 
-def test_what_survives_killing_is_told() -> None:
+def test_what_survives_killing_is_reported() -> None:
     done = subprocess.run([sys.executable, "-c", UNKILLABLE], capture_output=True, text=True, check=True)
     assert done.stdout == "True\n"

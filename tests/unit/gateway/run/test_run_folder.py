@@ -10,7 +10,7 @@ from evopolicy_common.errors import ConfigError
 from evopolicy_gateway.run.layout import OpenedRun, RunFolder, save, saved
 
 
-def test_a_file_that_a_disk_has_damaged_is_told(tmp_path: Path) -> None:
+def test_a_file_that_a_disk_has_damaged_is_reported(tmp_path: Path) -> None:
     folder = RunFolder(tmp_path)
     folder.state.mkdir()
     save(folder.opened, OpenedRun(run="r-1"))

@@ -156,7 +156,7 @@ def test_a_summary_of_missing_episodes_is_a_bug_not_a_file() -> None:
 
 
 @pytest.mark.parametrize("form", ["arrays", "lists"])
-def test_a_policy_that_failed_in_every_episode_is_told_loudly(form: ObservationForm) -> None:
+def test_a_policy_that_failed_in_every_episode_is_reported_loudly(form: ObservationForm) -> None:
     failure = PolicyFailure(category="act_error", step_index=0, message="ValueError: ambiguous", traceback="")
     failed = [EpisodeScore(index=i, episode_return=1.0, length=9, failure=failure) for i in range(3)]
     document = json.loads(summary_bytes("e", 0, done(3), failed, form))

@@ -81,7 +81,7 @@ def test_a_line_is_read_again_from_its_place(tmp_path: Path) -> None:
     journal.close()
 
 
-def test_a_damaged_line_in_the_middle_is_told(tmp_path: Path) -> None:
+def test_a_damaged_line_in_the_middle_is_reported(tmp_path: Path) -> None:
     data = written(tmp_path / "j")
     (tmp_path / "j").write_bytes(b"junk\n" + data)
     with pytest.raises(StorageError, match="line 1"):

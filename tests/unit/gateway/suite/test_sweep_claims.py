@@ -16,7 +16,7 @@ from evopolicy_gateway.suite.decisions import Decision, Found, decide
 from evopolicy_gateway.suite.suite_index import Entry
 
 
-def test_a_run_is_told_to_the_cluster_as_soon_as_it_is_open(
+def test_a_run_is_announced_to_the_cluster_as_soon_as_it_is_open(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     text = HEAD + "[parallel]\nclaim_ttl_s = 3600.0\n" + EVOLVE.format("a")
@@ -94,7 +94,7 @@ def test_a_claim_that_another_host_has_meanwhile_ends_the_run_here_and_its_resul
     assert decide(run, found) == Decision(run=run, kind="keep", attempt=1)
 
 
-def test_our_own_failure_gives_the_claim_back_and_is_told(
+def test_our_own_failure_gives_the_claim_back_and_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     stage = Stage(tmp_path, HEAD + CODEX.format("a"), monkeypatch)

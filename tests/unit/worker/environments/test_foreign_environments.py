@@ -162,7 +162,7 @@ def test_an_environment_that_breaks_its_word_is_refused_when_it_is_described(how
         ),
     ],
 )
-def test_what_cannot_be_made_is_told_with_the_field_to_correct(more: dict[str, Any], why: str) -> None:
+def test_what_cannot_be_made_is_reported_with_the_field_to_correct(more: dict[str, Any], why: str) -> None:
     define([Entry(**{"id": "acme/Glider", "gymnasium_id": "acme_envs:Glider-v0", **more})])
     with pytest.raises(WorkerError, match=why):
         describe("acme/Glider")
@@ -275,7 +275,7 @@ def test_texts_of_a_set_of_characters_are_made_of_these() -> None:
     assert set(codec.sample(np.random.default_rng(0))) <= {"a", "b"}
 
 
-def test_every_space_is_told_in_words(everything: Environment) -> None:
+def test_every_space_is_described_in_words(everything: Environment) -> None:
     text = everything.description.task_text
     for part in ("`graph`", "`either`", "`items`", "any number of items", "a pair of an index and a value"):
         assert part in text

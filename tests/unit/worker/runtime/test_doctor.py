@@ -45,14 +45,14 @@ def test_what_is_missing_comes_with_what_to_do(monkeypatch: pytest.MonkeyPatch, 
     assert doctor.best_tier(tuple(checks.values())) is None
 
 
-def test_a_namespace_that_cannot_be_made_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_namespace_that_cannot_be_made_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doctor, "_tried", lambda flags: 1)
     check = doctor._namespace("user", 0x10000000)
     assert check.verdict == "missing"
     assert distribution.permit_namespaces() in check.advice
 
 
-def test_kernel_that_does_not_tell_its_boot_id_is_told(
+def test_kernel_that_does_not_tell_its_boot_id_is_reported(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     assert doctor._boot_id().verdict == "ok"

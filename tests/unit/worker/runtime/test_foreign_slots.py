@@ -93,7 +93,7 @@ def test_pages_with_options_of_ones_own_have_browser_and_fonts_in_their_fingerpr
     assert versions.items() <= packages.items()
 
 
-def test_success_is_told_by_the_last_step_or_by_any(slots: Slots) -> None:
+def test_success_is_decided_by_the_last_step_or_by_any(slots: Slots) -> None:
     slot = slot_of(slots, "Treasure", success="is_success")
     slots.run(slot.start())
     try:
@@ -176,7 +176,7 @@ PUSHES = POLICY.format(action=0.9)
 
 
 @pytest.mark.parametrize("how", WRONG)
-def test_what_prevents_an_episode_is_told_by_name_and_is_nobodys_result(
+def test_what_prevents_an_episode_is_reported_by_name_and_is_nobodys_result(
     slots: Slots, how: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(slot_module, "_LOOK_S", 0.5)

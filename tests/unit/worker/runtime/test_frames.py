@@ -152,7 +152,7 @@ def test_both_ends_agree_on_the_numbers() -> None:
     assert frames.REPLY_HEADER.format == player.REPLY_HEADER.format
 
 
-def test_an_action_that_cannot_be_sent_is_told() -> None:
+def test_an_action_that_cannot_be_sent_is_reported() -> None:
     endless: list[Any] = []
     endless.append(endless)
     for action in (

@@ -162,7 +162,7 @@ def test_nothing_stands_of_a_policy_that_has_returned_nothing_or_plays_for_train
     assert slots.play(HONEST).failure is None
 
 
-def test_a_failure_by_a_limit_is_told_as_one(slots: Slots) -> None:
+def test_a_failure_by_a_limit_is_reported_as_one(slots: Slots) -> None:
     limits = msgspec.structs.replace(PATIENT, act_wall_s=0.5)
     source = CLOCKED.replace("AHEAD", "time.sleep(9.0 if self.e == 1 and self.n == 3 else 0.03)")
     slot = slots.slot()

@@ -355,7 +355,7 @@ def test_after_a_broken_environment_the_jobs_other_episodes_go_on(player: Player
     assert [outcome.failure is not None for outcome in outcomes] == [False, True, False]
 
 
-def test_an_answer_of_a_slots_process_that_is_none_is_told(slots: Slots) -> None:
+def test_an_answer_of_a_slots_process_that_is_none_is_reported(slots: Slots) -> None:
     slot = slots.new()
 
     async def work() -> None:

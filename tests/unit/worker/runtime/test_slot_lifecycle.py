@@ -48,7 +48,7 @@ def test_an_episode_of_random_actions_can_be_cancelled_too(slots: Slots) -> None
     assert slots.play(HONEST).failure is None
 
 
-def test_progress_is_told_while_a_job_runs(slots: Slots) -> None:
+def test_progress_is_reported_while_a_job_runs(slots: Slots) -> None:
     reports: list[tuple[int, int]] = []
     policy = HONEST.replace("return [", "import time; time.sleep(0.01); return [")
     slot = slots.slot()
@@ -65,7 +65,7 @@ def test_progress_is_told_while_a_job_runs(slots: Slots) -> None:
 
 
 @pytest.mark.parametrize("victim", ["env process", "zygote"])
-def test_the_death_of_a_slots_process_is_told_and_start_makes_it_new(slots: Slots, victim: str) -> None:
+def test_the_death_of_a_slots_process_is_reported_and_start_makes_it_new(slots: Slots, victim: str) -> None:
     slot = slots.new()
 
     async def work() -> tuple[EpisodeOutcome, ...]:

@@ -109,7 +109,7 @@ def test_a_policy_that_fails_gets_its_verdict_and_is_replaced(
         ),
     ],
 )
-def test_a_limit_of_time_is_told_with_its_value_and_what_was_used(
+def test_a_limit_of_time_is_reported_with_its_value_and_what_was_used(
     slots: Slots, source: str, changes: dict[str, float], category: str, limit: float
 ) -> None:
     failure = slots.play(source, limits=limits(**changes)).failure
@@ -136,7 +136,7 @@ def test_a_limit_of_time_is_told_with_its_value_and_what_was_used(
         ({"policy.py": misbehaving(init="bytearray(1 << 30)")}, "init_error", "268,435,456"),
     ],
 )
-def test_a_bundle_without_a_policy_is_told_at_index_0_and_not_played(
+def test_a_bundle_without_a_policy_is_reported_at_index_0_and_not_played(
     slots: Slots, source: dict[str, str | bytes], category: str, words: str
 ) -> None:
     at_first = slots.play(source, first=0, limits=limits(init_wall_s=0.5))
@@ -188,7 +188,7 @@ def test_a_policy_that_breaks_the_code_that_answers_for_it_is_told_so(slots: Slo
     assert "answers for the policy was broken" in failure.message
 
 
-def test_a_full_file_system_is_told_whatever_way_it_was_filled(slots: Slots) -> None:
+def test_a_full_file_system_is_reported_whatever_way_it_was_filled(slots: Slots) -> None:
     mapped = "import mmap; k = os.open('s', 66); os.truncate(k, 4 << 20); m = mmap.mmap(k, 4 << 20); "
     filled = "open('t', 'wb').write(bytes(3 << 20)); m[:] = bytes(4 << 20)"
     failure = slots.play(misbehaving(act=mapped + filled)).failure

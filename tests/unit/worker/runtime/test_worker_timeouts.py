@@ -36,7 +36,7 @@ def a_zygote(folder: Path) -> Iterator[Zygote]:
         yield found
 
 
-def test_a_zygote_that_does_not_start_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_zygote_that_does_not_start_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(zygote, "START_TIMEOUT_S", SOON_S)
     mute = jail.Jail(command=("sleep", "1000"), config={}, home=None, user=None)
     with pytest.raises(SandboxError, match="does not start: timed out"):
@@ -51,7 +51,7 @@ def test_a_zygote_that_stands_still_has_died(tmp_path: Path, monkeypatch: pytest
             found.spawn()
 
 
-def test_a_policys_process_that_survives_being_killed_is_told(
+def test_a_policys_process_that_survives_being_killed_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(zygote, "DEATH_TIMEOUT_S", SOON_S)
@@ -134,7 +134,7 @@ def test_a_slot_that_does_not_heed_a_cancel_is_ended(slots: Slots, monkeypatch: 
     slots.run(cancelled())
 
 
-def test_a_slots_process_that_hangs_up_and_stays_is_told_without_its_status(
+def test_a_slots_process_that_hangs_up_and_stays_is_reported_without_its_status(
     slots: Slots, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(slot, "LAST_WORDS_S", SOON_S)

@@ -57,7 +57,7 @@ def rising(n: int, shift: float = 0.0) -> tuple[float, ...]:
     return tuple(float(i) + shift + 0.1 * math.sin(7.0 * i + shift) for i in range(n))
 
 
-def test_missing_cases_leave_only_common_ones_and_their_number_is_told() -> None:
+def test_missing_cases_leave_only_common_ones_and_their_number_is_reported() -> None:
     first = entry("A", run(*rising(20, 1.0)))
     second = entry("B", run(math.nan, *rising(20)[1:18], math.inf))
     found = pair_of(first, second)
@@ -319,7 +319,7 @@ def test_random_reference_with_returns_is_compared_by_case_in_a_family_of_its_ow
         ("gym/racing", [900.0, 950.0, 10.0, 1.0], None),
     ],
 )
-def test_success_is_told_where_the_return_tells_it(
+def test_success_is_reported_where_the_return_tells_it(
     tmp_path: Path, env: str, returns: list[float], share: float | None
 ) -> None:
     write_run(
@@ -351,7 +351,7 @@ def test_success_is_told_where_the_return_tells_it(
         (None, None),
     ],
 )
-def test_rate_of_repaired_actions_is_told_where_it_was_recorded(
+def test_rate_of_repaired_actions_is_reported_where_it_was_recorded(
     tmp_path: Path, repaired: object, rate: float | None
 ) -> None:
     folder = write_run(tmp_path / "runs", [Version(policy(gain=1.0), (1.0,), 1.0)])
