@@ -12,8 +12,13 @@ from pathlib import Path
 
 import jsonschema
 import pytest
+from commands import toy_cluster
 from invented.policies import Version
 from invented.run_dirs import write_run
+from stages.cli_stage import FAKES
+from stages.model_api import ModelApi, Step
+
+from evopolicy_common.records.run_record import decode_run_record
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
 
@@ -85,6 +90,70 @@ def test_the_page_about_other_tools_does_what_it_says(tmp_path: Path) -> None:
     # This suite file replaces the shipped one, which plays sixteen environments.
     (tmp_path / "smoke.toml").write_text(SUITE)
     assert "evolve/toy_line/smoke-0" in bash(f"{live}\nwait", tmp_path)
+
+
+SMALL = "--budget 2 --validation 1 --heldout 1 --exp-id"
+SUBMIT = (
+    "echo '# better' >> system/policy.py; curl -s --noproxy '*' -X POST"
+    " -d '{\"env_instances\": [0, 1]}' $EVOPOLICYGYM_SUBMIT_URL"
+)
+
+
+def stand_ins(folder: Path) -> Path:
+    """A folder for the PATH with CLIs under their own names, which submit when they are prompted."""
+    programs = folder / "clis" / "bin"
+    programs.mkdir(parents=True)
+    (folder / "clis" / "lib").mkdir()  # as in an installation, whose files the jail shows
+    for name, source in (("codex", "codex"), ("fake_stream.py", "fake_stream.py"), ("gemini", "acp-agent")):
+        text = (FAKES / source).read_text()
+        text = text.replace('os.environ["FAKE_STATE"]', '".fake"').replace(
+            'os.environ["FAKE_SCENARIO"]', '"work"'
+        )
+        (programs / name).write_text(text)
+        (programs / name).chmod(0o755)
+    return programs
+
+
+def test_the_page_about_coding_agents_runs_its_agents(tmp_path: Path) -> None:
+    """Its commands with the shortest runs on the smallest environment. Codex and Gemini CLI are stand-ins here, the built-in
+    agent is itself; `test_real_clis.py` plays the real ones."""
+    page = "how-to/coding-agents.md"
+    lines = [
+        line
+        for block in blocks(page, "")
+        for line in block.replace("\\\n", " ").splitlines()
+        if line.startswith(("evopolicy texts", "evopolicy run")) and "remote" not in line
+    ]
+    (endpoint,) = [block for block in blocks(page, "toml") if "EXAMPLE_API_KEY" in block]
+    (tmp_path / "c").mkdir()
+    with toy_cluster(tmp_path / "c") as operator, ModelApi([Step(command=SUBMIT)]) as api:
+        (tmp_path / "operator-me").symlink_to(operator.parent if operator.is_file() else operator)
+        (tmp_path / "AGENT.toml").write_text(endpoint.replace("http://127.0.0.1:8000", api.base_url))
+        own = "evopolicy run --env gym/acrobot --agent file:AGENT.toml --credentials operator-me"
+        shown = {
+            "PATH": f"{stand_ins(tmp_path)}:{Path(sys.executable).parent}:{os.environ['PATH']}",
+            "EXAMPLE_API_KEY": "sk-stub-0123456789abcdef",
+            "GEMINI_API_KEY": "stub-0123456789abcdef",
+        }
+        played = []
+        for number, line in enumerate([*lines, own]):
+            if line.startswith("evopolicy texts"):
+                bash(line, tmp_path, **shown)
+                continue
+            agent = line.partition("--agent ")[2].split()[0].strip('"').partition(":")[0]
+            if "llm:" in line or "examples/agents" in line:
+                continue  # at the vendor's own address
+            small = line.replace("gym/acrobot", "toy/line")
+            bash(f"{small} {SMALL} r{number}", tmp_path, **shown)
+            played.append(agent)
+    assert played == ["codex", "codex", "acp", "file"]
+    records = [decode_run_record(path.read_bytes()) for path in (tmp_path / "runs").glob("*/*/*/run.json")]
+    assert [(one.jail, one.outcome.status, one.outcome.budget_used) for one in records] == [
+        ("bwrap", "completed", 2)
+    ] * len(played)
+    harnesses = sorted(one.agent.harness for one in records)
+    assert harnesses == ["acp", "codex", "codex", "llm"]
+    assert sum(bool(one.agent.prompts) and bool(one.experiment_dimensions.agents_md) for one in records) == 1
 
 
 def test_the_command_that_two_pages_name_prints_a_schema_that_accepts_the_pages_suite_file(
