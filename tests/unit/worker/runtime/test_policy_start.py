@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import ctypes
 import importlib.util
 import json
 import random
 import struct
+import subprocess
+import sys
 from types import ModuleType
 
 import numpy as np
@@ -86,3 +89,29 @@ def test_a_policy_finds_its_own_process_as_if_it_had_been_made_for_it(slots: Slo
     assert left == [1, ["system", "tmp"], ["policy.py"], []]
     again = json.loads(slots.play(SEES, tier=tier).stdout)
     assert (drawn, numpys) == (again[6], again[7])
+
+
+HEAP = """
+import ctypes, importlib.util, sys
+spec = importlib.util.spec_from_file_location("zygote", sys.argv[1])
+zygote = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(zygote)
+libc = zygote.libc
+libc.sbrk.restype = libc.mmap.restype = ctypes.c_void_p
+end = libc.sbrk(ctypes.c_long(0))
+if sys.argv[2] == "blocked":
+    page, flags = end + (8 << 20), 0x22 | zygote.MAP_FIXED_NOREPLACE
+    assert libc.mmap(ctypes.c_void_p(page), ctypes.c_size_t(4096), 0, flags, -1, ctypes.c_long(0)) == page
+with zygote.huge_pages():
+    kept = [(k,) for k in range(400_000)]
+print(sum(map(len, kept)), end < id(kept[-1]) < libc.sbrk(ctypes.c_long(0)))
+"""
+
+
+@pytest.mark.parametrize("room", ["free", "blocked"])
+def test_pythons_memory_extends_the_heap_only_where_there_is_room(room: str) -> None:
+    command = [sys.executable, "-c", HEAP, str(INSIDE / "zygote.py"), room]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    glibc = hasattr(ctypes.CDLL(None), "gnu_get_libc_version")
+    extends = room == "free" and glibc and sys.version_info < (3, 14)
+    assert (done.returncode, done.stdout) == (0, f"400000 {extends}\n"), done.stderr

@@ -38,7 +38,8 @@ P_PIDFD, WEXITED, MADV_DONTFORK, MADV_COLLAPSE = 3, 4, 10, 25
 SIGINFO_BYTES, REPORT_BYTES = 128, 128 + 144
 """Of `siginfo_t`; with `struct rusage` after it."""
 N_PIPES = 4
-ARENA, HUGE_PAGE = 1 << 20, 2 << 20
+ARENA, HUGE_PAGE, HEAP_ROOM = 1 << 20, 2 << 20, 256 << 20
+MAP_FIXED_NOREPLACE = 0x100000
 NOBODY = 65534
 PID_MARK = 0x7FFFABCD
 MAX_TEXT = 16_000
@@ -180,12 +181,12 @@ def huge_pages() -> Iterator[None]:
     """Puts what is allocated inside into huge pages, which a fork and the end of a process handle as one.
 
     Python's arenas usually lie between libraries, where no huge page fits. Here they extend the C library's heap. A
-    page that a policy's process writes to is copied alone. Without effect on kernels before 6.1 and with other C libraries.
+    page that a policy's process writes to is copied alone. Without effect on kernels before 6.1, with other C libraries,
+    from Python 3.14 on, and where the heap cannot grow by `HEAP_ROOM`.
     """
-    if not hasattr(libc, "gnu_get_libc_version") or sys.version_info >= (3, 14):
+    if not hasattr(libc, "gnu_get_libc_version") or sys.version_info >= (3, 14) or not heap_can_grow():
         yield
         return
-    libc.sbrk.restype = ctypes.c_void_p
     begin = libc.sbrk(ctypes.c_long(0))
     usual = Arenas()
     ctypes.pythonapi.PyObject_GetArenaAllocator(ctypes.byref(usual))
@@ -198,6 +199,17 @@ def huge_pages() -> Iterator[None]:
     end = libc.sbrk(ctypes.c_long(0))
     for at in range(begin // HUGE_PAGE * HUGE_PAGE - HUGE_PAGE, end - HUGE_PAGE + 1, HUGE_PAGE):
         libc.madvise(ctypes.c_void_p(at), ctypes.c_size_t(HUGE_PAGE), MADV_COLLAPSE)
+
+
+def heap_can_grow() -> bool:
+    """Whether there is room behind the C library's heap. Where there is none, `sbrk` returns -1, which is not 0: Python
+    would take it for an arena's address."""
+    libc.sbrk.restype = libc.mmap.restype = ctypes.c_void_p
+    end, size = ctypes.c_void_p(libc.sbrk(ctypes.c_long(0))), ctypes.c_size_t(HEAP_ROOM)
+    # Not by `sbrk`: taking it back could take what the C library has allocated meanwhile.
+    room = libc.mmap(end, size, 3, 0x22 | MAP_FIXED_NOREPLACE, -1, ctypes.c_long(0))
+    libc.munmap(ctypes.c_void_p(room), size)
+    return bool(room == end.value)
 
 
 def zygote(control: int, namespaces: bool, then: Callable[[int], None]) -> NoReturn:
