@@ -41,6 +41,7 @@ Code = Literal[
     "unknown_class",
     # Waits of a group, a permit or a run.
     "workers",
+    "description",
     "scoring",
     "being_put_off",
     "to_report",

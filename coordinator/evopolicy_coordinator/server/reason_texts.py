@@ -86,6 +86,7 @@ TEXTS: Mapping[Code, str | Callable[..., str]] = {
     "quarantined": "{worker} is quarantined: {why}",
     "unknown_class": _unknown_class,
     "workers": _workers,
+    "description": "a connected worker to describe {env}, as it does before its first episode",
     "scoring": "hidden cases of another run are being scored",
     "being_put_off": "hidden cases on this machine to be postponed",
     "to_report": "workers of this machine to report that they play no hidden cases",

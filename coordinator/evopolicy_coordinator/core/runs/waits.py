@@ -34,7 +34,14 @@ def waits_for_workers(state: State, flow: Flow) -> Reason | None:
         return None
     able = [worker for worker in state.workers.values() if worker.profile.offers(flow)]
     same = [worker for worker in able if flow.pin in (None, worker.profile.classes[flow.env])]
-    away = {worker.state for worker in same if worker.state != "active"}
+    later = [
+        worker
+        for worker in state.workers.values()
+        if flow.env in worker.undescribed and flow.tier in worker.profile.key[1]
+    ]
+    if any(worker.state == "active" for worker in later):
+        return because("description", env=flow.env)
+    away = {worker.state for worker in (*same, *later) if worker.state != "active"}
     return because(
         "workers",
         env=flow.env,

@@ -9,12 +9,14 @@ from typing import Any, Literal
 
 import pytest
 from rigs.asking import asked
-from rigs.core_rig import BUNDLE, Rig, describe, result, split_of
+from rigs.core_rig import BUNDLE, ENV, Rig, describe, result, split_of
 
 from evopolicy_common.messages import operator
 from evopolicy_common.messages import worker as wire
 from evopolicy_common.messages.environment import EnvironmentDescription
+from evopolicy_coordinator.core.runs.waits import waits_for_workers
 from evopolicy_coordinator.core.workers import scheduler
+from evopolicy_coordinator.server.reason_texts import words
 from evopolicy_worker.fingerprint import PACKAGES
 
 
@@ -443,6 +445,22 @@ def test_what_waits_too_long_is_named_with_what_it_waits_for() -> None:
     assert "r1/s0/train" in stall
     assert "a worker that offers toy/line" in stall
     assert rig.core.trace("r1/s0/train")
+
+
+def test_what_a_connected_worker_has_yet_to_describe_waits_for_that_and_for_no_other_worker() -> None:
+    rig = Rig()
+    rig.create()
+    flow = rig.core.state.runs["r1"].flow
+    rig.register("w1", envs=(), undescribed=(ENV,), tiers=("none",))
+    assert words(waits_for_workers(rig.core.state, flow)).startswith(f"a worker that offers {ENV}")
+    rig.register("w2", envs=(), undescribed=(ENV,))
+    assert words(waits_for_workers(rig.core.state, flow)) == (
+        f"a connected worker to describe {ENV}, as it does before its first episode"
+    )
+    rig.tell(asked(operator.SetWorker, request="away", worker="w2", state="paused"))
+    assert words(waits_for_workers(rig.core.state, flow)).endswith(": those that do are paused")
+    rig.register("w3")
+    assert waits_for_workers(rig.core.state, flow) is None
 
 
 def test_what_waits_after_faults_of_ours_is_named_with_the_last_of_them() -> None:
