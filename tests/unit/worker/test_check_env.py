@@ -130,3 +130,25 @@ print(list(conformance.play_all(["slow"], 1)))
     assert started.stderr.read() == b""
     started.stderr.close()
     assert not [each for each in Path("/proc").glob("[0-9]*") if mark in _command_line(each)]
+
+
+def test_a_process_whose_environment_forbids_files_ends_and_is_no_second_check(tmp_path: Path) -> None:
+    program = """
+import os, resource, sys
+from evopolicy_worker.environments.checks import conformance
+
+def play(env_id, steps):
+    resource.setrlimit(resource.RLIMIT_NOFILE, (0, 0))
+    return conformance.Played(env=env_id)
+
+conformance.play = play
+conformance.registry.load = lambda env_id: None
+log = os.open(sys.argv[1], os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)
+try:
+    (played,) = conformance.play_all(["greedy"], 1)
+finally:
+    os.write(log, b"went on\\n")
+"""
+    log = tmp_path / "log"
+    subprocess.run([sys.executable, "-P", "-c", program, str(log)], check=True, timeout=60)
+    assert log.read_bytes() == b"went on\n"

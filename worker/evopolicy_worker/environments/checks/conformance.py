@@ -335,8 +335,10 @@ def _in_child_with(temporary: Path, env_id: str, steps: int) -> Played:
                 os.dup2(null, 2)
                 out.write(msgspec.json.encode(play(env_id, steps)))
         finally:
-            _kill(proc.descendants(os.getpid()))
-            os._exit(0)
+            try:
+                _kill(proc.descendants(os.getpid()))  # fails if the environment allows no more files
+            finally:
+                os._exit(0)
     os.close(writing)
     data, why, limit = b"", "", _Limit(pid)
     with os.fdopen(reading, "rb") as answer:
