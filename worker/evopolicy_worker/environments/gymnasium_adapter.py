@@ -89,7 +89,16 @@ class GymnasiumFamily:
         assert entry.gymnasium_id is not None
         # Passed only when needed: not every environment accepts a render mode.
         mode: dict[str, Any] = {"render_mode": "rgb_array"} if render else {}
-        return gymnasium.make(entry.gymnasium_id, disable_env_checker=True, **mode, **entry.kwargs)
+        try:
+            return gymnasium.make(entry.gymnasium_id, disable_env_checker=True, **mode, **entry.kwargs)
+        except TypeError as error:
+            if not render or "unexpected keyword argument 'render_mode'" not in str(error):
+                raise
+        # It renders, but its constructor does not take the mode (HighwayEnv's lane-keeping-v0): the attribute is all that
+        # `Env.render` reads.
+        env = gymnasium.make(entry.gymnasium_id, disable_env_checker=True, **entry.kwargs)
+        env.unwrapped.render_mode = "rgb_array"
+        return env
 
     def encoding(self, space: gymnasium.Space[Any]) -> Opaque | None:
         """How values of a space are encoded that the protocol has no form for; None for a space of a known kind."""

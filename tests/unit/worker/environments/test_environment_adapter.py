@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium
+import msgspec
 import numpy as np
 import pytest
 
@@ -53,6 +54,16 @@ class Counter(gymnasium.Env[Any, Any]):
         self.closed = True
 
 
+class Drawn(Counter):
+    """Renders, but its constructor takes no render mode, as HighwayEnv's lane-keeping-v0."""
+
+    metadata = {"render_modes": ["rgb_array"]}
+
+    def render(self) -> Any:
+        assert self.render_mode == "rgb_array"
+        return np.full((2, 2, 3), self.buffer[0], dtype=np.uint8)
+
+
 class CounterFamily(GymnasiumFamily):
     def __init__(self, *, rebuilds: bool = False, wrap: int | None = None) -> None:
         self._rebuilds = rebuilds
@@ -96,6 +107,20 @@ def test_gymnasiums_shorter_limit_counts_and_is_described() -> None:
     environment.reset(Case(seed=0))
     assert [environment.step(0).truncated for _ in range(3)] == [False, False, True]
     assert environment.description.max_episode_steps == 3
+
+
+def test_an_environment_whose_constructor_takes_no_render_mode_renders() -> None:
+    gymnasium.register("Drawn-v0", Drawn)
+    try:
+        entry = msgspec.structs.replace(ENTRY, gymnasium_id="Drawn-v0")
+        environment = GymnasiumEnvironment(entry, GymnasiumFamily(), render=True)
+        environment.reset(Case(seed=0))
+        environment.step(0)
+        assert environment.render().tolist() == np.ones((2, 2, 3)).tolist()
+        with pytest.raises(TypeError, match="colour"):
+            GymnasiumFamily().make(msgspec.structs.replace(entry, kwargs={"colour": 1}), render=True)
+    finally:
+        del gymnasium.registry["Drawn-v0"]
 
 
 def test_step_values_are_plain_and_observations_are_copies() -> None:
