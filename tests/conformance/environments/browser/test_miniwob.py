@@ -171,6 +171,17 @@ def test_an_environment_keeps_what_the_interface_promises(env_id: str) -> None:
     assert played.verdict(None) == "ok"
 
 
+# Episodes in which the browser scrolls a dragged selection, or takes the focus from what is no longer shown, in its own time.
+@pytest.mark.parametrize(
+    ("env_id", "seed", "steps"),
+    [("miniwob/text-editor-v1", 20_011_117, 40), ("miniwob/choose-date-v1", 1, 15)],
+)
+def test_a_drag_and_a_lost_focus_are_waited_for(env_id: str, seed: int, steps: int, warm: Warm) -> None:
+    played = conformance.Played(env=env_id)
+    digests = {conformance._episode(played, warm(env_id), seed, steps) for _ in range(5)}
+    assert len(digests) == 1
+
+
 @pytest.mark.parametrize("env_id", SAMPLE)
 def test_a_text_has_the_page_s_own_instruction_and_no_equations(env_id: str, warm: Warm) -> None:
     text = warm(env_id).description.task_text

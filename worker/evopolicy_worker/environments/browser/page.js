@@ -238,7 +238,10 @@
     }
     return found;
   };
-  // Waits for what the browser does in its own time: tasks, images, fonts, answers; what is under the mouse; scrolling.
+  // What is no longer shown loses the focus, some time after the layout.
+  const unseen = (element) => element !== null && element !== document.body
+    && (!element.checkVisibility({ visibilityProperty: true }) || element.disabled === true);
+  // Waits for what the browser does in its own time: tasks, images, fonts, answers; what is under the mouse; scrolling; focus.
   const settle = async () => {
     for (let round = 0; round < 5000; round++) {
       await turn();
@@ -256,6 +259,7 @@
         const under = document.elementFromPoint(...clock.mouse);
         if (under !== null && under !== hovered()) { await frame(); continue; }
       }
+      if (round < 8 && unseen(document.activeElement)) { await frame(); continue; }
       return;
     }
     throw new Error("what the page asked for does not arrive");
@@ -281,6 +285,8 @@
     }));
   };
   const wheeled = async () => { await frame(); await frame(); await frame(); };
+  // A drag that selects text scrolls what it is in, in frames of its own: before a release, or it depends on the machine's load.
+  const dragged = async () => { await frame(); await frame(); await settle(); };
   // Timers that are due, in order, up to `ms` later; between them, what they promised.
   const advance = async (ms) => {
     if (!VIRTUAL) return;
@@ -312,5 +318,5 @@
     clock.now = 0; clock.next = 1; clock.left = ""; clock.error = "";
     clock.mouse = null;
   };
-  define(window, "__evopolicy", { clock, advance, settle, forget, clickable, wheeled, preload, json: native.json });
+  define(window, "__evopolicy", { clock, advance, settle, forget, clickable, wheeled, dragged, preload, json: native.json });
 })();

@@ -205,6 +205,10 @@ class Page:
             }
             # The time tells the page's script that it is an action's.
             numbers.append(self._send("Input.dispatchMouseEvent", **event, modifiers=modifiers, timestamp=1))
+            if kind == "mouseMoved" and self._held != "none":
+                self._await(numbers)
+                numbers.clear()
+                self.run("__evopolicy.dragged()")
         self._await(numbers)
 
     def wheel(self, x: float, y: float, delta_x: float, delta_y: float) -> None:
