@@ -119,6 +119,7 @@ def test_what_a_run_waits_for_is_described_then_and_kept_for_the_next_start(clus
     known = {env, asked}
     assert cluster.offered() == (known, ids - known)
     cluster.stop()
+    wait_until(lambda: not any(cluster.offered()))
     cluster.start()
     described, later = wait_until(lambda: found if env in (found := cluster.offered())[0] else None)
     assert (described, later) == (known, ids - known)

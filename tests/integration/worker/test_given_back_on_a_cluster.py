@@ -12,6 +12,7 @@ import os
 import sqlite3
 from collections.abc import Callable
 from pathlib import Path
+from typing import TypeVar
 
 import msgspec
 import pytest
@@ -29,6 +30,7 @@ from evopolicy_worker.episodes import begun
 from evopolicy_worker.slots.slot import Slot
 from evopolicy_worker.supervisor import Options, Supervisor
 
+T = TypeVar("T")
 CLOCKED = """
 import time
 
@@ -104,18 +106,17 @@ async def described(folder: Path) -> EnvironmentDescription:
 class Stored:
     """What the coordinator has on its disk."""
 
-    def __init__(self, state: Path, group: str) -> None:
+    def __init__(self, state: Path) -> None:
         self._path = state / "coordinator.sqlite"
         self._blobs = BlobStore(state / "blobs")
-        self._group = group
 
-    def _rows(self, table: str) -> list[bytes]:
+    def _rows(self, table: str, group: str) -> list[bytes]:
         with sqlite3.connect(f"file:{self._path}?mode=ro", uri=True) as db:
-            return [data for (data,) in db.execute(f"SELECT data FROM {table} WHERE grp = ?", (self._group,))]
+            return [data for (data,) in db.execute(f"SELECT data FROM {table} WHERE grp = ?", (group,))]
 
-    def begun(self) -> list[float]:
-        """The actions that the next attempt goes on from."""
-        for data in self._rows("begun"):
+    def begun(self, group: str) -> list[float]:
+        """The actions that the group's next attempt goes on from."""
+        for data in self._rows("begun", group):
             ref = msgspec.msgpack.decode(data, type=BegunRow).begun
             if ref is not None:
                 job = Job(job_id="", env="", bundle="b", episodes=(), record="actions", begun=ref)
@@ -124,9 +125,9 @@ class Stored:
                 return [float(each.action[0]) for each in begun.unpack(job)[0].unpacked().taken]
         return []
 
-    def played(self) -> list[float]:
-        """The actions of the episode that counts."""
-        for data in self._rows("outcomes"):
+    def played(self, group: str) -> list[float]:
+        """The actions of the group's episode that counts."""
+        for data in self._rows("outcomes", group):
             recording = msgspec.msgpack.decode(data, type=OutcomeRow).outcome.trajectory
             assert recording is not None
             return actions_of(recording.inline or self._blobs.read(recording.digest))
@@ -137,7 +138,8 @@ class Stored:
 def test_an_agent_that_stops_its_validation_again_and_again_gets_one_throw(
     tmp_path: Path, restart: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    thrown: list[list[float]] = []
+    # Of each checkpoint's validation: after a restart a later one may be played first.
+    thrown: dict[str, list[list[float]]] = {}
     place(tmp_path)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path / "package"), prepend=os.pathsep)
     options = Options(
@@ -156,10 +158,11 @@ def test_an_agent_that_stops_its_validation_again_and_again_gets_one_throw(
 
     coordinators = [coordinator_of()]
 
-    async def wait_for(look: Callable[[], bool]) -> None:
+    async def wait_for(look: Callable[[], T | None]) -> T:
         async with asyncio.timeout(TIMEOUT_S):
-            while not look():
+            while not (found := look()):
                 await asyncio.sleep(0.02)
+        return found
 
     async def scenario() -> None:
         coordinator = coordinators[0]
@@ -167,38 +170,41 @@ def test_an_agent_that_stops_its_validation_again_and_again_gets_one_throw(
             worker = Supervisor(link, options, lambda index, tier: slot_of(tmp_path / f"slot-{index}"))
             working = asyncio.create_task(worker.run())
             created = await operator.create(env=ENTRY.id, n_validation=1, n_heldout=1)
-            group = validation_group(created.run, 0)
-            stored = Stored(coordinator.state, group)
+            groups = [validation_group(created.run, number) for number in range(N_STOPS + 1)]
+            stored = Stored(coordinator.state)
 
-            def is_played_further() -> bool:
+            def played_further() -> str | None:
+                """The group whose episode is played, once it has gone on from where it was stopped."""
                 held, _ = worker._held.snapshot()
-                return any(
-                    each.job_id == f"{group}/0" and each.steps > 2 + len(stored.begun()) for each in held
-                )
+                steps = {each.job_id: each.steps for each in held}
+                return next((g for g in groups if steps.get(f"{g}/0", 0) > 2 + len(stored.begun(g))), None)
 
             async with gateway_of(coordinator, created) as gateway:
                 await gateway.submit(bundle_of(CLOCKED), (0,), "first")
                 await gateway.results(0)
                 for number in range(N_STOPS):
-                    await wait_for(is_played_further)
+                    group = await wait_for(played_further)
+                    before = len(stored.begun(group))
                     await gateway.submit(bundle_of(CLOCKED), (0,), f"again-{number}")
-                    await wait_for(lambda: len(stored.begun()) > sum(map(len, thrown[-1:])))
-                    thrown.append(stored.begun())
+                    await wait_for(lambda: len(stored.begun(group)) > before)  # noqa: B023
+                    thrown.setdefault(group, []).append(stored.begun(group))
                     if restart and number == 0:
                         coordinator.kill()
                         coordinators.append(coordinator_of())
                     await gateway.results(number + 1)
-                await wait_for(is_played_further)
+                await wait_for(played_further)
                 (tmp_path / "package" / "end").touch()
                 await gateway.close()
             finished = await operator.finished(created.run)
             worker.drain()
             await asyncio.wait_for(working, TIMEOUT_S)
         assert finished.infrastructure_retries == 0
-        played = stored.played()
-        assert [len(actions) for actions in (*thrown, played)] == sorted({len(a) for a in (*thrown, played)})
-        for actions in thrown:
-            assert played[: len(actions)] == actions
+        assert sum(map(len, thrown.values())) == N_STOPS
+        for group, attempts in thrown.items():
+            played = stored.played(group)
+            lengths = [len(actions) for actions in (*attempts, played)]
+            assert lengths == sorted(set(lengths))
+            assert all(played[: len(actions)] == actions for actions in attempts)
 
     try:
         asyncio.run(scenario())
