@@ -14,7 +14,7 @@ LINE = b"42 (a) Z 7 (b) ) T 7 42 40 0 -1 4194564 1 2 3 4 100 20 3 400 20 0 1 0 5
 PROGRAM = """
 import os, time
 if os.fork() == 0:
-    end = time.process_time() + 0.2
+    end = time.process_time() + 0.25  # the kernel counts in ticks, and rounds down
     while time.process_time() < end: pass
     os._exit(0)
 os.wait()
