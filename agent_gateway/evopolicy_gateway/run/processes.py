@@ -14,6 +14,8 @@ from evopolicy_common.processes import proc
 _PR_SET_CHILD_SUBREAPER = 36
 _KEYCTL_JOIN_SESSION_KEYRING = 1
 _PAUSE_S = 0.01
+_KILLS = 100
+"""How often children are killed between two looks at all processes."""
 KILL_TIMEOUT_S = 10.0
 
 
@@ -54,20 +56,21 @@ def end_descendants(
     collects. Returns the ids that survive `KILL_TIMEOUT_S` seconds of killing: none, unless the kernel holds them.
     """
     kept = {*spare, *waited}
-    _signal_all(_below(spare), signal.SIGTERM)
+    _signal_all(_left(spare, kept), signal.SIGTERM)
     deadline = time.monotonic() + grace_s
-    while _below(spare) and time.monotonic() < deadline:
+    while _left(spare, kept) and time.monotonic() < deadline:
         _reap(kept)
         time.sleep(_PAUSE_S)
     deadline = time.monotonic() + KILL_TIMEOUT_S
-    while (left := _below(spare)) and time.monotonic() < deadline:
+    while (left := _left(spare, kept)) and time.monotonic() < deadline:
         # Stopped first: a process that forks faster than it is found must not outrun the killing.
         _signal_all(left, signal.SIGSTOP)
-        _signal_all(_below(spare), signal.SIGKILL)
+        _signal_all(_left(spare, kept), signal.SIGKILL)
+        _kill_children(kept)
         _reap(kept)
         time.sleep(_PAUSE_S)
     _reap(kept)
-    return _below(spare)
+    return _left(spare, kept)
 
 
 def end_orphans(known: Collection[int]) -> list[int]:
@@ -79,8 +82,23 @@ def end_orphans(known: Collection[int]) -> list[int]:
     return end_descendants(0.0, spare=known) if _reaps else []
 
 
-def _below(spare: Collection[int]) -> list[int]:
-    return proc.descendants(os.getpid(), spare=spare)
+def _left(spare: Collection[int], kept: Collection[int]) -> list[int]:
+    """All processes below this one but the dead among `kept`.
+
+    The other dead count. In a chain of processes, each of which forks once and ends, all that were listed may be dead
+    when they are looked at, and the one that lives was not there yet.
+    """
+    found = proc.family(os.getpid(), spare=spare)[1:]
+    return [each.pid for each in found if not (each.dead and each.pid in kept)]
+
+
+def _kill_children(kept: Collection[int]) -> None:
+    """Kills this process's children, again and again for a moment: it has to be faster than such a chain forks."""
+    me = os.getpid()
+    with contextlib.suppress(OSError, ValueError), open(f"/proc/{me}/task/{me}/children", "rb", 0) as file:
+        for _ in range(_KILLS):
+            file.seek(0)
+            _signal_all([pid for pid in map(int, file.read().split()) if pid not in kept], signal.SIGKILL)
 
 
 def _signal_all(pids: list[int], number: signal.Signals) -> None:
@@ -93,6 +111,6 @@ def _reap(kept: Collection[int]) -> None:
     """Collects the exit status of dead children, so that no zombies accumulate."""
     me = os.getpid()
     for each in proc.table():
-        if each.parent == me and each.state == "Z" and each.pid not in kept:
+        if each.parent == me and each.dead and each.pid not in kept:
             with contextlib.suppress(ChildProcessError):
                 os.waitpid(each.pid, os.WNOHANG)

@@ -24,6 +24,12 @@ class Stat(NamedTuple):
     """Whether it is on its way out."""
     cpu_s: float
     """Processor time of all its threads, and of the children that it has waited for, seconds."""
+    threads: int = 1
+
+    @property
+    def dead(self) -> bool:
+        """Whether it is a zombie. Its state alone does not tell: it is Z as soon as the first thread has ended."""
+        return self.state in ("Z", "X") and self.threads <= 1
 
 
 def parse_stat(line: bytes) -> Stat:
@@ -31,7 +37,7 @@ def parse_stat(line: bytes) -> Stat:
     # The command's name is in parentheses, and may itself contain spaces and parentheses.
     head, _, tail = line.rpartition(b")")
     fields = tail.split()
-    if len(fields) < 15:
+    if len(fields) < 18:
         raise ValueError(f"not the stat of a process: {line[:200]!r}")
     return Stat(
         pid=int(head.partition(b" ")[0]),
@@ -40,6 +46,7 @@ def parse_stat(line: bytes) -> Stat:
         session=int(fields[3]),
         exiting=bool(int(fields[6]) & _PF_EXITING),
         cpu_s=sum(map(int, fields[11:15])) / _TICKS,
+        threads=int(fields[17]),
     )
 
 
@@ -78,7 +85,7 @@ def family(root: int, *, spare: Collection[int] = ()) -> list[Stat]:
 
 def descendants(root: int, *, spare: Collection[int] = ()) -> list[int]:
     """The ids of the live processes below `root`, as `family` has them, without zombies."""
-    return [each.pid for each in family(root, spare=spare)[1:] if each.state != "Z"]
+    return [each.pid for each in family(root, spare=spare)[1:] if not each.dead]
 
 
 def sizes(pid: int) -> tuple[int, int] | None:

@@ -7,6 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 from machines.own_processes import alive
 
 from evopolicy_common.processes.proc import descendants
@@ -94,3 +95,45 @@ def test_what_a_spared_process_starts_meanwhile_is_spared_too(tmp_path: Path) ->
     command = [sys.executable, "-c", SEARCHER, BREEDER, str(done), str(touched)]
     assert subprocess.run(command, timeout=600, check=False).returncode == 0
     assert not touched.exists()
+
+
+CHAIN = """
+import os, time
+# Each forks once and ends: at whatever moment one looks, all that one has seen are dead.
+end = time.monotonic() + 30
+while time.monotonic() < end:
+    if os.fork():
+        os._exit(0)
+    os.setsid()
+"""
+
+HEADLESS = """
+import ctypes, os, threading, time
+threading.Thread(target=time.sleep, args=(30,)).start()
+# The first thread ends alone: the system shows the process as a zombie.
+ctypes.CDLL(None).syscall({"x86_64": 60, "aarch64": 93}[os.uname().machine], 0)
+"""
+
+ENDS = """
+import os, subprocess, sys, time
+from evopolicy_common.processes import proc
+from evopolicy_gateway.run import processes
+processes.become_subreaper()
+child = subprocess.Popen([sys.executable, "-S", "-c", sys.argv[1]])
+deadline = time.monotonic() + 20
+while proc.stat(child.pid).state != "Z" and time.monotonic() < deadline:
+    time.sleep(0.01)
+left = processes.end_descendants(0.0)
+found = set()
+for _ in range(50):
+    found.update(proc.family(os.getpid())[1:])
+    time.sleep(0.002)
+print(left, sorted(found))
+"""
+
+
+@pytest.mark.parametrize("program", [CHAIN, HEADLESS])
+def test_a_process_that_looks_dead_does_not_survive(program: str) -> None:
+    command = [sys.executable, "-c", ENDS, program]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=100, check=False)
+    assert done.stdout == "[] []\n", done.stdout + done.stderr

@@ -268,4 +268,4 @@ def _limited_data() -> Iterator[None]:
 
 def _session(leader: int) -> list[int]:
     """Pids of the living processes of a session."""
-    return [each.pid for each in proc.table() if each.session == leader and each.state not in "ZX"]
+    return [each.pid for each in proc.table() if each.session == leader and not each.dead]
