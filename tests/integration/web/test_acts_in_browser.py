@@ -122,7 +122,7 @@ def test_runs_workers_and_sweeps_are_acted_on_from_the_page(tmp_path: Path) -> N
                 act("/cluster", "a.href.endsWith('/worker/w-first/pause')")
                 page.until(f"{TEXT}.includes('paused')")
                 (folder / "go-1").touch()
-                page.until("document.getElementById('queue').innerText.includes('those that do are paused')")
+                page.until("document.getElementById('queue')?.innerText.includes('those that do are paused')")
                 assert done(folder) == 1
                 act("/cluster", "a.href.endsWith('/worker/w-first/resume')")
                 wait_until(lambda: done(folder) == 2, lambda: sweep.text)
@@ -138,7 +138,7 @@ def test_runs_workers_and_sweeps_are_acted_on_from_the_page(tmp_path: Path) -> N
                     act(run_page, "a.href.includes('/repin?class=')", reason="the first machine has died")
                     page.visit(f"{base}{run_page}")
                     page.until(
-                        "document.getElementById('events').innerText.includes('Worker w-first was lost with 1 job of this run')"
+                        "document.getElementById('events')?.innerText.includes('Worker w-first was lost with 1 job of this run')"
                     )
                     (folder / "go-3").touch()
                     wait_until(lambda: done(folder) == 4, lambda: sweep.text)

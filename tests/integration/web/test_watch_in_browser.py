@@ -94,7 +94,7 @@ def test_a_sweep_is_watched_from_start_to_end(tmp_path: Path) -> None:
         with process(log, *works) as worker, process(log, *shows) as view, Page(timeout_s=120) as page:
             wait_until(answers)
             page.visit(f"http://127.0.0.1:{web}/login#token={token}")
-            page.until("document.title === 'runs' && document.getElementById('live').textContent === 'live'")
+            page.until("document.title === 'runs' && document.getElementById('live')?.textContent === 'live'")
             assert page.run("location.hash") == ""
             assert page.run("document.cookie") == "", "scripts see no cookie"
             with command(tmp_path, *plays) as sweep:
@@ -107,7 +107,7 @@ def test_a_sweep_is_watched_from_start_to_end(tmp_path: Path) -> None:
                 assert page.violations() == []
                 page.visit(page.run("document.querySelector('#run-rows a').href"))
                 page.until("document.querySelectorAll('#submit-rows tr').length === 1")
-                page.until("document.getElementById('messages').innerText.includes('<i>I saw</i>')")
+                page.until("document.getElementById('messages')?.innerText.includes('<i>I saw</i>')")
                 assert page.violations() == []
                 (first,) = workspaces()
 
@@ -133,10 +133,10 @@ def test_a_sweep_is_watched_from_start_to_end(tmp_path: Path) -> None:
                     # The view restarts, and the page reconnects by itself.
                     view.terminate()
                     view.wait(timeout=TIMEOUT_S)
-                    page.until("document.getElementById('live').dataset.state === 'away'")
+                    page.until("document.getElementById('live')?.dataset.state === 'away'")
                     with process(log, *shows):
                         wait_until(answers)
-                        page.until("document.getElementById('live').dataset.state === 'live'")
+                        page.until("document.getElementById('live')?.dataset.state === 'live'")
                         page.problems.clear()
 
                         # The first run is scored while the second one's agent is alive: its scores are hidden until that ends.
