@@ -1,7 +1,7 @@
 """An agent times its submits so that its hidden validation is stopped again and again: its policy's dice are thrown once.
 
 A real coordinator, a real supervisor and its real slot; the agent is on another machine, so that its submits may be played.
-The environment is the test's own: a hidden episode of it goes on until the test writes a file, however slow the machine is.
+The environment is the test's own: a hidden episode of it goes on until the test writes its length to a file, however slow the machine is.
 """
 
 from __future__ import annotations
@@ -57,14 +57,16 @@ class Held(gymnasium.Env):
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
-        self.left = 5 if seed == {train} else None
+        self.hidden = seed != {train}
+        self.steps = 0
         return 0, {{}}
 
     def step(self, action):
-        if self.left is not None:
-            self.left -= 1
-        over = os.path.exists({end!r}) if self.left is None else not self.left
-        return 0, 0.0, over, False, {{}}
+        self.steps += 1
+        length = 5
+        if self.hidden:
+            length = int(open({end!r}).read()) if os.path.exists({end!r}) else self.steps + 1
+        return 0, 0.0, self.steps >= length, False, {{}}
 """
 CASES = {"train": 11, "valid": 1_000_003, "heldout": 1_000_033}
 """The seed of each split's only case."""
@@ -193,7 +195,10 @@ def test_an_agent_that_stops_its_validation_again_and_again_gets_one_throw(
                         coordinators.append(coordinator_of())
                     await gateway.results(number + 1)
                 await wait_for(played_further)
-                (tmp_path / "package" / "end").touch()
+                # An episode that has yet to go on repeats what it began, so the end lies beyond that.
+                furthest = max(len(actions) for attempts in thrown.values() for actions in attempts)
+                (tmp_path / "length").write_text(str(furthest + 3))
+                (tmp_path / "length").rename(tmp_path / "package" / "end")
                 await gateway.close()
             finished = await operator.finished(created.run)
             worker.drain()
