@@ -132,7 +132,15 @@ def test_documentation_is_put_in_words() -> None:
         assert gone not in text
 
 
-@pytest.mark.parametrize(("env_id", "last"), [("gymnasium/Humanoid-v5", 44), ("gymnasium/FetchSlide-v4", 24)])
+@pytest.mark.parametrize(
+    ("env_id", "last"),
+    [
+        ("gymnasium/Humanoid-v5", 44),
+        ("gymnasium/FetchSlide-v4", 24),
+        ("gymnasium/Pendulum-v1", 2),
+        ("gymnasium/InvertedDoublePendulum-v5", 8),
+    ],
+)
 def test_a_long_table_of_an_observation_is_shown_whole(env_id: str, last: int, warm: Warm) -> None:
     observation = warm(env_id).description.task_text.partition("## Action")[0]
     first = re.search(r"(?:^\| *\d+ *\|.*\n)+", observation, re.MULTILINE)

@@ -44,12 +44,14 @@ _SIGNS = re.compile(
             r"\bkg\b|N m s|\bg = |inertia \d|damping \d|gravity \d|m/s²|weight.{0,40}\d",
             r"Runge|Euler(?! angles| frame)|\d\.\d+ s\)|\d+ × \d\.\d+ s|\d/\d+ s|frame_skip|\bdt\b|time ?step of|Hz",
             r"standard deviation|[Nn]ormal(ly)? with|uniform (in|over)",
-            r"^To (see|play|run)\b.*:$",
+            r"^To (see|play|run)\b.*:$|is defined as:$",
             r"gymnasium\.make|kwarg|arXiv|arxiv|http|[Ss]eed|reward threshold|initialized as|must be specified|argument|`options`|_reward=|naming convention|[Ii]f `",
         )
     )
 )
 """Matches sentences with equations of motion, reward formulas or constants, about options, or before a program to run."""
+_OF_AN_ANGLE = re.compile(r"(?:\b\w = )?\b(cos|sin)\((\w+)\)")
+"""Matches what an element of an observation is, in a table: the sine or cosine of an angle."""
 _IN_CODE = re.compile(r"[\w)\]] [+*/×÷−<>-] [\w(]|\w[*/+]\w|\|.+ − .+\||=")
 _INCLUDE = re.compile(r"^<!-- include: ([\w.-]+) -->$", re.MULTILINE)
 _UNSEEN = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff]")
@@ -204,6 +206,7 @@ def _block_in_words(block: str) -> str:
     if any(line.lstrip().startswith("|") for line in lines):
         rows = [line.strip() for line in lines if line.lstrip().startswith("|")]
         widths = {row.count("|") for row in rows}
+        rows = [_OF_AN_ANGLE.sub(_in_a_word, row) for row in rows]
         return "\n".join(row for row in rows if not _is_formula(row)) if len(widths) == 1 else ""
     items = re.split(r"\n(?=\s*(?:[-*]|\d+\.) )", "\n".join(lines))
     kept = []
@@ -213,6 +216,10 @@ def _block_in_words(block: str) -> str:
     return "\n".join(
         item for item in kept if re.search(r"[A-Za-z]{2}", item) and not re.fullmatch(r"[-*] \*.+\*:", item)
     )
+
+
+def _in_a_word(found: re.Match[str]) -> str:
+    return f"{'cosine' if found[1] == 'cos' else 'sine'} of {found[2]}"
 
 
 def _is_formula(text: str) -> bool:
