@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
-
-import gymnasium
+from typing import TYPE_CHECKING, Any
 
 from evopolicy_common.catalogue import Entry
 from evopolicy_worker.environments.gymnasium_adapter import GymnasiumFamily
+
+if TYPE_CHECKING:
+    import gymnasium
 
 _WORDS = {
     # Its documentation calls the action an array of shape (1,).
