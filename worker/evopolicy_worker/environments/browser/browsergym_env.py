@@ -40,7 +40,12 @@ class BrowserGymEnv(PageEnv):
         if dom_object:
             options["load"] = "each"
         self._dom = dom_object
-        usual = {"reward": "positive", "episode_ms": _EPISODE_MS, "scripts": (script("browsergym.js"),)}
+        usual = {
+            "reward": "positive",
+            "episode_ms": _EPISODE_MS,
+            "scripts": (script("browsergym.js"),),
+            "accessible": True,
+        }
         super().__init__(page, **{**usual, **options})
         width, height = self._size[:2]
         self.observation_space = spaces.Dict(

@@ -107,8 +107,6 @@ _FLAGS = (
     "--disk-cache-size=1",
     "--media-cache-size=1",
     "--enable-blink-features=ComputedAccessibilityInfo",
-    # Keeps the accessibility tree between two questions. Without it, each element's role and name builds a tree anew.
-    "--force-renderer-accessibility",
     "--disable-features=AutofillServerCommunication,BackForwardCache,CertificateTransparencyComponentUpdater,DialMediaRouteProvider,"
     "GlobalMediaControls,HttpsUpgrades,InterestFeedContentSuggestions,IsolateOrigins,MediaRouter,OptimizationHints,OverlayScrollbar,"
     "PaintHolding,Prerender2,RenderDocument,SpareRendererForSitePerProcess,Translate,site-per-process",

@@ -68,6 +68,8 @@ class Address(msgspec.Struct, frozen=True):
     """Whether its clock is its own; otherwise it is the wall's."""
     scripts: tuple[str, ...] = ()
     """Expressions that run once the document has loaded."""
+    accessible: bool = False
+    """Whether roles and names of its elements are asked for at each step."""
 
 
 class Page:
@@ -399,6 +401,8 @@ def _first(address: Address) -> list[tuple[str, dict[str, Any]]]:
         ("Fetch.enable", {"patterns": [{"urlPattern": "*"}]}),
         ("Target.setAutoAttach", {"autoAttach": True, "waitForDebuggerOnStart": True, "flatten": True}),
         ("Emulation.setFocusEmulationEnabled", {"enabled": True}),
+        # Keeps the accessibility tree between two questions. Without it, each element's role and name builds a tree anew.
+        *([("Accessibility.enable", {})] if address.accessible else []),
         (
             "Emulation.setDeviceMetricsOverride",
             {"width": address.width, "height": address.height, "deviceScaleFactor": 1, "mobile": False},

@@ -64,10 +64,12 @@ class PageEnv(gymnasium.Env[Any, Any]):
         screenshot: bool = False,
         render_mode: str | None = None,
         scripts: tuple[str, ...] = (),
+        accessible: bool = False,
     ) -> None:
         """`page`: its name, such as `click-test`. `data_mode`: of pages whose tasks differ between training and test.
         `episode_ms`: when the page times out, on the episode's clock; 0: as it says itself. `screenshot`: whether
-        observations have a picture. `scripts`: more that runs in the page once it has loaded.
+        observations have a picture. `scripts`: more that runs in the page once it has loaded. `accessible`: roles and
+        names of elements are asked for at each step.
 
         Raises ConfigError for an argument that is none of the choices, and WorkerError when a program or package is
         missing.
@@ -90,6 +92,7 @@ class PageEnv(gymnasium.Env[Any, Any]):
             height=self._size[1],
             virtual=clock == "steps",
             scripts=(script("miniwob.js"), *scripts),
+            accessible=accessible,
         )
         self._begun: tuple[int, str] = (0, data_mode)
         self._actions: list[Any] = []
