@@ -145,7 +145,8 @@ def missing(env_id: str) -> str:
 
 
 def check_played(env_ids: Iterable[str]) -> None:
-    """Raises ConfigError that names environments which cannot be played here, eight at most, each with the remedy."""
+    """Raises ConfigError that names environments which cannot be played here, each with the remedy: eight that are not
+    installed and eight that are unknown at most."""
     lacking = {env_id: what for env_id in env_ids if (what := missing(env_id))}
     known = [f"{env_id} needs {what}" for env_id, what in lacking.items() if _known(env_id)]
     texts = [what for env_id, what in lacking.items() if not _known(env_id)]
