@@ -54,7 +54,7 @@ demo: install
 	@$(BIN)/evopolicy demo
 
 # More processes than cores, since many tests wait for timers and other processes. One by one: make test ARGS="-n 0"
-PROCESSES := $$(( $$(nproc) + 6 ))
+PROCESSES := $$(( $$(nproc) + 9 ))
 
 # ARGS that name files play those, of whatever layer.
 test: LAYERS = not system and not families
