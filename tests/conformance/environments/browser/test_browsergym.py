@@ -65,6 +65,24 @@ def test_no_key_brings_back_what_was_typed_in_an_earlier_episode(warm: Warm) -> 
         assert "value" not in nodes(step.obs, "textbox")[0]
 
 
+@pytest.mark.parametrize("load", ["once", "each"])
+@pytest.mark.parametrize(
+    ("kept", "pasted"),
+    [
+        ("fill(F, 'kept')\npress(F, 'Control+a')\npress(F, 'Control+c')", "press(F, 'Control+v')"),
+        ("mouse_drag_and_drop(5, 5, 400, 310)", "click(F, button='middle')"),
+    ],
+)
+def test_no_paste_brings_back_a_text_of_an_earlier_episode(load: Any, kept: str, pasted: str) -> None:
+    environment = BrowserGymEnv("enter-text", load=load)
+    (field,) = nodes(environment.reset(seed=1)[0], "textbox")
+    environment.step(kept.replace("F", repr(bid(field))))
+    environment.reset(seed=2)
+    obs = environment.step(pasted.replace("F", repr(bid(field))))[0]
+    assert obs["last_action_error"] == ""
+    assert "value" not in nodes(obs, "textbox")[0]
+
+
 def test_an_option_is_selected_by_its_label(warm: Warm) -> None:
     environment = warm("browsergym/miniwob.choose-list")
     obs = environment.reset(Case(seed=2))

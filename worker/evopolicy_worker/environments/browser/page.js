@@ -36,8 +36,8 @@
   let outer = null;
   try { outer = window !== window.top ? window.top.__evopolicy : null; } catch { outer = null; }
   const clock = outer ? outer.clock : {
-    now: 0, next: 1, timers: new Map(), left: "", error: "", guarded: false, pending: 0, copied: false, mouse: null,
-    int32: generator(SEED),
+    now: 0, next: 1, timers: new Map(), left: "", error: "", guarded: false, pending: 0, copied: true, mouse: null,
+    int32: generator(SEED),  // `copied`: whether the clipboard may have a text; it outlasts a document.
   };
   const now = () => clock.now;
 
@@ -168,6 +168,12 @@
   for (const name of ["copy", "cut"]) {
     window.addEventListener(name, () => { clock.copied = true; }, true);
   }
+  // The middle button pastes what was last selected, also in an earlier episode.
+  let button;
+  for (const name of ["mousedown", "keydown"]) window.addEventListener(name, (event) => { button = event.button; }, true);
+  window.addEventListener("paste", (event) => {
+    if (button === 1) { event.preventDefault(); event.stopImmediatePropagation(); }
+  }, true);
 
   // The browser's history of edits outlasts an episode: undoing and redoing would bring back what was typed in an earlier one.
   window.addEventListener("beforeinput", (event) => {
