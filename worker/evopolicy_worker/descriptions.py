@@ -25,6 +25,7 @@ import msgspec
 from evopolicy_common import catalogue
 from evopolicy_common.errors import DECODE_ERRORS, SlotDiedError, StorageError, WorkerError
 from evopolicy_common.logs import structlog
+from evopolicy_common.messages import bounds
 from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_common.records.blobs import write_atomically
 from evopolicy_worker.environments import registry
@@ -32,6 +33,8 @@ from evopolicy_worker.environments import registry
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
 AT_ONCE = 16
+MAX_BYTES = 1 << 20
+"""Largest description; one message has those of all environments that a worker offers."""
 TRIES = 5
 PAUSE_S = 0.5
 
@@ -129,7 +132,7 @@ async def describe_all(
     await _started(slot)
     for env_id in env_ids:
         try:
-            (description,) = await _described(env_id, slot)
+            description = await _described(env_id, slot)
         except WorkerError as error:
             if not found and not or_none and env_id == env_ids[-1]:
                 raise
@@ -142,10 +145,10 @@ async def describe_all(
     return tuple(found)
 
 
-async def _described(env_id: str, slot: Describes) -> tuple[EnvironmentDescription, ...]:
+async def _described(env_id: str, slot: Describes) -> EnvironmentDescription:
     for tries_left in reversed(range(TRIES)):
         try:
-            return await slot.describe([env_id])
+            return _announceable(env_id, await slot.describe([env_id]))
         except SlotDiedError as error:
             if not tries_left:
                 raise
@@ -153,6 +156,32 @@ async def _described(env_id: str, slot: Describes) -> tuple[EnvironmentDescripti
             await asyncio.sleep(PAUSE_S)
             await _started(slot)
     raise AssertionError("unreachable")
+
+
+def _announceable(env_id: str, found: Sequence[EnvironmentDescription]) -> EnvironmentDescription:
+    """The description, if messages can carry it. Raises WorkerError otherwise: third-party code made it, and the worker
+    cannot register with it."""
+    if [each.env for each in found] != [env_id]:
+        raise WorkerError(f"environment {env_id}: its process described another one; correct the environment")
+    (description,) = found
+    for name, value in (
+        ("observation_space", description.obs_space),
+        ("action_space", description.action_space),
+        ("definition", description.definition),
+    ):
+        try:
+            bounds.check_plain(value)
+        except ValueError as error:
+            raise WorkerError(
+                f"environment {env_id}, {name}: {error}; make it simpler by a wrapper"
+            ) from error
+    size = len(msgspec.msgpack.encode(description))
+    if size > MAX_BYTES:
+        raise WorkerError(
+            f"environment {env_id}: its description has {size:,} bytes, and {MAX_BYTES:,} are the limit; give elements of a"
+            " Box the same bounds, or shorten the texts"
+        )
+    return description
 
 
 async def _started(slot: Describes) -> None:

@@ -6,7 +6,7 @@ They are wide enough for everything that earlier versions stored. `codec.MAX_MES
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from functools import cache
 from typing import Annotated, Any, TypeVar
 
@@ -30,7 +30,7 @@ Many = Annotated[tuple[T, ...], Meta(max_length=1 << 20)]
 Named = Annotated[dict[Word, T], Meta(max_length=1 << 16)]
 Numbered = Annotated[dict[Int, T], Meta(max_length=1 << 20)]
 Plain = Annotated[dict[str, Any], Meta(max_length=1 << 16, extra={"plain": True})]
-"""JSON-like data; `check_plain` bounds its content."""
+"""Data of JSON's kinds; `check_plain` checks and bounds its content."""
 
 
 def plain_parts(message: Struct) -> Iterator[object]:
@@ -75,19 +75,27 @@ def _alternatives(found: inspect.Type) -> Iterator[inspect.Type]:
 
 
 def check_plain(value: object) -> None:
-    """Raises ValueError for a value that nests too deep or consists of too many values."""
+    """Raises ValueError for a value that nests too deep, consists of too many values, or is not what JSON has."""
     n = 0
     level = [value]
     for _ in range(MAX_DEPTH):
         n += len(level)
         if n > MAX_VALUES:
             raise ValueError(f"it is made of more than {MAX_VALUES:,} values")
-        level = [
-            item
-            for part in level
-            if isinstance(part, dict | list | tuple)
-            for item in (part.values() if isinstance(part, dict) else part)
-        ]
+        level = [item for part in level for item in _items(part)]
         if not level:
             return
     raise ValueError(f"it nests deeper than {MAX_DEPTH}")
+
+
+def _items(part: object) -> Iterable[object]:
+    if isinstance(part, dict):
+        for key in part:
+            if not isinstance(key, str):
+                raise ValueError(f"a key in it is {key!r:.80}; keys have to be texts")
+        return part.values()
+    if isinstance(part, list | tuple):
+        return part
+    if part is None or isinstance(part, str | int | float):
+        return ()
+    raise ValueError(f"a value in it is of type {type(part).__name__}; JSON has no such value")

@@ -8,13 +8,14 @@ import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import proofs
 import pytest
 
 from evopolicy_common import catalogue
-from evopolicy_common.errors import BrokenEnvironmentError
+from evopolicy_common.errors import BrokenEnvironmentError, WorkerError
 from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_worker import descriptions
 from evopolicy_worker.environments import describe, process_environment, registry
@@ -163,3 +164,37 @@ def test_an_environment_that_cannot_be_described_is_left_out_and_the_others_are_
     with pytest.raises(BrokenEnvironmentError, match="gym/ant5, reset: it hangs"):
         asyncio.run(descriptions.describe_all(["gym/ant5"], slot))
     assert asyncio.run(descriptions.describe_all(["gym/ant5"], slot, or_none=True)) == ()
+
+
+@pytest.mark.parametrize(
+    ("changed", "why"),
+    [
+        ({"env": "toy/maze"}, "environment toy/line: its process described another one"),
+        (
+            {"obs_space": {"type": "Dict", "spaces": {1: {"type": "Discrete", "n": 2}}}},
+            "environment toy/line, observation_space: a key in it is 1; keys have to be texts; make it simpler",
+        ),
+        (
+            {"action_space": {"low": [0.0] * (1 << 20)}},
+            "environment toy/line, action_space: it is made of more than 1,048,576 values; make it simpler",
+        ),
+        (
+            {"obs_space": {"low": [0.1] * (1 << 17)}},
+            "environment toy/line: its description has 1,.* bytes, and 1,048,576 are the limit; give elements of a Box",
+        ),
+    ],
+)
+def test_a_description_that_no_message_can_carry_is_left_out_and_the_others_are_offered(
+    changed: dict[str, Any], why: str
+) -> None:
+    """The worker could not register with it, or the coordinator not store it."""
+
+    class Odd(Scripted):
+        async def describe(self, env_ids: Sequence[str]) -> tuple[EnvironmentDescription, ...]:
+            (found,) = await super().describe(env_ids)
+            return (msgspec.structs.replace(found, **changed) if found.env == "toy/line" else found,)
+
+    found = asyncio.run(descriptions.describe_all(["toy/line", "toy/maze"], Odd()))
+    assert [each.env for each in found] == ["toy/maze"]
+    with pytest.raises(WorkerError, match=why):
+        asyncio.run(descriptions.describe_all(["toy/line"], Odd()))

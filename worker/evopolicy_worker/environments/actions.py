@@ -57,7 +57,7 @@ def compile_actions(schema: SpaceSchema) -> ActionCodec:
     if kind in ("Box", "Image"):
         return _Box(schema)
     if kind == "MultiDiscrete":
-        return _MultiDiscrete(schema["nvec"], schema.get("start", 0))
+        return _MultiDiscrete(schema["nvec"], schema.get("start", 0), schema.get("dtype", "int64"))
     if kind == "MultiBinary":
         return _MultiBinary(schema["n"])
     if kind == "Text":
@@ -153,13 +153,13 @@ class _Box:
             whole = np.trunc(values)
             invalid = invalid or bool((whole != values).any())
             values = whole
-        return np.minimum(np.maximum(values, self._clip_low), self._clip_high).astype(self._dtype), invalid
+        return self._cast(np.minimum(np.maximum(values, self._clip_low), self._clip_high)), invalid
 
     def sample(self, rng: np.random.Generator) -> NDArray[Any]:
         low, below, above = self._low, self._bounded_below, self._bounded_above
         high = self._high if self._is_float else self._high + 1
         if self._is_float and self._bounded:
-            return rng.uniform(low, high).astype(self._dtype)
+            return self._cast(rng.uniform(low, high))
         values = np.empty(self._shape)
         # Gymnasium's order of drawing, so that the same generator gives the same action.
         free, only_high, only_low, both = ~below & ~above, ~below & above, below & ~above, below & above
@@ -169,19 +169,24 @@ class _Box:
         values[both] = rng.uniform(low=low[both], high=high[both], size=int(both.sum()))
         if not self._is_float:
             values = np.minimum(np.maximum(np.floor(values), self._clip_low), self._clip_high)
-        return values.astype(self._dtype)
+        return self._cast(values)
 
     def neutral(self) -> NDArray[Any]:
-        return self._neutral.astype(self._dtype)
+        return self._cast(self._neutral)
+
+    def _cast(self, values: Any) -> NDArray[Any]:
+        """A fresh array of the space's dtype; numpy makes scalars of arrays without axes."""
+        return np.asarray(values).astype(self._dtype)
 
 
 class _MultiDiscrete:
-    def __init__(self, nvec: Any, start: Any) -> None:
+    def __init__(self, nvec: Any, start: Any, dtype: str) -> None:
+        self._dtype = np.dtype(dtype)
         self._n = np.array(nvec, dtype=np.int64)
         self._low = np.broadcast_to(np.array(start, dtype=np.int64), self._n.shape)
         self._high = self._low + self._n - 1
 
-    def repair(self, raw: object) -> tuple[NDArray[np.int64], bool]:
+    def repair(self, raw: object) -> tuple[NDArray[Any], bool]:
         numbers = _numbers(raw)
         shaped, invalid = _shaped(numbers, self._n.shape) if numbers is not None else (None, True)
         if shaped is None:
@@ -192,23 +197,23 @@ class _MultiDiscrete:
             invalid = invalid or not bool(whole.all())
             shaped = np.where(whole, shaped, self._low)
         clipped = np.minimum(np.maximum(shaped, self._low), self._high)
-        return clipped.astype(np.int64), invalid or bool((clipped != shaped).any())
+        return clipped.astype(self._dtype), invalid or bool((clipped != shaped).any())
 
-    def sample(self, rng: np.random.Generator) -> NDArray[np.int64]:
-        return (rng.random(self._n.shape) * self._n).astype(np.int64) + self._low
+    def sample(self, rng: np.random.Generator) -> NDArray[Any]:
+        drawn = (rng.random(self._n.shape) * self._n).astype(np.int64) + self._low
+        return drawn.astype(self._dtype, copy=False)
 
-    def neutral(self) -> NDArray[np.int64]:
-        return self._low.copy()
+    def neutral(self) -> NDArray[Any]:
+        return self._low.astype(self._dtype)
 
 
 class _MultiBinary:
     def __init__(self, n: int | list[int]) -> None:
         self._shape = (n,) if isinstance(n, int) else tuple(n)
-        self._codec = _MultiDiscrete(np.full(self._shape, 2), 0)
+        self._codec = _MultiDiscrete(np.full(self._shape, 2), 0, "int8")
 
     def repair(self, raw: object) -> tuple[NDArray[np.int8], bool]:
-        action, invalid = self._codec.repair(raw)
-        return action.astype(np.int8), invalid
+        return self._codec.repair(raw)
 
     def sample(self, rng: np.random.Generator) -> NDArray[np.int8]:
         return rng.integers(low=0, high=2, size=self._shape, dtype=np.int8)

@@ -1,7 +1,7 @@
 """Spaces as plain dicts: from a Gymnasium space to the schema that policies, `/info` and the codecs read.
 
 Forms (as in the published protocol): `Discrete {n, start?}`, `Box {shape, dtype, low, high}`, `Image {shape, dtype, layout,
-value_range, storage}`, `MultiDiscrete {nvec, start?}`, `MultiBinary {n}`, `Tuple {spaces}`, `Dict {spaces}`, `Text
+value_range, storage}`, `MultiDiscrete {nvec, start?, dtype?}` (`dtype`: that of actions, unless int64), `MultiBinary {n}`, `Tuple {spaces}`, `Dict {spaces}`, `Text
 {min_length, max_length, characters?}`, and beyond it `Sequence {space, stacked}`, `Graph {node_space, edge_space}`, `OneOf {spaces}`. Infinities are `"inf"` and `"-inf"`. `low` and `high` are nested lists, or one number for all values
 where a Box has more than 32 and they are equal. A schema is JSON and msgpack by construction.
 """
@@ -49,6 +49,8 @@ def to_schema(space: gymnasium.Space[Any]) -> SpaceSchema:
         schema = {"type": "MultiDiscrete", "nvec": space.nvec.tolist()}
         if np.any(space.start):
             schema["start"] = space.start.tolist()
+        if space.dtype != np.int64:
+            schema["dtype"] = str(space.dtype)
         return schema
     if isinstance(space, spaces.MultiBinary):
         n = space.n
@@ -59,6 +61,9 @@ def to_schema(space: gymnasium.Space[Any]) -> SpaceSchema:
     if isinstance(space, spaces.Tuple):
         return {"type": "Tuple", "spaces": [to_schema(part) for part in space.spaces]}
     if isinstance(space, spaces.Dict):
+        for key in space.spaces:
+            if not isinstance(key, str):
+                raise TypeError(f"key {key!r:.80} of a Dict has no form here; its keys have to be texts")
         return {
             "type": "Dict",
             "spaces": {key: to_schema(part) for key, part in space.spaces.items()},
@@ -70,6 +75,11 @@ def to_schema(space: gymnasium.Space[Any]) -> SpaceSchema:
         return schema
     if isinstance(space, spaces.Sequence):
         inner = to_schema(space.feature_space)
+        if space.stack and inner["type"] in ("Dict", "Tuple"):
+            raise TypeError(
+                f"a stacked Sequence of {inner['type']} has no form here; give it without stack=True, or stack within the"
+                f" {inner['type']}"
+            )
         return {
             "type": "Sequence",
             "space": inner,

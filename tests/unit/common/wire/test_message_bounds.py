@@ -104,7 +104,14 @@ def beyond(found: inspect.Type) -> list[Any]:
     """Values that a part must not have."""
     match found:
         case inspect.Metadata():
-            return [nested(bounds.MAX_DEPTH), {"a": [None] * (bounds.MAX_VALUES + 1)}, {"a": nested(50_000)}]
+            return [
+                nested(bounds.MAX_DEPTH),
+                {"a": [None] * (bounds.MAX_VALUES + 1)},
+                {"a": nested(50_000)},
+                {"a": [{1: 2}]},
+                {"a": [b"b"]},
+                {"a": msgspec.msgpack.Ext(5, b"b")},
+            ]
         case inspect.StrType(max_length=int(n)):
             return ["x" * (n + 1), b"\xd6 "]
         case inspect.BytesType(max_length=int(n)):
@@ -178,6 +185,7 @@ def test_what_a_peer_would_refuse_is_not_sent() -> None:
         close(agent={"n": [0] * (bounds.MAX_VALUES + 1)}),
         close(agent={"n": 2**70}),
         close(agent={"n": object()}),
+        close(agent={"n": {1: 2}}),
         close(agent={f"{k}": "x" * 60_000 for k in range(300)}),
     ):
         with pytest.raises(ProtocolError, match="a CloseRun"):

@@ -137,6 +137,21 @@ def test_a_space_without_a_form_is_refused() -> None:
         to_schema(Quaternion())
 
 
+@pytest.mark.parametrize(
+    "inner", [spaces.Dict({"a": spaces.Discrete(2)}), spaces.Tuple([spaces.Discrete(2)])]
+)
+def test_a_stacked_sequence_of_several_parts_is_refused(inner: spaces.Space[Any]) -> None:
+    with pytest.raises(
+        TypeError, match=r"a stacked Sequence of (Dict|Tuple) has no form here; give it without stack"
+    ):
+        to_schema(spaces.Sequence(inner, stack=True))
+
+
+def test_a_key_that_is_no_text_is_refused() -> None:
+    with pytest.raises(TypeError, match="key 1 of a Dict has no form here; its keys have to be texts"):
+        to_schema(spaces.Tuple([spaces.Dict({1: spaces.Discrete(2)})]))  # type: ignore[dict-item]
+
+
 def test_observations_become_plain_in_the_order_and_dtypes_of_the_space() -> None:
     space = spaces.Dict(
         {
