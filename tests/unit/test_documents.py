@@ -68,7 +68,7 @@ def tree() -> frozenset[str]:
 
 
 @cache
-def tests_text() -> str:
+def text_of_tests() -> str:
     return "".join(path.read_text() for path in (ROOT / "tests").rglob("*.py"))
 
 
@@ -110,7 +110,7 @@ def test_options_that_a_document_names_are_ours(document: str) -> None:
     ours = {option for _, command in commands() for each in command.params for option in each.opts}
     code = [word for word in code_in(document) if " pytest " not in word]
     named = {option for word in code for option in re.findall(r"(?<![\w-])--[a-z][\w-]*", word)}
-    assert {option for option in named - ours - {"--help"} if f'"{option}"' not in tests_text()} == set()
+    assert {option for option in named - ours - {"--help"} if f'"{option}"' not in text_of_tests()} == set()
 
 
 def test_make_has_the_targets_that_documents_name() -> None:
@@ -124,6 +124,35 @@ def test_every_command_is_in_a_document_and_its_help_has_an_example() -> None:
     names = {name: f"`{name.partition(' ')[2]}" for name, _ in commands()}
     assert [name for name, short in names.items() if name not in text and short not in text] == []
     assert [name for name, each in commands() if "Example: " not in f"{each.epilog} {each.help}"] == []
+
+
+def test_the_architecture_names_every_folder_of_a_room_and_of_its_larger_parts() -> None:
+    table = text_of("ARCHITECTURE.md").partition("Folders inside the rooms:")[2].partition("\n## ")[0]
+    named = set(re.findall(r"`(\w+)/`", table))
+    parts = [
+        *ROOMS.values(),
+        "coordinator/evopolicy_coordinator/analysis/",
+        "worker/evopolicy_worker/environments/",
+    ]
+    inside = {
+        path.removeprefix(part).partition("/")[0]
+        for path in tree()
+        for part in parts
+        if path.startswith(part) and path.endswith(".py") and "/" in path.removeprefix(part)
+    }
+    assert inside - named == set()
+
+
+def test_the_places_of_rules_that_the_architecture_names_define_them() -> None:
+    text = text_of("ARCHITECTURE.md").partition("**Where to find a rule:**")[2].partition("\n## ")[0]
+    named = re.findall(r"`([\w/]+\.py)`(?:: | \()`(\w+)`", text)
+    assert len(named) > 20
+    for path, name in named:
+        (found,) = (each for each in tree() if each.endswith("/" + path) and not each.startswith("tests/"))
+        assert re.search(rf"^(def |async def |class )?{name}\b", (ROOT / found).read_text(), re.MULTILINE), (
+            path,
+            name,
+        )
 
 
 def test_the_keys_that_the_architecture_lists_are_those_that_are_answered() -> None:
