@@ -173,7 +173,7 @@ async def _suite(order: Order) -> int:
             suite_file.check_agents_start(begun)
             for one in decided:
                 if one.kind == "keep":
-                    _keep(order, index, one)
+                    _keep(index, one)
                 elif one.run.name not in index.runs:
                     # The live view then also shows the reasons of waiting runs.
                     index.runs[one.run.name] = suite_index.waiting(one.run)
@@ -220,7 +220,7 @@ def _tell(order: Order, index: Index, decided: list[Decision], console: Terminal
             view.event("planned", one.run.name, what=one.kind, attempt=one.attempt, why=one.why)
 
 
-def _keep(order: Order, index: Index, decision: Decision) -> None:
+def _keep(index: Index, decision: Decision) -> None:
     """Brings the index in line with a finished run's own record."""
     run = decision.run
     path = run.folder.run_json

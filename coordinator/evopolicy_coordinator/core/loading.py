@@ -68,7 +68,7 @@ def load(state: State, snapshot: Snapshot, step: Step, drain: Callable[[State, S
     while loading.reloaded:
         group = loading.reloaded.pop(0)
         if not group.closed:
-            _conclude(state, group, step)
+            _conclude(group, step)
             drain(state, step)
     state.loading = None
     if state.adopting:
@@ -110,6 +110,6 @@ def _spent(run: Run, row: SubmitRow) -> None:
         run.rollout_s += max(0.0, row.completed_at - started_at)
 
 
-def _conclude(state: State, group: JobGroup, step: Step) -> None:
+def _conclude(group: JobGroup, step: Step) -> None:
     if group.done:
         step.tell(EpisodesDone(group, None, ()))

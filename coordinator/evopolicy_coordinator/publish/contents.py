@@ -41,8 +41,6 @@ DIGESTS, RUN, OPENING, SALT, RESULT, EPISODES = (
 )
 LOG = "logs/agent.jsonl"
 """Of a run, where its publisher chose to: the agent's log. The journal does not fix it."""
-ALWAYS = (RUN, OPENING, SALT, RESULT, EPISODES)
-"""Of each run; actions and checkpoints may have been withheld."""
 MAX_RUNS = 4096
 MAX_DOCUMENT_BYTES = 64 << 20
 MAX_RECORDING_BYTES = 1 << 30

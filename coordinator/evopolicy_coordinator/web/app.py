@@ -233,7 +233,7 @@ class Site:
         index = request.path_params["index"]
         values = None
         if run is not None:
-            values = await asyncio.to_thread(submit_values, run, self.runs, self.reader, index)
+            values = await asyncio.to_thread(submit_values, run, self.reader, index)
         if run is None or values is None:
             return self._message(
                 request, "Not found", "There is no such submit, or it has no verdict yet.", 404

@@ -74,11 +74,6 @@ class Cluster:
         """Whether the status is recent enough to decide by."""
         return self.status is not None and time.monotonic() - self._at < STALE_S
 
-    @property
-    def age_s(self) -> float:
-        """Seconds since the last answer."""
-        return time.monotonic() - self._at
-
     def look(self) -> None:
         """Somebody looks: the next question need not wait for the idle pause."""
         self._wake.set()

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 from acceleration_drivers import Driver, competent_driver, random_driver
-from environment_checks import IDS, _digest
+from environment_checks import IDS, value_digest
 from gymnasium.envs.box2d.car_racing import PLAYFIELD
 from gymnasium.envs.classic_control.acrobot import AcrobotEnv
 
@@ -61,7 +61,7 @@ def compare(
     try:
         for seed in seeds:
             obs = plain.reset(Case(seed=seed))
-            if _digest(accelerated.reset(Case(seed=seed))) != _digest(obs):
+            if value_digest(accelerated.reset(Case(seed=seed))) != value_digest(obs):
                 raise DifferenceError(f"{env_id}, seed {seed}: first observation")
             driver = factory(plain, seed)
             done.episodes += 1
@@ -75,9 +75,9 @@ def compare(
                 done.plain_s += between - started
                 done.steps += 1
                 done.returns += expected.reward
-                if _digest(_state(accelerated)) != _digest(_state(plain)):
+                if value_digest(_state(accelerated)) != value_digest(_state(plain)):
                     raise DifferenceError(f"{env_id}, seed {seed}, step {index}: state of the simulator")
-                if _digest(tuple(found)) != _digest(tuple(expected)):
+                if value_digest(tuple(found)) != value_digest(tuple(expected)):
                     raise DifferenceError(f"{env_id}, seed {seed}, step {index}: {_parts(found, expected)}")
                 obs = expected.obs
                 if expected.terminated or expected.truncated:
@@ -141,7 +141,9 @@ def _state(environment: Any) -> list[Any]:
 
 def _parts(found: Any, expected: Any) -> str:
     names = [
-        name for name in found._fields if _digest(getattr(found, name)) != _digest(getattr(expected, name))
+        name
+        for name in found._fields
+        if value_digest(getattr(found, name)) != value_digest(getattr(expected, name))
     ]
     return ", ".join(names)
 

@@ -17,8 +17,9 @@ from typing import Any
 import numpy as np
 
 from evopolicy_common.catalogue import suites
-from evopolicy_common.messages.environment import Case, SpaceSchema
+from evopolicy_common.messages.environment import SpaceSchema
 from evopolicy_worker.environments import Environment, make
+from evopolicy_worker.environments.checks.episodes import add, rollout
 
 IDS = [*suites()["core16"].environments, *suites()["toy"].environments]
 """Those with a text and numbers of their own; `test_families.py` looks at the others."""
@@ -35,42 +36,16 @@ def play(
 
     With `frames`, every step is also rendered, and FRAMES steps are played.
     """
-    env_id = environment.description.env
-    limit = steps or (FRAMES if frames else STEPS.get(env_id, 80))
-    rng = np.random.default_rng(seed)
-    digests = [_digest(environment.reset(Case(seed=seed)))]
-    for _ in range(limit):
-        if frames:
-            environment.render()
-        step = environment.step(environment.action_codec.sample(rng))
-        digests.append(_digest(tuple(step)))
-        if step.terminated or step.truncated:
-            break
-    return digests
+    limit = steps or (FRAMES if frames else STEPS.get(environment.description.env, 80))
+    episode = rollout(environment, seed, limit, drawn=frames)
+    return [value_digest(tuple(step) if n else step.obs) for n, (_, step) in enumerate(episode)]
 
 
-def _digest(value: Any) -> str:
+def value_digest(value: Any) -> str:
+    """Digest of an observation, of a step, or of a simulator's state."""
     state = hashlib.sha256()
-    for part in _bytes(value):
-        state.update(part)
+    add(state, value)
     return state.hexdigest()[:16]
-
-
-def _bytes(value: Any) -> Iterator[bytes]:
-    """Everything that tells one value from another, types and signs of zero included."""
-    if isinstance(value, np.ndarray):
-        yield f"{value.dtype.str}{value.shape}".encode()
-        yield value.tobytes()
-    elif isinstance(value, dict):
-        for key, item in value.items():
-            yield key.encode()
-            yield from _bytes(item)
-    elif isinstance(value, list | tuple):
-        yield f"{len(value)}".encode()
-        for item in value:
-            yield from _bytes(item)
-    else:
-        yield f"{type(value).__name__}:{value.hex() if isinstance(value, float) else value!r}".encode()
 
 
 def leaves(schema: SpaceSchema, path: str = "") -> Iterator[tuple[str, SpaceSchema]]:

@@ -8,17 +8,9 @@ from importlib.resources import files
 
 from evopolicy_coordinator.analysis.scoring.scores import ScoreTable, read_score_csv
 
-TABLES = (
-    "table1_heldout_returns",
-    "table2_aggregate",
-    "normalised_performance",
-    "code_structure",
-    "edit_types",
-)
-
 
 def text(name: str) -> str:
-    """The CSV text of one of `TABLES`."""
+    """The CSV text of one table, by its file's name without the ending."""
     return files("evopolicy_coordinator.analysis").joinpath("data", f"{name}.csv").read_text(encoding="utf-8")
 
 
@@ -28,5 +20,5 @@ def heldout_returns() -> ScoreTable:
 
 
 def rows(name: str) -> list[dict[str, str]]:
-    """One of `TABLES` as printed, one dict per row."""
+    """One table as printed, one dict per row."""
     return list(csv.DictReader(io.StringIO(text(name))))

@@ -51,12 +51,10 @@ def conflict(state: State, priority: int, family: Family | None, worker: Worker)
         return train_conflict(state, family, worker.kernel)
     if priority not in HIDDEN:
         return False
-    return hidden_conflict(state, family, worker.kernel) is not None or _train_waits(
-        state, priority, family, worker
-    )
+    return hidden_conflict(state, family, worker.kernel) is not None or _train_waits(priority, family, worker)
 
 
-def _train_waits(state: State, priority: int, family: Family | None, worker: Worker) -> bool:
+def _train_waits(priority: int, family: Family | None, worker: Worker) -> bool:
     """Whether related train jobs wait for workers like this one: hidden jobs must not delay them."""
     assert family is not None
     if priority != EARLY_VALIDATION and related(worker.kernel.reversals, family):

@@ -40,10 +40,10 @@ def leased(state: State, lease: Lease, worker: Worker, serial: int, step: Step) 
         serial,
     )
     lease.occupancy = occupancy
-    _enter(state, occupancy)
+    _enter(occupancy)
 
 
-def _enter(state: State, occupancy: Occupancy) -> None:
+def _enter(occupancy: Occupancy) -> None:
     family = occupancy.family
     if family is not None:
         family.users += 1
@@ -143,7 +143,7 @@ def unknown(state: State, worker: Worker, item: HeldLease, step: Step) -> None:
 
 def _linger(state: State, occupancy: Occupancy, step: Step) -> None:
     occupancy.until = step.now + state.settings.silent_bar_s
-    _enter(state, occupancy)
+    _enter(occupancy)
     state.lingering.setdefault(occupancy.worker, {})[occupancy.id] = occupancy
     state.timers.arm_once(("linger", occupancy.worker), occupancy.until)
 

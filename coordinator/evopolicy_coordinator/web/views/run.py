@@ -41,7 +41,7 @@ def run_view(
     detail = None if run.path is None else Detail(run.path)
     reference = ("random, held-out", run.random) if may_show and run.random is not None else None
     parts = {
-        "facts": part("facts", facts=_run_facts(run, may_show, submits)),
+        "facts": part("facts", facts=_run_facts(run, may_show)),
         "notices": part("notices", notices=_one_run_notices(run, may_show)),
         "curve": part(
             "figure",
@@ -95,7 +95,7 @@ def _retried(one: RetriedJobs) -> Happened:
     return Happened(at=at, level="warning", text=f"{what}. {again}, at no charge.")
 
 
-def _run_facts(run: RunFacts, may_show: bool, submits: Sequence[SubmitFacts]) -> list[tuple[str, str]]:
+def _run_facts(run: RunFacts, may_show: bool) -> list[tuple[str, str]]:
     facts = [
         ("state", state_words(run.state)),
         ("episodes used", f"{run.used} of {run.budget}" if run.budget else str(run.used)),
@@ -179,7 +179,7 @@ def _classes(run: RunFacts, status: StatusReply | None) -> list[str]:
     )
 
 
-def submit_values(run: RunFacts, runs: Runs, reader: Reader, index: int) -> dict[str, Any] | None:
+def submit_values(run: RunFacts, reader: Reader, index: int) -> dict[str, Any] | None:
     """The parts of one submit's page; None for an unknown submit."""
     if run.path is None:
         return None

@@ -9,7 +9,6 @@ from typing import Any
 MAX_CALLS = 32
 """Of one action."""
 MAX_NUMBER = 1e6
-_ANY = (str, int, float, list)
 _NUMBER = (int, float)
 BID = {"bid": str}
 _POINT: dict[str, Any] = {"x": _NUMBER, "y": _NUMBER}

@@ -8,7 +8,6 @@ each id. It loads a family once and forks a process per id, so that a crash or h
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import io
 import os
 import pickle
@@ -34,7 +33,8 @@ from evopolicy_common.processes.parent_death import end_with_parent
 from evopolicy_common.processes.scratch import remove_tree
 from evopolicy_common.records.episodes.rendered import Renderer, decode
 from evopolicy_worker.environments import registry, spaces
-from evopolicy_worker.environments.base import Environment
+from evopolicy_worker.environments.base import Environment, Step
+from evopolicy_worker.environments.checks.episodes import digest, digest_of, rollout
 from evopolicy_worker.environments.gymnasium_adapter import GymnasiumEnvironment
 
 SEEDS = (20_011_117, 20_011_229)
@@ -124,14 +124,14 @@ def _play(played: Played, steps: int) -> None:
     played.observation, played.action = description.obs_space["type"], description.action_space["type"]
     played.rebuilt = bool(getattr(environment, "rebuilds", False))
     with _no_pickles(played):
-        first = _episode(played, environment, SEEDS[0], steps, looked_at=True)
+        first = digest_of(_looked_at(played, environment, steps))
     played.digest = first
-    _episode(played, environment, SEEDS[1], steps)
-    played.reused = _episode(played, environment, SEEDS[0], steps) == first
-    _nonsense(played, environment)
+    digest(environment, SEEDS[1], steps)
+    played.reused = digest(environment, SEEDS[0], steps) == first
+    _nonsense(environment)
     environment.close()
     again = registry.make(played.env)
-    played.fresh = _episode(played, again, SEEDS[0], steps) == first
+    played.fresh = digest(again, SEEDS[0], steps) == first
     if isinstance(again, GymnasiumEnvironment):
         played.microseconds = round(_bare_step(again, steps) * 1e6, 1)
     played.rendered = _rendered(played, again, min(steps, _RENDERED_STEPS)) if description.renders else "none"
@@ -143,64 +143,41 @@ def _rendered(played: Played, plain: Environment, steps: int) -> str:
     if find_library("EGL") is None:
         return ""
     drawn = registry.make(played.env, render=True)
-    there = _episode(played, drawn, SEEDS[0], steps, drawn=True)
+    there = digest(drawn, SEEDS[0], steps, drawn=True)
     drawn.close()
-    if there == _episode(played, plain, SEEDS[0], steps):
+    if there == digest(plain, SEEDS[0], steps):
         return "same"
     played.faults.append("an episode that is drawn is another one")
     return "differs"
 
 
-def _episode(
-    played: Played,
-    environment: Environment,
-    seed: int,
-    steps: int,
-    *,
-    looked_at: bool = False,
-    drawn: bool = False,
-) -> str:
-    """Digest of an episode with random actions drawn from `seed`. `looked_at`: also check everything in it. `drawn`: draw each
-    state."""
-    description = environment.description
-    rng = np.random.default_rng(seed)
-    digest = hashlib.sha256()
+def _looked_at(played: Played, environment: Environment, steps: int) -> Iterator[tuple[Any, Step]]:
+    """Plays an episode, and checks everything in it."""
+    description, seed = environment.description, SEEDS[0]
     recorder = Renderer("arrays", description.obs_storage)
-    obs = environment.reset(Case(seed=seed))
-    _update(digest, obs)
-    n, ended = 0, "going on"
+    obs: Any = None
     success: dict[str, None] = {}
-    while n < steps and ended == "going on":
-        if looked_at:
-            _look(played, description.obs_space, obs, n)
-        if drawn:
-            environment.render()
-        action = environment.action_codec.sample(rng)
-        step = environment.step(action)
-        n += 1
-        ended = "terminated" if step.terminated else "truncated" if step.truncated else ended
-        _update(digest, tuple(step))
-        if looked_at:
+    for n, (action, step) in enumerate(rollout(environment, seed, steps)):
+        if n:
             recorder.append(obs, action, step.reward, step.terminated, step.truncated, step.info)
             success |= dict.fromkeys(key for key in step.info if "success" in key)
             if not np.isfinite(step.reward):
                 played.faults.append(f"step {n}: the reward is {step.reward}")
             if seed in _numbers(step.info) or any("seed" in key for key in step.info):
                 played.faults.append(f"step {n}: info names the seed")
-            if ended == "truncated" and n > description.max_episode_steps:
-                played.faults.append(f"its limit of {description.max_episode_steps} steps is not kept")
         obs = step.obs
-    if looked_at:
         _look(played, description.obs_space, obs, n)
-        played.steps, played.ended, played.success = n, ended, list(success)
-        if n >= description.max_episode_steps and ended == "going on":
-            played.faults.append(f"its limit of {description.max_episode_steps} steps is not kept")
-        files = decode(recorder.finish()).files
-        played.step_bytes = round(sum(map(len, files.values())) / n)
-        for name, data in files.items():
-            if name.endswith((".npy", ".npz")):
-                _loaded_without_pickle(played, name, data)
-    return digest.hexdigest()[:16]
+        yield action, step
+    played.steps, played.success = n, list(success)
+    played.ended = "terminated" if step.terminated else "truncated" if step.truncated else "going on"
+    limit = description.max_episode_steps
+    if (played.ended == "truncated" and n > limit) or (played.ended == "going on" and n >= limit):
+        played.faults.append(f"its limit of {limit} steps is not kept")
+    files = decode(recorder.finish()).files
+    played.step_bytes = round(sum(map(len, files.values())) / n)
+    for name, data in files.items():
+        if name.endswith((".npy", ".npz")):
+            _loaded_without_pickle(played, name, data)
 
 
 def _loaded_without_pickle(played: Played, name: str, data: bytes) -> None:
@@ -243,7 +220,7 @@ def _look(played: Played, schema: Any, obs: Any, n: int) -> None:
             played.faults.append(f"step {n}: the observation names the seed")
 
 
-def _nonsense(played: Played, environment: Environment) -> None:
+def _nonsense(environment: Environment) -> None:
     environment.reset(Case(seed=SEEDS[0]))
     for raw in _NONSENSE:
         action, invalid = environment.action_codec.repair(raw)
@@ -269,25 +246,6 @@ def _bare_step(environment: GymnasiumEnvironment, steps: int) -> float:
         if terminated or truncated or n % environment.description.max_episode_steps == 0:
             bare.reset(seed=n)
     return spent / n
-
-
-def _update(digest: Any, value: Any) -> None:
-    """Hashes a value so that any difference shows, including types and signs of zero."""
-    if isinstance(value, np.ndarray):
-        digest.update(f"{value.dtype.str}{value.shape}".encode())
-        digest.update(value.tobytes())
-    elif isinstance(value, dict):
-        for key, item in value.items():
-            digest.update(str(key).encode())
-            _update(digest, item)
-    elif isinstance(value, list | tuple):
-        digest.update(f"{len(value)}".encode())
-        for item in value:
-            _update(digest, item)
-    else:
-        digest.update(
-            f"{type(value).__name__}:{value.hex() if isinstance(value, float) else value!r}".encode()
-        )
 
 
 def _numbers(value: Any) -> set[float]:
