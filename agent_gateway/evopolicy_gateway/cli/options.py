@@ -38,7 +38,8 @@ Slots = Annotated[
     typer.Option(
         min=1,
         max=1024,
-        help="Episodes that the local worker plays at the same time.",
+        help="Episodes that the local worker plays at the same time. Environments in a virtual environment of their"
+        " own have a worker with as many.",
         rich_help_panel=CLUSTER,
     ),
 ]

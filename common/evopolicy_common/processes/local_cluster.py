@@ -84,7 +84,8 @@ class LocalCluster:
         self, env_ids: Sequence[str], *, slots: int, tiers: Collection[Tier] = ()
     ) -> None:
         """Starts a worker that offers these environments, or one from each virtual environment that they need; in an
-        audited cluster two of each. They divide the slots, and each has one at least.
+        audited cluster two of each, which divide the slots. Workers of different virtual environments do not divide
+        them: they are rarely busy at the same time, and a slot that waits for an episode takes no processor time.
 
         `tiers`: sandbox tiers that will be used. If one does not work here, the cluster fails with the remedy.
         """
@@ -107,8 +108,7 @@ async def _start_workers(
     options: Sequence[str],
 ) -> None:
     divided = installs.divided(wanted.env_ids)
-    n_workers = len(divided) * (2 if audited else 1)
-    started = 0
+    suffixes = ("", "-2") if audited else ("",)
     for python, env_ids in divided.items():
         # --unsandboxed: whoever starts this cluster also chooses the tiers of its runs.
         program = [*_module("evopolicy_worker.cli", python), "--grace", "1", "--unsandboxed", *credentials]
@@ -118,9 +118,8 @@ async def _start_workers(
         for tier in sorted(wanted.tiers):
             program += ["--need-tier", tier]
         own = "" if python == sys.executable else f"-{Path(python).parents[1].name}"
-        for suffix in ("", "-2") if audited else ("",):
-            slots = wanted.slots // n_workers + (started < wanted.slots % n_workers)
-            started += 1
+        for k, suffix in enumerate(suffixes):
+            slots = max(1, -(-(wanted.slots - k) // len(suffixes)))
             await processes.keep_up(f"worker{own}{suffix}", [*program, "--slots", str(max(1, slots))])
 
 

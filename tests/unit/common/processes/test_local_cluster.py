@@ -186,6 +186,37 @@ def test_workers_divide_the_slots_of_an_audited_cluster(
     assert started["test-worker-2"][-2:] == ["--slots", "2"]
 
 
+def test_each_virtual_environments_worker_has_all_slots(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    programs(monkeypatch, SERVES)
+    started: dict[str, list[str]] = {}
+    start = ChildProcess.start
+
+    async def noted(program: Sequence[str], log: Path, **more: Any) -> ChildProcess:
+        started[log.stem] = list(program[3:])
+        return await start(program, log, **more)
+
+    other = tmp_path / "toys" / "bin" / "python"
+    other.parent.mkdir(parents=True)
+    other.symlink_to(sys.executable)
+    monkeypatch.setattr(
+        local_cluster.installs,
+        "divided",
+        lambda env_ids: {sys.executable: env_ids[:1], str(other): env_ids[1:]},
+    )
+    monkeypatch.setattr(ChildProcess, "start", noted)
+    monkeypatch.setattr(local_cluster, "END_GRACE_S", SOON_S)
+
+    async def main() -> None:
+        async with local_cluster.local_cluster("test", state=tmp_path) as cluster:
+            await cluster.start_workers(["toy/line", "toy/maze"], slots=2)
+
+    asyncio.run(main())
+    assert started["test-worker"][-4:] == ["--env", "toy/line", "--slots", "2"]
+    assert started["test-worker-toys"][-4:] == ["--env", "toy/maze", "--slots", "2"]
+
+
 def test_workers_are_started_beside_the_coordinator(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     programs(monkeypatch, SERVES)
     started: dict[str, list[str]] = {}
