@@ -308,7 +308,7 @@ class Double:
 
     def has_permit(self) -> bool:
         """Whether the run's agent may be alive somewhere."""
-        core = self.world.service._core
+        core = self.world.service.host.core
         return core is not None and self.run_id in core.state.permits
 
     async def _ask(self, key: str, message: Message) -> Any:
@@ -383,15 +383,15 @@ class Double:
         for index in order:
             await self._report_results([found[index]])
         if len(order) < len(found):
-            self.world.service._unix_offset += SUBMIT_WALL_S + 1.0
-            self.world.service._on_timer()
+            self.world.service.host._unix_offset += SUBMIT_WALL_S + 1.0
+            self.world.service.host._on_timer()
             # The leases live meanwhile: an expired one would be a fault of ours, after which the limit begins again.
             while self._plays_train():
                 await asyncio.sleep(0.05)
             self._held.clear()
 
     def _plays_train(self) -> bool:
-        core = self.world.service._core
+        core = self.world.service.host.core
         return core is not None and any(group.kind == "train" for group in core.state.groups.values())
 
     async def _report_results(self, leases: list[worker.Lease]) -> None:

@@ -108,9 +108,9 @@ async def run(options: Options, stop: asyncio.Event, on_ready: Callable[[Ready],
                 from evopolicy_coordinator.server.monitoring.metrics import Meter
                 from evopolicy_coordinator.server.monitoring.metrics_server import metrics_server
 
-                service.meter = Meter(state.root, service.status)
+                meter = service.host.meter = Meter(state.root, service.status)
                 port = await serving.enter_async_context(
-                    metrics_server(options.metrics, service.meter, lambda: service.serves)
+                    metrics_server(options.metrics, meter, lambda: service.serves)
                 )
                 log.info("metrics are served", address=options.metrics, port=port)
             await service.start()
@@ -165,7 +165,7 @@ async def _serve(
 
 async def _until(stop: asyncio.Event, service: Service) -> None:
     """Waits for `stop`. Raises PartFailedError as soon as the service cannot continue."""
-    waiting = [asyncio.ensure_future(stop.wait()), asyncio.ensure_future(service.failure())]
+    waiting = [asyncio.ensure_future(stop.wait()), asyncio.ensure_future(service.host.failure())]
     try:
         done, _ = await asyncio.wait(waiting, return_when=asyncio.FIRST_COMPLETED)
         for task in done:

@@ -5,15 +5,8 @@ Rules that this module owns:
   have the reader's threads, and the transport's threads send replies.
 - Every batch of queries is one tick: all its events are handled, then their effects go to the outbox, so that one
   fsync serves them all.
-- When the store refuses to write, the service drops the core and all undelivered effects, and loads a new core from
-  disk as soon as the disk allows. Meanwhile it refuses requests that would change something, with the reason, and
-  ends all others without a reply, so that the clients retry. It does the same after a bug in the core, or a row that
-  the store does not accept, but only a few times in a row.
-- A failure that the service cannot recover from (a store that cannot be loaded for another reason, a failure that
-  recurs after each load, a failure of the service itself) ends the process with the reason. Its supervisor restarts
-  it from the state on disk. See `failure`.
-- `now` is Unix time at the start, but no earlier than the latest time on disk, advanced by the monotonic clock. A
-  change of the wall clock has no effect.
+- While no core is loaded (see `core_host`), the service refuses requests that would change something if the store
+  cannot be written, with the reason, and ends all others without a reply, so that the clients retry.
 """
 
 from __future__ import annotations
@@ -23,22 +16,21 @@ import contextlib
 import hmac
 import time
 from collections.abc import Callable, Coroutine
+from functools import partial
 from importlib import metadata
-from typing import TYPE_CHECKING
 
 import msgspec
 from msgspec.structs import replace
 
 from evopolicy_common.errors import (
     DamagedStoreError,
-    PartFailedError,
     ProtocolError,
     RefusedError,
     StorageError,
 )
 from evopolicy_common.logs import structlog
 from evopolicy_common.messages import operator
-from evopolicy_common.messages.worker import BlobGet, BlobPut, Fingerprint, LeaseRequest, Message, Refused
+from evopolicy_common.messages.worker import BlobGet, BlobPut, LeaseRequest, Message, Refused
 from evopolicy_common.records.policies import bundles
 from evopolicy_common.wire import codec
 from evopolicy_common.wire.refusals import Refusal
@@ -53,9 +45,9 @@ from evopolicy_coordinator.core.events import (
 )
 from evopolicy_coordinator.core.machine import Core
 from evopolicy_coordinator.core.model import Worker
-from evopolicy_coordinator.core.records import latest_time
 from evopolicy_coordinator.core.settings import CoreSettings
 from evopolicy_coordinator.server.claims import Claims
+from evopolicy_coordinator.server.core_host import CoreHost
 from evopolicy_coordinator.server.definitions import undescribed
 from evopolicy_coordinator.server.monitoring.watchdog import LoopWatchdog
 from evopolicy_coordinator.server.pending import PendingQueries
@@ -64,20 +56,11 @@ from evopolicy_coordinator.server.reason_texts import message, words
 from evopolicy_coordinator.server.refused_workers import RefusedWorkers
 from evopolicy_coordinator.server.request_parser import Parsed, RequestParser
 from evopolicy_coordinator.storage.store import Store
-from evopolicy_coordinator.storage.writer import Outbox, Writer
-
-if TYPE_CHECKING:
-    from evopolicy_coordinator.server.monitoring.metrics import Meter
+from evopolicy_coordinator.storage.writer import Writer
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
 MAX_BUNDLE_BYTES = bundles.MAX_BYTES + bundles.MAX_FILES * (bundles.MAX_PATH_BYTES + 32)
-_FIRST_PAUSE_S = 0.2
-_LONGEST_PAUSE_S = 5.0
-_LOADS_MAX = 5
-"""Maximum number of reloads after consecutive failures that are not the disk's, each within `_SOON_S` of the one
-before."""
-_SOON_S = 60.0
 _FORGET_S = 120.0
 """Longer than any long poll: the core answers those within `CoreSettings.max_wait_s`."""
 _STALLS_LOGGED = 5
@@ -104,44 +87,21 @@ class Service:
         self._writer = Writer(store)
         self._claims = Claims(self._writer)
         self._refused_workers = RefusedWorkers()
-        self._outbox: Outbox | None = None
-        self._core: Core | None = None
         self._pending = PendingQueries()
-        self._incarnation = 0
-        self._timer: asyncio.TimerHandle | None = None
-        self._timer_at = 0.0
+        self.host = CoreHost(settings, self._writer, self._carry_out, self._pending.let_go)
         self._tasks: set[asyncio.Task[None]] = set()
-        self._reload_pause_s = _FIRST_PAUSE_S
-        self._n_failures = 0
-        """Failures of the core, each within `_SOON_S` of the one before."""
-        self._failed_at = 0.0
-        self._storage_error = ""
-        self._stopping = False
-        self._failed: asyncio.Future[None] = self._loop.create_future()
-        self._unix_offset = time.time() - self._loop.time()
-        self._started_at = self.now()
+        self._started_at = self.host.now()
         self._watchdog: LoopWatchdog | None = None
         self._sweeper: asyncio.TimerHandle | None = None
-        self.n_events = 0
+        self._n_events = 0
         self._last_status: tuple[float, bytes] | None = None
         """When the last status reply was made, and the reply."""
         self._status_cost_s = 0.0
         self._disk: operator.DiskUse | None = None
-        self.meter: Meter | None = None
-        """If set, observes the effects of every step."""
 
     async def start(self) -> None:
-        """Loads the core from the store.
-
-        Raises StorageError when the store cannot be read or its incarnation cannot be incremented, and
-        PartFailedError when the store can be read but no core can be built from it.
-        """
-        try:
-            await self._load()
-        except StorageError:
-            raise
-        except Exception as error:
-            raise self._fail("loading the state", error) from error
+        """Loads the core from the store. Raises StorageError and PartFailedError, as `CoreHost.start`."""
+        await self.host.start()
         self._watchdog = LoopWatchdog()
         self._sweep()
 
@@ -150,41 +110,20 @@ class Service:
 
         A second call does nothing.
         """
-        if self._stopping:
+        if self.host.stopping:
             return
-        self._stopping = True
-        self._cancel_timer()
+        self.host.stop()
         if self._sweeper is not None:
             self._sweeper.cancel()
         for task in list(self._tasks):
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
-        while self._outbox is not None and not self._outbox.idle:
-            # Returns after all work submitted before it, including the flush that this work triggers.
-            await self._writer.call(lambda store: None)
+        await self.host.settle()
         self._pending.let_go()
         await self._writer.close()
         await asyncio.to_thread(self._reader.close)
         if self._watchdog is not None:
             self._watchdog.close()
-
-    async def failure(self) -> None:
-        """Never returns. Raises PartFailedError with the reason when a part of the service cannot continue."""
-        await asyncio.shield(self._failed)
-
-    def _fail(self, part: str, error: BaseException) -> PartFailedError:
-        """Stops serving, as the process must end. The state on disk stays, and the next process starts from it."""
-        log.error("a part of the coordinator failed", part=part, exc_info=error)
-        failed = PartFailedError(f"{part} failed: {type(error).__name__}: {error}")
-        if not self._failed.done():
-            self._failed.set_exception(failed)
-            self._failed.exception()  # mark as retrieved: nothing may await it, as during the start
-        self._forget_core()
-        return failed
-
-    def now(self) -> float:
-        """Unix time in seconds; never goes back."""
-        return self._unix_offset + self._loop.time()
 
     # Queries in.
 
@@ -196,19 +135,19 @@ class Service:
             except Exception:
                 log.exception("request failed", key=query.key)
                 query.drop()
-        self._flush()
+        self.host.flush()
 
     def on_liveliness(self, key: str, alive: bool) -> None:
         """Handles the appearance or loss of a worker's liveliness token."""
         worker = key.rsplit("/", 2)[-2]
         log.debug("liveliness", worker=worker, alive=alive)
-        if not alive and self._core is not None and not self._stopping:
-            self._handle(LivenessLost(stimulus_id=self._stimulus("liveness"), worker=worker))
-            self._flush()
+        if not alive and self.serves:
+            self.host.handle(LivenessLost(stimulus_id=self._stimulus("liveness"), worker=worker))
+            self.host.flush()
 
     def _receive(self, query: IncomingQuery) -> None:
-        core = self._core
-        if core is None or self._stopping:
+        core = self.host.core
+        if core is None or self.host.stopping:
             self._turn_away(query)
             return
         try:
@@ -238,22 +177,9 @@ class Service:
         elif isinstance(message, operator.JournalRequest | operator.OpeningRequest | operator.SignRequest):
             self._reader.published(message, answer_to(query, parsed.asker))
         elif isinstance(message, operator.DescribeEnvironment):
-            found = {
-                repr(each.profile.fingerprints[message.env]): each.profile
-                for each in core.state.workers.values()
-                if message.env in each.profile.descriptions
-            }.values()
-            fingerprints = tuple(each.fingerprints[message.env] for each in found)
-            classes = tuple(each.classes[message.env] for each in found)
-            awaited = not found and any(
-                message.env in each.undescribed and each.state != "lost"
-                for each in core.state.workers.values()
-            )
-            if awaited:
-                self._handle(DescriptionAwaited(stimulus_id=self._stimulus_of(message), env=message.env))
-            self._spawn(self._serve_description(query, message, fingerprints, classes, awaited))
+            self._spawn(self._serve_read(query, self._description(core, message)))
         elif isinstance(message, operator.FurtherCasesRequest):
-            self._spawn(self._serve_further(query, message))
+            self._spawn(self._serve_read(query, partial(self._further_cases, message)))
         elif isinstance(message, operator.EnvironmentsRequest):
             workers = core.state.workers.values()
             page = _page(self._parser.definitions.offered(workers), message.cursor)
@@ -274,7 +200,7 @@ class Service:
                 raise
             if isinstance(message, LeaseRequest):
                 event = msgspec.structs.replace(event, waited_s=self._loop.time() - query.arrived)
-            self._handle(event)
+            self.host.handle(event)
 
     def _pinned(self, core: Core, parsed: Parsed) -> Parsed:
         """Returns the request with the environment definition that its episodes are played in."""
@@ -317,8 +243,8 @@ class Service:
             query.drop()
             return
         if request in self._pending:  # otherwise the core was dropped meanwhile, and the query with it
-            self._handle(event)
-            self._flush()
+            self.host.handle(event)
+            self.host.flush()
 
     def _event_from_files(self, parsed: Parsed, request: int, stimulus: str) -> AnyEvent:
         message = parsed.message
@@ -333,53 +259,54 @@ class Service:
             return DisclosureRequested(stimulus_id=stimulus, request=request, message=message, epochs=epochs)
         return self._parser.event(parsed, request, stimulus)
 
-    async def _serve_description(
-        self,
-        query: IncomingQuery,
-        message: operator.DescribeEnvironment,
-        fingerprints: tuple[Fingerprint, ...],
-        classes: tuple[str, ...],
-        awaited: bool,
-    ) -> None:
-        """Replies with the split hashes and the fingerprints that matter for replaying a run's episodes."""
+    async def _serve_read(self, query: IncomingQuery, read: Callable[[], Message]) -> None:
+        """Replies with a message that `read` makes from files and the store, on a thread."""
         try:
-            row = await asyncio.to_thread(self._reader.finished_run, message.run)
-            hashes = await asyncio.to_thread(self._parser.split_hashes, message, row)
+            query.reply(answer_bytes(await asyncio.to_thread(read)))
         except RefusedError as error:
             self._refuse(query, error)
         except Exception:
             log.exception("request failed", key=query.key)
             query.drop()
-        else:
-            known = operator.EnvironmentState(
-                split_hashes=hashes,
+
+    def _description(self, core: Core, message: operator.DescribeEnvironment) -> Callable[[], Message]:
+        """Reads the split hashes and the fingerprints that matter for replaying a run's episodes."""
+        workers = core.state.workers.values()
+        found = {
+            repr(each.profile.fingerprints[message.env]): each.profile
+            for each in workers
+            if message.env in each.profile.descriptions
+        }.values()
+        awaited = not found and any(
+            message.env in each.undescribed and each.state != "lost" for each in workers
+        )
+        fingerprints = tuple(each.fingerprints[message.env] for each in found)
+        classes = tuple(each.classes[message.env] for each in found)
+        if awaited:
+            self.host.handle(DescriptionAwaited(stimulus_id=self._stimulus_of(message), env=message.env))
+
+        def read() -> operator.EnvironmentState:
+            row = self._reader.finished_run(message.run)
+            return operator.EnvironmentState(
+                split_hashes=self._parser.split_hashes(message, row),
                 knows_run=row is not None,
                 fingerprints=fingerprints,
                 classes=classes,
                 awaited=awaited,
             )
-            query.reply(answer_bytes(known))
 
-    async def _serve_further(self, query: IncomingQuery, message: operator.FurtherCasesRequest) -> None:
-        """Replies with further hidden cases for a finished run."""
+        return read
 
-        def derived() -> operator.FurtherCases:
-            row, _ = self._reader.finished_with_result(message.run)
-            found = self._parser.further_cases(message, row, self._reader.revealed())
-            return operator.FurtherCases(cases=found.cases, epoch=found.epoch)
-
-        try:
-            query.reply(answer_bytes(await asyncio.to_thread(derived)))
-        except RefusedError as error:
-            self._refuse(query, error)
-        except Exception:
-            log.exception("request failed", key=query.key)
-            query.drop()
+    def _further_cases(self, message: operator.FurtherCasesRequest) -> operator.FurtherCases:
+        """Derives further hidden cases for a finished run."""
+        row, _ = self._reader.finished_with_result(message.run)
+        found = self._parser.further_cases(message, row, self._reader.revealed())
+        return operator.FurtherCases(cases=found.cases, epoch=found.epoch)
 
     async def _serve_claim(self, query: IncomingQuery, message: operator.Claim) -> None:
         """Serves a claim without the core: claims change no run."""
         try:
-            answer: Message = await self._claims.ask(message, self.now())
+            answer: Message = await self._claims.ask(message, self.host.now())
         except RefusedError as error:
             self._refuse(query, error)
             return
@@ -421,28 +348,28 @@ class Service:
     @property
     def serves(self) -> bool:
         """Whether a core is loaded."""
-        return self._core is not None and not self._stopping
+        return self.host.core is not None and not self.host.stopping
 
     def status(self) -> operator.StatusReply | None:
         """The current status for operators; None while no core is loaded."""
-        return None if self._core is None else self._status(self._core)
+        return None if self.host.core is None else self._status(self.host.core)
 
     def _status_bytes(self, core: Core, max_age_s: float) -> bytes:
         """The status as a message; the last one again if it is young enough, as each visits all state."""
-        if self._last_status is None or self.now() - self._last_status[0] >= max_age_s:
+        if self._last_status is None or self.host.now() - self._last_status[0] >= max_age_s:
             began = time.thread_time()
-            self._last_status = self.now(), answer_bytes(self._status(core))
+            self._last_status = self.host.now(), answer_bytes(self._status(core))
             self._status_cost_s = time.thread_time() - began
         return self._last_status[1]
 
     def _status(self, core: Core) -> operator.StatusReply:
-        part = core.status(self.now(), words)._asdict()
+        part = core.status(self.host.now(), words)._asdict()
         part["stalls"] = self._stalls(part["stalls"])
         return operator.StatusReply(
             cluster=self._cluster,
             version=metadata.version("evopolicy"),
-            uptime_s=self.now() - self._started_at,
-            turned_away=self._refused_workers.recent(self.now()),
+            uptime_s=self.host.now() - self._started_at,
+            turned_away=self._refused_workers.recent(self.host.now()),
             disk=self._disk,
             cost_s=self._status_cost_s,
             **part,
@@ -451,17 +378,17 @@ class Service:
     def _refuse(self, query: IncomingQuery, error: RefusedError) -> None:
         log.info("refused", key=query.key, status=error.status, why=error.message)
         answer = Refused(status=error.status, message=error.message)
-        self._refused_workers.answered(query.key, query.payload, answer, self.now())
+        self._refused_workers.answered(query.key, query.payload, answer, self.host.now())
         query.reply(answer_bytes(answer))
 
     def _turn_away(self, query: IncomingQuery) -> None:
         """Without a core, refuses requests that would change something, with the reason, and drops all others."""
-        if self._storage_error and self._parser.asks_for_change(query.key, query.payload):
+        if self.host.storage_error and self._parser.asks_for_change(query.key, query.payload):
             why = "the coordinator cannot write its store and accepts no changes until it can"
             if not self._parser.is_gateways(
                 query.key
             ):  # the reason contains paths, which agents must not see
-                why += f": {self._storage_error}"
+                why += f": {self.host.storage_error}"
             query.reply(answer_bytes(Refused(status=Refusal.UNAVAILABLE, message=why)))
         else:
             query.drop()
@@ -470,132 +397,8 @@ class Service:
         return self._stimulus(type(message).__name__.lower())
 
     def _stimulus(self, what: str) -> str:
-        self.n_events += 1
-        return f"{what}-{self._incarnation}.{self.n_events}"
-
-    # The core.
-
-    def _handle(self, event: AnyEvent) -> None:
-        self._advance(lambda core: core.handle(event, self.now()))
-
-    def _advance(self, step: Callable[[Core], list[Effect]]) -> None:
-        core, outbox = self._core, self._outbox
-        if core is None or outbox is None:
-            return
-        try:
-            effects = step(core)
-        except Exception as error:
-            # A bug. The core's state in memory may be half changed; the state on disk is not.
-            self._core_failed(error)
-            return
-        if self.meter is not None:
-            self.meter.observe(effects)
-        outbox.put(effects)
-
-    def _core_failed(self, error: Exception) -> None:
-        """Reloads the core, unless the last reloads did not help."""
-        now = self._loop.time()
-        self._n_failures = self._n_failures + 1 if now - self._failed_at < _SOON_S else 1
-        self._failed_at = now
-        if self._n_failures > _LOADS_MAX:
-            self._fail(f"the core, {self._n_failures} times in a row,", error)
-            return
-        log.error("the core failed; reloading it from the store", n=self._n_failures, exc_info=error)
-        self._drop_core()
-
-    def _flush(self) -> None:
-        try:
-            if self._outbox is not None:
-                self._outbox.flush()
-            self._set_timer()
-        except Exception as error:
-            self._fail("the outbox", error)
-
-    def _set_timer(self) -> None:
-        deadline = None if self._core is None or self._stopping else self._core.next_deadline()
-        if deadline is None:
-            self._cancel_timer()
-            return
-        at = deadline - self._unix_offset
-        if self._timer is not None:
-            if self._timer_at <= at:
-                # The old timer fires early, finds nothing due and is set again: cheaper than resetting it for each
-                # event.
-                return
-            self._timer.cancel()
-        self._timer_at = at
-        self._timer = self._loop.call_at(at, self._on_timer)
-
-    def _cancel_timer(self) -> None:
-        if self._timer is not None:
-            self._timer.cancel()
-            self._timer = None
-
-    def _on_timer(self) -> None:
-        self._timer = None
-        # If it fires too early, it only sets itself again.
-        self._advance(lambda core: core.handle_deadline(self.now()) if _is_due(core, self.now()) else [])
-        self._flush()
-
-    async def _load(self) -> None:
-        snapshot = await self._writer.call(Store.load)
-        self._incarnation = snapshot.incarnation
-        # The clock may have been set back while no coordinator ran. Nothing may end before it started.
-        self._unix_offset += max(0.0, latest_time(snapshot) - self.now())
-        self._core, effects = Core.load(self._settings, snapshot, self.now())
-        if self.meter is not None:
-            self.meter.loaded(self._core)
-        self._outbox = Outbox(self._writer, self._carry_out, self._on_write_failure)
-        self._outbox.put(effects)
-        self._storage_error = ""
-        log.info("loaded", incarnation=snapshot.incarnation, runs=len(snapshot.runs))
-        self._flush()
-
-    def _on_write_failure(self, error: BaseException) -> None:
-        if isinstance(error, DamagedStoreError):
-            self._core_failed(error)
-            return
-        if not isinstance(error, StorageError):
-            self._fail("writing the store", error)
-            return
-        self._storage_error = str(error)
-        self._drop_core()
-        log.error("the store cannot write; requests are refused until it can", error=str(error))
-
-    def _drop_core(self) -> None:
-        """Drops all state that is not on disk and starts reloading."""
-        if self._outbox is not None and self._outbox.commits:
-            self._reload_pause_s = _FIRST_PAUSE_S
-        self._forget_core()
-        if not self._stopping:
-            self._spawn(self._reload())
-
-    def _forget_core(self) -> None:
-        if self._outbox is not None:
-            self._outbox.discard()
-        self._core = None
-        self._outbox = None
-        self._cancel_timer()
-        self._pending.let_go()
-
-    async def _reload(self) -> None:
-        while True:
-            await asyncio.sleep(self._reload_pause_s)
-            self._reload_pause_s = min(_LONGEST_PAUSE_S, 2 * self._reload_pause_s)
-            try:
-                await self._load()
-            except DamagedStoreError as error:
-                self._fail("loading the state", error)
-                return
-            except StorageError as error:
-                log.error("the store still cannot write", error=str(error))
-                self._storage_error = str(error)
-            except Exception as error:
-                self._fail("loading the state", error)
-                return
-            else:
-                log.info("the store writes again")
-                return
+        self._n_events += 1
+        return f"{what}-{self.host.incarnation}.{self._n_events}"
 
     # Effects out.
 
@@ -611,14 +414,14 @@ class Service:
             pending = self._pending.take(effect.request)
             if pending is not None:
                 query, reply = pending.query, message(effect)
-                self._refused_workers.answered(query.key, query.payload, reply, self.now())
+                self._refused_workers.answered(query.key, query.payload, reply, self.host.now())
                 query.reply(answer_bytes(reply), lane_of(pending.asker))
         elif isinstance(effect, ReadEffect):
             pending = self._pending.take(effect.request)
             if pending is not None:
                 self._reader.page(effect, answer_to(pending.query, pending.asker))
         elif isinstance(effect, AuditEffect):
-            self._reader.audit(effect, self._audit_listener(self._incarnation))
+            self._reader.audit(effect, self._audit_listener(self.host.incarnation))
         elif isinstance(effect, Log):
             getattr(log, effect.level)(effect.event, stimulus=effect.stimulus_id, **effect.fields)
 
@@ -627,9 +430,9 @@ class Service:
         own."""
 
         def arrived(event: AuditEvent) -> None:
-            if incarnation == self._incarnation and not self._stopping:
-                self._handle(event)
-                self._flush()
+            if incarnation == self.host.incarnation and not self.host.stopping:
+                self.host.handle(event)
+                self.host.flush()
 
         def tell(event: AuditEvent) -> None:
             with contextlib.suppress(RuntimeError):  # the loop is closed: the process is ending
@@ -653,24 +456,23 @@ class Service:
 
     def _tell_stalls(self) -> None:
         """Logs jobs and groups that wait too long, as `evopolicy status` shows them."""
-        stalls = () if self._core is None else self._stalls(self._core.status(self.now(), words).stalls)
+        stalls = (
+            ()
+            if self.host.core is None
+            else self._stalls(self.host.core.status(self.host.now(), words).stalls)
+        )
         if stalls:
             log.warning("stalls", n=len(stalls), first=stalls[:_STALLS_LOGGED])
 
     def _stalls(self, of_core: tuple[str, ...]) -> tuple[str, ...]:
         """Descriptions of waits longer than `stall_s`, for the disk and in the core."""
-        writing_s = 0.0 if self._outbox is None else self._outbox.writing_s
+        writing_s = self.host.writing_s
         if writing_s <= self._settings.stall_s:
             return of_core
         return (
             f"{len(self._pending)} requests wait for the disk: it has been writing for {writing_s:.0f} s",
             *of_core,
         )
-
-
-def _is_due(core: Core, now: float) -> bool:
-    deadline = core.next_deadline()
-    return deadline is not None and now >= deadline
 
 
 def _check_session(core: Core, name: str, session: str) -> Worker:

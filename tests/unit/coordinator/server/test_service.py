@@ -22,7 +22,7 @@ from evopolicy_common.messages.operator import RunSettings
 from evopolicy_common.wire import keys
 from evopolicy_coordinator.core.machine import Core
 from evopolicy_coordinator.core.settings import CoreSettings
-from evopolicy_coordinator.server import process, service
+from evopolicy_coordinator.server import core_host, process, service
 
 
 def test_all_events_of_a_tick_share_one_write(tmp_path: Path) -> None:
@@ -225,10 +225,10 @@ def test_a_clock_set_back_between_two_starts_ends_nothing_before_it_began(
 
     async def first(world: World) -> None:
         await world.create()
-        began.append(world.service.now())
+        began.append(world.service.host.now())
 
     async def second(world: World) -> None:
-        assert world.service.now() >= began[0] - 60.0
+        assert world.service.host.now() >= began[0] - 60.0
 
     true_time = time.time
     play(tmp_path, first)
@@ -263,7 +263,7 @@ def test_a_poll_that_its_worker_gave_up_while_the_loop_stood_still_gets_no_lease
 async def failed(world: World) -> str:
     """Why the service cannot go on."""
     with pytest.raises(PartFailedError) as error:
-        await asyncio.wait_for(world.service.failure(), 20)
+        await asyncio.wait_for(world.service.host.failure(), 20)
     return str(error.value)
 
 
@@ -325,7 +325,7 @@ def test_a_core_that_fails_after_each_load_ends_the_service_with_the_reason(
         assert await failing == "the core, 6 times in a row, failed: ZeroDivisionError: planted"
         assert len(loads) == 1 + 5
 
-    monkeypatch.setattr(service, "_LONGEST_PAUSE_S", 0.2)
+    monkeypatch.setattr(core_host, "_LONGEST_PAUSE_S", 0.2)
     monkeypatch.setattr(Core, "load", counted)
     play(tmp_path, scenario)
 
@@ -351,7 +351,7 @@ def test_a_core_that_fails_now_and_then_is_loaded_each_time(
                 await asyncio.sleep(0.01)
             assert isinstance(answer, gateway.StateReply)
 
-    monkeypatch.setattr(service, "_SOON_S", 0.0)
+    monkeypatch.setattr(core_host, "_SOON_S", 0.0)
     play(tmp_path, scenario)
 
 
@@ -371,7 +371,7 @@ def test_a_row_that_the_store_never_takes_ends_the_service_with_the_reason(
             await asyncio.sleep(0.01)
         assert "refuses a row that contradicts another" in await failing
 
-    monkeypatch.setattr(service, "_LONGEST_PAUSE_S", 0.2)
+    monkeypatch.setattr(core_host, "_LONGEST_PAUSE_S", 0.2)
     play(tmp_path, scenario)
 
 
@@ -421,7 +421,7 @@ def test_the_process_ends_when_its_service_cannot_go_on(tmp_path: Path) -> None:
     async def scenario(world: World) -> None:
         waiting = asyncio.create_task(process._until(asyncio.Event(), world.service))
         await asyncio.sleep(0)
-        world.service._fail("a test", RuntimeError("why"))
+        world.service.host.fail("a test", RuntimeError("why"))
         with pytest.raises(PartFailedError, match="a test failed: RuntimeError: why"):
             await asyncio.wait_for(waiting, 20)
 
