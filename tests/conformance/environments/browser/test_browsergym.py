@@ -83,6 +83,18 @@ def test_no_paste_brings_back_a_text_of_an_earlier_episode(load: Any, kept: str,
     assert "value" not in nodes(obs, "textbox")[0]
 
 
+@pytest.mark.parametrize("page", ["copy-paste", "text-editor"])
+def test_a_text_that_grows_with_each_paste_stays_short(page: str) -> None:
+    environment = BrowserGymEnv(page)
+    tree = json.loads(environment.reset(seed=1)[0]["axtree_object"])["nodes"]
+    field = next(bid(each) for each in tree if any(each["name"] == "editable" for each in each["properties"]))
+    keys = ("Control+a", "Control+c", "ArrowRight", *["Control+v"] * 9)
+    for _ in range(9):
+        step = environment.step("\n".join([f"focus({field!r})", *(f"keyboard_press({each!r})" for each in keys)]))
+    assert 5_000 < len(step[0]["axtree_object"]) < 400_000
+    assert step[2] is False
+
+
 def test_an_option_is_selected_by_its_label(warm: Warm) -> None:
     environment = warm("browsergym/miniwob.choose-list")
     obs = environment.reset(Case(seed=2))

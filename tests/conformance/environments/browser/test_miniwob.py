@@ -165,6 +165,28 @@ def test_a_page_times_out_within_the_limit_of_its_id(warm: Warm) -> None:
     assert len(steps) == catalogue.entry("miniwob/click-test-v1").max_episode_steps - 1
 
 
+@pytest.mark.parametrize(
+    ("env_id", "grow", "reason"),
+    [
+        ("miniwob/click-test-v1", "...Array.from({length: 9000}, () => document.createElement('p'))", "too many"),
+        ("miniwob/click-test-v1", "'word '.repeat(9000), document.createElement('br')", "cannot be listed"),
+        ("browsergym/miniwob.click-test", "...Array.from({length: 9000}, () => document.createElement('p'))", "too many"),
+    ],
+)  # fmt: skip
+def test_an_episode_ends_when_its_page_has_grown_too_large(
+    warm: Warm, env_id: str, grow: str, reason: str
+) -> None:
+    environment = warm(env_id)
+    nothing = action("NONE") if env_id.startswith("miniwob/") else "noop()"
+    first = str(environment.reset(Case(seed=1)))
+    shared().run(f"document.body.append({grow})")
+    step = environment.step(nothing)
+    assert step.terminated
+    assert reason in step.info["reason"]
+    assert step.reward <= 0
+    assert str(environment.reset(Case(seed=1))) == first
+
+
 @pytest.mark.parametrize("env_id", SAMPLE)
 def test_an_environment_keeps_what_the_interface_promises(env_id: str) -> None:
     played = conformance.play(env_id, 20)

@@ -3,6 +3,7 @@
   "use strict";
   const { clock, advance, settle, forget } = __evopolicy;
   const MAX_CHARACTERS = 256;
+  const MAX_ELEMENTS = 8192;
   const READY_ROUNDS = 20;
   const READY_MS = 50;
   const clip = (text) => {
@@ -35,7 +36,8 @@
     done: Boolean(WOB_DONE_GLOBAL), reward: Number(WOB_REWARD_GLOBAL), raw: Number(WOB_RAW_REWARD_GLOBAL),
     reason: WOB_REWARD_REASON == null ? "" : clip(typeof WOB_REWARD_REASON === "string" ? WOB_REWARD_REASON
       : JSON.stringify(WOB_REWARD_REASON)),
-    left: clock.left, now: clock.now,
+    left: clock.left || (document.getElementsByTagName("*").length > MAX_ELEMENTS ? "the page has too many elements" : ""),
+    now: clock.now,
   });
   const look = () => {
     const found = state();
@@ -43,7 +45,12 @@
     const told = core.getUtterance();
     found.utterance = clip(typeof told === "string" ? told : told.utterance);
     found.fields = typeof told === "string" ? null : Object.entries(told.fields);
-    found.elements = flat(core.getDOMInfo(), 0, []);
+    try {
+      found.elements = flat(core.getDOMInfo(), 0, []);
+    } catch (error) {
+      // It gives up on a text of too many lines.
+      found.left = `the page's elements cannot be listed: ${clip(error)}`;
+    }
     return found;
   };
   const begin = async (seed, mode, limit, ms) => {

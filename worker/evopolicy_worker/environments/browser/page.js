@@ -5,6 +5,7 @@
   "use strict";
   const EPOCH = 1483228800000;  // What the clock shows when a document begins: 2017-01-01, UTC.
   const FRAME_MS = 16;
+  const MAX_TYPED = 16384;  // Characters of a field, with its markup.
   const native = {
     Date, Map, Object, Promise, Set, WeakMap, setTimeout: window.setTimeout.bind(window),
     frame: window.requestAnimationFrame.bind(window),
@@ -176,8 +177,15 @@
   }, true);
 
   // The browser's history of edits outlasts an episode: undoing and redoing would bring back what was typed in an earlier one.
+  // A text that doubles with each paste would soon be more than the browser can lay out.
   window.addEventListener("beforeinput", (event) => {
-    if (event.inputType.startsWith("history")) { event.preventDefault(); event.stopImmediatePropagation(); }
+    const { target, inputType, data, dataTransfer } = event;
+    const added = data ?? (dataTransfer ? dataTransfer.getData("text/plain") : "");
+    const tooLong = (target.value ?? target.innerHTML ?? "").length + added.length > MAX_TYPED;
+    if (inputType.startsWith("history") || (inputType.startsWith("insert") && tooLong)) {
+      event.preventDefault();
+      event.stopImmediatePropagation();
+    }
   }, true);
 
   // Which elements do something when they are clicked.

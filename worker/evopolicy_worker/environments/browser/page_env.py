@@ -170,7 +170,8 @@ class PageEnv(gymnasium.Env[Any, Any]):
         """Reward, whether the episode has ended, and `info`, from the page's report."""
         done, raw = bool(found["done"]), float(found["raw"])
         if found["left"]:
-            # MiniWoB++'s reward at the timeout.
+            # MiniWoB++'s reward at the timeout. The page is loaded anew for the next episode: it may have grown too large.
+            self.page.opened = None
             done, raw, found = True, -1.0, {**found, "reward": -1.0, "reason": found["left"]}
         reward = {
             "decayed": float(found["reward"]),
