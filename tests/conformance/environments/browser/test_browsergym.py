@@ -90,7 +90,9 @@ def test_a_text_that_grows_with_each_paste_stays_short(page: str) -> None:
     field = next(bid(each) for each in tree if any(each["name"] == "editable" for each in each["properties"]))
     keys = ("Control+a", "Control+c", "ArrowRight", *["Control+v"] * 9)
     for _ in range(9):
-        step = environment.step("\n".join([f"focus({field!r})", *(f"keyboard_press({each!r})" for each in keys)]))
+        step = environment.step(
+            "\n".join([f"focus({field!r})", *(f"keyboard_press({each!r})" for each in keys)])
+        )
     assert 5_000 < len(step[0]["axtree_object"]) < 400_000
     assert step[2] is False
 
@@ -125,8 +127,9 @@ def test_a_drawing_that_the_page_fills_later_is_an_image(warm: Warm) -> None:
     [
         ("", "empty action"),
         ("I would click the button", "no function call"),
-        ("__import__('os').system('true')", "no function call"),
-        ("click(__import__('os'))", "texts, numbers or lists"),
+        ("__import__('os').system('true')", "'__import__': it does not exist"),
+        ("click(button)", "no function call"),
+        ("click(__import__('os'))", "'__import__': it does not exist"),
         ("goto('http://localhost')", "leaves the page"),
         ("jump('1')", "does not exist"),
         ("click()", "misses its argument 'bid'"),
@@ -135,9 +138,15 @@ def test_a_drawing_that_the_page_fills_later_is_an_image(warm: Warm) -> None:
         ("mouse_click(1e999, 0)", "not of the right type"),
         ("keyboard_type('\\ud800')", "not of the right type"),
         ("click('999999')", "Could not find"),
-        ("fill('8', 'a')", "not an <input>"),
+        ("fill('10', 'a')", "not an <input>"),
+        ("fill('8', 'a')", "not visible"),
+        ("select_option('14', 'a')", "not a <select>"),
+        ("check('14')", "no checkbox"),
         ("keyboard_press('Nonsense')", "Unknown key"),
-        ("click('8', button='fourth')", "left, middle or right"),
+        ("keyboard_press('')", "Unknown key"),
+        ("keyboard_press('Shift+')", "Unknown key"),
+        ("click('14', modifiers=['Caps'])", "modifiers has 'Caps'"),
+        ("click('14', button='fourth')", "left, middle or right"),
         ("noop()\n" * 40, "32 are the limit"),
         ("(" * 4000, "no function call"),
     ],
@@ -210,7 +219,75 @@ def test_a_snapshot_of_the_documents_comes_when_it_is_asked_for_and_repeats() ->
     assert "dom_object" not in BrowserGymEnv("enter-text").observation_space.spaces
 
 
-def test_calls_are_taken_apart_and_never_run() -> None:
+@pytest.mark.parametrize(
+    ("pressed", "typed"),
+    [
+        ("keyboard_press('Shift+a') keyboard_press('Shift+1') keyboard_press('Shift+KeyB')", "A!B"),
+        ("keyboard_down('Shift') keyboard_press('a') keyboard_up('Shift') keyboard_press('a')", "Aa"),
+        (
+            "keyboard_press('+') keyboard_press('Shift++') keyboard_press('Numpad7') keyboard_press('é')",
+            "++7é",
+        ),
+        ("keyboard_type('aB é中😀')", "aB é中😀"),
+        (
+            "keyboard_type('ab') keyboard_press('Control+a') keyboard_press('Backspace') keyboard_type('c')",
+            "c",
+        ),
+    ],
+)
+def test_keys_type_what_they_do_in_browsergym(warm: Warm, pressed: str, typed: str) -> None:
+    environment = warm("browsergym/miniwob.enter-text")
+    (field,) = nodes(environment.reset(Case(seed=1)), "textbox")
+    step = environment.step(f"focus({bid(field)!r}) {pressed}")
+    assert step.obs["last_action_error"] == ""
+    assert nodes(step.obs, "textbox")[0]["value"]["value"] == typed
+
+
+def test_options_of_a_list_are_clicked_also_several_with_a_key_held(warm: Warm) -> None:
+    environment = warm("browsergym/miniwob.click-scroll-list")
+    first, *_, last = nodes(environment.reset(Case(seed=1)), "option")
+
+    def selected(step: Any) -> list[str]:
+        assert step.obs["last_action_error"] == ""
+        return [
+            bid(option)
+            for option in nodes(step.obs, "option")
+            if any(each["name"] == "selected" and each["value"]["value"] for each in option["properties"])
+        ]
+
+    assert selected(environment.step(f"click({bid(first)!r})")) == [bid(first)]
+    step = environment.step(f"click({bid(last)!r})")
+    assert selected(step) == [bid(last)]
+    properties = json.loads(step.obs["extra_element_properties"])
+    assert (properties[bid(first)]["visibility"], properties[bid(last)]["visibility"]) == (0, 1)
+    x, y, width, height = properties[bid(last)]["bbox"]
+    above = f"mouse_click({x + width / 2}, {y - height / 2})"
+    assert len(selected(environment.step(f"keyboard_down('Control') {above} keyboard_up('Control')"))) == 2
+    assert len(selected(environment.step(above))) == 1
+
+
+def test_nothing_is_typed_elsewhere_when_a_field_cannot_be_filled(warm: Warm) -> None:
+    environment = warm("browsergym/miniwob.enter-password")
+    one, other = nodes(environment.reset(Case(seed=1)), "textbox")
+    environment.step(f"fill({bid(one)!r}, 'kept')")
+    shared().run(f"document.querySelector('[bid=\"{bid(other)}\"]').style.visibility = 'hidden'")
+    step = environment.step(f"focus({bid(one)!r}) fill({bid(other)!r}, 'lost')")
+    assert "not visible" in step.obs["last_action_error"]
+    assert [each["value"]["value"] for each in nodes(step.obs, "textbox")] == ["kept"]
+
+
+def test_calls_are_found_in_other_words_and_never_run() -> None:
+    text = """I'd click('3') now: fill('4', "two
+lines")  # click('5')
+```
+hover(
+    bid='6',  # the second
+)```"""
+    assert [(name, *given.values()) for name, given in calls(text)] == [
+        ("click", "3", "left", []),
+        ("fill", "4", "two\nlines"),
+        ("hover", "6"),
+    ]
     assert calls("click('3')\nfill(bid='4', value='x')") == [
         ("click", {"bid": "3", "button": "left", "modifiers": []}),
         ("fill", {"bid": "4", "value": "x"}),

@@ -74,18 +74,37 @@
     const found = document.elementFromPoint((box.left + box.right) / 2, (box.top + box.bottom) / 2);
     return found !== null && (found === element || element.contains(found));
   };
+  // The part of the window in which an element's children are shown.
+  const clipped = (element, known) => {
+    if (element === null || element === document.body || element === document.documentElement) {
+      return { left: 0, top: 0, right: innerWidth, bottom: innerHeight };
+    }
+    if (!known.has(element)) {
+      const style = getComputedStyle(element);
+      const around = within(element, style, known);
+      known.set(element, style.overflow === "visible" ? around : common(element.getBoundingClientRect(), around));
+    }
+    return known.get(element);
+  };
+  const within = (element, style, known) =>
+    clipped(style.position === "absolute" ? element.offsetParent : element.parentElement, known);
+  const common = (one, other) => ({
+    left: Math.max(one.left, other.left), top: Math.max(one.top, other.top),
+    right: Math.min(one.right, other.right), bottom: Math.min(one.bottom, other.bottom),
+  });
   const properties = () => {
     const found = {};
+    const known = new Map();
     const marked = new Map();
     const buttons = [];
     const round = (x) => Math.round(x * 100) / 100;
     for (const element of document.querySelectorAll("[bid]")) {
       const box = element.getBoundingClientRect();
       const area = box.width * box.height;
-      const wide = Math.max(0, Math.min(box.right, innerWidth) - Math.max(box.left, 0));
-      const high = Math.max(0, Math.min(box.bottom, innerHeight) - Math.max(box.top, 0));
       const tag = element.tagName.toLowerCase();
       const style = getComputedStyle(element);
+      const shown = common(box, within(element, style, known));
+      const [wide, high] = [Math.max(0, shown.right - shown.left), Math.max(0, shown.bottom - shown.top)];
       let som = false;
       if (area >= 20 && (MARKED.has(tag) || element.onclick !== null || style.cursor === "pointer") && hit(element, box)
           && buttons.every((button) => !button.contains(element))) {
@@ -207,16 +226,24 @@
     document.body.style.transformOrigin = "top left";
   };
 
-  // Places and states of elements, for actions that name one.
+  // Places and states of elements, for actions that name one. Each refuses what BrowserGym's would wait for in vain.
   const named = (bid) => document.querySelector(`[bid="${CSS.escape(bid)}"]`);
+  const labelled = (element) => (element && !element.matches("a, button, input, select, textarea, [role=button], [role=link]")
+    && !element.isContentEditable && element.closest("label")?.control) || element;
+  const refused = (bid, element) => {
+    if (element === null) return `Could not find element with bid "${bid}"`;
+    const box = element.getBoundingClientRect();
+    if (box.width === 0 || box.height === 0 || getComputedStyle(element).visibility !== "visible") {
+      return `Element with bid "${bid}" is not visible`;
+    }
+    return element.disabled ? `Element with bid "${bid}" is not enabled` : "";
+  };
   const place = (bid) => {
     const element = named(bid);
-    if (element === null) return { error: `Could not find element with bid "${bid}"` };
-    element.scrollIntoView({ block: "nearest", inline: "nearest", behavior: "instant" });
+    element?.scrollIntoView({ block: "nearest", inline: "nearest", behavior: "instant" });
+    const error = refused(bid, element);
+    if (error) return { error };
     const box = element.getBoundingClientRect();
-    if (box.width === 0 || box.height === 0) return { error: `Element with bid "${bid}" is not visible` };
-    if (element.disabled) return { error: `Element with bid "${bid}" is not enabled` };
-    if (element instanceof HTMLOptionElement) return { error: `Element with bid "${bid}" is not visible` };
     const [x, y] = [box.left + box.width / 2, box.top + box.height / 2];
     const top = document.elementFromPoint(x, y);
     if (top === null || !(top === element || element.contains(top) || top.contains(element)
@@ -231,52 +258,60 @@
     element.focus();
     return {};
   };
-  const select = (bid) => {
-    const element = named(bid);
-    if (element === null) return { error: `Could not find element with bid "${bid}"` };
-    if (element.disabled || element.readOnly) return { error: `Element with bid "${bid}" is not editable` };
-    element.focus();
-    if (element instanceof HTMLInputElement || element instanceof HTMLTextAreaElement) { element.select(); return {}; }
-    if (!element.isContentEditable) {
-      return { error: `Element with bid "${bid}" is not an <input>, <textarea> or [contenteditable] element` };
-    }
-    getSelection().selectAllChildren(element);
-    return {};
-  };
-  const fillable = (bid) => {
-    const element = named(bid);
-    return element instanceof HTMLInputElement
-      && ["color", "date", "time", "datetime-local", "month", "range", "week"].includes(element.type);
-  };
-  const set = (bid, value) => {
-    const element = named(bid);
-    element.focus();
-    element.value = value;
-    if (element.value !== value) return { error: "Malformed value" };
+  const changed = (element) => {
     element.dispatchEvent(new Event("input", { bubbles: true, composed: true }));
     element.dispatchEvent(new Event("change", { bubbles: true }));
-    return {};
+  };
+  // Whether the value is in its place; otherwise it has to be typed, in place of what is selected now.
+  const fill = (bid, value) => {
+    const element = labelled(named(bid));
+    const error = refused(bid, element);
+    if (error) return { error };
+    if (element.readOnly) return { error: `Element with bid "${bid}" is not editable` };
+    const input = element instanceof HTMLInputElement;
+    if (!input && !(element instanceof HTMLTextAreaElement) && !element.isContentEditable) {
+      return { error: `Element with bid "${bid}" is not an <input>, <textarea> or [contenteditable] element` };
+    }
+    element.focus();
+    if (input && ["color", "date", "time", "datetime-local", "month", "range", "week"].includes(element.type)) {
+      element.value = value;
+      if (element.value !== value) return { error: "Malformed value" };
+      changed(element);
+      return { filled: true };
+    }
+    if (input && !["email", "number", "password", "search", "tel", "text", "url"].includes(element.type)) {
+      return { error: `Input of type "${element.type}" cannot be filled` };
+    }
+    if (input && element.type === "number" && Number.isNaN(Number(value))) {
+      return { error: "Cannot type text into input[type=number]" };
+    }
+    if (element.isContentEditable) getSelection().selectAllChildren(element); else element.select();
+    return { filled: false };
   };
   const checked = (bid) => {
-    const element = named(bid);
+    const element = labelled(named(bid));
     if (!(element instanceof HTMLInputElement && ["checkbox", "radio"].includes(element.type))) {
       return { error: `Element with bid "${bid}" is no checkbox or radio button` };
     }
     return { checked: element.checked };
   };
   const choose = (bid, wanted) => {
-    const element = named(bid);
+    const element = labelled(named(bid));
+    const error = refused(bid, element);
+    if (error) return { error };
     if (!(element instanceof HTMLSelectElement)) return { error: `Element with bid "${bid}" is not a <select> element` };
+    const meant = (option, each) => option.value === each || option.label === each || option.text.trim() === each;
     const options = [...element.options];
-    const found = wanted.map((each) => options.find((option) => option.value === each || option.label === each
-      || option.text.trim() === each));
-    if (found.includes(undefined)) return { error: `The element with bid "${bid}" has no option ${JSON.stringify(wanted)}` };
+    const found = options.filter((option) => wanted.some((each) => meant(option, each)));
+    const missing = wanted.filter((each) => !options.some((option) => meant(option, each)));
+    if (missing.length && (element.multiple || !found.length)) {
+      return { error: `The element with bid "${bid}" has no option ${JSON.stringify(missing)}` };
+    }
     const kept = element.multiple ? found : found.slice(0, 1);
     element.focus();
     for (const option of options) option.selected = kept.includes(option);
-    element.dispatchEvent(new Event("input", { bubbles: true, composed: true }));
-    element.dispatchEvent(new Event("change", { bubbles: true }));
+    changed(element);
     return {};
   };
-  __evopolicy.gym = { begin: enter, look, first, place, focus, select, fillable, set, checked, choose };
+  __evopolicy.gym = { begin: enter, look, first, place, focus, fill, checked, choose };
 })();

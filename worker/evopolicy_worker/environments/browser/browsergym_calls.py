@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -55,37 +56,53 @@ ELSEWHERE = (
 """BrowserGym's actions that leave the page, which these tasks never need."""
 
 
+_TEXT = r"""\"{3}.*?\"{3}|'{3}.*?'{3}|"(?:\\.|[^"\\])*"|'(?:\\.|[^'\\])*'"""
+_CALL = re.compile(
+    rf"""\#[^\n]*|\b([A-Za-z_]\w*)\s*\(((?>{_TEXT}|\#[^\n]*|[^()'"#])*+)\)""",
+    re.DOTALL,
+)
+"""A comment, or a function's name and its arguments."""
+
+
 def calls(text: str) -> list[tuple[str, dict[str, Any]]]:
-    """The calls of an action, in order: functions and their arguments by name. ValueError, in words, for a text that is
-    none."""
+    """The calls of an action, in order: functions and their arguments by name. As BrowserGym does, it finds them anywhere in
+    the text, skips comments and the words in between, and lets a text have several lines. ValueError, in words, for an
+    action without calls."""
+    found = [
+        (match[1], given)
+        for match in _CALL.finditer(text)
+        if match[1] and (given := _given(match[2])) is not None
+    ]
+    if not found:
+        raise ValueError(f"Received an empty action: there is no function call in {text[:200]!r}")
+    if len(found) > MAX_CALLS:
+        raise ValueError(f"Received {len(found)} calls; {MAX_CALLS} are the limit")
+    return [(name, _arguments(name, *given)) for name, given in found]
+
+
+def _given(text: str) -> tuple[list[Any], dict[str, Any]] | None:
+    """Arguments by position and by name; None where they are not all texts, numbers or lists of them."""
+    text = re.sub(
+        _TEXT, lambda match: match[0].replace("\r", "\\r").replace("\n", "\\n"), text, flags=re.DOTALL
+    )
     try:
-        body = ast.parse(text.strip(), mode="exec").body
-    except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
-        raise ValueError(f"Received an action that is no function call: {text[:200]!r}") from error
-    if not body:
-        raise ValueError("Received an empty action.")
-    if len(body) > MAX_CALLS:
-        raise ValueError(f"Received {len(body)} calls; {MAX_CALLS} are the limit")
-    return [_call(each) for each in body]
+        call = ast.parse(f"call({text}\n)", mode="eval").body
+        assert isinstance(call, ast.Call)
+        named = {str(each.arg): ast.literal_eval(each.value) for each in call.keywords}
+        return list(map(ast.literal_eval, call.args)), named
+    except (ValueError, TypeError, SyntaxError, RecursionError, MemoryError):
+        return None
 
 
-def _call(node: ast.stmt) -> tuple[str, dict[str, Any]]:
-    call = node.value if isinstance(node, ast.Expr) else None
-    if not isinstance(call, ast.Call) or not isinstance(call.func, ast.Name):
-        raise ValueError(f"Received an action that is no function call: {ast.unparse(node)[:200]!r}")
-    name = call.func.id
+def _arguments(name: str, given: list[Any], named: dict[str, Any]) -> dict[str, Any]:
     if name not in SIGNATURES:
         why = "leaves the page" if name in ELSEWHERE else "does not exist"
         raise ValueError(f"Invalid action type '{name}': it {why}; there are {', '.join(SIGNATURES)}.")
     wanted = SIGNATURES[name]
-    try:
-        given = dict(zip(wanted, map(ast.literal_eval, call.args), strict=False))
-        given |= {str(each.arg): ast.literal_eval(each.value) for each in call.keywords}
-    except (ValueError, TypeError, SyntaxError, RecursionError, MemoryError) as error:
-        raise ValueError(f"{name}: its arguments have to be texts, numbers or lists of them") from error
-    if len(call.args) > len(wanted) or not given.keys() <= wanted.keys():
-        raise ValueError(f"{name} takes {', '.join(wanted)}; it was given {ast.unparse(call)[:200]}")
-    return name, {each: _argument(name, each, parameter, given) for each, parameter in wanted.items()}
+    if len(given) > len(wanted) or not named.keys() <= wanted.keys():
+        raise ValueError(f"{name} takes {', '.join(wanted)}; it was given {[*given, *named]}")
+    all_given = dict(zip(wanted, given, strict=False)) | named
+    return {each: _argument(name, each, parameter, all_given) for each, parameter in wanted.items()}
 
 
 def _argument(name: str, argument: str, parameter: Any, given: Mapping[str, Any]) -> Any:

@@ -128,10 +128,8 @@ class BrowserGymEnv(PageEnv):
         self.page.wheel(x, y, delta_x, delta_y)
 
     def _fill(self, bid: str, value: str) -> None:
-        if self._ask("fillable", bid):
-            self._do("set", bid, value)
+        if self._do("fill", bid, value)["filled"]:
             return
-        self._do("select", bid)
         if value:
             self.page.insert(value)
         else:
@@ -156,20 +154,15 @@ class BrowserGymEnv(PageEnv):
                 raise ValueError("Clicking the checkbox did not change its state")
 
     def _click(self, bid: str, button: Any, modifiers: list[Any], times: int = 1) -> None:
-        _button(button)
         place = self._do("place", bid)
-        held = sum(
-            keys.MODIFIERS.get(str(each).replace("ControlOrMeta", "Control"), 0)
-            for each in set(map(str, modifiers))
-        )
-        self._mouse(place["x"], place["y"], button, times, modifiers=held)
+        self._presses(place["x"], place["y"], button, times, modifiers=_modifiers(modifiers))
 
     def _dblclick(self, bid: str, button: Any, modifiers: list[Any]) -> None:
         self._click(bid, button, modifiers, 2)
 
     def _hover(self, bid: str) -> None:
         place = self._do("place", bid)
-        self.page.mouse((_MOVE, place["x"], place["y"], "left", 0))
+        self._mouse((_MOVE, place["x"], place["y"], "left", 0))
 
     def _press(self, bid: str, key_comb: str) -> None:
         self._do("focus", bid)
@@ -180,36 +173,33 @@ class BrowserGymEnv(PageEnv):
 
     def _drag_and_drop(self, from_bid: str, to_bid: str) -> None:
         start = self._do("place", from_bid)
-        self.page.mouse(
-            (_MOVE, start["x"], start["y"], "left", 0), (_PRESS, start["x"], start["y"], "left", 1)
-        )
+        self._mouse_down(start["x"], start["y"], "left")
         end = self._do("place", to_bid)
-        self.page.mouse((_MOVE, end["x"], end["y"], "left", 0), (_RELEASE, end["x"], end["y"], "left", 1))
+        self._mouse_up(end["x"], end["y"], "left")
 
     def _mouse_move(self, x: float, y: float) -> None:
-        self.page.mouse((_MOVE, x, y, "left", 0))
+        self._mouse((_MOVE, x, y, "left", 0))
 
     def _mouse_down(self, x: float, y: float, button: Any) -> None:
-        self.page.mouse((_MOVE, x, y, "left", 0), (_PRESS, x, y, _button(button), 1))
+        self._mouse((_MOVE, x, y, "left", 0), (_PRESS, x, y, _button(button), 1))
 
     def _mouse_up(self, x: float, y: float, button: Any) -> None:
-        self.page.mouse((_MOVE, x, y, "left", 0), (_RELEASE, x, y, _button(button), 1))
+        self._mouse((_MOVE, x, y, "left", 0), (_RELEASE, x, y, _button(button), 1))
 
     def _mouse_click(self, x: float, y: float, button: Any) -> None:
-        self._mouse(x, y, button, 1)
+        self._presses(x, y, button, 1, modifiers=self._held)
 
     def _mouse_dblclick(self, x: float, y: float, button: Any) -> None:
-        self._mouse(x, y, button, 2)
+        self._presses(x, y, button, 2, modifiers=self._held)
 
     def _mouse_drag_and_drop(self, from_x: float, from_y: float, to_x: float, to_y: float) -> None:
-        self.page.mouse(
-            (_MOVE, from_x, from_y, "left", 0),
-            (_PRESS, from_x, from_y, "left", 1),
-            (_MOVE, to_x, to_y, "left", 0),
-            (_RELEASE, to_x, to_y, "left", 1),
-        )
+        self._mouse_down(from_x, from_y, "left")
+        self._mouse_up(to_x, to_y, "left")
 
-    def _mouse(self, x: float, y: float, button: Any, times: int, modifiers: int = 0) -> None:
+    def _mouse(self, *events: tuple[str, float, float, Any, int]) -> None:
+        self.page.mouse(*events, modifiers=self._held)
+
+    def _presses(self, x: float, y: float, button: Any, times: int, *, modifiers: int) -> None:
         which = _button(button)
         clicks = [(kind, x, y, which, k) for k in range(1, times + 1) for kind in (_PRESS, _RELEASE)]
         self.page.mouse((_MOVE, x, y, which, 0), *clicks, modifiers=modifiers)
@@ -226,7 +216,7 @@ class BrowserGymEnv(PageEnv):
 
     def _keyboard_press(self, key: str) -> None:
         found, modifiers = _key(key)
-        self.page.press(found, modifiers | self._held)
+        self.page.press(found, modifiers, self._held)
 
     def _keyboard_type(self, text: str) -> None:
         self.page.type(text)
@@ -237,11 +227,10 @@ class BrowserGymEnv(PageEnv):
     def _now(self) -> float:
         return float(self.page.run("__evopolicy.clock.now")) / 1000
 
-    def _ask(self, what: str, *arguments: Any) -> Any:
-        return self.page.run(f"__evopolicy.gym.{what}({', '.join(map(json.dumps, arguments))})")
-
     def _do(self, what: str, *arguments: Any) -> dict[str, Any]:
-        found: dict[str, Any] = self._ask(what, *arguments)
+        found: dict[str, Any] = self.page.run(
+            f"__evopolicy.gym.{what}({', '.join(map(json.dumps, arguments))})"
+        )
         if "error" in found:
             raise ValueError(found["error"])
         return found
@@ -284,6 +273,17 @@ def _button(name: Any) -> Any:
     if name not in ("left", "middle", "right"):
         raise ValueError(f"button is {name!r}: left, middle or right")
     return name
+
+
+def _modifiers(names: list[Any]) -> int:
+    """The modifiers of a click."""
+    found = 0
+    for name in names:
+        key = "Control" if name == "ControlOrMeta" else name
+        if key not in keys.MODIFIERS:
+            raise ValueError(f"modifiers has {name!r}: {', '.join(keys.MODIFIERS)}, ControlOrMeta")
+        found |= keys.MODIFIERS[key]
+    return found
 
 
 def _key(name: str) -> tuple[keys.Key, int]:

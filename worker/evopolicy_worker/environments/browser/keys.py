@@ -103,6 +103,7 @@ _BY_CODE = {key.code: key for key in PRINTABLE.values() if not key.shift} | {
     "AltLeft": NAMED["Alt"],
     "MetaLeft": NAMED["Meta"],
 }
+_SHIFTED = {key.code: key for key in PRINTABLE.values() if key.shift}
 MODIFIERS = {"Alt": ALT, "Control": CONTROL, "Meta": META, "Shift": SHIFT}
 
 
@@ -137,12 +138,14 @@ def miniwob(name: str) -> tuple[Key, int] | None:
 
 
 def combined(name: str) -> tuple[Key, int] | None:
-    """Key and modifiers by BrowserGym's name: `Enter`, `Control+a`, `Shift+Tab`. None for an unknown one."""
-    *held, last = (
-        [part or "+" for part in name.replace("++", "+\0").replace("\0", "").split("+")]
-        if name != "+"
-        else ["+"]
-    )
+    """Key and modifiers by BrowserGym's name: `Enter`, `Control+a`, `Shift+Tab`, `Control++`. None for an unknown one."""
+    parts = [""]
+    for character in name:
+        if character == "+" and parts[-1]:
+            parts.append("")
+        else:
+            parts[-1] += character
+    *held, last = parts
     modifiers = 0
     for each in held:
         if each == "ControlOrMeta":
@@ -152,3 +155,8 @@ def combined(name: str) -> tuple[Key, int] | None:
         modifiers |= MODIFIERS[each]
     key = named(last)
     return None if key is None else (key, modifiers | (SHIFT if key.shift else 0))
+
+
+def shifted(key: Key) -> Key:
+    """The key with the character that it types together with Shift."""
+    return _SHIFTED.get(key.code, key)

@@ -298,9 +298,9 @@
       return picture.decode().catch(() => undefined);
     }));
   };
-  const wheeled = async () => { await frame(); await frame(); await frame(); };
-  // A drag that selects text scrolls what it is in, in frames of its own: before a release, or it depends on the machine's load.
-  const dragged = async () => { await frame(); await frame(); await settle(); };
+  // The browser scrolls some frames after the wheel has turned, or a drag has selected text: before the next event, or
+  // it depends on the machine's load.
+  const moved = async () => { await frame(); await frame(); await frame(); await settle(); };
   // Timers that are due, in order, up to `ms` later; between them, what they promised.
   const advance = async (ms) => {
     if (!VIRTUAL) return;
@@ -332,5 +332,5 @@
     clock.now = 0; clock.next = 1; clock.left = ""; clock.error = "";
     clock.mouse = null;
   };
-  define(window, "__evopolicy", { clock, advance, settle, forget, clickable, wheeled, dragged, preload, json: native.json });
+  define(window, "__evopolicy", { clock, advance, settle, forget, clickable, moved, preload, json: native.json });
 })();

@@ -23,7 +23,7 @@ import msgspec
 
 from evopolicy_worker.environments.browser.chromium import MAX_MB, REMEDY, Chromium, program
 from evopolicy_worker.environments.browser.devtools import BrowserLostError
-from evopolicy_worker.environments.browser.keys import MODIFIERS, NAMED, SHIFT, Key, typed
+from evopolicy_worker.environments.browser.keys import MODIFIERS, NAMED, SHIFT, Key, shifted, typed
 
 ORIGIN = "http://pages.invalid"
 """Origin of the pages. Not `localhost`, which is a secure context with service workers."""
@@ -210,18 +210,19 @@ class Page:
             if kind == "mouseMoved" and self._held != "none":
                 self._await(numbers)
                 numbers.clear()
-                self.run("__evopolicy.dragged()")
+                self.run("__evopolicy.moved()")
         self._await(numbers)
 
     def wheel(self, x: float, y: float, delta_x: float, delta_y: float) -> None:
         """Turns the mouse's wheel at a place, CSS pixels."""
         self.send("Input.dispatchMouseEvent", type="mouseWheel", x=x, y=y, deltaX=delta_x, deltaY=delta_y)
-        self.run("__evopolicy.wheeled()")
+        self.run("__evopolicy.moved()")
 
     def keys(self, *events: tuple[Literal["down", "up"], Key, int]) -> None:
         """Keys pressed and released in order, each with the modifiers held (1 Alt, 2 Control, 4 Meta, 8 Shift)."""
         numbers = []
-        for kind, key, modifiers in events:
+        for kind, pressed, modifiers in events:
+            key = shifted(pressed) if modifiers & SHIFT else pressed
             event: dict[str, Any] = {
                 "key": key.key,
                 "code": key.code,
@@ -237,14 +238,14 @@ class Page:
             numbers.append(self._send("Input.dispatchKeyEvent", **event))
         self._await(numbers)
 
-    def press(self, key: Key, modifiers: int = 0) -> None:
-        """One key, with modifiers held."""
-        held = [NAMED[name] for name, bit in MODIFIERS.items() if modifiers & bit]
+    def press(self, key: Key, modifiers: int = 0, held: int = 0) -> None:
+        """One key together with modifiers. `held`: modifiers that are down before and after it."""
+        added = [NAMED[name] for name, bit in MODIFIERS.items() if modifiers & bit & ~held]
         self.keys(
-            *(("down", each, modifiers) for each in held),
-            ("down", key, modifiers),
-            ("up", key, modifiers),
-            *(("up", each, 0) for each in reversed(held)),
+            *(("down", each, modifiers | held) for each in added),
+            ("down", key, modifiers | held),
+            ("up", key, modifiers | held),
+            *(("up", each, held) for each in reversed(added)),
         )
 
     def type(self, text: str) -> None:
