@@ -25,7 +25,7 @@ import msgspec
 from invented.web_site import site_of, status
 from scale import Load
 
-from evopolicy_common.messages.operator import StatusReply
+from evopolicy_common.messages.status import StatusReply
 from evopolicy_common.wire import codec
 from evopolicy_coordinator.server.reason_texts import words as reason_words
 from evopolicy_coordinator.web import cluster as polling

@@ -33,6 +33,8 @@ from host_faults import enter_namespaces, full_file_system
 
 from evopolicy_common.errors import RefusedError, TransportError
 from evopolicy_common.messages import operator
+from evopolicy_common.messages.run_settings import RunSettings
+from evopolicy_common.messages.status import StatusReply, StatusRequest
 from evopolicy_common.processes import proc
 from evopolicy_common.records.run_difference import differences
 from evopolicy_common.wire import codec, keys
@@ -224,7 +226,7 @@ def times_frozen(cluster: FaultCluster) -> int:
 
 async def refusals(cluster: FaultCluster, name: str) -> list[str]:
     """Asks a coordinator whose disk is full for runs until it refuses one; says what is wrong about that."""
-    settings = operator.RunSettings(env="toy/line", entry="probe", model="none", exp_id="probe", budget=1)
+    settings = RunSettings(env="toy/line", entry="probe", model="none", exp_id="probe", budget=1)
     taken: list[str] = []
     wrong = [f"with a full disk it took {TIMEOUT_S:g} s of new runs"]
     deadline = time.monotonic() + TIMEOUT_S
@@ -279,12 +281,12 @@ async def play_until(
     """Starts a run, and comes back once `wanted` episodes of it are done or it has ended, with its phase."""
     async with connect(cluster.operators) as link:
         ask = Requester(link, partial(keys.operator_key, link.credentials.cluster), codec.operator_replies)
-        message = operator.StatusRequest(token=link.credentials.token)
-        before = (await ask.until_answered("status", message, operator.StatusReply)).episodes_done
+        message = StatusRequest(token=link.credentials.token)
+        before = (await ask.until_answered("status", message, StatusReply)).episodes_done
         command = cluster.command(name)
         while wanted is not None and command.poll() is None:
             with contextlib.suppress(TransportError):
-                status = await ask.once("status", message, operator.StatusReply)
+                status = await ask.once("status", message, StatusReply)
                 if status.runs and status.episodes_done - before >= wanted:
                     return command, status.runs[0].phase
             await asyncio.sleep(0.01)

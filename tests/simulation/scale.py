@@ -28,7 +28,7 @@ from evopolicy_common.messages import gateway, operator
 from evopolicy_common.messages import worker as wire
 from evopolicy_common.messages.environment import Case, EnvironmentDescription
 from evopolicy_common.messages.episode import EpisodeOutcome
-from evopolicy_common.messages.operator import RunSettings
+from evopolicy_common.messages.run_settings import RunSettings
 from evopolicy_coordinator.core.effects import Effect, ReadResults, Reply
 from evopolicy_coordinator.core.machine import Core
 from evopolicy_coordinator.core.records import Snapshot

@@ -11,7 +11,7 @@ from sim_worker import Asker
 from evopolicy_common.messages import gateway, operator
 from evopolicy_common.messages import worker as wire
 from evopolicy_common.messages.environment import Case
-from evopolicy_common.messages.operator import RunSettings
+from evopolicy_common.messages.run_settings import RunSettings
 from evopolicy_common.wire.refusals import NOT_NOW, RUN_OVER
 
 if TYPE_CHECKING:

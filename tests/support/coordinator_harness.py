@@ -22,7 +22,9 @@ from evopolicy_common.errors import RefusedError, TransportError
 from evopolicy_common.messages import gateway, operator, worker
 from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome, EpisodeSpec, Job
-from evopolicy_common.messages.operator import RunFinished, RunSettings
+from evopolicy_common.messages.operator import RunFinished
+from evopolicy_common.messages.run_settings import RunSettings
+from evopolicy_common.messages.status import StatusReply, StatusRequest
 from evopolicy_common.records.policies import bundles
 from evopolicy_common.records.policies.bundles import Bundle, BundleFile
 from evopolicy_common.wire import codec, credentials, keys
@@ -306,10 +308,8 @@ class OperatorClient:
             if page.finished:
                 return outcomes
 
-    async def status(self) -> operator.StatusReply:
-        return await self.ask.until_answered(
-            "status", operator.StatusRequest(token=self.token), operator.StatusReply
-        )
+    async def status(self) -> StatusReply:
+        return await self.ask.until_answered("status", StatusRequest(token=self.token), StatusReply)
 
 
 @contextlib.asynccontextmanager

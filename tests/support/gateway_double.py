@@ -37,7 +37,7 @@ from evopolicy_common.messages.gateway import (
     Submit,
     SubmitAccepted,
 )
-from evopolicy_common.messages.operator import RunSettings
+from evopolicy_common.messages.run_settings import RunSettings
 from evopolicy_common.messages.worker import BlobPut, Message, Refused
 from evopolicy_common.records.blobs import digest_of
 from evopolicy_common.records.episodes.trajectory import Recorder

@@ -15,7 +15,7 @@ from evopolicy_common import catalogue
 from evopolicy_common.errors import ConfigError, ProtocolError, RequestError
 from evopolicy_common.messages.episode import LARGEST_LIMIT, LARGEST_LIMITS, ResourceLimits, Tier
 from evopolicy_common.messages.gateway import Profile
-from evopolicy_common.messages.operator import PUBLISHED, RunSettings
+from evopolicy_common.messages.run_settings import PUBLISHED, RunSettings
 from evopolicy_common.processes.packages import packages_in, policy_versions
 from evopolicy_common.records.run_record import decode_run_record
 from evopolicy_common.wire.credentials import local_state_dir

@@ -11,7 +11,7 @@ import typer
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.environment import ObservationForm, PolicyScope, StepLimit
 from evopolicy_common.messages.gateway import FeedbackDetail, FinishRule, SimulationRule, VideoOption
-from evopolicy_common.messages.operator import RunSettings
+from evopolicy_common.messages.run_settings import RunSettings
 from evopolicy_gateway import harnesses
 from evopolicy_gateway.agent_supervisor.clock import SILENCE_S
 from evopolicy_gateway.cli.options import (

@@ -19,7 +19,7 @@ from urllib.parse import urlsplit
 import msgspec
 
 from evopolicy_common.errors import ConfigError
-from evopolicy_common.messages.operator import ELSEWHERE
+from evopolicy_common.messages.run_settings import ELSEWHERE
 from evopolicy_common.processes import host
 from evopolicy_gateway.run.layout import IntendedRun, RunFolder, saved
 

@@ -13,7 +13,7 @@ import msgspec
 from evopolicy_common.cli import end_on_sigterm
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.episode import Tier
-from evopolicy_common.messages.operator import RunSettings
+from evopolicy_common.messages.run_settings import RunSettings
 from evopolicy_common.processes.local_cluster import LocalCluster, Workers, local_cluster
 from evopolicy_common.terminal import say
 from evopolicy_common.wire import transport

@@ -19,9 +19,9 @@ from evopolicy_common.messages.operator import (
     Rescore,
     RunCreated,
     RunProgress,
-    RunSettings,
     WaitRun,
 )
+from evopolicy_common.messages.run_settings import RunSettings
 from evopolicy_common.messages.worker import Message
 from evopolicy_common.processes.notices import notify_if_slow
 from evopolicy_common.wire import credentials

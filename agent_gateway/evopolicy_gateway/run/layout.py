@@ -13,7 +13,7 @@ from typing import TypeVar
 import msgspec
 
 from evopolicy_common.errors import DECODE_ERRORS, ConfigError
-from evopolicy_common.messages.operator import RunSettings
+from evopolicy_common.messages.run_settings import RunSettings
 from evopolicy_common.records.blobs import write_atomically
 from evopolicy_common.records.run_record import Artifacts
 from evopolicy_common.wire import keys

@@ -11,7 +11,7 @@ import msgspec
 from evopolicy_common import catalogue
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.environment import StepLimit
-from evopolicy_common.messages.operator import RunSettings
+from evopolicy_common.messages.run_settings import RunSettings
 from evopolicy_common.processes.preflight import check_installed, check_loopback, check_text, check_writable
 from evopolicy_common.processes.scratch import remove_tree
 from evopolicy_gateway import harnesses

@@ -18,14 +18,11 @@ from evopolicy_common.messages.environment import (
 )
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome, Record, ResourceLimits, Tier
 from evopolicy_common.messages.gateway import (
-    FeedbackDetail,
-    FinishRule,
-    Profile,
-    SimulationRule,
     SubmitStatus,
-    VideoOption,
 )
 from evopolicy_common.messages.journal import Committed
+from evopolicy_common.messages.run_settings import HiddenIsolation, RunSettings
+from evopolicy_common.messages.status import StatusReply, StatusRequest
 from evopolicy_common.messages.worker import (
     BlobAck,
     BlobChunk,
@@ -35,89 +32,6 @@ from evopolicy_common.messages.worker import (
     Message,
     Refused,
 )
-
-HiddenIsolation = Literal["exclusive", "shared", "waived", "unknown"]
-"""Whether hidden episodes and agents could share a kernel. exclusive: never. shared: possible, as the rule was off
-for all or part of the run. waived: the operator vouched for where the agent was. unknown: the run was played before
-this was recorded."""
-
-HiddenCases = Literal["shared", "per_run"]
-"""Validation and held-out cases: the same for all runs of an environment, or each run's own (no paired statistics)."""
-
-ELSEWHERE = "elsewhere"
-"""Value of `RunSettings.agent_host`: the operator vouches that the agent is on no machine of the cluster."""
-
-
-class RunSettings(msgspec.Struct, frozen=True, kw_only=True):
-    """Settings with which a run is opened. None means the suite's own number."""
-
-    env: Word
-    entry: Word
-    """Name of the agent in tables, such as `evolve` or `GPT-5.5 (Codex)`."""
-    model: Word
-    exp_id: Word
-    repeat: Int = 0
-    attempt: Int = 1
-    budget: Int | None = None
-    min_episodes_per_submit: Int | None = None
-    max_episodes_per_submit: Int | None = None
-    n_validation: Int | None = None
-    n_heldout: Int | None = None
-    policy_scope: PolicyScope = "episode"
-    observations: ObservationForm = "arrays"
-    sandbox_tier: Tier = "bwrap"
-    video: VideoOption = "off"
-    replays: VideoOption | None = None
-    """Which held-out episodes of the selected checkpoint are recorded as video for people; None: as `video`."""
-    limits: ResourceLimits = ResourceLimits()
-    notes: Named[Text] = {}
-    """The operator's own labels, such as the name of a sweep; kept in the coordinator's database, not in `run.json`."""
-    hidden_cases: HiddenCases = "shared"
-    simulation: SimulationRule = "forbidden"
-    finish: FinishRule = "early"
-    step_limit: StepLimit = "natural"
-    """Missing in rows and messages of earlier versions."""
-    profile: Profile = "own"
-    feedback: FeedbackDetail = "pictures"
-    agents_md: Word = ""
-    """SHA-256, hex, of the operator's text in place of `AGENTS.md`; empty: the standard text."""
-    prompts: Word = ""
-    """SHA-256, hex, of the operator's prompts; empty: the standard ones."""
-    inputs: Word = ""
-    """SHA-256, hex, of the skills and MCP servers that the operator gives to the agent; empty: none."""
-    definition: Word = ""
-    """First digits of the digest of the environment's definition; empty: the definition that ships or is approved."""
-    agent_host: Word = ""
-    """Boot id of the agent's kernel, or `ELSEWHERE`; empty: the gateway's own kernel, or unknown for a remote agent."""
-
-    @property
-    def recorded_heldout(self) -> VideoOption:
-        """Which held-out episodes are recorded as video."""
-        return self.video if self.replays is None else self.replays
-
-
-PUBLISHED: dict[str, str] = {
-    "policy_scope": "submit",
-    "observations": "lists",
-    "simulation": "forbidden",
-    "finish": "budget",
-    "step_limit": "published",
-    "hidden_cases": "shared",
-    "feedback": "pictures",
-}
-"""The settings of the profile `published`, by their names in `RunSettings`. Its cases are the published files."""
-PUBLISHED_TRAIN = 1024
-"""Number of train ids in the published case files."""
-
-
-def off_profile(settings: RunSettings) -> str:
-    """The settings in which a run of profile `published` differs from the profile, in words; empty when none does."""
-    if settings.profile == "own":
-        return ""
-    values = {name: getattr(settings, name) for name in PUBLISHED}
-    return ", ".join(
-        f"{name} {values[name]} (not {value})" for name, value in PUBLISHED.items() if values[name] != value
-    )
 
 
 class CreateRun(Message, frozen=True, kw_only=True, tag="create_run"):
@@ -532,147 +446,6 @@ class ApproveEnvironment(Message, frozen=True, kw_only=True, tag="approve_enviro
     token: Word
     env: Word
     digest: Word
-
-
-class StatusRequest(Message, frozen=True, kw_only=True, tag="status"):
-    """Requests the cluster's status."""
-
-    token: Word
-    max_age_s: Number = 0.0
-    """A reply that the coordinator made at most this many seconds ago will do: any number of watchers cost one."""
-
-
-class WorkerStatus(msgspec.Struct, frozen=True, kw_only=True):
-    """One worker that is connected, or recently was."""
-
-    worker: Word
-    host: Word
-    slots: Int
-    state: Literal["active", "paused", "draining", "lost", "quarantined"]
-    tiers: Many[Tier]
-    environments: Many[Text]
-    fingerprint: Text
-    """Short class of the whole worker's fingerprint: workers with equal classes may share any run."""
-    versions: Named[Text]
-    """The components of the class: `evopolicy-worker`, `python`, the environments' packages, `cpu`."""
-    held: Int
-    running: Int
-    last_seen_s: Number
-    """Seconds since its last heartbeat."""
-    refused: Named[Text] = {}
-    """Run id to the reason why this worker gets no work of that run."""
-    boot_id: Word = ""
-    hidden_bar: Text = ""
-    """Why it plays no hidden episodes now; empty when it may."""
-    classes: Named[Word] = {}
-    """Environment to its fingerprint class on this worker: only workers of one class share a run of it."""
-    playing: Named[Int] = {}
-    """Episode jobs that it plays now, by run or evaluation."""
-    installation: Word = ""
-    """Its Python installation, as in `versions.installations` of `run.json`."""
-
-
-class RetriedJobs(msgspec.Struct, frozen=True, kw_only=True):
-    """Jobs of a run that are played again after an infrastructure failure."""
-
-    at: Number
-    """Unix time, seconds."""
-    worker: Word
-    """The worker that held them."""
-    failure: Word
-    """`worker_lost`, `failed`, `overdue`, or `unlisted` (the lease never arrived)."""
-    jobs: Int = 1
-
-
-class RunStatus(msgspec.Struct, frozen=True, kw_only=True):
-    """One unfinished run."""
-
-    run: Word
-    entry: Word
-    env: Word
-    phase: Text
-    budget: Int
-    remaining_budget: Int
-    n_submits: Int
-    queued: Int
-    running: Int
-    done: Int
-    """Finished episode jobs, train and hidden together."""
-    waits_for: Text = ""
-    agent_host: Word = ""
-    """Place of its agent: a host's name, a boot id, or `everywhere`; empty: nowhere."""
-    exp_id: Word = ""
-    repeat: Int = 0
-    best_mean: Number | None = None
-    """Highest visible mean return of its ok submits so far."""
-    created_at: Number = 0.0
-    """Unix time, seconds."""
-    retries: Many[RetriedJobs] = ()
-    """The last ones since the coordinator started, oldest first."""
-
-
-class QueuedJobs(msgspec.Struct, frozen=True, kw_only=True):
-    """The unfinished jobs of one priority and environment."""
-
-    priority: Word
-    """`train`, `reference`, `heldout`, `validation` (of runs that are still open), `audit` or `hidden audit`."""
-    env: Word
-    runs: Int
-    """Number of runs and evaluations."""
-    waiting: Int
-    leased: Int
-    waits_for: Named[Int] = {}
-    """Reason why none of a group's jobs is leased, to the number of such groups."""
-
-
-class DiskUse(msgspec.Struct, frozen=True, kw_only=True):
-    """The coordinator's disk, bytes."""
-
-    database: Int
-    """The database files of the state folder."""
-    free: Int
-    total: Int
-
-
-class TurnedAway(msgspec.Struct, frozen=True, kw_only=True):
-    """A worker whose registration was refused."""
-
-    worker: Word
-    """The name that it sent."""
-    host: Word
-    why: Text
-    ago_s: Number
-    """Seconds since its last attempt."""
-
-
-class StatusReply(Message, frozen=True, kw_only=True, tag="status_reply"):
-    """The reply to `StatusRequest`."""
-
-    cluster: Word
-    version: Word
-    uptime_s: Number
-    episodes_done: Int
-    episodes_per_s: Number
-    """Over the last minute."""
-    workers: Many[WorkerStatus]
-    runs: Many[RunStatus]
-    stalls: Many[Text] = ()
-    """Items that have waited too long, with the reasons."""
-    audit_share: Number = 0.0
-    """Share of the episodes of new runs that is audited, 0 to 1."""
-    audits: Named[Int] = {}
-    """Audited episodes of the unfinished runs, by state (`open`, `agreed`, `disputed`, `not_audited`)."""
-    disputes: Many[Text] = ()
-    """Disagreements of workers, the latest last."""
-    quarantined: Named[Text] = {}
-    """Workers that get no more leases, with the reason."""
-    turned_away: Many[TurnedAway] = ()
-    queue: Many[QueuedJobs] = ()
-    """Highest priority first."""
-    disk: DiskUse | None = None
-    """None until it is known."""
-    cost_s: Number = 0.0
-    """CPU seconds that the coordinator spent on its previous status reply; 0.0 before the first."""
 
 
 OperatorRequest = (

@@ -23,7 +23,8 @@ from evopolicy_common.errors import DECODE_ERRORS, ProtocolError
 from evopolicy_common.messages.bounds import Int, Many, Named, Number, Word
 from evopolicy_common.messages.environment import Case
 from evopolicy_common.messages.gateway import SubmitStatus
-from evopolicy_common.messages.operator import RunFinished, RunSettings
+from evopolicy_common.messages.operator import RunFinished
+from evopolicy_common.messages.run_settings import RunSettings
 
 EMPTY_HEAD = hashlib.sha256(b"evopolicy journal 1").hexdigest()
 SALT_BYTES = 32

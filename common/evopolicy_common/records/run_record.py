@@ -21,7 +21,8 @@ from evopolicy_common.messages.environment import ObservationForm, PolicyScope, 
 from evopolicy_common.messages.episode import FailureCategory, ResourceLimits, Tier
 from evopolicy_common.messages.gateway import FeedbackDetail, FinishRule, Profile, SimulationRule, VideoOption
 from evopolicy_common.messages.journal import Committed
-from evopolicy_common.messages.operator import HiddenCases, HiddenIsolation, RunEnd
+from evopolicy_common.messages.operator import RunEnd
+from evopolicy_common.messages.run_settings import HiddenCases, HiddenIsolation
 from evopolicy_common.records.policies.code_metrics import PUBLISHED_SCHEMA
 
 RECORD_VERSION = 2

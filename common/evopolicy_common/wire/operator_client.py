@@ -40,9 +40,8 @@ from evopolicy_common.messages.operator import (
     SetWorker,
     Signed,
     SignRequest,
-    StatusReply,
-    StatusRequest,
 )
+from evopolicy_common.messages.status import StatusReply, StatusRequest
 from evopolicy_common.wire.refusals import Refusal
 from evopolicy_common.wire.requests import operator_requests
 from evopolicy_common.wire.transport import Link

@@ -22,9 +22,7 @@ from evopolicy_common.cli import Connect, CredentialsFile, fail_on_our_errors
 from evopolicy_common.commands import App
 from evopolicy_common.console import table, terminal
 from evopolicy_common.errors import ConfigError
-from evopolicy_common.messages.operator import (
-    StatusReply,
-)
+from evopolicy_common.messages.status import StatusReply
 from evopolicy_common.terminal import say, say_json
 from evopolicy_common.wire import credentials, transport
 from evopolicy_common.wire.operator_client import OperatorClient

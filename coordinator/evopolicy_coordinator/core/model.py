@@ -24,7 +24,7 @@ from evopolicy_common.messages.episode import (
     Tier,
 )
 from evopolicy_common.messages.gateway import VideoOption
-from evopolicy_common.messages.operator import RetriedJobs
+from evopolicy_common.messages.status import RetriedJobs
 from evopolicy_common.messages.worker import Fingerprint
 
 from .events import RequestId

@@ -25,7 +25,8 @@ from evopolicy_common.messages.episode import (
 )
 from evopolicy_common.messages.gateway import SubmitDone, SubmitStatus
 from evopolicy_common.messages.journal import Committed
-from evopolicy_common.messages.operator import HiddenIsolation, PlayedAs, RunFinished, RunSettings
+from evopolicy_common.messages.operator import PlayedAs, RunFinished
+from evopolicy_common.messages.run_settings import HiddenIsolation, RunSettings
 from evopolicy_common.messages.worker import Fingerprint
 
 Phase = Literal["open", "closed", "finished"]

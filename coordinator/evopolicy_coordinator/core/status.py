@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Callable
 from typing import NamedTuple
 
-from evopolicy_common.messages.operator import QueuedJobs, RunStatus, WorkerStatus
+from evopolicy_common.messages.status import QueuedJobs, RunStatus, WorkerStatus
 
 from .agents import permits
 from .isolation import conflicts

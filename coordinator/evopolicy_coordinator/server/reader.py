@@ -21,7 +21,6 @@ from evopolicy_common.logs import structlog
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome
 from evopolicy_common.messages.gateway import EpisodeFeedback, ResultsPage
 from evopolicy_common.messages.operator import (
-    DiskUse,
     EvaluationPage,
     JournalPage,
     JournalRequest,
@@ -33,6 +32,7 @@ from evopolicy_common.messages.operator import (
     Signed,
     SignRequest,
 )
+from evopolicy_common.messages.status import DiskUse
 from evopolicy_common.messages.worker import BlobAck, BlobChunk, BlobGet, BlobPut, Message, Refused
 from evopolicy_common.records.blobs import BlobStore, digest_of, is_digest
 from evopolicy_common.wire import codec

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import OrderedDict
 
 from evopolicy_common.errors import ProtocolError
-from evopolicy_common.messages.operator import TurnedAway
+from evopolicy_common.messages.status import TurnedAway
 from evopolicy_common.messages.worker import Message, Refused, Register
 from evopolicy_common.wire import codec
 

@@ -21,6 +21,7 @@ from evopolicy_common.errors import ConfigError, ProtocolError, RefusedError
 from evopolicy_common.messages import gateway, operator, worker
 from evopolicy_common.messages.environment import Split, StepLimit
 from evopolicy_common.messages.episode import BlobRef
+from evopolicy_common.messages.run_settings import PUBLISHED_TRAIN, RunSettings, off_profile
 from evopolicy_common.messages.worker import BlobGet, BlobPut, Message
 from evopolicy_common.records.blobs import BlobStore, is_digest
 from evopolicy_common.records.journal import SALT_BYTES
@@ -463,11 +464,11 @@ class RequestParser:
         )
         return events.EvaluationRequested(stimulus_id=stimulus, request=request, message=m, row=row)
 
-    def _check_profile(self, wanted: operator.RunSettings) -> None:
+    def _check_profile(self, wanted: RunSettings) -> None:
         """Raises ConfigError when a run of profile `published` has other settings, or would not play case files."""
         if wanted.profile == "own":
             return
-        if differences := operator.off_profile(wanted):
+        if differences := off_profile(wanted):
             raise ConfigError(f"profile published excludes {differences}")
         if not self._source.from_files:
             raise ConfigError(
@@ -476,10 +477,10 @@ class RequestParser:
             )
 
     def _check_published(self, n_train: int) -> None:
-        if n_train != operator.PUBLISHED_TRAIN:
+        if n_train != PUBLISHED_TRAIN:
             raise RefusedError(
                 Refusal.INVALID_SETTINGS,
-                f"the published train splits have {operator.PUBLISHED_TRAIN:,} cases each, the one in this coordinator's"
+                f"the published train splits have {PUBLISHED_TRAIN:,} cases each, the one in this coordinator's"
                 f" --data has {n_train:,}; give it data/main-128 of the published software, or leave out the profile",
             )
 

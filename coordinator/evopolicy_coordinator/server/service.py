@@ -30,6 +30,7 @@ from evopolicy_common.errors import (
 )
 from evopolicy_common.logs import structlog
 from evopolicy_common.messages import operator
+from evopolicy_common.messages.status import DiskUse, StatusReply, StatusRequest
 from evopolicy_common.messages.worker import BlobGet, BlobPut, LeaseRequest, Message, Refused
 from evopolicy_common.records.policies import bundles
 from evopolicy_common.wire import codec
@@ -97,7 +98,7 @@ class Service:
         self._last_status: tuple[float, bytes] | None = None
         """When the last status reply was made, and the reply."""
         self._status_cost_s = 0.0
-        self._disk: operator.DiskUse | None = None
+        self._disk: DiskUse | None = None
 
     async def start(self) -> None:
         """Loads the core from the store. Raises StorageError and PartFailedError, as `CoreHost.start`."""
@@ -170,7 +171,7 @@ class Service:
             self._serve_get(core, query, parsed, message)
         elif isinstance(message, operator.Claim):
             self._spawn(self._serve_claim(query, message))
-        elif isinstance(message, operator.StatusRequest):
+        elif isinstance(message, StatusRequest):
             query.reply(self._status_bytes(core, message.max_age_s), lane_of(parsed.asker))
         elif isinstance(message, operator.RecordedRequest):
             self._reader.recorded(message, answer_to(query, parsed.asker))
@@ -350,7 +351,7 @@ class Service:
         """Whether a core is loaded."""
         return self.host.core is not None and not self.host.stopping
 
-    def status(self) -> operator.StatusReply | None:
+    def status(self) -> StatusReply | None:
         """The current status for operators; None while no core is loaded."""
         return None if self.host.core is None else self._status(self.host.core)
 
@@ -362,10 +363,10 @@ class Service:
             self._status_cost_s = time.thread_time() - began
         return self._last_status[1]
 
-    def _status(self, core: Core) -> operator.StatusReply:
+    def _status(self, core: Core) -> StatusReply:
         part = core.status(self.host.now(), words)._asdict()
         part["stalls"] = self._stalls(part["stalls"])
-        return operator.StatusReply(
+        return StatusReply(
             cluster=self._cluster,
             version=metadata.version("evopolicy"),
             uptime_s=self.host.now() - self._started_at,

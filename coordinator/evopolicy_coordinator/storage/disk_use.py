@@ -22,7 +22,7 @@ from pathlib import Path
 import msgspec
 
 from evopolicy_common.errors import ConfigError
-from evopolicy_common.messages.operator import DiskUse
+from evopolicy_common.messages.status import DiskUse
 from evopolicy_common.records.blobs import BlobStore
 from evopolicy_coordinator.core.records import (
     AuditRow,

@@ -27,7 +27,7 @@ from starlette.types import ASGIApp
 
 from evopolicy_common.errors import ConfigError, EvopolicyError
 from evopolicy_common.logs import structlog
-from evopolicy_common.messages.operator import StatusReply
+from evopolicy_common.messages.status import StatusReply
 from evopolicy_common.wire.credentials import Credentials
 from evopolicy_coordinator.server.monitoring.metrics import CONTENT_TYPE, StatusCollector
 from evopolicy_coordinator.web import acting, rendering

@@ -17,7 +17,7 @@ import msgspec
 
 from evopolicy_common.errors import EvopolicyError
 from evopolicy_common.logs import structlog
-from evopolicy_common.messages.operator import RetriedJobs, StatusReply
+from evopolicy_common.messages.status import RetriedJobs, StatusReply
 from evopolicy_common.wire import transport
 from evopolicy_common.wire.credentials import Credentials
 from evopolicy_common.wire.operator_client import OperatorClient

@@ -20,7 +20,8 @@ from typing import Any
 import msgspec
 
 from evopolicy_common.errors import DECODE_ERRORS, ProtocolError
-from evopolicy_common.messages.operator import RunSettings, RunStatus
+from evopolicy_common.messages.run_settings import RunSettings
+from evopolicy_common.messages.status import RunStatus
 from evopolicy_common.records.run_record import RunRecord, decode_run_record
 from evopolicy_common.records.suite_folder import INDEX, PAUSED
 from evopolicy_common.records.summary import Summary, decode_summary

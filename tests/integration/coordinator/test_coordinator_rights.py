@@ -20,8 +20,9 @@ from coordinator_harness import (
 )
 
 from evopolicy_common.errors import RefusedError, TransportError
-from evopolicy_common.messages import gateway, operator, worker
+from evopolicy_common.messages import gateway, worker
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome, EpisodeSpec, Job
+from evopolicy_common.messages.status import StatusReply, StatusRequest
 from evopolicy_common.messages.worker import Refused
 from evopolicy_common.wire import codec, keys
 from evopolicy_common.wire.credentials import Credentials
@@ -168,7 +169,7 @@ def test_bytes_that_are_no_message_are_refused(coordinator: Coordinator) -> None
         async with connect(coordinator.credentials("gateway")) as link:
             key = keys.gateway_key("local", "r", "open")
             wrong = msgspec.msgpack.encode({"op": "open_run", "run": 7})
-            operators = codec.encode(operator.StatusRequest(token=""))
+            operators = codec.encode(StatusRequest(token=""))
             for payload in (b"", b"\xc1", b"x" * 100_000, wrong, operators, b"\x91" * 50_000):
                 assert await refusal(link, key, payload) == "bad_message"
 
@@ -183,15 +184,13 @@ def test_router_lets_a_role_ask_on_its_own_keys_only(coordinator: Coordinator, s
             with pytest.raises(TransportError):
                 await link.ask(
                     keys.operator_key("local", "status"),
-                    codec.encode(operator.StatusRequest(token=operator_token)),
+                    codec.encode(StatusRequest(token=operator_token)),
                     3,
                 )
             client = OperatorClient(link)
             client.token = operator_token
             with pytest.raises(TransportError):
-                await client.ask.once(
-                    "status", operator.StatusRequest(token=operator_token), operator.StatusReply
-                )
+                await client.ask.once("status", StatusRequest(token=operator_token), StatusReply)
 
     run(scenario)
 

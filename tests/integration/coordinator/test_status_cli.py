@@ -25,7 +25,7 @@ from coordinator_harness import (
 )
 from typer.testing import CliRunner, Result
 
-from evopolicy_common.messages.operator import WorkerStatus
+from evopolicy_common.messages.status import WorkerStatus
 from evopolicy_coordinator.cli.status import runs_app, status_app, workers_app
 
 APPS = {"status": status_app, "workers": workers_app, "runs": runs_app}

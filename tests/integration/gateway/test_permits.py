@@ -11,7 +11,7 @@ from gateway_double import Double, answering, gateway_on, opened, prepare, serve
 
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.gateway import CloseRun, OpenRun, RequestPermit
-from evopolicy_common.messages.operator import ELSEWHERE, RunSettings
+from evopolicy_common.messages.run_settings import ELSEWHERE, RunSettings
 from evopolicy_common.messages.worker import Message, Refused
 from evopolicy_common.processes import host
 from evopolicy_common.wire.refusals import Refusal

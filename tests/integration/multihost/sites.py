@@ -27,7 +27,7 @@ from pathlib import Path
 from machines.hosts import Host, Network
 
 from evopolicy_common.errors import TransportError
-from evopolicy_common.messages import operator
+from evopolicy_common.messages.status import StatusReply, StatusRequest
 from evopolicy_common.wire import codec, credentials, keys
 from evopolicy_common.wire.requests import Requester
 from evopolicy_common.wire.transport import connect
@@ -192,23 +192,23 @@ class Sites:
         return False
 
     def status_until(
-        self, fits: Callable[[operator.StatusReply], bool], process: subprocess.Popen[bytes] | None = None
-    ) -> operator.StatusReply:
+        self, fits: Callable[[StatusReply], bool], process: subprocess.Popen[bytes] | None = None
+    ) -> StatusReply:
         """What the coordinator tells an operator at its own machine, once it fits.
 
         AssertionError when the process ends before, or it takes too long.
         """
 
-        async def ask() -> operator.StatusReply:
+        async def ask() -> StatusReply:
             deadline = time.monotonic() + TIMEOUT_S
             async with connect(credentials.read(Path(self.own["operator"]))) as link:
                 requester = Requester(
                     link, partial(keys.operator_key, link.credentials.cluster), codec.operator_replies
                 )
-                message = operator.StatusRequest(token=link.credentials.token)
+                message = StatusRequest(token=link.credentials.token)
                 while time.monotonic() < deadline:
                     with contextlib.suppress(TransportError):
-                        reply = await requester.once("status", message, operator.StatusReply)
+                        reply = await requester.once("status", message, StatusReply)
                         if fits(reply):
                             return reply
                     assert process is None or process.poll() is None, "it ended before"

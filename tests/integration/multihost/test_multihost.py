@@ -19,7 +19,7 @@ import pytest
 from machines import hosts
 from sites import EPISODES, REAL, SUBMITS, TIMEOUT_S, TOTAL, TOY, Sites, sites
 
-from evopolicy_common.messages.operator import StatusReply
+from evopolicy_common.messages.status import StatusReply
 from evopolicy_common.records.run_difference import differences
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]

@@ -9,7 +9,8 @@ from typing import Any
 import msgspec
 from starlette.testclient import TestClient
 
-from evopolicy_common.messages.operator import RunSettings, RunStatus, StatusReply, WorkerStatus
+from evopolicy_common.messages.run_settings import RunSettings
+from evopolicy_common.messages.status import RunStatus, StatusReply, WorkerStatus
 from evopolicy_common.records.policies.bundles import BundleFile, pack
 from evopolicy_common.wire.credentials import Credentials
 from evopolicy_coordinator.web.access import Access, Tokens

@@ -14,7 +14,8 @@ from evopolicy_common.messages.episode import (
     PolicyFailure,
     ResourceLimits,
 )
-from evopolicy_common.messages.operator import RunFinished, RunSettings
+from evopolicy_common.messages.operator import RunFinished
+from evopolicy_common.messages.run_settings import RunSettings
 from evopolicy_coordinator.core import events
 from evopolicy_coordinator.core.effects import (
     AuditEffect,

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from evopolicy_common.messages.operator import RunFinished, RunSettings, SubmitRecord
+from evopolicy_common.messages.operator import RunFinished, SubmitRecord
+from evopolicy_common.messages.run_settings import RunSettings
 from evopolicy_common.messages.worker import Fingerprint
 
 SETTINGS = RunSettings(env="toy/line", entry="evolve", model="none", exp_id="t", budget=8)

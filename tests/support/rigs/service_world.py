@@ -12,7 +12,7 @@ from evopolicy_common.errors import StorageError
 from evopolicy_common.messages import gateway, operator, worker
 from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_common.messages.episode import PolicyFailure
-from evopolicy_common.messages.operator import RunSettings
+from evopolicy_common.messages.run_settings import RunSettings
 from evopolicy_common.messages.worker import Message
 from evopolicy_common.records.blobs import BlobStore
 from evopolicy_common.wire import codec, keys

@@ -12,7 +12,8 @@ from typing import Any
 import pytest
 
 from evopolicy_common.console import Terminal
-from evopolicy_common.messages.operator import ClaimState, RunFinished, RunSettings
+from evopolicy_common.messages.operator import ClaimState, RunFinished
+from evopolicy_common.messages.run_settings import RunSettings
 from evopolicy_common.records.run_record import RunRecord
 from evopolicy_common.wire.credentials import Credentials
 from evopolicy_gateway.operator.child_messages import AgentDoing

@@ -14,7 +14,7 @@ from collections.abc import Iterable
 import msgspec
 
 from evopolicy_common.messages import gateway
-from evopolicy_common.messages.operator import ELSEWHERE
+from evopolicy_common.messages.run_settings import ELSEWHERE
 from evopolicy_common.wire.refusals import Refusal
 from evopolicy_coordinator.core.isolation import conflicts, kernels, occupancies
 from evopolicy_coordinator.core.isolation.kernels import all_related, put, related, take

@@ -14,7 +14,7 @@ from prometheus_client import CollectorRegistry, Counter, Histogram, ProcessColl
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, InfoMetricFamily, Metric
 from prometheus_client.registry import Collector
 
-from evopolicy_common.messages import operator
+from evopolicy_common.messages.status import StatusReply
 from evopolicy_common.messages.worker import Leases
 from evopolicy_coordinator.core.effects import Effect, Log, Persist, Reply
 from evopolicy_coordinator.core.machine import Core
@@ -30,7 +30,7 @@ _PHASES = ("open", "validation", "heldout", "random", "finished")
 class Meter:
     """Counts a core's activity from the effects of each step."""
 
-    def __init__(self, state: Path, status: Callable[[], operator.StatusReply | None]) -> None:
+    def __init__(self, state: Path, status: Callable[[], StatusReply | None]) -> None:
         """`state`: the state folder, whose size is reported. `status` is called at every scrape; it returns None
         while no core is loaded."""
         self.registry = CollectorRegistry()
@@ -125,7 +125,7 @@ class Meter:
 class StatusCollector(Collector):
     """Gauges from a status reply."""
 
-    def __init__(self, status: Callable[[], operator.StatusReply | None]) -> None:
+    def __init__(self, status: Callable[[], StatusReply | None]) -> None:
         self._status = status
 
     def collect(self) -> Iterator[Metric]:

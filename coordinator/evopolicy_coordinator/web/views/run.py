@@ -7,7 +7,7 @@ from typing import Any
 
 from markupsafe import Markup
 
-from evopolicy_common.messages.operator import RetriedJobs, StatusReply
+from evopolicy_common.messages.status import RetriedJobs, StatusReply
 from evopolicy_common.records.summary import utc_text
 from evopolicy_coordinator.analysis.behaviour.trace import diff
 from evopolicy_coordinator.analysis.palette import looks

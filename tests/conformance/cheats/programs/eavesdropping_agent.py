@@ -10,7 +10,7 @@ import msgspec
 import zenoh
 
 from evopolicy_common.messages.gateway import StateRequest
-from evopolicy_common.messages.operator import StatusRequest
+from evopolicy_common.messages.status import StatusRequest
 from evopolicy_common.wire import codec, keys, transport
 from evopolicy_common.wire.credentials import Credentials
 

@@ -9,7 +9,7 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 from rigs.core_rig import Rig, done
 
-from evopolicy_common.messages.operator import StatusReply
+from evopolicy_common.messages.status import StatusReply
 from evopolicy_coordinator.core.effects import Effect
 from evopolicy_coordinator.server.monitoring.metrics import Meter
 

@@ -17,7 +17,8 @@ from evopolicy_common.errors import ProtocolError, RefusedError
 from evopolicy_common.messages import gateway, operator, worker
 from evopolicy_common.messages.environment import Case
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome, PolicyFailure, ResourceLimits
-from evopolicy_common.messages.operator import RunSettings
+from evopolicy_common.messages.run_settings import PUBLISHED, RunSettings
+from evopolicy_common.messages.status import StatusRequest
 from evopolicy_common.messages.worker import Message
 from evopolicy_common.records.blobs import BlobStore
 from evopolicy_common.wire import codec, keys
@@ -322,7 +323,7 @@ def test_only_what_makes_something_new_asks_for_change(parser: RequestParser) ->
     assert parser.asks_for_change(SUBMIT, codec.encode(submit()))
     assert parser.asks_for_change(OPS, codec.encode(create()))
     assert parser.asks_for_change(OPS, codec.encode(evaluate()))
-    assert not parser.asks_for_change(OPS, codec.encode(operator.StatusRequest(token="")))
+    assert not parser.asks_for_change(OPS, codec.encode(StatusRequest(token="")))
     assert not parser.asks_for_change(SUBMIT, b"junk")
     assert not parser.asks_for_change(keys.worker_key("c", "done"), codec.encode(report_results()))
 
@@ -357,7 +358,7 @@ def test_profile_published_plays_the_published_files_by_the_published_rules_or_n
         source = SplitSource(data=data, secret=b"s" * 32)
         return RequestParser(IDENTITY, blobs, source, Uploads(), allowed_imports=(), denied_imports=())
 
-    published = {**operator.PUBLISHED, "profile": "published"}
+    published = {**PUBLISHED, "profile": "published"}
     whole = at(published_tree(tmp_path / "whole", 1024))
     made = event(whole, OPS, create(**published, n_validation=16, n_heldout=32))
     assert (len(made.row.train), len(made.row.validation), len(made.row.heldout)) == (1024, 16, 32)

@@ -18,7 +18,8 @@ from structlog.testing import capture_logs
 
 from evopolicy_common.errors import DamagedStoreError, PartFailedError
 from evopolicy_common.messages import gateway, operator, worker
-from evopolicy_common.messages.operator import RunSettings
+from evopolicy_common.messages.run_settings import RunSettings
+from evopolicy_common.messages.status import StatusRequest
 from evopolicy_common.wire import keys
 from evopolicy_coordinator.core.machine import Core
 from evopolicy_coordinator.core.settings import CoreSettings
@@ -156,7 +157,7 @@ def test_a_disk_that_does_not_come_to_an_end_is_named_in_status_and_log(
         world.ask(created)
         stalls: tuple[str, ...] = ()
         while not stalls:
-            status = Requested(keys.operator_key("c", "status"), operator.StatusRequest(token="operate"))
+            status = Requested(keys.operator_key("c", "status"), StatusRequest(token="operate"))
             world.ask(status)
             stalls = (await status.message()).stalls
             await asyncio.sleep(0.01)
@@ -175,7 +176,7 @@ def test_a_disk_that_does_not_come_to_an_end_is_named_in_status_and_log(
 def test_any_number_of_watchers_costs_one_status(tmp_path: Path) -> None:
     async def scenario(world: World) -> None:
         async def shown(max_age_s: float) -> tuple[float, int]:
-            message = operator.StatusRequest(token="operate", max_age_s=max_age_s)
+            message = StatusRequest(token="operate", max_age_s=max_age_s)
             asked = Requested(keys.operator_key("c", "status"), message)
             world.ask(asked)
             reply = await asked.message()
@@ -194,7 +195,7 @@ def test_any_number_of_watchers_costs_one_status(tmp_path: Path) -> None:
 def test_the_status_tells_of_the_disk(tmp_path: Path) -> None:
     async def scenario(world: World) -> None:
         while True:
-            asked = Requested(keys.operator_key("c", "status"), operator.StatusRequest(token="operate"))
+            asked = Requested(keys.operator_key("c", "status"), StatusRequest(token="operate"))
             world.ask(asked)
             if (disk := (await asked.message()).disk) is not None:
                 break

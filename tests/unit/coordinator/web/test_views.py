@@ -7,7 +7,12 @@ from pathlib import Path
 
 from invented.web_site import client, finished_run, open_run, open_status, site_of, status
 
-from evopolicy_common.messages.operator import DiskUse, QueuedJobs, RetriedJobs, WorkerStatus
+from evopolicy_common.messages.status import (
+    DiskUse,
+    QueuedJobs,
+    RetriedJobs,
+    WorkerStatus,
+)
 from evopolicy_coordinator.web.cluster import _RETRIES_OF_A_RUN
 from evopolicy_coordinator.web.run_folders import key_of
 

@@ -20,7 +20,7 @@ from invented.web_site import (
 )
 
 from evopolicy_common.errors import ConfigError
-from evopolicy_common.messages.operator import WorkerStatus
+from evopolicy_common.messages.status import WorkerStatus
 from evopolicy_coordinator.web.access import POLICY, kept_tokens
 from evopolicy_coordinator.web.run_folders import key_of
 

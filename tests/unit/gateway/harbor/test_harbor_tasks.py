@@ -15,7 +15,7 @@ from invented.run_dirs import write_run
 from starlette.testclient import TestClient
 
 from evopolicy_common.errors import ConfigError
-from evopolicy_common.messages.operator import RunSettings
+from evopolicy_common.messages.run_settings import RunSettings
 from evopolicy_gateway.harbor import scores
 from evopolicy_gateway.harbor.scores import make_app, tasks_in, token_of, write_task
 from evopolicy_gateway.http.listener import Listener, finish

@@ -19,7 +19,8 @@ from rigs.finished_run import SETTINGS, finished
 from evopolicy_common.console import Terminal
 from evopolicy_common.errors import ConfigError, ProtocolError
 from evopolicy_common.messages.episode import LARGEST_LIMIT, LARGEST_LIMITS, ResourceLimits
-from evopolicy_common.messages.operator import PUBLISHED, RunProgress, off_profile
+from evopolicy_common.messages.operator import RunProgress
+from evopolicy_common.messages.run_settings import PUBLISHED, off_profile
 from evopolicy_common.records.run_record import decode_run_record, encode_run_record
 from evopolicy_gateway.cli.options import cases_of, limits_of, one_environment, packages_for
 from evopolicy_gateway.cli.play import _unjailed

@@ -12,7 +12,7 @@ import pytest
 from rigs.finished_run import finished
 
 from evopolicy_common.console import Terminal
-from evopolicy_common.messages.operator import RunSettings
+from evopolicy_common.messages.run_settings import RunSettings
 from evopolicy_common.records.run_record import RunRecord
 from evopolicy_gateway.run.plan import Plan
 from evopolicy_gateway.run.record import run_record

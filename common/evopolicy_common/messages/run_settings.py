@@ -1,0 +1,95 @@
+"""The settings with which an operator opens a run, and those of the published protocol."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import msgspec
+
+from evopolicy_common.messages.bounds import Int, Named, Text, Word
+from evopolicy_common.messages.environment import ObservationForm, PolicyScope, StepLimit
+from evopolicy_common.messages.episode import ResourceLimits, Tier
+from evopolicy_common.messages.gateway import FeedbackDetail, FinishRule, Profile, SimulationRule, VideoOption
+
+HiddenIsolation = Literal["exclusive", "shared", "waived", "unknown"]
+"""Whether hidden episodes and agents could share a kernel. exclusive: never. shared: possible, as the rule was off
+for all or part of the run. waived: the operator vouched for where the agent was. unknown: the run was played before
+this was recorded."""
+
+HiddenCases = Literal["shared", "per_run"]
+"""Validation and held-out cases: the same for all runs of an environment, or each run's own (no paired statistics)."""
+
+ELSEWHERE = "elsewhere"
+"""Value of `RunSettings.agent_host`: the operator vouches that the agent is on no machine of the cluster."""
+
+
+class RunSettings(msgspec.Struct, frozen=True, kw_only=True):
+    """Settings with which a run is opened. None means the suite's own number."""
+
+    env: Word
+    entry: Word
+    """Name of the agent in tables, such as `evolve` or `GPT-5.5 (Codex)`."""
+    model: Word
+    exp_id: Word
+    repeat: Int = 0
+    attempt: Int = 1
+    budget: Int | None = None
+    min_episodes_per_submit: Int | None = None
+    max_episodes_per_submit: Int | None = None
+    n_validation: Int | None = None
+    n_heldout: Int | None = None
+    policy_scope: PolicyScope = "episode"
+    observations: ObservationForm = "arrays"
+    sandbox_tier: Tier = "bwrap"
+    video: VideoOption = "off"
+    replays: VideoOption | None = None
+    """Which held-out episodes of the selected checkpoint are recorded as video for people; None: as `video`."""
+    limits: ResourceLimits = ResourceLimits()
+    notes: Named[Text] = {}
+    """The operator's own labels, such as the name of a sweep; kept in the coordinator's database, not in `run.json`."""
+    hidden_cases: HiddenCases = "shared"
+    simulation: SimulationRule = "forbidden"
+    finish: FinishRule = "early"
+    step_limit: StepLimit = "natural"
+    """Missing in rows and messages of earlier versions."""
+    profile: Profile = "own"
+    feedback: FeedbackDetail = "pictures"
+    agents_md: Word = ""
+    """SHA-256, hex, of the operator's text in place of `AGENTS.md`; empty: the standard text."""
+    prompts: Word = ""
+    """SHA-256, hex, of the operator's prompts; empty: the standard ones."""
+    inputs: Word = ""
+    """SHA-256, hex, of the skills and MCP servers that the operator gives to the agent; empty: none."""
+    definition: Word = ""
+    """First digits of the digest of the environment's definition; empty: the definition that ships or is approved."""
+    agent_host: Word = ""
+    """Boot id of the agent's kernel, or `ELSEWHERE`; empty: the gateway's own kernel, or unknown for a remote agent."""
+
+    @property
+    def recorded_heldout(self) -> VideoOption:
+        """Which held-out episodes are recorded as video."""
+        return self.video if self.replays is None else self.replays
+
+
+PUBLISHED: dict[str, str] = {
+    "policy_scope": "submit",
+    "observations": "lists",
+    "simulation": "forbidden",
+    "finish": "budget",
+    "step_limit": "published",
+    "hidden_cases": "shared",
+    "feedback": "pictures",
+}
+"""The settings of the profile `published`, by their names in `RunSettings`. Its cases are the published files."""
+PUBLISHED_TRAIN = 1024
+"""Number of train ids in the published case files."""
+
+
+def off_profile(settings: RunSettings) -> str:
+    """The settings in which a run of profile `published` differs from the profile, in words; empty when none does."""
+    if settings.profile == "own":
+        return ""
+    values = {name: getattr(settings, name) for name in PUBLISHED}
+    return ", ".join(
+        f"{name} {values[name]} (not {value})" for name, value in PUBLISHED.items() if values[name] != value
+    )

@@ -1,0 +1,152 @@
+"""The status of a cluster, as operators get it: workers, unfinished runs, waiting jobs, the disk."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import msgspec
+
+from evopolicy_common.messages.bounds import Int, Many, Named, Number, Text, Word
+from evopolicy_common.messages.episode import Tier
+from evopolicy_common.messages.worker import Message
+
+
+class StatusRequest(Message, frozen=True, kw_only=True, tag="status"):
+    """Requests the cluster's status."""
+
+    token: Word
+    max_age_s: Number = 0.0
+    """A reply that the coordinator made at most this many seconds ago will do: any number of watchers cost one."""
+
+
+class WorkerStatus(msgspec.Struct, frozen=True, kw_only=True):
+    """One worker that is connected, or recently was."""
+
+    worker: Word
+    host: Word
+    slots: Int
+    state: Literal["active", "paused", "draining", "lost", "quarantined"]
+    tiers: Many[Tier]
+    environments: Many[Text]
+    fingerprint: Text
+    """Short class of the whole worker's fingerprint: workers with equal classes may share any run."""
+    versions: Named[Text]
+    """The components of the class: `evopolicy-worker`, `python`, the environments' packages, `cpu`."""
+    held: Int
+    running: Int
+    last_seen_s: Number
+    """Seconds since its last heartbeat."""
+    refused: Named[Text] = {}
+    """Run id to the reason why this worker gets no work of that run."""
+    boot_id: Word = ""
+    hidden_bar: Text = ""
+    """Why it plays no hidden episodes now; empty when it may."""
+    classes: Named[Word] = {}
+    """Environment to its fingerprint class on this worker: only workers of one class share a run of it."""
+    playing: Named[Int] = {}
+    """Episode jobs that it plays now, by run or evaluation."""
+    installation: Word = ""
+    """Its Python installation, as in `versions.installations` of `run.json`."""
+
+
+class RetriedJobs(msgspec.Struct, frozen=True, kw_only=True):
+    """Jobs of a run that are played again after an infrastructure failure."""
+
+    at: Number
+    """Unix time, seconds."""
+    worker: Word
+    """The worker that held them."""
+    failure: Word
+    """`worker_lost`, `failed`, `overdue`, or `unlisted` (the lease never arrived)."""
+    jobs: Int = 1
+
+
+class RunStatus(msgspec.Struct, frozen=True, kw_only=True):
+    """One unfinished run."""
+
+    run: Word
+    entry: Word
+    env: Word
+    phase: Text
+    budget: Int
+    remaining_budget: Int
+    n_submits: Int
+    queued: Int
+    running: Int
+    done: Int
+    """Finished episode jobs, train and hidden together."""
+    waits_for: Text = ""
+    agent_host: Word = ""
+    """Place of its agent: a host's name, a boot id, or `everywhere`; empty: nowhere."""
+    exp_id: Word = ""
+    repeat: Int = 0
+    best_mean: Number | None = None
+    """Highest visible mean return of its ok submits so far."""
+    created_at: Number = 0.0
+    """Unix time, seconds."""
+    retries: Many[RetriedJobs] = ()
+    """The last ones since the coordinator started, oldest first."""
+
+
+class QueuedJobs(msgspec.Struct, frozen=True, kw_only=True):
+    """The unfinished jobs of one priority and environment."""
+
+    priority: Word
+    """`train`, `reference`, `heldout`, `validation` (of runs that are still open), `audit` or `hidden audit`."""
+    env: Word
+    runs: Int
+    """Number of runs and evaluations."""
+    waiting: Int
+    leased: Int
+    waits_for: Named[Int] = {}
+    """Reason why none of a group's jobs is leased, to the number of such groups."""
+
+
+class DiskUse(msgspec.Struct, frozen=True, kw_only=True):
+    """The coordinator's disk, bytes."""
+
+    database: Int
+    """The database files of the state folder."""
+    free: Int
+    total: Int
+
+
+class TurnedAway(msgspec.Struct, frozen=True, kw_only=True):
+    """A worker whose registration was refused."""
+
+    worker: Word
+    """The name that it sent."""
+    host: Word
+    why: Text
+    ago_s: Number
+    """Seconds since its last attempt."""
+
+
+class StatusReply(Message, frozen=True, kw_only=True, tag="status_reply"):
+    """The reply to `StatusRequest`."""
+
+    cluster: Word
+    version: Word
+    uptime_s: Number
+    episodes_done: Int
+    episodes_per_s: Number
+    """Over the last minute."""
+    workers: Many[WorkerStatus]
+    runs: Many[RunStatus]
+    stalls: Many[Text] = ()
+    """Items that have waited too long, with the reasons."""
+    audit_share: Number = 0.0
+    """Share of the episodes of new runs that is audited, 0 to 1."""
+    audits: Named[Int] = {}
+    """Audited episodes of the unfinished runs, by state (`open`, `agreed`, `disputed`, `not_audited`)."""
+    disputes: Many[Text] = ()
+    """Disagreements of workers, the latest last."""
+    quarantined: Named[Text] = {}
+    """Workers that get no more leases, with the reason."""
+    turned_away: Many[TurnedAway] = ()
+    queue: Many[QueuedJobs] = ()
+    """Highest priority first."""
+    disk: DiskUse | None = None
+    """None until it is known."""
+    cost_s: Number = 0.0
+    """CPU seconds that the coordinator spent on its previous status reply; 0.0 before the first."""
