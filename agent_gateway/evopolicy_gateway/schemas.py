@@ -15,11 +15,11 @@ from typing import Any, NamedTuple
 import msgspec
 
 from evopolicy_common.errors import ConfigError
+from evopolicy_common.records import suite_folder
 from evopolicy_common.records.policies.code_metrics import PUBLISHED_SCHEMA
 from evopolicy_common.records.run_record import RECORD_VERSION, RunRecord
 from evopolicy_common.records.summary import Summary
 from evopolicy_gateway.harnesses.agent_config import AgentConfig
-from evopolicy_gateway.suite import suite_index
 from evopolicy_gateway.suite.suite_file import SuiteFile
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
@@ -46,8 +46,8 @@ KINDS = {
         "The result of one submit, in its feedback folder; also the reply to the submit.",
     ),
     "suite.json": Kind(
-        suite_index.Index,
-        str(suite_index.SCHEMA_VERSION),
+        suite_folder.Index,
+        str(suite_folder.SCHEMA_VERSION),
         "The state of each run of a sweep, in the sweep's folder.",
     ),
     "suite.toml": Kind(SuiteFile, "1", "A sweep, as `evopolicy suite` reads it."),

@@ -26,9 +26,8 @@ from evopolicy_common.errors import DECODE_ERRORS, ConfigError, ProtocolError
 from evopolicy_common.records.blobs import write_atomically
 from evopolicy_common.records.run_files import run_folders
 from evopolicy_common.records.run_record import RunRecord, decode_run_record
-from evopolicy_common.records.suite_folder import INDEX
+from evopolicy_common.records.suite_folder import INDEX, Index
 from evopolicy_common.records.summary import Summary
-from evopolicy_gateway.suite.suite_index import Index
 
 POLL_S = 2.0
 _KNOWN = "evopolicy.json"

@@ -21,7 +21,7 @@ from evopolicy_common.errors import ConfigError
 from evopolicy_common.processes.local_cluster import unless_failed
 from evopolicy_common.processes.preflight import check_installed, check_loopback, check_writable
 from evopolicy_common.records.run_record import decode_run_record
-from evopolicy_common.records.suite_folder import INDEX
+from evopolicy_common.records.suite_folder import FINISHED, INDEX, Index
 from evopolicy_common.wire.credentials import SWEEP_STATE
 from evopolicy_gateway.cli import options
 from evopolicy_gateway.operator.cluster import Cluster, connected
@@ -32,7 +32,6 @@ from evopolicy_gateway.suite.claimed import ClaimedSweep, look
 from evopolicy_gateway.suite.decisions import Changed, Decision
 from evopolicy_gateway.suite.ends import exit_code, next_step
 from evopolicy_gateway.suite.suite_file import SuiteFile
-from evopolicy_gateway.suite.suite_index import FINISHED, Index
 from evopolicy_gateway.suite.suite_view import JsonView, results_table, view_of
 
 app = App()

@@ -28,7 +28,7 @@ from evopolicy_common.messages.operator import ClaimState
 from evopolicy_common.processes.local_cluster import unless_failed
 from evopolicy_common.processes.scratch import remove_tree
 from evopolicy_common.records.run_record import decode_run_record
-from evopolicy_common.records.suite_folder import PAUSED
+from evopolicy_common.records.suite_folder import FINISHED, PAUSED, Entry, Index
 from evopolicy_common.wire.credentials import Credentials
 from evopolicy_gateway import harnesses
 from evopolicy_gateway.harnesses.coding_agents import session
@@ -40,7 +40,6 @@ from evopolicy_gateway.run.plan import Plan
 from evopolicy_gateway.suite import suite_index, sweep
 from evopolicy_gateway.suite.decisions import Decision, Found
 from evopolicy_gateway.suite.suite_file import SuiteFile
-from evopolicy_gateway.suite.suite_index import FINISHED, Entry, Index
 from evopolicy_gateway.suite.suite_view import SuiteView
 from evopolicy_gateway.suite.sweep import Sweep
 

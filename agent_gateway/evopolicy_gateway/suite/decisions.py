@@ -19,8 +19,8 @@ import msgspec
 
 from evopolicy_common import catalogue
 from evopolicy_common.errors import ConfigError
+from evopolicy_common.records.suite_folder import FINISHED, Entry
 from evopolicy_gateway.run.plan import Plan
-from evopolicy_gateway.suite.suite_index import FINISHED, Entry
 
 Kind = Literal["keep", "new", "resume", "finish", "restart"]
 Changed = Literal["refuse", "keep", "rerun"]

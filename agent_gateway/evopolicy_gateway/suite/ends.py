@@ -6,9 +6,9 @@ import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
+from evopolicy_common.records.suite_folder import Entry, Index
 from evopolicy_common.terminal import say_lines
 from evopolicy_gateway.run.plan import Plan
-from evopolicy_gateway.suite.suite_index import Entry, Index
 
 EXIT_CODES = {"error": 1, "cancelled": 5, "agent_failed": 4, "no_ok_submit": 3}
 """Exit codes of a command that plays runs, most severe first; 0 when every run completed."""

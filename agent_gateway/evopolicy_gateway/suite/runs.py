@@ -13,6 +13,7 @@ from evopolicy_common.console import Terminal, table
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.processes.local_cluster import unless_failed
 from evopolicy_common.records.run_record import RunRecord
+from evopolicy_common.records.suite_folder import Entry, Index
 from evopolicy_common.terminal import number
 from evopolicy_common.wire.credentials import Credentials
 from evopolicy_gateway.operator.cluster import Cluster, connected
@@ -22,7 +23,7 @@ from evopolicy_gateway.run.plan import Plan
 from evopolicy_gateway.suite.decisions import Decision
 from evopolicy_gateway.suite.ends import next_step
 from evopolicy_gateway.suite.suite_file import Parallel
-from evopolicy_gateway.suite.suite_index import Entry, Index, entry_of
+from evopolicy_gateway.suite.suite_index import entry_of
 from evopolicy_gateway.suite.sweep import Sweep
 
 

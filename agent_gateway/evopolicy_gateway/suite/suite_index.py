@@ -7,66 +7,19 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import msgspec
 
 from evopolicy_common.errors import DECODE_ERRORS, ConfigError
-from evopolicy_common.messages.operator import RunEnd
 from evopolicy_common.records.blobs import write_atomically
 from evopolicy_common.records.run_record import RunRecord
-from evopolicy_common.records.suite_folder import INDEX
+from evopolicy_common.records.suite_folder import INDEX, SCHEMA_VERSION, Entry, Index, State
 from evopolicy_common.records.summary import utc_text
 from evopolicy_gateway.harnesses.usage import tokens_in
 from evopolicy_gateway.run.plan import Plan
 
-SCHEMA_VERSION = 1
-
 _NO_RUN = "its agent failed before its first submit; its logs/agent.jsonl and logs/harness.log tell why"
-
-State = Literal["pending", "running"] | RunEnd
-FINISHED: frozenset[str] = frozenset({"completed", "no_ok_submit"})
-
-
-class Entry(msgspec.Struct, frozen=True, kw_only=True):
-    """One run."""
-
-    name: str
-    agent: str
-    env: str
-    repeat: int
-    digest: str
-    """Digest of `settings`."""
-    settings: dict[str, Any] = {}
-    """The settings that it is or was played with."""
-    state: State = "pending"
-    attempt: int = 1
-    directory: str = ""
-    """Relative to the sweep's folder; empty for a run on another host."""
-    run: str = ""
-    """The cluster's id."""
-    host: str = ""
-    score: float | None = None
-    random: float | None = None
-    n_submits: int = 0
-    budget_used: int = 0
-    tokens: dict[str, Any] | None = None
-    earlier: dict[str, Any] | None = None
-    """Tokens of the earlier attempts."""
-    closed_reason: str = ""
-    """Why its agent stopped, as in `run.json`."""
-    error: str | None = None
-    wall_s: float = 0.0
-    finished_at: str = ""
-
-
-class Index(msgspec.Struct, kw_only=True):
-    """The whole file."""
-
-    schema_version: int = SCHEMA_VERSION
-    suite: str
-    updated_at: str = ""
-    runs: dict[str, Entry] = {}
 
 
 def load(root: Path, suite: str) -> Index:

@@ -19,6 +19,7 @@ import msgspec
 
 from evopolicy_common.processes.preflight import foreseen
 from evopolicy_common.records.run_record import RunRecord
+from evopolicy_common.records.suite_folder import Entry, Index
 from evopolicy_common.wire.credentials import Credentials
 from evopolicy_gateway.operator.operations import Operations
 from evopolicy_gateway.operator.watch import Watch
@@ -26,7 +27,7 @@ from evopolicy_gateway.run.lifecycle import RunLifecycle
 from evopolicy_gateway.run.plan import Plan
 from evopolicy_gateway.suite.decisions import Decision, side_by_side
 from evopolicy_gateway.suite.suite_file import Parallel
-from evopolicy_gateway.suite.suite_index import Entry, Index, directory_of
+from evopolicy_gateway.suite.suite_index import directory_of
 
 LOOK_S = 1.0
 MAX_SCORED = 256

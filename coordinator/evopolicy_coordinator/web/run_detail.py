@@ -19,6 +19,7 @@ import numpy as np
 
 from evopolicy_common.errors import DECODE_ERRORS, BundleError
 from evopolicy_common.records.blobs import is_digest
+from evopolicy_common.records.json_lines import objects
 from evopolicy_common.records.policies import bundles
 from evopolicy_common.records.policies.checkpoints import METADATA
 from evopolicy_coordinator.web.confined import Confined, NotThereError
@@ -117,7 +118,7 @@ class Detail:
         except NotThereError:
             return None
         bundles_by_key: dict[str, str | None] = {}
-        for entry in _objects(data.splitlines()):
+        for entry in objects(data.splitlines()):
             if entry.get("what") == "requested":
                 bundles_by_key[str(entry.get("key"))] = entry.get("bundle") or entry.get("kept")
             elif entry.get("what") == "accepted" and entry.get("submit_index") == index:
@@ -219,7 +220,7 @@ class Detail:
         actions: list[Any] = []
         inline: list[Any] = []
         data = self.files.read(f"{folder}/trajectory.jsonl", _MAX_TRAJECTORY)
-        for row in _objects(data.splitlines()):
+        for row in objects(data.splitlines()):
             if len(rewards) == MAX_STEPS:
                 break
             reward = row.get("reward")
@@ -274,7 +275,7 @@ class Detail:
         """The last events of the run; newest first."""
         found = []
         for _, line in self._last_lines("logs/harness.log", None):
-            for entry in _objects([line]):
+            for entry in objects([line]):
                 found.append(_event(entry))
         return found[-MAX_WORDS:][::-1]
 
@@ -336,16 +337,6 @@ def _as_text(data: bytes) -> str | None:
         return None
 
 
-def _objects(lines: list[bytes]) -> Iterator[dict[str, Any]]:
-    for line in lines:
-        try:
-            value = msgspec.json.decode(line)
-        except DECODE_ERRORS:
-            continue
-        if isinstance(value, dict):
-            yield value
-
-
 def _series(columns: Any, n: int, name: str) -> tuple[tuple[Series, ...], str]:
     """Lines of those values that are numeric with one length; and a note if some are left out."""
     if columns is None:
@@ -380,7 +371,7 @@ def _series(columns: Any, n: int, name: str) -> tuple[tuple[Series, ...], str]:
 
 
 def _messages(at: int, line: bytes) -> Iterator[Message]:
-    for value in _objects([line]):
+    for value in objects([line]):
         for number, (kind, title, text) in enumerate(_entries(value)):
             if text.strip() or title:
                 yield Message(at=at + number, kind=kind, title=title[:200], text=_cut(text.strip()))

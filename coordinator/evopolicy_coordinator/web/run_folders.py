@@ -23,7 +23,7 @@ from evopolicy_common.errors import DECODE_ERRORS, ProtocolError
 from evopolicy_common.messages.run_settings import RunSettings
 from evopolicy_common.messages.status import RunStatus
 from evopolicy_common.records.run_record import RunRecord, decode_run_record
-from evopolicy_common.records.suite_folder import INDEX, PAUSED
+from evopolicy_common.records.suite_folder import INDEX, PAUSED, Entry, Index
 from evopolicy_common.records.summary import Summary, decode_summary
 from evopolicy_coordinator.analysis.reading.reader import find_run_dirs
 from evopolicy_coordinator.analysis.scoring.scores import learn_names
@@ -32,36 +32,6 @@ from evopolicy_coordinator.web.confined import Confined, NotThereError
 _MAX_RECORD_BYTES = 64 << 20
 _MAX_SUMMARY_BYTES = 8 << 20
 _MAX_INDEX_BYTES = 64 << 20
-
-
-class SuiteEntry(msgspec.Struct, frozen=True, kw_only=True):
-    """The fields of one run in a sweep's `suite.json`; other fields are skipped."""
-
-    name: str
-    agent: str
-    env: str
-    repeat: int = 0
-    state: str = "pending"
-    attempt: int = 1
-    directory: str = ""
-    run: str = ""
-    host: str = ""
-    score: float | None = None
-    random: float | None = None
-    n_submits: int = 0
-    budget_used: int = 0
-    tokens: dict[str, Any] | None = None
-    earlier: dict[str, Any] | None = None
-    closed_reason: str = ""
-    error: str | None = None
-    wall_s: float = 0.0
-
-
-class SuiteIndex(msgspec.Struct, frozen=True, kw_only=True):
-    """The fields of `suite.json`."""
-
-    suite: str
-    runs: dict[str, SuiteEntry] = {}
 
 
 class _Intended(msgspec.Struct, frozen=True, kw_only=True):
@@ -234,7 +204,7 @@ class Reader:
         self._forget(by_key.values())
         return Runs(sweeps=tuple(sweeps), by_key=by_key, shut=frozenset(alive) if cluster_is_known else None)
 
-    def run(self, folder: Path, entry: SuiteEntry | None, by_run: Mapping[str, RunStatus]) -> RunFacts:
+    def run(self, folder: Path, entry: Entry | None, by_run: Mapping[str, RunStatus]) -> RunFacts:
         """One run with a folder."""
         record = folder / "run.json"
         try:
@@ -272,7 +242,7 @@ class Reader:
             found.append(msgspec.structs.replace(submit, consumed=consumed))
         return found
 
-    def _open(self, folder: Path, entry: SuiteEntry | None, by_run: Mapping[str, RunStatus]) -> RunFacts:
+    def _open(self, folder: Path, entry: Entry | None, by_run: Mapping[str, RunStatus]) -> RunFacts:
         settings, run = _settings(folder), _opened(folder)
         status = by_run.get(run)
         submits = self.submits(folder)
@@ -402,7 +372,7 @@ def _of_record(folder: Path, record: RunRecord) -> RunFacts:
     )
 
 
-def _without_folder(root: Path, entry: SuiteEntry, status: RunStatus | None) -> RunFacts:
+def _without_folder(root: Path, entry: Entry, status: RunStatus | None) -> RunFacts:
     """A run of a sweep without a folder here: it has not started, or another host plays it."""
     ended = entry.state not in ("pending", "running")
     return RunFacts(
@@ -463,9 +433,9 @@ def _may_be_alive(status: RunStatus) -> bool:
     return bool(status.agent_host) or status.phase == "open"
 
 
-def _sweep_folders(roots: Iterable[Path]) -> list[tuple[Path, SuiteIndex | None]]:
+def _sweep_folders(roots: Iterable[Path]) -> list[tuple[Path, Index | None]]:
     """The sweeps at and directly below the roots, with their indexes; and a root that is none, for what else is in it."""
-    found: dict[Path, SuiteIndex | None] = {}
+    found: dict[Path, Index | None] = {}
     for root in roots:
         if (root / INDEX).exists():
             found[root] = _index(root)
@@ -478,10 +448,10 @@ def _sweep_folders(roots: Iterable[Path]) -> list[tuple[Path, SuiteIndex | None]
     return list(found.items())
 
 
-def _index(root: Path) -> SuiteIndex | None:
+def _index(root: Path) -> Index | None:
     try:
         with (root / INDEX).open("rb") as file:
-            return msgspec.json.decode(file.read(_MAX_INDEX_BYTES), type=SuiteIndex)
+            return msgspec.json.decode(file.read(_MAX_INDEX_BYTES), type=Index)
     except (OSError, *DECODE_ERRORS):
         return None
 

@@ -15,6 +15,7 @@ from evopolicy_common.console import Terminal
 from evopolicy_common.messages.operator import ClaimState, RunFinished
 from evopolicy_common.messages.run_settings import RunSettings
 from evopolicy_common.records.run_record import RunRecord
+from evopolicy_common.records.suite_folder import Index
 from evopolicy_common.wire.credentials import Credentials
 from evopolicy_gateway.operator.child_messages import AgentDoing
 from evopolicy_gateway.operator.cluster import Cluster as LocalCluster
@@ -26,7 +27,6 @@ from evopolicy_gateway.suite import runs, suite_index, sweep
 from evopolicy_gateway.suite.claimed import ClaimedSweep
 from evopolicy_gateway.suite.decisions import Found, decide
 from evopolicy_gateway.suite.suite_file import SuiteFile, expand, read
-from evopolicy_gateway.suite.suite_index import Index
 from evopolicy_gateway.suite.suite_view import SuiteView
 
 TIMEOUT_S = 30.0

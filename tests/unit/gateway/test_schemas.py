@@ -17,8 +17,9 @@ from invented.policies import Version
 from invented.run_dirs import write_run
 from jsonschema import Draft202012Validator
 
+from evopolicy_common.records.suite_folder import Entry, Index
 from evopolicy_gateway import schemas
-from evopolicy_gateway.suite.suite_index import Entry, Index, save
+from evopolicy_gateway.suite.suite_index import save
 
 ROOT = Path(__file__).parents[3]
 SUITES = sorted((ROOT / "agent_gateway/evopolicy_gateway/suite/shipped").glob("*.toml"))

@@ -26,6 +26,7 @@ from typing import Any
 import msgspec
 
 from evopolicy_common.errors import DECODE_ERRORS
+from evopolicy_common.records.json_lines import objects
 from evopolicy_coordinator.analysis.reading.records import Submit
 
 MAX_LOG_BYTES = 64 << 20
@@ -88,10 +89,11 @@ class LogReading(msgspec.Struct, frozen=True, kw_only=True):
 def read_agent_log(path: Path, submits: Sequence[Submit]) -> LogReading:
     """Reads a run's log; empty when it is missing. Never raises for damaged content."""
     try:
-        events = list(itertools.islice(_events(_lines(path)), MAX_EVENTS))
+        events = (event for value in objects(_lines(path)) for event in _events_of(value))
+        kept = list(itertools.islice(events, MAX_EVENTS))
     except OSError:
         return LogReading()
-    return place(events, submits)
+    return place(kept, submits)
 
 
 def place(events: Sequence[LogEvent], submits: Sequence[Submit]) -> LogReading:
@@ -170,16 +172,6 @@ def _lines(path: Path) -> Iterator[bytes]:
                 return
             left -= len(line)
             yield line
-
-
-def _events(lines: Iterable[bytes]) -> Iterator[LogEvent]:
-    for line in lines:
-        try:
-            value = msgspec.json.decode(line)
-        except DECODE_ERRORS:
-            continue
-        if isinstance(value, dict):
-            yield from _events_of(value)
 
 
 def _events_of(value: dict[str, Any]) -> Iterator[LogEvent]:

@@ -10,9 +10,7 @@ import re
 from collections.abc import Iterable, Iterator
 from typing import Any
 
-import msgspec
-
-from evopolicy_common.errors import DECODE_ERRORS
+from evopolicy_common.records.json_lines import objects
 from evopolicy_common.simulators import SIMULATORS
 from evopolicy_coordinator.analysis.scan.signals import Kind, Signal, signal
 
@@ -61,14 +59,9 @@ def log_signals(lines: Iterable[bytes]) -> Iterator[Signal]:
             return
         if len(line) > _MAX_LINE:
             continue
-        try:
-            value = msgspec.json.decode(line)
-        except DECODE_ERRORS:
-            continue
-        if not isinstance(value, dict):
-            continue
-        for text in _calls(value):
-            yield from _command(text[:_MAX_COMMAND], number)
+        for value in objects([line]):
+            for text in _calls(value):
+                yield from _command(text[:_MAX_COMMAND], number)
 
 
 def _calls(value: dict[str, Any]) -> Iterator[str]:

@@ -2,26 +2,29 @@
 
 from __future__ import annotations
 
-import json
+from functools import partial
 from pathlib import Path
 
+import msgspec
 from invented.web_site import finished_run, open_run, open_status
 
+from evopolicy_common.records.suite_folder import INDEX, Entry, Index
 from evopolicy_coordinator.web.run_folders import Reader
 
 
 def test_a_sweep_shows_its_runs_on_all_hosts_once(tmp_path: Path) -> None:
     root = tmp_path / "runs"
     here = open_run(root, exp_id="s-0", run="r-here")
-    entries = {
-        "b/0": {"agent": "Agent B", "env": "gym/acrobot", "repeat": 0, "state": "running", "run": "r-here",
-                "directory": str(here.relative_to(root))},
-        "b/1": {"agent": "Agent B", "env": "gym/acrobot", "repeat": 1},
-        "b/2": {"agent": "Agent B", "env": "gym/acrobot", "repeat": 2},
-        "b/3": {"agent": "Agent B", "env": "gym/acrobot", "repeat": 3, "state": "error", "error": "no key", "host": "lab3"},
-    }  # fmt: skip
-    documents = {name: {"name": name, **entry} for name, entry in entries.items()}
-    (root / "suite.json").write_text(json.dumps({"suite": "s", "runs": documents}))
+    entry = partial(Entry, agent="Agent B", env="gym/acrobot", digest="d")
+    directory = str(here.relative_to(root))
+    entries = (
+        entry(name="b/0", repeat=0, state="running", run="r-here", directory=directory),
+        entry(name="b/1", repeat=1),
+        entry(name="b/2", repeat=2),
+        entry(name="b/3", repeat=3, state="error", error="no key", host="lab3"),
+    )
+    index = Index(suite="s", runs={each.name: each for each in entries})
+    (root / INDEX).write_bytes(msgspec.json.encode(index))
     other = open_status(
         "r-there", exp_id="s-1", repeat=1, best_mean=-70.5, waits_for="a free slot", agent_host="lab2"
     )

@@ -6,6 +6,7 @@ import fcntl
 import os
 from pathlib import Path
 
+import msgspec
 import pytest
 from invented.web_site import (
     HOST,
@@ -21,6 +22,7 @@ from invented.web_site import (
 
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.status import WorkerStatus
+from evopolicy_common.records.suite_folder import INDEX, Entry, Index
 from evopolicy_coordinator.web.access import POLICY, kept_tokens
 from evopolicy_coordinator.web.run_folders import key_of
 
@@ -385,11 +387,11 @@ def test_without_a_cluster_the_lock_of_an_agent_keeps_scores_hidden(tmp_path: Pa
 
 
 def test_scores_in_a_sweeps_index_are_hidden_as_well(tmp_path: Path) -> None:
-    entry = (
-        '{"name": "a", "agent": "Agent B", "env": "gym/acrobot", "state": "completed", "score": 4242.5, "random": -4322.5,'
-        ' "host": "lab2"}'
-    )
-    (tmp_path / "suite.json").write_text('{"suite": "s", "runs": {"a": ' + entry + "}}")
+    entry = Entry(
+        name="a", agent="Agent B", env="gym/acrobot", repeat=0, digest="d", state="completed", score=4242.5,
+        random=-4322.5, host="lab2",
+    )  # fmt: skip
+    (tmp_path / INDEX).write_bytes(msgspec.json.encode(Index(suite="s", runs={"a": entry})))
     with client(site_of(tmp_path, cluster=status(open_status("r-2")))) as reader:
         assert not shown([reader.get("/").text])
     with client(site_of(tmp_path, cluster=status())) as reader:

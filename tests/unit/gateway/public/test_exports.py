@@ -22,7 +22,8 @@ from invented.run_dirs import write_run
 from evopolicy import load_runs
 from evopolicy._exports import tracking
 from evopolicy_common.records.blobs import write_atomically
-from evopolicy_gateway.suite.suite_index import Entry, Index, save
+from evopolicy_common.records.suite_folder import Entry, Index
+from evopolicy_gateway.suite.suite_index import save
 
 VERSIONS = [
     Version({"policy.py": "x = 1"}, (1.0, 2.0), 0.5),

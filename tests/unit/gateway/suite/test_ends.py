@@ -14,6 +14,7 @@ from rigs.finished_run import finished
 from evopolicy_common.console import Terminal
 from evopolicy_common.messages.run_settings import RunSettings
 from evopolicy_common.records.run_record import RunRecord
+from evopolicy_common.records.suite_folder import Entry, Index
 from evopolicy_gateway.run.plan import Plan
 from evopolicy_gateway.run.record import run_record
 from evopolicy_gateway.run.times import Times
@@ -21,7 +22,7 @@ from evopolicy_gateway.suite import suite_index
 from evopolicy_gateway.suite.ends import exit_code
 from evopolicy_gateway.suite.runs import Played, documents, report
 from evopolicy_gateway.suite.suite_file import expand, read
-from evopolicy_gateway.suite.suite_index import Entry, Index, entry_of
+from evopolicy_gateway.suite.suite_index import entry_of
 
 FILE = """
 name = "s"

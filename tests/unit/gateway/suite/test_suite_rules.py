@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from evopolicy_common import catalogue
 from evopolicy_common.console import Terminal
 from evopolicy_common.errors import ConfigError
+from evopolicy_common.records.suite_folder import Entry, Index
 from evopolicy_gateway.operator.child_messages import AgentDoing, Progress
 from evopolicy_gateway.run.plan import Plan
 from evopolicy_gateway.suite import suite_index
@@ -27,7 +28,7 @@ from evopolicy_gateway.suite.decisions import (
     side_by_side,
 )
 from evopolicy_gateway.suite.suite_file import check_agents_start, expand, read
-from evopolicy_gateway.suite.suite_index import Entry, Index, used
+from evopolicy_gateway.suite.suite_index import used
 from evopolicy_gateway.suite.suite_view import SuiteView
 
 FILE = """

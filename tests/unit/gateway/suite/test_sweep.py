@@ -8,9 +8,8 @@ from pathlib import Path
 import pytest
 from stages.sweep_stage import CODEX, EVOLVE, HEAD, TIMEOUT_S, TOKENS, Stage, until
 
-from evopolicy_common.records.suite_folder import PAUSED
+from evopolicy_common.records.suite_folder import PAUSED, Entry
 from evopolicy_gateway.suite import suite_index, sweep
-from evopolicy_gateway.suite.suite_index import Entry
 
 
 def test_limits_per_machine_agent_and_provider_hold(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

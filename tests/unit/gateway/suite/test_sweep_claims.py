@@ -11,9 +11,9 @@ from stages.sweep_stage import CODEX, EVOLVE, HEAD, TOKENS, Stage, until
 
 from evopolicy_common.errors import EvopolicyError
 from evopolicy_common.messages.operator import ClaimState
+from evopolicy_common.records.suite_folder import Entry
 from evopolicy_gateway.suite import claimed, sweep
 from evopolicy_gateway.suite.decisions import Decision, Found, decide
-from evopolicy_gateway.suite.suite_index import Entry
 
 
 def test_a_run_is_announced_to_the_cluster_as_soon_as_it_is_open(
