@@ -122,7 +122,7 @@ class App(typer.Typer):
 
 
 def run_app(app: typer.Typer, extra: str | None = None) -> NoReturn:
-    """Runs the command that `sys.argv` names, and exits. `extra`: what it needs; None for that of a missing module."""
+    """Runs the command that `sys.argv` names, and exits. `extra`: the extra that it needs; None: that of a missing module."""
     open_streams()
     end_without_reader()
     try:

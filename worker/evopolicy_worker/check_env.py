@@ -54,7 +54,7 @@ class InASlot(msgspec.Struct, frozen=True, kw_only=True):
     microseconds: float = 0.0
     """A step of a train episode with a policy that always returns the same; 0: not measured."""
     memory_mb: int = 0
-    """Memory of all of the slot's processes after it, MiB; what they share counts for each."""
+    """Memory of all of the slot's processes after it, MiB; shared memory counts for each."""
     fault: str = ""
     """Why an episode could not be played."""
 

@@ -1,4 +1,4 @@
-"""The worker's fingerprint: what its results depend on. Computed without importing a simulator."""
+"""The worker's fingerprint: everything that its results depend on. Computed without importing a simulator."""
 
 from __future__ import annotations
 

@@ -284,8 +284,8 @@ class Supervisor:
             self._describing = asyncio.create_task(self._describe_wanted(wanted))
 
     async def _describe_wanted(self, wanted: Sequence[str]) -> None:
-        """Describes environments that runs wait for, and registers with them. Whatever fails is tried again when the next
-        heartbeat asks."""
+        """Describes environments that runs wait for, and registers with them. A description that fails is tried again when
+        the next heartbeat asks."""
         assert self._describe is not None
         log.info("describing", environments=wanted)
         try:

@@ -86,7 +86,7 @@ def serve(
 
 @contextlib.contextmanager
 def _failures_in_the_log() -> Iterator[None]:
-    """For a log that holds JSON lines only: what ends the process is one of them."""
+    """Logs the error that ends the process, for a log that holds JSON lines only."""
     try:
         yield
     except ConfigError as error:

@@ -140,7 +140,7 @@ class AgentConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     """Provider whose outage or quota pauses this agent; None: the harness's usual one."""
     user_config: bool | tuple[str, ...] = False
     """Gives the CLI the user's own settings, rules, memory and login, as a copy for the run; off, so that a run depends on this
-    file alone. Paths in `~/`: what to copy for a CLI of which evopolicy does not know where it keeps them."""
+    file alone. Paths in `~/` name the files to copy for a CLI whose places evopolicy does not know."""
     retries: int = 5
     """Most retries in a row, for one turn."""
     backoff_s: float = 4.0

@@ -48,7 +48,7 @@ class Needs:
 
 
 def needs_of(command: Sequence[str], search: str | None, more: Sequence[Sequence[str]] = ()) -> Needs:
-    """What the operator's command needs: its program, the files it names, and our own Python.
+    """The files that the operator's command needs: its program, those that it names, and our own Python.
 
     `search`: the PATH. `more`: commands of which the programs are needed.
     """

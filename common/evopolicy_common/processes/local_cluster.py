@@ -140,7 +140,7 @@ async def local_cluster(
 
     `kind` names its logs and its folder. `state` None: a temporary folder. `audit`: share of the episodes that a second
     worker replays, 0 to 1. `hidden_isolation`: the coordinator's option, None for its default. `unjailed`: agents could
-    read the folder; see the coordinator's `--unjailed-agents`. `policy_packages`: what policies may import besides numpy.
+    read the folder; see the coordinator's `--unjailed-agents`. `policy_packages`: those that policies may import besides numpy.
     `browser`: the workers' Chromium; None for the machine's own. `workers`: workers to start at once, in parallel with
     the coordinator. Raises ConfigError when the coordinator does not start (the folder may be in use).
     """

@@ -25,7 +25,7 @@ _NOT_IN_SITE = ("..", "__pycache__", "bin")
 
 def files_of(names: Iterable[str], *, metadata_too: bool = False) -> dict[str, str]:
     """Modules, packages and bundled libraries of the named distributions (or import names), and of those that they
-    require: name in the packages folder → path on this machine. What a distribution requires and is not installed is left
+    require: name in the packages folder → path on this machine. Required distributions that are not installed are left
     out. `metadata_too`: with the folders by which libraries find versions, their own and others'.
 
     Raises ConfigError that names the package when it is not installed, or is or requires a simulator.

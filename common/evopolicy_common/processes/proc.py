@@ -1,4 +1,4 @@
-"""What /proc says of this machine's processes: state, tree, processor time and memory. Linux only."""
+"""Reads this machine's processes from /proc: state, tree, processor time and memory. Linux only."""
 
 from __future__ import annotations
 

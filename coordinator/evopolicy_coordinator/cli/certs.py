@@ -159,7 +159,7 @@ def revoke(
 ) -> None:
     """Revoke a machine's certificate. The coordinator closes its connections within seconds and refuses new ones.
 
-    What its worker holds is played by others. Revoke at your routers as well, where there are any.
+    Other workers play the jobs that its worker holds. Revoke at your routers as well, where there are any.
     """
     with fail_on_our_errors():
         gone = machines.revoke(state or default_state_dir(), name, _now())

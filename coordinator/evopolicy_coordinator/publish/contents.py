@@ -1,6 +1,6 @@
-"""What a file of published results holds, and under which paths. Pure.
+"""The content of a file of published results, and its paths. Pure.
 
-    manifest.json              digests of everything below; what the signature is of
+    manifest.json              digests of everything below; the signature covers it
     signature.json             key and signature of the manifest's SHA-256
     journal.jsonl              all entries of the coordinator's journal, a line each, as they were hashed
     removed.json               what was taken out before publication

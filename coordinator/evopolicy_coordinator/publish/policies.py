@@ -67,7 +67,7 @@ async def play_policies(
 ) -> None:
     """Plays a share of the episodes of deterministic policies, drawn by `seed`, and adds the findings to `checked`.
 
-    `packages`: what policies may import besides numpy, where their run names it."""
+    `packages`: those that policies may import besides numpy, where their run names it."""
     checked.findings = [each for each in checked.findings if each.kind != _KIND]
     declared: dict[tuple[str, int], Bundle] = {}
     for run in checked.runs:

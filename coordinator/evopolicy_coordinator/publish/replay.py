@@ -4,8 +4,8 @@ Rules that this module owns:
 - Nothing of the file is executed, and no limit of it is taken over: actions are data, the environments are the installed ones,
   and the worker's slots run them in its jail.
 - The splits are those of the opening, which the commitment fixes. A run whose environment is not installed, or in other versions
-  than the run tells, is not played: other versions give other numbers. Nor is one whose environment does not repeat episodes, as
-  this machine knows it; what the file says about that counts for nothing.
+  than the run tells, is not played: other versions give other numbers. Nor is one whose environment does not repeat episodes
+  according to this machine; the file's own statement does not count.
 """
 
 from __future__ import annotations
@@ -174,7 +174,7 @@ async def cluster_of(
     slots: int,
     packages: Sequence[str] = (),
 ) -> OperatorClient:
-    """A cluster whose splits are those of the runs. `packages`: what policies may import besides numpy."""
+    """A cluster whose splits are those of the runs. `packages`: those that policies may import besides numpy."""
     data = Path(stack.enter_context(scratch_folder("check-data")))
     by_env = {run.opening.settings.env: run for run in runs}
     for env, run in by_env.items():

@@ -1,4 +1,4 @@
-"""The transcript scan of published results: what in checkpoints and logs deserves a look. Adds findings that are never `failed`."""
+"""The transcript scan of published results: places in checkpoints and logs that a person should look at. Adds findings that are never `failed`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Who may read and act: tokens, cookies, and the checks of every request.
+"""Access to the live view: tokens, cookies, and the checks of every request.
 
 Rules that this module owns:
 - A token is needed on loopback too, since an agent without a jail reaches loopback. It travels in the body of a sign-in, in

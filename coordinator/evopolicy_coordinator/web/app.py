@@ -346,7 +346,7 @@ class Site:
     # ---- acting ----
 
     async def act(self, request: Request) -> Response:
-        """GET: what would happen, and a button. POST: it is done."""
+        """GET describes the action and shows a button. POST carries it out."""
         kind, name, verb = (request.path_params[each] for each in ("kind", "name", "verb"))
         act = acting.ACTS.get((kind, verb))
         shown = self._shown(request, "act")

@@ -1,4 +1,4 @@
-"""Tables of pages: what a request asks to see of one, and the rows of its page."""
+"""Tables of pages: the part of one that a request asks for, and the rows of its page."""
 
 from __future__ import annotations
 

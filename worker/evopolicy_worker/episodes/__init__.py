@@ -1,1 +1,1 @@
-"""Episodes: what the environment's process of a slot runs."""
+"""Playing episodes, in the environment process of a slot."""

@@ -248,14 +248,14 @@ def elements(space: SpaceSchema) -> int:
 
 
 def init_frame(init: dict[str, Any], files: bytes) -> list[bytes]:
-    """The first request: what the policy's process is to be, and its bundle."""
+    """The first request: the settings of the policy's process, and its bundle."""
     head = json.dumps(init).encode()
     length = len(head) + len(files)
     return [REQUEST_HEADER.pack(length, INIT, len(head)), head, files]
 
 
 def action(tag: int, payload: bytes, max_values: int = 1024) -> Any:
-    """What `act` returned. BadReplyError for what is no action at all; whether it is valid is not decided here.
+    """The value that `act` returned. Raises BadReplyError if the bytes encode no value; its validity is not checked here.
 
     `max_values`: how many numbers, texts, lists and dicts, with what is in them, it may be made of; of arrays the
     numbers count, or the innermost lists where there are none.

@@ -358,9 +358,9 @@ class _Episode:
         tell: Callable[[bytes], None],
         begun: Begun,
     ) -> None:
-        """`begun`: what the policy has returned in this episode before it was ended from outside, which stands: it is asked
-        again, and its first answers do not count. Those that do are added. Where it has failed, too, no policy is asked, and
-        random actions follow.
+        """`begun`: the actions that the policy returned in this episode before it was ended from outside. They remain valid:
+        the policy is asked again, and its first answers are ignored; later ones are added to `begun`. If the policy had
+        failed, no policy is asked, and random actions follow.
         """
         self._tell = tell
         self._begun = begun

@@ -48,7 +48,7 @@ class Verdict(NamedTuple):
 
 
 class Output:
-    """The first `limit` bytes of a stream; what follows is read and dropped."""
+    """Keeps the first `limit` bytes of a stream; reads and drops all others."""
 
     def __init__(self, limit: int) -> None:
         self._limit = limit
@@ -102,8 +102,8 @@ class Watch:
         """Whether it was ended because it stood stopped."""
         self._held = held
         self._looked = self._next = time.monotonic()
-        # What is excused, seconds: in the episode; in the answer that was owed at the last look, since when; the waits for a
-        # processor apart, which the kernel counts.
+        # Excused seconds: in the episode; in the answer that was owed at the last look, and its start; separately, the waits
+        # for a processor, which the kernel counts.
         self._excused_s = self._in_episode_s = 0.0
         self._answer = self._answer_excused_s = self._in_answer_s = 0.0
         self._episode_waited = 0.0

@@ -185,7 +185,7 @@ class PolicyProcess:
         self._expect_ok(frame, "reset", self._limits.act_wall_s)
 
     def prepare_acts(self) -> None:
-        """After `reset`: what `act` need not do on every step."""
+        """After `reset`: does once the work that `act` would otherwise do on every step."""
         self._watch.what = "act"
         self._watch.answer_limit_s = self._limits.act_wall_s
 
@@ -211,7 +211,7 @@ class PolicyProcess:
         raise self._reported_failure(tag, payload, "act")
 
     def _count_surplus(self, n_bytes: int) -> None:
-        """Actions are kept as they came: what they take beyond the usual is bounded for the whole episode too."""
+        """Actions are kept as they came; their bytes beyond the usual size are also bounded for the whole episode."""
         self._surplus_bytes += n_bytes
         limit = self._limits.episode_action_bytes
         if self._surplus_bytes > limit:
@@ -522,7 +522,7 @@ def oom_kills() -> int | None:
 
 
 def _memory(pid: int) -> tuple[int, int]:
-    """Bytes of address space and of memory that the process has; what Python with numpy has when that cannot be read."""
+    """Bytes of address space and of memory of the process; if they cannot be read, those of Python with numpy."""
     return proc.sizes(pid) or (1 << 29, 1 << 25)
 
 

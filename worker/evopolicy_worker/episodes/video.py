@@ -43,7 +43,7 @@ class Order(msgspec.Struct, frozen=True, kw_only=True):
 
     case: Case
     actions: bytes
-    """`trajectory` codec bytes with record "actions": what was played, after repair, and what came of it."""
+    """`trajectory` codec bytes with record "actions": the repaired actions and their results."""
 
 
 class Made(msgspec.Struct, frozen=True, kw_only=True):
@@ -128,7 +128,7 @@ def serve(env_id: str, orders: BinaryIO, replies: BinaryIO) -> None:
                 environment = environments.make(env_id, render=True)
             made = Made(mp4=replay(environment, order.case, order.actions))
         except Exception as error:
-            # Whatever a driver or a simulator has against it: a missing picture is no failure of the episode.
+            # Drivers and simulators raise any exception here, and a missing picture is no failure of the episode.
             what = str(error) if isinstance(error, WorkerError) else f"{type(error).__name__}: {error}"
             made = Made(mp4=None, error=what)
         data = msgspec.msgpack.encode(made)

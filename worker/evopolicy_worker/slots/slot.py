@@ -78,7 +78,7 @@ class Slot:
         limits: Limits = USUAL,
     ) -> None:
         """`core`: the CPU that all processes are pinned to; None for no pinning. `scratch`: a folder for this slot
-        alone. `definitions`: environments that do not ship. `limits`: what an environment may use.
+        alone. `definitions`: environments that do not ship. `limits`: those of an environment.
 
         `sealed=False` (tests only) leaves the policy's process unsealed.
         """

@@ -60,7 +60,7 @@ class Where(msgspec.Struct, frozen=True, kw_only=True):
         """A link to the cluster; with `--local` the cluster too, which has no workers yet.
 
         `kind` names the logs of that cluster. `needs_state`: whether its state folder has to exist; otherwise a temporary one
-        replaces the usual one. `packages`: what policies may import besides numpy. Raises ConfigError for a folder that does
+        replaces the usual one. `packages`: those that policies may import besides numpy. Raises ConfigError for a folder that does
         not exist.
         """
         async with contextlib.AsyncExitStack() as stack:

@@ -210,7 +210,7 @@ def resume(state: State, run: Run, step: Step) -> None:
 
 
 def words(row: AuditRow) -> str:
-    """The dispute in words: who disagrees about which episode."""
+    """The dispute in words: the workers, the episode, and the difference."""
     others = " and ".join(row.replayed_by)
     return f"{row.player} and {others} disagree about {row.group}, episode {row.index}: {row.difference}"
 

@@ -1,1 +1,1 @@
-"""What operators observe of a running coordinator: its metrics, and stalls of its event loop."""
+"""Monitoring of a running coordinator: its metrics, and stalls of its event loop."""

@@ -1,1 +1,1 @@
-"""What the live view's pages show, as parts that are updated one by one: all runs, one run, the cluster."""
+"""The pages of the live view, as parts that are updated one by one: all runs, one run, the cluster."""

@@ -34,7 +34,7 @@ def run_view(
     status: StatusReply | None,
     retries: Sequence[RetriedJobs] = (),
 ) -> View:
-    """One run: curve, submits, words, events. `retries`: what the cluster has played again of it."""
+    """One run: curve, submits, words, events. `retries`: the jobs of it that the cluster has played again."""
     may_show = runs.may_show(run)
     look = looks([run.entry], None)[run.entry]
     submits = [] if run.path is None else reader.submits(run.path)

@@ -316,7 +316,7 @@ def _in_child_with(temporary: Path, env_id: str, steps: int) -> Played:
 
 
 class _Limit:
-    """What a process may use; see `TIMEOUT_S` and `LONGEST_S`."""
+    """The limits of a process; see `TIMEOUT_S` and `LONGEST_S`."""
 
     def __init__(self, pid: int) -> None:
         self._pid = pid
