@@ -12,7 +12,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Coroutine
 from pathlib import Path
 from typing import Any
 
@@ -89,6 +89,11 @@ class Coordinator:
         if self.process.poll() is None:
             self.process.send_signal(signal.SIGTERM)
         return self.process.wait(timeout=TIMEOUT_S)
+
+
+def run(scenario: Callable[[], Coroutine[Any, Any, None]], within_s: float = 60.0) -> None:
+    """Runs a scenario to its end, which has to come within that time."""
+    asyncio.run(asyncio.wait_for(scenario(), within_s))
 
 
 def bundle_of(source: str) -> Bundle:

@@ -9,7 +9,6 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Awaitable, Callable, Iterator
 from pathlib import Path
 
 import msgspec
@@ -22,6 +21,7 @@ from coordinator_harness import (
     gateway_of,
     operator_of,
     play,
+    run,
     working,
 )
 from typer.testing import CliRunner
@@ -34,17 +34,6 @@ from evopolicy_coordinator.cli import gc as gc_cli
 from evopolicy_coordinator.storage import backup, disk_use
 
 WEEK_S = 7 * 24 * 3600.0
-
-
-@pytest.fixture
-def coordinator(tmp_path: Path) -> Iterator[Coordinator]:
-    coordinator = Coordinator(tmp_path / "state")
-    yield coordinator
-    coordinator.stop()
-
-
-def run(scenario: Callable[[], Awaitable[None]]) -> None:
-    asyncio.run(asyncio.wait_for(scenario(), 60))  # type: ignore[arg-type]
 
 
 async def whole_run(coordinator: Coordinator, key: str, source: str) -> str:

@@ -12,20 +12,16 @@ import sqlite3
 import stat
 import subprocess
 import sys
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Awaitable
 from pathlib import Path
 
 import msgspec
 import pytest
-from coordinator_harness import TIMEOUT_S, Coordinator, bundle_of, gateway_of, operator_of, working
+from coordinator_harness import TIMEOUT_S, Coordinator, bundle_of, gateway_of, operator_of, run, working
 
 from evopolicy_common.errors import RefusedError
 from evopolicy_common.wire import credentials
 from evopolicy_coordinator.core.records import RunRow
-
-
-def run(scenario: Callable[[], Awaitable[None]]) -> None:
-    asyncio.run(asyncio.wait_for(scenario(), 60))
 
 
 async def refusal(answer: Awaitable[object]) -> RefusedError:
@@ -43,13 +39,6 @@ def command(*args: object, **env: str) -> subprocess.CompletedProcess[str]:
         timeout=TIMEOUT_S,
         env={**os.environ, **env},
     )
-
-
-@pytest.fixture
-def coordinator(tmp_path: Path) -> Iterator[Coordinator]:
-    coordinator = Coordinator(tmp_path / "state")
-    yield coordinator
-    coordinator.kill()
 
 
 def test_ready_file_tells_where_to_connect_and_goes_with_the_process(coordinator: Coordinator) -> None:

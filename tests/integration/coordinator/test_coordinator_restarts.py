@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import random
-from collections.abc import Awaitable, Callable
 from pathlib import Path
 
 from coordinator_harness import (
@@ -14,6 +13,7 @@ from coordinator_harness import (
     comparable,
     gateway_of,
     operator_of,
+    run,
     working,
 )
 
@@ -21,10 +21,6 @@ from evopolicy_common.messages.operator import RunFinished
 from evopolicy_common.wire.transport import connect
 
 SUBMITS = (((0, 1, 1, 5), "# one"), ((2, 3), "# two"), ((7, 7, 7, 7, 8, 9), "# three"))
-
-
-def run(scenario: Callable[[], Awaitable[None]]) -> None:
-    asyncio.run(asyncio.wait_for(scenario(), 120))
 
 
 async def whole_run(coordinator: Coordinator) -> RunFinished:
@@ -78,7 +74,7 @@ def test_coordinator_killed_through_a_whole_run_ends_with_the_same_outcome(tmp_p
                 )
 
         try:
-            run(scenario)
+            run(scenario, 120)
         finally:
             holder[0].kill()
     assert outcomes[0]["budget_used"] == 12
@@ -103,7 +99,7 @@ def test_accepted_submit_survives_kill_before_any_result(tmp_path: Path) -> None
             assert (await operator.create()) == created
 
     try:
-        run(scenario)
+        run(scenario, 120)
     finally:
         holder[0].kill()
 
@@ -130,7 +126,7 @@ def test_results_handed_in_twice_over_a_restart_are_taken_once(tmp_path: Path) -
                 assert sorted(episode.index for episode in episodes) == [0, 1]
 
     try:
-        run(scenario)
+        run(scenario, 120)
     finally:
         holder[0].kill()
 
@@ -153,7 +149,7 @@ def test_finished_run_is_reported_after_a_restart(tmp_path: Path) -> None:
                 assert (await gateway.state()).is_finalized
 
     try:
-        run(scenario)
+        run(scenario, 120)
     finally:
         holder[0].kill()
 
@@ -178,7 +174,7 @@ def test_workers_find_the_same_coordinator_after_an_orderly_restart(tmp_path: Pa
                 assert done.status == "ok"
 
     try:
-        run(scenario)
+        run(scenario, 120)
     finally:
         holder[0].kill()
 
@@ -200,6 +196,6 @@ def test_request_on_its_way_when_the_coordinator_dies_is_answered_by_the_next(tm
                     assert (await waiting).status == "no_ok_submit"
 
     try:
-        run(scenario)
+        run(scenario, 120)
     finally:
         holder[0].kill()

@@ -16,6 +16,7 @@ from coordinator_harness import (
     gateway_of,
     operator_of,
     play,
+    run,
     working,
 )
 
@@ -34,10 +35,6 @@ def coordinator(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Coordinato
     coordinator = Coordinator(tmp_path_factory.mktemp("rights") / "state")
     yield coordinator
     coordinator.kill()
-
-
-def run(scenario: Callable[[], Awaitable[None]]) -> None:
-    asyncio.run(asyncio.wait_for(scenario(), 60))
 
 
 async def refusal(link: Link, key: str, payload: bytes) -> str:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
-from collections.abc import Awaitable, Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -15,21 +13,11 @@ from coordinator_harness import (
     gateway_of,
     operator_of,
     play,
+    run,
     working,
 )
 
 from evopolicy_common.errors import RefusedError
-
-
-@pytest.fixture
-def coordinator(tmp_path: Path) -> Iterator[Coordinator]:
-    coordinator = Coordinator(tmp_path / "state")
-    yield coordinator
-    coordinator.kill()
-
-
-def run(scenario: Callable[[], Awaitable[None]]) -> None:
-    asyncio.run(asyncio.wait_for(scenario(), 60))
 
 
 async def play_two_submits(gateway: GatewayClient) -> None:

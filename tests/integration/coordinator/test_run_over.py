@@ -6,7 +6,7 @@ import asyncio
 from pathlib import Path
 
 import pytest
-from coordinator_harness import Coordinator, GatewayClient, bundle_of, gateway_of, operator_of, working
+from coordinator_harness import Coordinator, GatewayClient, bundle_of, gateway_of, operator_of, run, working
 
 from evopolicy_common.errors import RefusedError
 from evopolicy_common.messages import gateway, operator
@@ -44,7 +44,7 @@ def test_every_refusal_to_the_gateway_of_an_ended_run_says_that_it_is_over(tmp_p
         finally:
             coordinator.kill()
 
-    asyncio.run(asyncio.wait_for(scenario(), 120))
+    run(scenario, 120)
 
 
 async def ended(coordinator: Coordinator, client: GatewayClient, run: str, end: str) -> None:

@@ -21,6 +21,7 @@ from coordinator_harness import (
     bundle_of,
     gateway_of,
     operator_of,
+    run,
     working,
 )
 from typer.testing import CliRunner, Result
@@ -73,7 +74,7 @@ def test_status_shows_workers_runs_and_what_waits(coordinator: Coordinator) -> N
                         assert f"{name} {version}" in " ".join(result.stdout.split())
                     assert created.run in [run["run"] for run in reply["runs"]]
 
-    asyncio.run(asyncio.wait_for(scenario(), 60))
+    run(scenario)
 
 
 @pytest.mark.parametrize(("command", "state"), [("drain", "draining"), ("pause", "paused")])
@@ -98,7 +99,7 @@ def test_worker_out_of_service_gets_no_work_until_it_is_taken_back(
                 await gateway.results(0)
                 assert [job for job in worker.jobs if created.run in job.job_id]
 
-    asyncio.run(asyncio.wait_for(scenario(), 60))
+    run(scenario)
 
 
 def test_workers_and_runs_are_listed_and_a_worker_that_is_not_there_is_an_error(
@@ -124,7 +125,7 @@ def test_workers_and_runs_are_listed_and_a_worker_that_is_not_there_is_an_error(
                 assert "w-listed" in wrong.stderr
                 assert (await called(coordinator, "workers", command, "nosuch", "--absent")).exit_code == 0
 
-    asyncio.run(asyncio.wait_for(scenario(), 60))
+    run(scenario)
 
 
 def test_cancelled_run_is_finished_without_a_score(coordinator: Coordinator) -> None:
@@ -136,7 +137,7 @@ def test_cancelled_run_is_finished_without_a_score(coordinator: Coordinator) -> 
             assert finished.status == "cancelled"
             assert finished.final_score is None
 
-    asyncio.run(asyncio.wait_for(scenario(), 60))
+    run(scenario)
 
 
 def test_run_goes_on_with_workers_of_another_class_when_an_operator_says_why(
@@ -162,7 +163,7 @@ def test_run_goes_on_with_workers_of_another_class_when_an_operator_says_why(
                     _, done = await gateway.results(1)
                     assert done.status == "ok"
 
-    asyncio.run(asyncio.wait_for(scenario(), 60))
+    run(scenario)
 
 
 async def worker_shown(operator: OperatorClient, name: str) -> WorkerStatus:

@@ -21,6 +21,7 @@ from coordinator_harness import (
     bundle_of,
     comparable,
     operator_of,
+    run,
 )
 from machines.own_certs import OwnCerts, of
 
@@ -98,7 +99,7 @@ def test_a_run_is_played_by_machines_that_have_certificates(
             assert finished.status == "completed"
             assert worker.jobs
 
-    asyncio.run(asyncio.wait_for(scenario(), 120))
+    run(scenario, 120)
     assert coordinator.stop() == 0
 
 
@@ -133,7 +134,7 @@ def test_a_revoked_worker_loses_its_leases_to_an_honest_one(
             async with connect(of(cheat), timeout_s=0.5):
                 pass
 
-    asyncio.run(asyncio.wait_for(scenario(), 150))
+    run(scenario, 150)
 
 
 def test_a_revoked_operator_asks_for_nothing_more(certs: OwnCerts, coordinator: Coordinator) -> None:
@@ -151,7 +152,7 @@ def test_a_revoked_operator_asks_for_nothing_more(certs: OwnCerts, coordinator: 
         async with operator_of(coordinator) as own:
             await own.status()
 
-    asyncio.run(asyncio.wait_for(scenario(), 120))
+    run(scenario, 120)
 
 
 def test_machines_find_their_way_back_when_another_is_issued_or_the_coordinator_restarts(
@@ -181,7 +182,7 @@ def test_machines_find_their_way_back_when_another_is_issued_or_the_coordinator_
         finally:
             first.kill()
 
-    asyncio.run(asyncio.wait_for(scenario(), 150))
+    run(scenario, 150)
 
 
 def refused(*args: object) -> str:

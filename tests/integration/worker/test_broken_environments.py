@@ -42,13 +42,6 @@ PROBLEMS = {
 
 
 @pytest.fixture
-def coordinator(tmp_path: Path) -> Iterator[Coordinator]:
-    found = Coordinator(tmp_path / "state")
-    yield found
-    found.stop()
-
-
-@pytest.fixture
 def worker(
     tmp_path: Path, coordinator: Coordinator, request: pytest.FixtureRequest
 ) -> Iterator[subprocess.Popen[bytes]]:

@@ -10,7 +10,7 @@ import contextlib
 import json
 import signal
 from collections import Counter
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,7 @@ from coordinator_harness import (
     gateway_of,
     operator_of,
     play,
+    run,
 )
 
 from evopolicy_common.errors import PartFailedError, SandboxError, SlotDiedError, WorkerError
@@ -145,13 +146,6 @@ async def supervising(
             await asyncio.wait_for(task, 30)
 
 
-@pytest.fixture
-def coordinator(tmp_path: Path) -> Iterator[Coordinator]:
-    coordinator = Coordinator(tmp_path / "state")
-    yield coordinator
-    coordinator.stop()
-
-
 async def whole_run(coordinator: Coordinator, key: str = "run") -> dict[str, Any]:
     """Two submits, closed and finished; what must not depend on the workers."""
     async with operator_of(coordinator) as operator:
@@ -162,10 +156,6 @@ async def whole_run(coordinator: Coordinator, key: str = "run") -> dict[str, Any
                 await gateway.results(number)
             await gateway.close()
         return comparable(await operator.finished(created.run))
-
-
-def run(scenario: Callable[[], Awaitable[None]]) -> None:
-    asyncio.run(asyncio.wait_for(scenario(), 60))  # type: ignore[arg-type]
 
 
 def test_a_whole_run_goes_through_the_supervisor(coordinator: Coordinator, tmp_path: Path) -> None:
