@@ -45,6 +45,21 @@ def programs(monkeypatch: pytest.MonkeyPatch, coordinator: str, worker: str = ST
     monkeypatch.setattr(local_cluster, "_RESTART_PAUSE_S", 0.0)
 
 
+def noted(monkeypatch: pytest.MonkeyPatch) -> dict[str, list[str]]:
+    """The arguments of each program that a cluster of obedient programs starts, by the name of its log."""
+    programs(monkeypatch, SERVES)
+    monkeypatch.setattr(local_cluster, "END_GRACE_S", SOON_S)
+    started: dict[str, list[str]] = {}
+    start = ChildProcess.start
+
+    async def start_and_note(program: Sequence[str], log: Path, **more: Any) -> ChildProcess:
+        started[log.stem] = list(program[3:])
+        return await start(program, log, **more)
+
+    monkeypatch.setattr(ChildProcess, "start", start_and_note)
+    return started
+
+
 def bring_up(state: Path) -> str:
     """What the command ends with: the error of a cluster that cannot be kept up, or no word of one that serves."""
 
@@ -152,16 +167,7 @@ def test_a_worker_that_dies_now_and_then_is_started_again_however_often(
 def test_workers_divide_the_slots_of_an_audited_cluster(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    programs(monkeypatch, SERVES)
-    started: dict[str, list[str]] = {}
-    start = ChildProcess.start
-
-    async def noted(program: Sequence[str], log: Path, **more: Any) -> ChildProcess:
-        started[log.stem] = list(program[3:])
-        return await start(program, log, **more)
-
-    monkeypatch.setattr(ChildProcess, "start", noted)
-    monkeypatch.setattr(local_cluster, "END_GRACE_S", SOON_S)
+    started = noted(monkeypatch)
 
     async def main() -> None:
         async with local_cluster.local_cluster(
@@ -189,14 +195,7 @@ def test_workers_divide_the_slots_of_an_audited_cluster(
 def test_each_virtual_environments_worker_has_all_slots(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    programs(monkeypatch, SERVES)
-    started: dict[str, list[str]] = {}
-    start = ChildProcess.start
-
-    async def noted(program: Sequence[str], log: Path, **more: Any) -> ChildProcess:
-        started[log.stem] = list(program[3:])
-        return await start(program, log, **more)
-
+    started = noted(monkeypatch)
     other = tmp_path / "toys" / "bin" / "python"
     other.parent.mkdir(parents=True)
     other.symlink_to(sys.executable)
@@ -205,8 +204,6 @@ def test_each_virtual_environments_worker_has_all_slots(
         "divided",
         lambda env_ids: {sys.executable: env_ids[:1], str(other): env_ids[1:]},
     )
-    monkeypatch.setattr(ChildProcess, "start", noted)
-    monkeypatch.setattr(local_cluster, "END_GRACE_S", SOON_S)
 
     async def main() -> None:
         async with local_cluster.local_cluster("test", state=tmp_path) as cluster:
@@ -218,16 +215,7 @@ def test_each_virtual_environments_worker_has_all_slots(
 
 
 def test_workers_are_started_beside_the_coordinator(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    programs(monkeypatch, SERVES)
-    started: dict[str, list[str]] = {}
-    start = ChildProcess.start
-
-    async def noted(program: Sequence[str], log: Path, **more: Any) -> ChildProcess:
-        started[log.stem] = list(program[3:])
-        return await start(program, log, **more)
-
-    monkeypatch.setattr(ChildProcess, "start", noted)
-    monkeypatch.setattr(local_cluster, "END_GRACE_S", SOON_S)
+    started = noted(monkeypatch)
     workers = local_cluster.Workers(["toy/line"], 2, {"bwrap"})
 
     async def main() -> None:
