@@ -180,7 +180,7 @@ class Page:
             time.sleep(0.1)
 
     def violations(self) -> list[str]:
-        """What axe-core finds wrong with the page's accessibility: rule, and the elements."""
+        """Faults of the page's accessibility that axe-core finds: the rule and the elements of each."""
         axe = (Path(__file__).parent / "vendor" / "axe.min.js").read_text()
         self.run(f"(() => {{ {axe}; }})(), true")
         found = self.run("axe.run().then((result) => result.violations)")

@@ -127,7 +127,7 @@ class Command:
         return pid
 
     def kill(self) -> None:
-        """SIGKILL to the command alone: what it started has to notice, and is waited for."""
+        """Sends SIGKILL to the command alone, and waits until the processes that it started have noticed."""
         self.process.kill()
         self.process.wait()
         wait_until(lambda: not self.alive())

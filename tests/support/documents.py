@@ -1,4 +1,4 @@
-"""What documents say of our commands, held against the commands themselves. Nothing is run."""
+"""Compares the commands in documents with the commands themselves. Runs nothing."""
 
 from __future__ import annotations
 

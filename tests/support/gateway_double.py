@@ -105,7 +105,7 @@ def packed_episode(case: int, n_steps: int = 3) -> bytes:
 
 
 def outcome(spec: EpisodeSpec, failure: PolicyFailure | None = None) -> EpisodeOutcome:
-    """What came of an episode; its recording goes with it where its case is odd, else it is uploaded before."""
+    """The outcome of an episode. If its case is odd, it includes the recording, which is otherwise uploaded before."""
     case = spec.case.seed
     packed = packed_episode(case)
     return EpisodeOutcome(
@@ -469,7 +469,7 @@ class Served(msgspec.Struct, frozen=True):
     """A gateway that serves, and what a test looks at."""
 
     waits: list[str]
-    """What it has said that it waits for."""
+    """The reasons for waiting that it has reported."""
 
     double: Double
     folder: RunFolder

@@ -23,7 +23,7 @@ class Proof(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     env: str
     """Where a policy of ours beats random actions, and which `evolve` plays in a whole run."""
     check: tuple[str, ...]
-    """What `check-env` plays of it."""
+    """The environments that `check-env` plays."""
     check_steps: int = 100
     """Steps of each of these."""
     budget: int = 4

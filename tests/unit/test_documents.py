@@ -46,7 +46,7 @@ def text_of(document: str) -> str:
 
 
 def code_in(document: str) -> list[str]:
-    """What stands in backticks within a line."""
+    """The texts in backticks within a line."""
     return re.findall(r"`([^`\n]+)`", re.sub(r"```.*?```", "", text_of(document), flags=re.DOTALL))
 
 

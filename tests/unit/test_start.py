@@ -34,7 +34,7 @@ LARGE = {
         "evopolicy_gateway.operator",
     ),
 }
-"""What takes longer to import than typer, or leads to it."""
+"""Modules that take longer to import than typer, or import it."""
 ASYNCIO = {"asyncio", "logging", "socket", "ssl", "tempfile"}
 """asyncio, and what it imports."""
 LISTED = "import atexit, sys; atexit.register(lambda: print(*sys.modules, file=sys.stderr)); "

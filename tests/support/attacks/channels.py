@@ -1,4 +1,4 @@
-"""Ways for a policy to tell something to whoever is on the same machine, and how much of it arrives.
+"""Ways for a policy to send bits to other processes of its machine, and the share that arrives.
 
 A writer (a policy in a sealed slot) sends bits by the clock, one a period. A reader (a program in an agent's jail, or another
 policy) samples what it can see. What it makes of it, with a threshold learnt from the first half of the bits, says how many of
@@ -44,7 +44,7 @@ WAYS = {
     "has threads": ("processes", "threads_started"),
     "opens a library": ("opens",),
 }
-"""What a writer does, and the readings by which a reader may notice."""
+"""The actions of a writer, each with the readings by which a reader may notice it."""
 
 WRITER = """
 import ctypes, json, os, sys, threading, time

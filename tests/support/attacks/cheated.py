@@ -157,7 +157,7 @@ class Cheated:
 
 
 class CheatingRun:
-    """What a cheating agent came to."""
+    """The result of a cheating agent."""
 
     def __init__(self, cheated: Cheated, name: str, *options: str) -> None:
         before = len(cheated.listener.heard)

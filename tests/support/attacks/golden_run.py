@@ -139,7 +139,7 @@ class GoldenCluster:
         )
 
     def ask(self, question: Callable[[OperatorClient], Any]) -> Any:
-        """What the coordinator answers an operator."""
+        """The coordinator's replies to an operator."""
 
         async def main() -> Any:
             async with connect(credentials.read(Path(self.files["operator"]))) as link:

@@ -130,7 +130,7 @@ def unpacked(data: bytes) -> Iterator[bytes]:
 
 
 def memory_of(pid: int) -> Iterator[bytes]:
-    """What can be read of a process, region by region, but for the text and constants of programs and libraries.
+    """The readable memory of a process, region by region, without the text and constants of programs and libraries.
 
     The process may run on meanwhile: a region that it gives back is left out.
     """
@@ -170,7 +170,7 @@ def _unpacked(data: bytes, depth: int) -> Iterator[bytes]:
 
 
 def _content(data: bytes, start: int) -> bytes:
-    """What the stream at `start` holds, as far as it can be read; empty where there is none after all."""
+    """The content of the stream at `start`, as far as it can be read; empty if there is none."""
     view = memoryview(data)[start : start + _MAX_PACKED_BYTES]
     try:
         if data[start] == 0x28:

@@ -14,7 +14,7 @@ from evopolicy_common.wire import codec
 
 
 class Moment(msgspec.Struct, frozen=True):
-    """What happened, in the order in which the coordinator asked and answered."""
+    """The events, in the order in which the coordinator received requests and replied."""
 
     what: str
     """`permit` granted, `close` asked, `hidden` or `train` leased, `done` reported or given up."""
@@ -84,6 +84,6 @@ def met(cluster: GoldenCluster, moments: Sequence[Moment], elsewhere: Sequence[s
 
 
 def heard_by(folder: Path) -> dict[str, list[float]]:
-    """What a listening agent has written down so far; nothing before it listens."""
+    """The lines that a listening agent has written so far; none before it listens."""
     path = folder / "workspace" / "heard.json"
     return json.loads(path.read_text()) if path.exists() else {}

@@ -1,4 +1,4 @@
-"""What both fake CLIs share: a scenario that says, start by start, what goes wrong, and an agent that submits.
+"""Shared by both fake CLIs: a scenario with the faults of each start, and an agent that submits.
 
 `FAKE_SCENARIO`: names joined by commas, one for each start of the program; the last holds for all further ones.
 `FAKE_STATE`: a folder where starts are counted and sessions are kept.
@@ -17,7 +17,7 @@ STATE = Path(os.environ.get("FAKE_STATE", ".fake"))
 
 
 def scenario() -> str:
-    """What this start plays."""
+    """The part of the scenario for this start."""
     names = os.environ.get("FAKE_SCENARIO", "work").split(",")
     STATE.mkdir(parents=True, exist_ok=True)
     starts = STATE / "starts"

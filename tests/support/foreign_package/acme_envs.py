@@ -243,7 +243,7 @@ class Opaque(gymnasium.Space[Any]):
 
 
 class Page:
-    """What a browser or a game might observe: an object."""
+    """An observation as of a browser or a game: an object."""
 
     def __init__(self, title: str, links: tuple[str, ...]) -> None:
         self.title = title

@@ -1,4 +1,4 @@
-"""What the log of an agent that made these versions looks like, in the form of each kind of CLI."""
+"""Logs of an agent that made given versions, in the form of each kind of CLI."""
 
 from __future__ import annotations
 

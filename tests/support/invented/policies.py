@@ -67,7 +67,7 @@ class Version:
     failed: Sequence[int] = ()
     images: Mapping[str, bytes] = field(default_factory=dict)
     says: str = ""
-    """What the agent says before it, for the log."""
+    """The agent's message before it, for the log."""
 
 
 def png(width: int = 48, height: int = 32, seed: int = 0) -> bytes:

@@ -52,7 +52,7 @@ def client(site: Site, role: str | None = "read") -> TestClient:
 
 
 def status(*runs: RunStatus, workers: tuple[WorkerStatus, ...] = (), **more: Any) -> StatusReply:
-    """What a coordinator might answer."""
+    """A status as a coordinator may send it."""
     return StatusReply(
         cluster="c",
         version="1",

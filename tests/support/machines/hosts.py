@@ -57,7 +57,7 @@ class Host:
     def __init__(self, name: str, enter: list[str], holder: subprocess.Popen[bytes] | None) -> None:
         self.name = name
         self.enter = enter
-        """What a command is prefixed with to run here, without another process in between."""
+        """The words before a command that make it run here, without another process in between."""
         self._holder = holder
         self._started: list[subprocess.Popen[Any]] = []
 
@@ -68,7 +68,7 @@ class Host:
         return self._holder.pid
 
     def run(self, *command: str) -> str:
-        """What the command says; CalledProcessError, with what it said to stderr as a note, when it fails."""
+        """The output of a command. Raises CalledProcessError, with its stderr as a note, when it fails."""
         try:
             done = subprocess.run(
                 [*self.enter, *command], check=True, capture_output=True, text=True, timeout=_TIMEOUT_S
@@ -98,7 +98,7 @@ class Host:
         return process
 
     def hide(self, *folders: Path) -> None:
-        """Lays an empty file system over each: what is there is another host's disk."""
+        """Lays an empty file system over each folder, which belongs to another host's disk."""
         for folder in folders:
             self.run("mount", "-t", "tmpfs", "-o", "mode=700,size=1m", "none", str(folder))
 

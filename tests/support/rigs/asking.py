@@ -1,4 +1,4 @@
-"""What a core is told when somebody asks: the event that the shell makes of a message."""
+"""Events for a core, as the shell makes them of messages."""
 
 from __future__ import annotations
 

@@ -133,7 +133,7 @@ class Fleet:
 
     @property
     def audits(self) -> list[tuple[str, str]]:
-        """Who played what again, and of whom."""
+        """The replays: the worker of each, and the player of the original."""
         found = []
         for name, job in self.played:
             group, mark, rest = job.rpartition("/")[0].partition("/audit-")

@@ -1,4 +1,4 @@
-"""A core with a store in memory and a clock that tests set: what a shell does, without waiting or failing."""
+"""A core with a store in memory and a clock that tests set. It replaces the shell, and never waits or fails."""
 
 from __future__ import annotations
 
@@ -120,7 +120,7 @@ class Rig:
         self.replies: dict[events.RequestId, Any] = {}
         self.logs: list[Log] = []
         self.audits: list[AuditEffect] = []
-        """What the shell is to do for audits."""
+        """The effects for audits that the shell has to carry out."""
         self.incarnation = 0
         self._requests = 0
         self.core = self.load()
@@ -364,7 +364,7 @@ class Rig:
     # ---- looking ----
 
     def status(self) -> CoreStatus:
-        """What an operator sees."""
+        """An operator's view of the status."""
         return self.core.status(self.now, words)
 
     def row(self, kind: type[T], *key: Any) -> T:

@@ -1,1 +1,1 @@
-"""What stands in for a cluster around an agent, its CLI, or a sweep under test: gateways, a model API, runs."""
+"""Stand-ins for a cluster around an agent, its CLI, or a sweep under test: gateways, a model API, runs."""

@@ -73,7 +73,7 @@ def counting_gateway(budget: int, asked_in_flight: int = 0) -> Iterator[dict[str
 
 
 class Played:
-    """What playing an agent came to."""
+    """The result of playing an agent."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder

@@ -14,7 +14,7 @@ DESCRIPTION = "Use it when a lamp has to be read."
 
 
 def declare(folder: Path) -> tuple[tuple[str, ...], dict[str, McpServer]]:
-    """Writes both into a folder: what `skills` and `mcp` of an agent's file say."""
+    """Writes both into a folder: the values of `skills` and `mcp` in an agent's file."""
     skill = folder / "skills" / "lamps"
     (skill / "scripts").mkdir(parents=True)
     (skill / "SKILL.md").write_text(

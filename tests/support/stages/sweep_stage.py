@@ -37,7 +37,7 @@ TOKENS = {"input_noncached": 100, "cache_read": 20, "cache_creation": 0, "output
 
 
 class Cluster:
-    """The part of `Operations` that a sweep uses itself. `answer`: what a claim is answered; granted as it stands."""
+    """The part of `Operations` that a sweep uses itself. `answer`: the reply to a claim; by default it is granted."""
 
     def __init__(self) -> None:
         self.reports: list[tuple[str, str, dict[str, Any] | None]] = []
@@ -128,9 +128,9 @@ class Stage:
         self.attempts: dict[str, int] = {}
         self.act: Callable[[str], Awaitable[None]] = lambda name: asyncio.sleep(0.01)
         self.score: Callable[[str], Awaitable[None]] = lambda name: asyncio.sleep(0.0)
-        """What a run takes once its agent is gone."""
+        """The work on a run once its agent is gone."""
         self.beside: Callable[[], Awaitable[None]] = lambda: asyncio.sleep(0.0)
-        """What happens beside the sweep."""
+        """Other work, beside the sweep."""
         stage = self
 
         class Play(Lifecycle):

@@ -61,7 +61,7 @@ def noted(monkeypatch: pytest.MonkeyPatch) -> dict[str, list[str]]:
 
 
 def bring_up(state: Path) -> str:
-    """What the command ends with: the error of a cluster that cannot be kept up, or no word of one that serves."""
+    """The error with which a command over a cluster that cannot be kept up ends."""
 
     async def main() -> str:
         async with local_cluster.local_cluster("test", state=state) as cluster:

@@ -32,7 +32,7 @@ SHOWN = {
     "SubmitAccepted": ("submit_index", "first_global_episode", "remaining_budget"),
     "HandInReply": ("n",),
 }
-"""What is shown of rows and messages; of others their name."""
+"""The shown fields of rows and messages; of others, only the name is shown."""
 
 
 class Transcript(Rig):
@@ -63,7 +63,7 @@ class Transcript(Rig):
         return noted
 
     def do(self, line: str) -> str:
-        """What comes of one line."""
+        """The lines of the transcript that follow from one line."""
         self.lines.clear()
         verb, *words = shlex.split(line)
         plain = [word for word in words if "=" not in word]

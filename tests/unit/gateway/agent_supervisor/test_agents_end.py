@@ -156,7 +156,7 @@ def test_time_that_submits_were_held_is_given_back(tmp_path: Path) -> None:
 
 
 class Cluster(Operations):
-    """What it is asked for."""
+    """Records the requests that it gets."""
 
     def __init__(self) -> None:
         self.asked: list[str] = []

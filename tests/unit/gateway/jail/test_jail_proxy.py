@@ -14,7 +14,7 @@ from evopolicy_gateway.jail.settings import Host
 
 
 async def ask(request: bytes, hosts: frozenset[Host] = frozenset(), *, then: bytes = b"") -> bytes:
-    """What the proxy answers, its listening socket handed over as a jail does it."""
+    """The proxy's answer; its listening socket is handed over as a jail does it."""
     opened = JailProxy({}, hosts)
     here, there = socket.socketpair()
     listening = socket.create_server(("127.0.0.1", 0))

@@ -192,7 +192,7 @@ def test_a_bubblewrap_that_hangs_builds_no_jail(tmp_path: Path, monkeypatch: pyt
 
 
 async def _sent(url: str, text: str) -> bytes:
-    """What the service says to a client that sends this and then nothing more."""
+    """The service's answer to a client that sends this and then nothing more."""
     host, _, rest = url.removeprefix("http://").partition("/")
     reader, writer = await asyncio.open_connection(*host.split(":"))
     writer.write(text.replace("PATH", f"/{rest}").encode())

@@ -165,7 +165,7 @@ WRONG = {
     "leak": "environment acme/Bad.* memory.*--env-memory",
     "custom space": "environment acme/Bad, observation_space: a space of type Opaque",
 }
-"""What a slot says of an episode that an environment prevents."""
+"""A slot's error for an episode that an environment prevents."""
 POLICY = """
 class Policy:
     def __init__(self, *spaces): pass

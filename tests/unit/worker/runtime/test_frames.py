@@ -182,7 +182,7 @@ CHECKED = {
 
 
 def allowed(program: bytes, number: int, *arguments: int) -> int:
-    """What the filter says of a system call: it is run here, instruction by instruction."""
+    """The verdict of the filter on a system call, run here instruction by instruction."""
     data = struct.pack(
         "<iIQ6Q", number, bpf.AUDIT_ARCH["x86_64"], 0, *arguments, *([0] * (6 - len(arguments)))
     )

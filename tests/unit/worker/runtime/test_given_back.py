@@ -50,7 +50,7 @@ def going_on(job: Job, slot: Slot) -> Job:
 
 
 def begun_by(actions: bytes) -> bytes:
-    """What another worker may have told."""
+    """Actions as another worker may have reported them."""
     return msgspec.msgpack.encode({0: begun.PackedBegun(actions=actions), 7: begun.PackedBegun()})
 
 

@@ -110,7 +110,7 @@ def test_a_policy_that_is_killed_again_and_again_is_played_elsewhere(slots: Slot
 def after(
     slots: Slots, slot: Slot, number: int, place: int, source: str = "", **options: object
 ) -> list[EpisodeOutcome]:
-    """What comes of a job when one process of the slot gets that signal in the policy's pause.
+    """The outcome of a job when one process of the slot gets that signal in the policy's pause.
 
     `place`: in the slot's family, counted from the environment's process.
     """
