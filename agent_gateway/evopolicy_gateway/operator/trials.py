@@ -213,7 +213,14 @@ def policy_bundle(policy: Path) -> bundles.Bundle:
     """Bundles the policy in a folder, or in `system/` below it. Raises ConfigError when it is missing or invalid."""
     folder = policy if (policy / "policy.py").is_file() else policy / "system"
     if not (folder / "policy.py").is_file():
-        raise ConfigError(f"{policy} holds no policy.py")
+        problem = (
+            f"{policy} holds no policy.py"
+            if policy.is_dir()
+            else f"{policy} is a file"
+            if policy.exists()
+            else f"there is no folder {policy}"
+        )
+        raise ConfigError(f"{problem}; name a folder with policy.py in it, or in its folder system/")
     try:
         return bundle_of(folder)
     except BundleError as error:

@@ -102,7 +102,8 @@ def check_writable(
             return
         why = _REMEDIES.get(error.errno or 0, error.strerror or str(error))
         raise refused(
-            error, f"cannot write to {folder}: {why}, or choose another folder with {choose}"
+            error,
+            f"cannot write to {folder}: {why}; if this cannot be changed, choose another folder with {choose}",
         ) from error
     n_bytes, least_inodes = free.f_bavail * free.f_frsize, LEAST_INODES if free.f_files else 0
     if not may_be_full and (n_bytes < least_bytes or free.f_favail < least_inodes):

@@ -57,7 +57,14 @@ def find_run_dirs(paths: Iterable[Path]) -> tuple[list[Path], list[LeftOut]]:
     """As `run_folders`; paths without a run directory are returned with the reason."""
     found, without = run_folders(paths)
     return found, [
-        LeftOut(path=path, reason="no run directory here" if path.is_dir() else "no such folder")
+        LeftOut(
+            path=path,
+            reason="no run directory here"
+            if path.is_dir()
+            else "a file, not a run directory"
+            if path.exists()
+            else "no such folder",
+        )
         for path in without
     ]
 

@@ -212,8 +212,13 @@ def test_same_run_given_twice_counts_once_and_a_copy_is_named(tmp_path: Path) ->
 
 def test_path_without_runs_is_listed(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
-    loaded = load_runs([tmp_path / "empty", tmp_path / "absent"])
-    assert [left.reason for left in loaded.left_out] == ["no run directory here", "no such folder"]
+    (tmp_path / "notes.txt").touch()
+    loaded = load_runs([tmp_path / "empty", tmp_path / "notes.txt", tmp_path / "absent"])
+    assert {left.path.name: left.reason for left in loaded.left_out} == {
+        "empty": "no run directory here",
+        "notes.txt": "a file, not a run directory",
+        "absent": "no such folder",
+    }
 
 
 def test_a_run_inside_a_run_is_not_searched_for(tmp_path: Path) -> None:
