@@ -83,6 +83,29 @@ def test_no_paste_brings_back_a_text_of_an_earlier_episode(load: Any, kept: str,
     assert "value" not in nodes(obs, "textbox")[0]
 
 
+@pytest.mark.parametrize(
+    ("name", "act"),
+    [
+        ("choose-date", "mouse_click(80, 100)"),
+        ("terminal", "mouse_click(100, 150) keyboard_down('Control') keyboard_press('a')"),
+    ],
+)
+def test_an_episode_leaves_nothing_in_its_page(warm: Warm, name: str, act: str) -> None:
+    environment = warm(f"browsergym/miniwob.{name}")
+
+    def seen() -> list[str]:
+        first = environment.reset(Case(seed=1))
+        second = environment.step("mouse_click(100, 150) keyboard_type('ls')").obs
+        return [
+            each[key] for each in (first, second) for key in ("axtree_object", "extra_element_properties")
+        ]
+
+    undisturbed = seen()
+    environment.reset(Case(seed=2))
+    environment.step(act)
+    assert seen() == undisturbed
+
+
 @pytest.mark.parametrize("page", ["copy-paste", "text-editor"])
 def test_a_text_that_grows_with_each_paste_stays_short(page: str) -> None:
     environment = BrowserGymEnv(page)
