@@ -176,6 +176,18 @@ class Bad(Glider):
             os._exit(3)
         elif self.how == "leave":
             sys.exit("no more levels")
+        elif self.how == "interrupt":
+            raise KeyboardInterrupt
+        elif self.how == "huge":
+            reward = 1e308
+        elif self.how == "component":
+            info = {"fuel": float("nan")}
+        elif self.how == "success in words":
+            info = {"near": "no"}
+        elif self.how == "success in an array":
+            info = {"near": np.zeros(1)}
+        elif self.how == "change spaces in step":
+            self.action_space = spaces.Discrete(2)  # type: ignore[assignment]
         elif self.how == "close stdout":
             sys.stdout.close()
             with contextlib.suppress(OSError):
@@ -199,6 +211,29 @@ class Bad(Glider):
         elif self.how == "hang":
             time.sleep(3600)
         return obs, reward, terminated, truncated, info
+
+
+GIVEN: dict[str, tuple[Any, Any]] = {
+    "byte": (spaces.Box(0, 255, (2,), np.uint8), np.array([2, 300])),
+    "picture": (spaces.Box(0, 255, (20, 20, 3), np.uint8), np.full((20, 20, 3), 0.5)),
+    "fraction": (spaces.Discrete(5), 1.7),
+    "parts": (spaces.Dict({"a": spaces.Tuple([spaces.MultiDiscrete([3, 3])])}), {"a": ([0.5, 1.0],)}),
+    "number": (spaces.Text(5), 12),
+    "letters": (spaces.Text(5, charset="ab"), "abc"),
+}
+"""Spaces, and observations that are in none of them though a value of the space can be made of each."""
+
+
+class Misread(Glider):
+    """Gives observations that are not in its space."""
+
+    def __init__(self, what: str) -> None:
+        super().__init__()
+        self.observation_space, self.given = GIVEN[what]
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        super().reset(seed=seed)
+        return self.given, {}
 
 
 class Grumbles(gymnasium.Wrapper[Any, Any, Any, Any]):
@@ -291,6 +326,7 @@ for name, cls, limit in (
     ("Everything", Everything, 5),
     ("Treasure", Treasure, 20),
     ("Bad", Bad, 8),
+    ("Misread", Misread, 8),
     ("Keeper", Keeper, 8),
     ("Browser", Browser, 5),
 ):

@@ -14,6 +14,7 @@ from typing import Literal
 import msgspec
 
 from evopolicy_common.errors import EvopolicyError, SandboxError, SlotDiedError
+from evopolicy_common.terminal import one_line
 
 Kind = Literal["", "make", "reset", "step", "render", "close"]
 
@@ -109,6 +110,15 @@ def hung(call: str, limits: Limits) -> str:
 def note(text: str) -> None:
     """Tells the operator, by the worker's log."""
     print(f"{NOTE}{text}", file=sys.stderr, flush=True)
+
+
+def described(error: BaseException) -> str:
+    """Type and text of an exception of third-party code, in one line."""
+    try:
+        text = str(error)
+    except Exception:
+        text = "its text cannot be made"
+    return one_line(f"{type(error).__name__}: {text}")
 
 
 def raised(error: BaseException, text: str, limits: Limits) -> str:

@@ -27,6 +27,7 @@ from evopolicy_worker.environments.actions import compile_actions
 from evopolicy_worker.environments.adapters import adapter, versions
 from evopolicy_worker.environments.base import Environment, Frame, Observation, Step
 from evopolicy_worker.environments.calls import current as call
+from evopolicy_worker.environments.calls import described
 from evopolicy_worker.environments.info import plain_info
 from evopolicy_worker.environments.observations import compile_observation
 from evopolicy_worker.environments.opaque import Opaque, converter, declared, visible
@@ -164,7 +165,9 @@ class GymnasiumEnvironment(Environment):
         self._encode = converter(self._env.observation_space, family.encoding, back=False)
         self._decode = converter(self._env.action_space, family.encoding, back=True)
         self._promises = (
-            None if is_shipped(entry.id) else trial.Promises(obs_schema, action_schema, self._schema)
+            None
+            if is_shipped(entry.id)
+            else trial.Promises(obs_schema, action_schema, self._schema, entry.success)
         )
         self._plain = family.info
         self.action_codec = compile_actions(action_schema)
@@ -233,11 +236,13 @@ class GymnasiumEnvironment(Environment):
             self._promises.after_reset(returned)
         obs, _ = returned
         try:
-            plain = self._observe(obs if self._encode is None else self._encode(obs))
+            if self._encode is not None:
+                obs = self._encode(obs)
+            plain = self._observe(obs)
         except _MISSHAPEN as error:
             raise WorkerError(f"{call}, {trial.no_observation(obs, error)}") from error
         if self._promises is not None:
-            self._promises.observation(plain)
+            self._promises.observation(plain, obs)
         call.done()
         return plain
 
@@ -267,7 +272,7 @@ class GymnasiumEnvironment(Environment):
             fault = trial.misshapen(returned, error, vector=self._rewards is not None)
             raise WorkerError(f"{call}, {fault}") from error
         if self._promises is not None:
-            self._promises.after_step(step)
+            self._promises.after_step(step, obs)
         call.done()
         return step
 
@@ -294,7 +299,7 @@ class GymnasiumEnvironment(Environment):
                 raise
             where = f"kwargs {entry.kwargs} of its file" if entry.kwargs else "its gymnasium_id"
             raise WorkerError(
-                f"{call}: gymnasium.make({entry.gymnasium_id!r}) raised {type(error).__name__}: {error}; correct {where}, or the"
+                f"{call}: gymnasium.make({entry.gymnasium_id!r}) raised {described(error)}; correct {where}, or the"
                 " environment"
             ) from error
         limits = [entry.max_episode_steps]

@@ -75,12 +75,12 @@ def describe(env_id: str) -> EnvironmentDescription:
     out for a few steps. Raises as `make`, and WorkerError when the trial fails.
     """
     environment = make(env_id)
-    try:
-        if not catalogue.is_shipped(env_id) and isinstance(environment, GymnasiumEnvironment):
-            environment.try_out()
-        return measured(environment)
-    finally:
-        environment.close()
+    if not catalogue.is_shipped(env_id) and isinstance(environment, GymnasiumEnvironment):
+        environment.try_out()
+    description = measured(environment)
+    # Not after an exception: it belongs to the call that is running, which its message names.
+    environment.close()
+    return description
 
 
 def measured(environment: Environment) -> EnvironmentDescription:

@@ -152,10 +152,7 @@ def compile_checker(schema: SpaceSchema) -> Checker:
         low, end = schema.get("start", 0), schema.get("start", 0) + schema["n"]
         return lambda value: "" if low <= value < end else f"it is {value}, not {low} to {end - 1}"
     if kind == "Text":
-        low, high = schema["min_length"], schema["max_length"]
-        return lambda value: (
-            "" if low <= len(value) <= high else f"a text of {len(value)} characters, not {low} to {high}"
-        )
+        return _text_checker(schema)
     if kind == "Sequence":
         item = compile_checker(schema["space"])
         return lambda value: next((f"[{k}] {why}" for k, each in enumerate(value) if (why := item(each))), "")
@@ -169,6 +166,19 @@ def compile_checker(schema: SpaceSchema) -> Checker:
     if kind == "Graph":
         return lambda value: ""
     return _array_checker(schema)
+
+
+def _text_checker(schema: SpaceSchema) -> Checker:
+    low, high = schema["min_length"], schema["max_length"]
+    allowed = frozenset(schema["characters"]) if "characters" in schema else None
+
+    def check(value: str) -> str:
+        if not low <= len(value) <= high:
+            return f"a text of {len(value)} characters, not {low} to {high}"
+        strange = "" if allowed is None else next((each for each in value if each not in allowed), "")
+        return f"a text with {strange!r}, which is not one of its characters" if strange else ""
+
+    return check
 
 
 def _array_checker(schema: SpaceSchema) -> Checker:

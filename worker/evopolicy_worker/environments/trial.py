@@ -19,7 +19,7 @@ from evopolicy_common.terminal import one_line
 from evopolicy_worker.environments import spaces
 from evopolicy_worker.environments.base import Environment, Step
 from evopolicy_worker.environments.calls import current as call
-from evopolicy_worker.environments.calls import note
+from evopolicy_worker.environments.calls import described, note
 
 STEPS = 32
 SEEDS = (0, 1)
@@ -30,12 +30,17 @@ class Promises:
     """Checks one environment after its calls. Raises WorkerError that names environment, call, field and remedy."""
 
     def __init__(
-        self, obs_space: SpaceSchema, action_space: SpaceSchema, schema_of: Callable[[str], SpaceSchema]
+        self,
+        obs_space: SpaceSchema,
+        action_space: SpaceSchema,
+        schema_of: Callable[[str], SpaceSchema],
+        success: str = "",
     ) -> None:
-        """`schema_of`: the environment's present `observation_space` or `action_space`."""
+        """`schema_of`: the environment's present `observation_space` or `action_space`. `success`: the key in `info`."""
         self._schema_of = schema_of
+        self._success = success
         self.strict = False
-        """Whether values beyond bounds are refused, too."""
+        """Whether values beyond bounds, and a success that is no truth value, are refused, too."""
         self._reported = False
         self._spaces = {"observation_space": obs_space, "action_space": action_space}
         self._outside = spaces.compile_checker(obs_space)
@@ -45,19 +50,29 @@ class Promises:
             raise WorkerError(
                 f"{call}: it returned {_shown(returned)}; it has to return an observation and a dict, as Gymnasium 1.x has it"
             )
+        self._check_spaces()
+
+    def after_step(self, step: Step, raw: Any) -> None:
+        """`raw`: the observation as the environment gave it."""
+        if not math.isfinite(step.reward):
+            raise WorkerError(f"{call}, reward: it is {step.reward}; rewards have to be finite")
+        self.observation(step.obs, raw)
+        if self.strict and (told := step.info.get(self._success)) is not None and solved(told) is None:
+            raise WorkerError(
+                f"{call}, info[{self._success!r}]: it is {_shown(told)}; success is true or false"
+            )
+        if self.strict or step.terminated or step.truncated:
+            self._check_spaces()
+
+    def _check_spaces(self) -> None:
         for name, schema in self._spaces.items():
             if self._schema_of(name) != schema:
                 raise WorkerError(
                     f"{call}, {name}: it has changed; a space has to stay as it was when the environment was made"
                 )
 
-    def after_step(self, step: Step) -> None:
-        if not math.isfinite(step.reward):
-            raise WorkerError(f"{call}, reward: it is {step.reward}; rewards have to be finite")
-        self.observation(step.obs)
-
-    def observation(self, obs: Any) -> None:
-        fault = self._outside(obs)
+    def observation(self, obs: Any, raw: Any) -> None:
+        fault = self._outside(obs) or _altered(obs, raw)
         if not fault:
             return
         text = f"{call}, observation: {fault}; correct the environment, or its observation_space"
@@ -66,6 +81,31 @@ class Promises:
         if not self._reported:
             self._reported = True
             note(text)
+
+
+def _altered(obs: Any, raw: Any) -> str:
+    """How the observation differs from the raw one, as integers and texts are made of anything; empty where it does not."""
+    if isinstance(obs, dict):
+        parts = [(key, raw[key] if isinstance(raw, Mapping) else getattr(raw, key)) for key in obs]
+        return next((f"[{key!r}] {why}" for key, each in parts if (why := _altered(obs[key], each))), "")
+    if isinstance(obs, tuple):
+        pairs = enumerate(zip(obs, raw, strict=True))
+        return next((f"[{k}] {why}" for k, (one, each) in pairs if (why := _altered(one, each))), "")
+    if isinstance(obs, str):
+        return "" if isinstance(raw, str) else f"it is {_shown(raw)}, not a text"
+    if isinstance(obs, int):
+        return "" if raw == obs else f"it is {_shown(raw)}, not an integer"
+    if not isinstance(obs, np.ndarray) or obs.dtype.kind == "f":
+        return ""
+    given = np.asarray(raw)
+    if given.dtype == obs.dtype:
+        return ""
+    given = given.reshape(obs.shape)
+    wrong = np.argwhere(given != obs)
+    if not len(wrong):
+        return ""
+    where = tuple(wrong[0].tolist())
+    return f"element {where} is {given[where]}, which {obs.dtype} does not have"
 
 
 def misshapen(returned: Any, error: Exception, *, vector: bool) -> str:
@@ -114,6 +154,12 @@ def _shown(value: Any) -> str:
     return f"{one_line(repr(value))[:60]} ({type(value).__name__})"
 
 
+def solved(told: Any) -> bool | None:
+    """What the value of a success key in a plain `info` says; None if it is no number."""
+    value = told[0] if isinstance(told, list) and len(told) == 1 else told
+    return value == value and bool(value) if isinstance(value, int | float) else None
+
+
 def play(environment: Environment) -> None:
     """Plays random episodes of a few steps. Raises WorkerError that names the environment, the field and the remedy."""
     rng = np.random.default_rng(0)
@@ -126,13 +172,13 @@ def play(environment: Environment) -> None:
                     break
     except EvopolicyError:
         raise
-    except Exception as error:
+    except BaseException as error:  # such as an environment's sys.exit
         remedy = (
             "it has to take any seed"
             if call.what == "reset"
             else "it has to take any action of its action_space"
         )
-        raise WorkerError(f"{call}: it raised {type(error).__name__}: {error}; {remedy}") from error
+        raise WorkerError(f"{call}: it raised {described(error)}; {remedy}") from error
 
 
 def _sampled(environment: Environment, rng: np.random.Generator) -> Any:

@@ -18,7 +18,13 @@ import threading
 import time
 from pathlib import Path
 
-from evopolicy_common.errors import EvopolicyError, SandboxError, SlotDiedError, WorkerError
+from evopolicy_common.errors import (
+    BrokenEnvironmentError,
+    EvopolicyError,
+    SandboxError,
+    SlotDiedError,
+    WorkerError,
+)
 from evopolicy_worker import environments
 from evopolicy_worker.environments import calls
 from evopolicy_worker.episodes.loop import CancelledJobError, Player, Progress, fault_of
@@ -131,7 +137,7 @@ class EnvProcess:
         except CancelledJobError:
             progress.give_up(self._channel.send)
             return messages.framed(messages.Played(cancelled=True))
-        except (Exception, SystemExit) as error:  # an environment's sys.exit
+        except BaseException as error:  # such as an environment's sys.exit
             progress.give_up(self._channel.send)
             # With a cancellation: whatever it met on its way out.
             answer = messages.Played(cancelled=True) if progress.cancelled else self._fault(error)
@@ -145,7 +151,7 @@ class EnvProcess:
         self._monitor.wake()
         try:
             return messages.Described(environments=tuple(player.describe(env_id) for env_id in env_ids))
-        except (Exception, SystemExit) as error:
+        except BaseException as error:
             return self._fault(error)
         finally:
             self._monitor.ticking = False
@@ -153,8 +159,8 @@ class EnvProcess:
     def _fault(self, error: BaseException) -> messages.Fault:
         text = calls.raised(error, fault_of(error), self._limits)
         calls.current.what = ""
-        if text:
-            return messages.Fault(kind="environment", message=text)
+        if text or isinstance(error, BrokenEnvironmentError):
+            return messages.Fault(kind="environment", message=text or fault_of(error))
         kind = "sandbox" if isinstance(error, SandboxError | SlotDiedError) else "worker"
         return messages.Fault(kind=kind, message=fault_of(error))
 

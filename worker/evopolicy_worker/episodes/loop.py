@@ -30,7 +30,13 @@ import msgspec
 import numpy as np
 
 from evopolicy_common.catalogue import is_shipped
-from evopolicy_common.errors import EvopolicyError, SandboxError, SlotDiedError, WorkerError
+from evopolicy_common.errors import (
+    BrokenEnvironmentError,
+    EvopolicyError,
+    SandboxError,
+    SlotDiedError,
+    WorkerError,
+)
 from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_common.messages.episode import (
     LARGEST_LIMITS,
@@ -49,7 +55,8 @@ from evopolicy_common.records.episodes.trajectory import Recorder, decode
 from evopolicy_common.wire import codec
 from evopolicy_worker import environments
 from evopolicy_worker.environments import Environment
-from evopolicy_worker.environments.calls import note
+from evopolicy_worker.environments.calls import described, note
+from evopolicy_worker.environments.trial import solved
 from evopolicy_worker.episodes import float_environment
 from evopolicy_worker.episodes.begun import Begun, Returned, is_kept, unpack
 from evopolicy_worker.episodes.monitor import Monitor
@@ -215,14 +222,14 @@ class Player:
                 policies.drop()
             except (CancelledJobError, SandboxError, SlotDiedError, OSError, MemoryError):
                 raise
-            except (Exception, SystemExit) as error:  # an environment's sys.exit
+            except BaseException as error:  # such as an environment's sys.exit
                 if progress.cancelled or not episode.acted:
                     raise
                 # The same actions would fail again, and another worker would give the policy a second attempt.
                 note(f"{job.env} broke down on a policy's actions: {fault_of(error)}")
                 begun.failure = begun.failure or endings.broken_down(Ending("environment", "exit"))
                 begun.taken.clear()
-                with contextlib.suppress(Exception, SystemExit):  # of what broke down
+                with contextlib.suppress(BaseException):  # of what broke down
                     self._environments.pop(job.env).close()
 
     def prepare(self) -> None:
@@ -501,7 +508,8 @@ class _Episode:
             for name in names:
                 sums[name] += _number(components.get(name))
             if solves and (reported_success := info.get(solves)) is not None:
-                success = bool(reported_success) or (ever and bool(success))
+                now = solved(reported_success)
+                success = success if now is None else now or (ever and bool(success))
             if invalid:
                 info = {**info, "action_invalid": True}
             if failed:
@@ -517,9 +525,12 @@ class _Episode:
             if progress.cancelled:
                 raise CancelledJobError
             obs = next_obs
-        for name, value in (("return", total), *sums.items()):
+        for name, value in (("reward", total), *sums.items()):
             if not math.isfinite(value):
-                raise WorkerError(f"{self._job.env}, episode {self._spec.index}: its {name} is {value}")
+                raise BrokenEnvironmentError(
+                    f"environment {self._job.env}, {name}: its sum over {t} steps is {value}; rewards, their components, and"
+                    " their sums have to be finite"
+                )
         return total, sums, t, terminated, truncated, success
 
 
@@ -587,5 +598,5 @@ def _blob(data: bytes) -> BlobRef:
 
 def fault_of(error: BaseException) -> str:
     """An infrastructure error in one line, with its type unless it is one of our own errors."""
-    text = str(error) if isinstance(error, EvopolicyError) else f"{type(error).__name__}: {error}"
+    text = str(error) if isinstance(error, EvopolicyError) else described(error)
     return text.encode("utf-8", "replace").decode()[:MAX_FAULT]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ from evopolicy_worker.environments import Environment, compile_actions, define, 
 from evopolicy_worker.environments.gymnasium_adapter import GymnasiumFamily
 from evopolicy_worker.environments.opaque import Opaque
 from evopolicy_worker.environments.spaces import outside
+from evopolicy_worker.environments.trial import solved
 from evopolicy_worker.episodes.frames import compile_writer
 from evopolicy_worker.sandbox.inside import player
 
@@ -190,6 +192,40 @@ def test_a_reward_vector_is_recorded_whole_and_counts_by_its_weights() -> None:
         WorkerError, match="reward_vector: it names 3 elements, and the environment's rewards have 2"
     ):
         describe(defined("Treasure", reward_vector=("a", "b", "c")))
+
+
+@pytest.mark.parametrize(
+    ("what", "why"),
+    [
+        ("byte", r"element \(1,\) is 300, which uint8 does not have"),
+        ("picture", r"element \(0, 0, 0\) is 0.5, which uint8 does not have"),
+        ("fraction", r"it is 1.7 \(float\), not an integer"),
+        ("parts", r"\['a'\] \[0\] element \(0,\) is 0.5, which int64 does not have"),
+        ("number", r"it is 12 \(int\), not a text"),
+        ("letters", "a text with 'c', which is not one of its characters"),
+    ],
+)
+def test_an_observation_is_not_turned_into_one_of_its_space(what: str, why: str) -> None:
+    with pytest.raises(WorkerError, match=f"environment acme/Misread, reset, observation: {why}; correct"):
+        describe(defined("Misread", kwargs={"what": what}))
+
+
+def test_a_success_that_is_no_truth_value_is_refused() -> None:
+    with pytest.raises(
+        WorkerError, match=r"acme/Bad, step 0, info\['near'\]: it is 'no' \(str\); success is true or"
+    ):
+        describe(defined("Bad", kwargs={"how": "success in words"}, success="near"))
+    assert [solved(each) for each in (True, 0.0, [1], [0.0], [], [1, 1], "False", {}, math.nan)] == [
+        *(True, False, True, False),
+        *(None, None, None, None, False),
+    ]
+
+
+def test_a_space_that_changes_in_a_step_is_refused() -> None:
+    with pytest.raises(
+        WorkerError, match="acme/Bad, step 0, action_space: it has changed; a space has to stay"
+    ):
+        describe(defined("Bad", kwargs={"how": "change spaces in step"}))
 
 
 @pytest.fixture

@@ -105,6 +105,12 @@ def test_success_is_decided_by_the_last_step_or_by_any(slots: Slots) -> None:
         slots.run(slot.close())
     (line,) = slots.play_all(None, env="toy/line")
     assert line.success is None
+    slot = slot_of(slots, "Bad", kwargs={"how": "success in an array"}, success="near")
+    slots.run(slot.start())
+    try:
+        assert slots.play_all(None, slot=slot, env="acme/Bad")[0].success is False
+    finally:
+        slots.run(slot.close())
 
 
 @pytest.mark.parametrize("env", ["gymnasium/FetchPush-v4", "gymnasium/parking-v0"])
@@ -127,6 +133,15 @@ def test_success_of_hidden_episodes_is_recorded_where_the_definition_names_none(
         ("no bounds", "environment acme/Bad, action_space"),
         ("custom space", "environment acme/Bad, observation_space: a space of type Opaque"),
         ("exit", "environment acme/Bad: its process ended while it was tried out"),
+        (
+            "leave",
+            "environment acme/Bad, step 0: it raised SystemExit: no more levels; it has to take any action",
+        ),
+        ("interrupt", "environment acme/Bad, step 0: it raised KeyboardInterrupt"),
+        (
+            "raise in reset, later",
+            "environment acme/Bad, reset: it raised RuntimeError: no level of that seed",
+        ),
         ("hang", "environment acme/Bad, step 0: it has not returned for 4 s"),
         ("hang in make", "environment acme/Bad, make: it has not returned for 4 s"),
         ("hang in close", "environment acme/Bad, close: it has not returned for 4 s"),
@@ -137,7 +152,10 @@ def test_what_breaks_its_word_is_refused_where_it_is_described_and_the_next_slot
     slots: Slots, how: str, why: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(slot_module, "SILENT_S", 8.0)
-    slot = slot_of(slots, "Bad", Limits(call_s=4.0), kwargs={"how": how})
+    how, later, _ = how.partition(", later")
+    # After the trial, steps are timed in episodes of other seeds.
+    kwargs = {"how": how, "seeds_from": 2 if later else 0}
+    slot = slot_of(slots, "Bad", Limits(call_s=4.0), kwargs=kwargs)
     slots.run(slot.start())
     try:
         with pytest.raises((WorkerError, SlotDiedError), match=why):
@@ -155,6 +173,9 @@ WRONG = {
     "error": "environment acme/Bad, step 0: it raised FileNotFoundError: levels.dat; correct the environment",
     "exit": "environment acme/Bad: its process ended while it played; the slot's process ended with status 3",
     "leave": "environment acme/Bad, step 0: it raised SystemExit: no more levels; correct the environment",
+    "interrupt": "environment acme/Bad, step 0: it raised KeyboardInterrupt: ; correct the environment",
+    "huge": "environment acme/Bad, reward: its sum over 8 steps is inf; rewards, .* have to be finite",
+    "component": "environment acme/Bad, fuel: its sum over 8 steps is nan; rewards, their components, .* finite",
     "close files": "environment acme/Bad",
     "object reward": r"environment acme/Bad, step 0, reward: it is <object .* \(object\); a reward has to be one number",
     "hang": "environment acme/Bad, step 0: it has not returned for 4 s, the limit of one call; .*--env-timeout",
@@ -189,7 +210,7 @@ def test_what_prevents_an_episode_is_reported_by_name_and_is_nobodys_result(
         if how == "leak"
         else USUAL
     )
-    slot = slot_of(slots, "Bad", limits, kwargs={"how": how})
+    slot = slot_of(slots, "Bad", limits, kwargs={"how": how}, reward_components={"fuel": "spent"})
     slots.run(slot.start())
     try:
         # Also where the policy's actions come first, and random ones play the episode again.
