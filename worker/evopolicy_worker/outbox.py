@@ -41,9 +41,8 @@ MAX_HAND_IN_BYTES = 4 << 20
 """Maximum size of a message with more than one result, in bytes."""
 MAX_RESULT_BYTES = 1 << 20
 """A result that is larger than this without its large blobs sends its episodes as one blob."""
-MANY_EPISODES = 300
-"""In jobs with more episodes, recordings over 1 KiB are uploaded as blobs too, so that all outcomes fit into one
-blob."""
+FEW_EPISODES, MANY_EPISODES = 8, 300
+"""Jobs with at most so many and with more episodes: see `inline_bytes`."""
 MAX_LOST = 5
 """How often the coordinator may lose the blobs of one result before that counts as a refusal."""
 UNPACK_S = 30.0
@@ -52,6 +51,14 @@ PAUSE_S = 1.0
 LINGER_S = 0.05
 """Longest wait of a result for others, seconds. A report and the leases that follow it cost all processes together as
 much as a short episode's simulation."""
+
+
+def inline_bytes(n_episodes: int) -> int:
+    """Larger recordings of a job with so many episodes are uploaded as blobs of their own, bytes: all outcomes of a job
+    have to fit into one blob, and those of few episodes into a message."""
+    if n_episodes <= FEW_EPISODES:
+        return codec.INLINE_BYTES
+    return 24 << 10 if n_episodes <= MANY_EPISODES else 1 << 10
 
 
 class Outbox:
@@ -160,7 +167,7 @@ class Outbox:
 
     async def _portable(self, result: JobResult) -> tuple[JobResult, int]:
         """The result with its large parts replaced by digests, and its encoded size in bytes."""
-        most = codec.INLINE_BYTES if len(result.episodes) <= MANY_EPISODES else 1024
+        most = inline_bytes(len(result.episodes))
         outcomes = [
             msgspec.structs.replace(
                 outcome,

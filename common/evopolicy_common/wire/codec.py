@@ -26,8 +26,9 @@ WIRE_VERSION = 1
 CHUNK_BYTES = 256 * 1024
 """Payload of one blob chunk, bytes: as large as a page of results, so that it occupies its lane no longer."""
 
-INLINE_BYTES = 24 * 1024
-"""A blob up to this many bytes is sent inside the message that refers to it."""
+INLINE_BYTES = 128 * 1024
+"""A blob up to this many bytes is sent inside the message that refers to it. An upload of its own costs coordinator,
+gateway, and worker together as much CPU as a short episode."""
 
 INLINE_BEGUN_BYTES = 4096
 """The same limit for `JobResult.begun` and `Job.begun`, bytes: one reply may carry hundreds of jobs."""

@@ -31,6 +31,7 @@ from coordinator_harness import (
 from evopolicy_common.errors import PartFailedError, SandboxError, SlotDiedError, WorkerError
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome, Job, Tier
 from evopolicy_common.records.blobs import digest_of
+from evopolicy_common.wire import codec
 from evopolicy_common.wire.requests import Requester
 from evopolicy_common.wire.transport import connect
 from evopolicy_worker import outbox, supervisor
@@ -84,7 +85,8 @@ class ScriptedSlot:
 def large(outcome: EpisodeOutcome) -> EpisodeOutcome:
     """The outcome with a trajectory that is too big to travel inline."""
     assert outcome.trajectory is not None
-    data = (outcome.trajectory.inline or b"") * 4000
+    data = (outcome.trajectory.inline or b"") * 8000
+    assert len(data) > codec.INLINE_BYTES
     blob = BlobRef(digest=digest_of(data), size=len(data), inline=data)
     return msgspec.structs.replace(outcome, trajectory=blob)
 
@@ -355,7 +357,7 @@ def test_results_wait_for_each_other_while_jobs_wait_and_the_last_ones_for_nothi
     run(scenario)
 
 
-@pytest.mark.parametrize("bulk", [40, 40_000, 2_000_000])
+@pytest.mark.parametrize("bulk", [40, 200_000, 2_000_000])
 def test_a_result_that_is_refused_for_good_blocks_no_other(
     coordinator: Coordinator, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, bulk: int
 ) -> None:
@@ -366,10 +368,10 @@ def test_a_result_that_is_refused_for_good_blocks_no_other(
         """Bytes that are not those of their digest: as a part of the message, as a blob, or as a part of a packed blob."""
         if outcome.index in (2, 3) and len(broken) < 4:
             broken.append(outcome.index)
-            size = 40_000 if bulk == 40_000 else 40
+            size = bulk if bulk == 200_000 else 40
             blob = BlobRef(digest=digest_of(b"other"), size=size, inline=bytes(size))
             return msgspec.structs.replace(
-                outcome, trajectory=blob, stdout=bytes(bulk if bulk > 40_000 else 0)
+                outcome, trajectory=blob, stdout=bytes(bulk if bulk > 200_000 else 0)
             )
         return large(outcome)
 

@@ -10,6 +10,7 @@ from evopolicy_common.errors import WorkerError
 from evopolicy_common.messages.episode import EpisodeOutcome, PolicyFailure
 from evopolicy_common.wire import codec
 from evopolicy_worker.episodes import loop as episodes
+from evopolicy_worker.outbox import inline_bytes
 
 LOUD = "[os.write(k, b'x' * 65536) for k in (1, 2) for _ in range(2)]"
 
@@ -45,12 +46,12 @@ def test_the_largest_outcomes_of_a_job_can_be_handed_in(n: int) -> None:
         ),
         episodes._share(job),
     )
-    assert n * len(msgspec.msgpack.encode(outcome)) <= codec.MAX_PACKED_BYTES - n * codec.INLINE_BYTES // 24
+    assert n * len(msgspec.msgpack.encode(outcome)) <= codec.MAX_PACKED_BYTES - n * 1024
     if n <= 327:
         assert outcome.failure == failure
     if n > 1:
         # Small trajectories travel in the outcome, and there is room for them in a job of any size that is usual.
-        assert 327 * (codec.INLINE_BYTES + len(msgspec.msgpack.encode(outcome))) <= codec.MAX_PACKED_BYTES
+        assert 327 * (inline_bytes(n) + len(msgspec.msgpack.encode(outcome))) <= codec.MAX_PACKED_BYTES
 
 
 def test_a_recording_that_no_coordinator_takes_is_the_workers_failure(
