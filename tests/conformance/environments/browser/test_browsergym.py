@@ -88,6 +88,8 @@ def test_no_paste_brings_back_a_text_of_an_earlier_episode(load: Any, kept: str,
     [
         ("choose-date", "mouse_click(80, 100)"),
         ("terminal", "mouse_click(100, 150) keyboard_down('Control') keyboard_press('a')"),
+        ("use-colorwheel", "mouse_click(84, 112) mouse_click(84, 196)"),
+        ("use-colorwheel-2", "mouse_click(84, 112) mouse_click(84, 196)"),
     ],
 )
 def test_an_episode_leaves_nothing_in_its_page(warm: Warm, name: str, act: str) -> None:
