@@ -45,6 +45,7 @@ _EXIT_S = 5.0
 _LARGE_SHARE = 0.125
 """Share of its memory limit above which a policy that ended silently, while the system ran out of memory, counts as
 ended for its own memory use."""
+_ROUND_BYTES = 1 << 20
 _SHIM_BROKEN = 70
 """The status with which `inside/zygote.py` ends a process that it should never come back from."""
 _ARRAY_HEAD_BYTES = 8 + 4 * 64
@@ -60,6 +61,15 @@ _STAGES: dict[str, FailureCategory] = {
     "reset": "reset_error",
     "act": "act_error",
 }
+
+
+def address_space(base_bytes: int, memory_bytes: int) -> int:
+    """The limit of a policy's address space, bytes, which the policy can read.
+
+    `base_bytes`: its size with Python alone. It differs by a page between the zygotes of a machine, depending on where the
+    kernel put the heap, so that a policy could tell slots apart; rounded up to 1 MiB, it does not.
+    """
+    return -(-base_bytes // _ROUND_BYTES) * _ROUND_BYTES + memory_bytes
 
 
 class PolicyFailedError(Exception):
@@ -142,7 +152,7 @@ class PolicyProcess:
         self._usual_bytes = _USUAL_ACTION_BYTES + needed
         n_folders = len({name.rpartition("/")[0] for name, _, _ in bundle.names}) * 16
         rlimits = {
-            "RLIMIT_AS": self._base_bytes + limits.memory_bytes,
+            "RLIMIT_AS": address_space(self._base_bytes, limits.memory_bytes),
             "RLIMIT_FSIZE": limits.file_bytes,
             "RLIMIT_NOFILE": limits.open_files,
             "RLIMIT_CORE": 0,

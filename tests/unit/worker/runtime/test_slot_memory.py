@@ -8,7 +8,10 @@ import sys
 from pathlib import Path
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
+from evopolicy_worker.episodes.policy_process import address_space
 from evopolicy_worker.slots.slot import _memory
 
 
@@ -37,3 +40,17 @@ def test_memory_counts_children_whether_or_not_the_kernel_shows_what_is_shared(
         child.stdin.close()
     assert alone > 0
     assert both > alone + (60 << 20)
+
+
+@given(base=st.integers(1 << 20, 1 << 33), memory=st.integers(1 << 20, 1 << 33))
+def test_the_limit_of_the_address_space_grants_the_memory_and_hides_where_the_heap_began(
+    base: int, memory: int
+) -> None:
+    granted = address_space(base, memory)
+    assert 0 <= granted - base - memory < 1 << 20
+    assert (granted - memory) % (1 << 20) == 0
+
+
+def test_zygotes_whose_heaps_begin_elsewhere_give_the_same_limit() -> None:
+    # Sizes of two zygotes of one machine.
+    assert address_space(111_756 << 10, 1 << 29) == address_space(111_760 << 10, 1 << 29)
