@@ -14,11 +14,14 @@ import msgspec
 
 from evopolicy_common.errors import DECODE_ERRORS, ProtocolError
 from evopolicy_common.messages.bounds import Int, Many, Named, Number, Text, Word
+from evopolicy_common.records.run_files import read_regular
 
 FORMAT = "evopolicy rescore 1"
 FOLDER = "rescore"
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 _MAX_BYTES = 64 << 20
+LARGEST = 1e100
+"""Bound on every number of a run, so that sums of squares over many runs stay finite."""
 
 
 class Rescored(msgspec.Struct, frozen=True, kw_only=True):
@@ -92,7 +95,7 @@ def read_rescore(run: Path, name: str) -> RescoreRecord | None:
     try:
         if path.stat().st_size > _MAX_BYTES:
             raise ProtocolError(f"{path} is larger than {_MAX_BYTES >> 20} MiB")
-        found = _decoder.decode(path.read_bytes())
+        found = _decoder.decode(read_regular(path))
     except FileNotFoundError:
         return None
     except OSError as error:
@@ -104,4 +107,11 @@ def read_rescore(run: Path, name: str) -> RescoreRecord | None:
     whole = [found.random_returns, *(each.returns for each in found.checkpoints)]
     if found.n_cases < 1 or any(len(returns) != found.n_cases for returns in whole):
         raise ProtocolError(f"{path} does not have {found.n_cases} returns for each checkpoint")
+    if any(abs(value) > LARGEST for returns in whole for value in returns):
+        raise ProtocolError(f"{path} has a return beyond {LARGEST:g}, which is not plausible")
+    places = {place for each in found.checkpoints for place in each.failures}
+    if odd := sorted(
+        place for place in places if not (place.isascii() and place.isdecimal() and len(place) < 10)
+    ):
+        raise ProtocolError(f"{path} has a failure of episode {odd[0][:20]!r}, which is no position")
     return found

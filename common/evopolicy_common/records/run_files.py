@@ -1,13 +1,25 @@
-"""Finds finished runs below folders, and the submits of a run's folder."""
+"""Finds finished runs below folders and the submits of a run's folder, and reads files that others wrote."""
 
 from __future__ import annotations
 
+import errno
 import os
 import re
+import stat
 from collections.abc import Iterable
 from pathlib import Path
 
 _SUBMIT = re.compile(r"submit_([0-9]{1,9})")
+
+
+def read_regular(path: Path) -> bytes:
+    """The bytes of a file that others wrote. Raises OSError, also when it is no regular file: to open a pipe would wait
+    for its writer forever."""
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    with open(descriptor, "rb") as file:
+        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+            raise OSError(errno.EINVAL, "not a regular file", str(path))
+        return file.read()
 
 
 def run_folders(paths: Iterable[Path]) -> tuple[list[Path], list[Path]]:

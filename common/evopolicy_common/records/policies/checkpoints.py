@@ -18,6 +18,7 @@ from evopolicy_common.records.blobs import write_atomically
 from evopolicy_common.records.policies import bundles
 from evopolicy_common.records.policies.bundles import Bundle, BundleFile
 from evopolicy_common.records.policies.code_metrics import PUBLISHED_SCHEMA, CodeMetrics, code_metrics
+from evopolicy_common.records.run_files import read_regular
 from evopolicy_common.simulators import SIMULATORS
 
 META = "_meta.json"
@@ -120,7 +121,7 @@ def read_meta(folder: Path, episode_budget: int) -> CheckpointMeta | None:
     """The metadata of the checkpoint in `folder`; None when it has none. Raises ProtocolError when they are damaged."""
     for name in (META, METRICS):
         try:
-            data = (folder / name).read_bytes()
+            data = read_regular(folder / name)
             if name == META:
                 return _meta.decode(data)
             if _header.decode(data).schema_version == PUBLISHED_SCHEMA:

@@ -14,6 +14,7 @@ import msgspec
 
 from evopolicy_common.processes.left_files import left_files
 from evopolicy_common.records.policies.checkpoints import policy_folder
+from evopolicy_common.records.run_files import read_regular
 from evopolicy_coordinator.analysis.behaviour.edits import Transition, classify
 from evopolicy_coordinator.analysis.behaviour.line_diff import unified
 from evopolicy_coordinator.analysis.reading.agent_log import Evidence, LogReading, read_agent_log
@@ -89,7 +90,7 @@ def sources(run: Run, submit: Submit) -> dict[str, str]:
     system = policy_folder(run.checkpoint(submit.index))
     try:
         if submit.source is not None:
-            found = {path: (system / path).read_bytes() for path in submit.source.files}
+            found = {path: read_regular(system / path) for path in submit.source.files}
         else:
             found = read_python_files(system)
     except OSError:

@@ -19,6 +19,7 @@ from evopolicy_common import catalogue
 from evopolicy_common.errors import DECODE_ERRORS, ProtocolError
 from evopolicy_common.records.policies.checkpoints import read_meta
 from evopolicy_common.records.policies.code_metrics import PUBLISHED_SCHEMA
+from evopolicy_common.records.run_files import read_regular
 from evopolicy_common.records.run_record import (
     Agent,
     Artifacts,
@@ -71,7 +72,7 @@ def is_published(value: Any) -> bool:
 def read_summary(path: Path) -> PublishedSummary | None:
     """A submit's summary; None when it is missing. Raises ProtocolError when it is damaged."""
     try:
-        return _summary.decode(path.read_bytes())
+        return _summary.decode(read_regular(path))
     except FileNotFoundError:
         return None
     except (OSError, *DECODE_ERRORS) as error:

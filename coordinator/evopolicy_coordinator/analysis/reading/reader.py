@@ -18,7 +18,8 @@ import msgspec
 
 from evopolicy_common.errors import ProtocolError
 from evopolicy_common.records.policies.checkpoints import policy_folder, read_meta
-from evopolicy_common.records.run_files import run_folders, submit_folders
+from evopolicy_common.records.rescores import LARGEST
+from evopolicy_common.records.run_files import read_regular, run_folders, submit_folders
 from evopolicy_common.records.run_record import RunRecord, decode_run_record
 from evopolicy_common.records.summary import Summary, decode_summary
 from evopolicy_coordinator.analysis.behaviour.line_diff import n_changed
@@ -38,8 +39,6 @@ _MAX_REASON_CHARS = 1000
 _PARALLEL_FROM = 40
 """Number of runs from which parallel reading outweighs the start of its processes."""
 _MAX_RUN_JSON_BYTES = 64 << 20
-_LARGEST = 1e100
-"""Bound on every number of a run, so that sums of squares over many runs stay finite."""
 
 
 class Loaded(msgspec.Struct, frozen=True, kw_only=True):
@@ -177,8 +176,8 @@ def _check_numbers(record: Any) -> None:
             queue += [(f"{name}.{key}" if name else str(key), inner) for key, inner in value.items()]
         elif isinstance(value, list | tuple):
             queue += [(name, inner) for inner in value]
-        elif isinstance(value, int | float) and not -_LARGEST <= value <= _LARGEST:
-            raise UnreadableRunError(f"{name}: a number beyond {_LARGEST:g} is not plausible in a run")
+        elif isinstance(value, int | float) and not -LARGEST <= value <= LARGEST:
+            raise UnreadableRunError(f"{name}: a number beyond {LARGEST:g} is not plausible in a run")
 
 
 def _read_record(folder: Path) -> RunRecord:
@@ -187,7 +186,7 @@ def _read_record(folder: Path) -> RunRecord:
         raise UnreadableRunError("unfinished: run.json is missing")
     if path.stat().st_size > _MAX_RUN_JSON_BYTES:
         raise UnreadableRunError(f"run.json is larger than {_MAX_RUN_JSON_BYTES >> 20} MiB")
-    data = path.read_bytes()
+    data = read_regular(path)
     try:
         value = published.decode(data)
         record = (
@@ -262,7 +261,7 @@ def _read_summary(folder: Path, record: RunRecord) -> Summary | PublishedSummary
     try:
         if record.record_version == PUBLISHED:
             return published.read_summary(path)
-        return decode_summary(path.read_bytes())
+        return decode_summary(read_regular(path))
     except ProtocolError as error:
         raise UnreadableRunError(f"{folder.name}/summary.json: {error}") from error
 

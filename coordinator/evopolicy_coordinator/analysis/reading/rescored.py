@@ -60,7 +60,6 @@ def _replaced(run: Run, record: RescoreRecord, best: int) -> Run:
     failures += tuple(
         PolicyFailureRecord(split=_HELDOUT, submit_index=best, episode=int(episode), category=category)  # type: ignore[arg-type]
         for episode, category in sorted(played.failures.items())
-        if episode.isdecimal()
     )
     random = record.random_returns
     reference = ReferenceScore(

@@ -10,10 +10,12 @@ from __future__ import annotations
 import ast
 import hashlib
 import os
+import stat
 from collections.abc import Mapping
 from pathlib import Path
 
 from evopolicy_common.records.policies.code_metrics import parse
+from evopolicy_common.records.run_files import read_regular
 
 MAX_FILE_BYTES = 1 << 20
 """Larger Python files are not parsed: they are data in disguise, and would stall a report."""
@@ -22,8 +24,8 @@ MAX_FILES = 400
 
 
 def read_python_files(system_dir: Path) -> dict[str, bytes]:
-    """Python files under a checkpoint's `system/`, by path relative to it with `/`, sorted. Symlinks are not
-    followed.
+    """Python files under a checkpoint's `system/`, by path relative to it with `/`, sorted. Symlinks, pipes
+    and devices are left out.
 
     At most `MAX_FILES` files, each at most `MAX_FILE_BYTES`. Raises OSError when the folder cannot be read.
     """
@@ -34,9 +36,12 @@ def read_python_files(system_dir: Path) -> dict[str, bytes]:
         folders[:] = sorted(name for name in folders if name != "__pycache__" and not name.startswith("."))
         for name in sorted(names):
             path = Path(root, name)
-            if not name.endswith(".py") or path.is_symlink() or path.stat().st_size > MAX_FILE_BYTES:
+            if not name.endswith(".py"):
                 continue
-            found[path.relative_to(system_dir).as_posix()] = path.read_bytes()
+            status = path.lstat()
+            if not stat.S_ISREG(status.st_mode) or status.st_size > MAX_FILE_BYTES:
+                continue
+            found[path.relative_to(system_dir).as_posix()] = read_regular(path)
             if len(found) >= MAX_FILES:
                 return found
     return dict(sorted(found.items()))

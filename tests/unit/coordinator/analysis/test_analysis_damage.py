@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import random
 import shutil
+import signal
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -36,6 +38,32 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_run(folder, VERSIONS)
     write_run(folder, VERSIONS[:1], entry="Agent B")
     return folder
+
+
+def test_pipes_in_place_of_a_runs_files_do_not_stop_the_reader(whole: Path, tmp_path: Path) -> None:
+    waited: list[Path] = []
+
+    def waits(number: int, frame: object) -> None:
+        waited.append(path)
+        raise TimeoutError
+
+    before = signal.signal(signal.SIGALRM, waits)
+    try:
+        files = sorted(path for path in (whole / "Agent-A").rglob("*") if path.is_file())
+        assert {path.name for path in files} > {"run.json", "policy.py"}
+        for k, path in enumerate(files):
+            shutil.copytree(whole, tmp_path / str(k))
+            replaced = tmp_path / str(k) / path.relative_to(whole)
+            replaced.unlink()
+            os.mkfifo(replaced)
+            signal.alarm(10)
+            loaded = load_runs([tmp_path / str(k)])
+            signal.alarm(0)
+            assert "Agent B" in {run.entry for run in loaded.runs}, path
+            assert not waited
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, before)
 
 
 @settings(max_examples=75, deadline=None)
