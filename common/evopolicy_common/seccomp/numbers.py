@@ -13,7 +13,7 @@ fallocate=285 fsync=74 fdatasync=75 utime=132 utimes=235 utimensat=280 futimesat
 fadvise64=221 readahead=187 sendfile=40 copy_file_range=326 poll=7 ppoll=271 select=23 pselect6=270
 epoll_create=213 epoll_create1=291 epoll_ctl=233 epoll_wait=232 epoll_pwait=281 epoll_pwait2=441
 eventfd=284 eventfd2=290 timerfd_create=283 timerfd_settime=286 timerfd_gettime=287 mmap=9 munmap=11
-mremap=25 mprotect=10 madvise=28 brk=12 msync=26 membarrier=324 futex=202 set_robust_list=273
+mremap=25 mprotect=10 madvise=28 brk=12 msync=26 futex=202 set_robust_list=273
 get_robust_list=274 rseq=334 set_tid_address=218 restart_syscall=219 rt_sigaction=13 rt_sigprocmask=14
 rt_sigreturn=15 rt_sigpending=127 rt_sigsuspend=130 rt_sigtimedwait=128 sigaltstack=131 pause=34 alarm=37
 getitimer=36 setitimer=38 nanosleep=35 clock_nanosleep=230 clock_gettime=228 clock_getres=229
@@ -36,7 +36,7 @@ fchmod=52 fchmodat=53 truncate=45 ftruncate=46 fallocate=47 fsync=82 fdatasync=8
 fadvise64=223 readahead=213 sendfile=71 copy_file_range=285 ppoll=73 pselect6=72 epoll_create1=20
 epoll_ctl=21 epoll_pwait=22 epoll_pwait2=441 eventfd2=19 timerfd_create=85 timerfd_settime=86
 timerfd_gettime=87 mmap=222 munmap=215 mremap=216 mprotect=226 madvise=233 brk=214 msync=227
-membarrier=283 futex=98 set_robust_list=99 get_robust_list=100 rseq=293 set_tid_address=96
+futex=98 set_robust_list=99 get_robust_list=100 rseq=293 set_tid_address=96
 restart_syscall=128 rt_sigaction=134 rt_sigprocmask=135 rt_sigreturn=139 rt_sigpending=136
 rt_sigsuspend=133 rt_sigtimedwait=137 sigaltstack=132 getitimer=102 setitimer=103 nanosleep=101
 clock_nanosleep=115 clock_gettime=113 clock_getres=114 gettimeofday=169 times=153 getrusage=165

@@ -7,6 +7,7 @@ parsed as plain values and arrays, and never executed; any other bytes raise Bad
 
 from __future__ import annotations
 
+import datetime
 import json
 import math
 import struct
@@ -317,18 +318,28 @@ def _ext_hook(code: int, data: memoryview) -> Any:
 _decoder = msgspec.msgpack.Decoder(ext_hook=_ext_hook)
 
 
+_COUNTED = (dict, list, np.ndarray, datetime.datetime)
+
+
 def _values(value: Any, left: int) -> int:
-    """How many values it is made of; ValueError when it nests deeper than `left`."""
+    """How many values it is made of.
+
+    ValueError when it nests deeper than `left`, or holds what the shim never sends: timestamps, and keys that are not texts.
+    """
     if left < 0:
         raise ValueError(f"it nests deeper than {MAX_DEPTH}")
     n = 1
     if isinstance(value, dict):
+        if not all(type(key) is str for key in value):
+            raise ValueError("a dict with a key that is no text")
         n += len(value)
         value = value.values()
     elif isinstance(value, np.ndarray):
         return _numbers(value)
+    elif isinstance(value, datetime.datetime):
+        raise ValueError("a timestamp")
     elif not isinstance(value, list):
         return n
     for item in value:
-        n += _values(item, left - 1) if isinstance(item, dict | list | np.ndarray) else 1
+        n += _values(item, left - 1) if isinstance(item, _COUNTED) else 1
     return n

@@ -46,6 +46,7 @@ def clone3(flags):
     os.waitpid(child, 0)
     return True
 
+
 def attempts():
     yield "a mount", call(165, 40, b"none", b"/tmp", b"tmpfs", 0, None)
     yield "a new network namespace", call(272, 97, 0x40000000)
@@ -66,3 +67,5 @@ def attempts():
     yield "a process in new namespaces", lambda: clone3(0x7E020000)
     yield "a new root", call(161, 51, b"/")
     yield "an inotify", call(294, 26, 0)
+    yield "joining those whom a barrier on all cores interrupts", call(324, 283, 4, 0, 0)
+    yield "a barrier on all cores", call(324, 283, 2, 0, 0)

@@ -92,10 +92,15 @@ def test_hostile_replies_are_an_action_or_refused_and_nothing_else(tag: int, pay
         struct.pack("<4sI17I", b"|u1", 17, *[1] * 17) + b"x",
         struct.pack("<4sII", b"<f2", 1, 2000) + bytes(4000),
         b"\x91\xc7\x10\x01" + struct.pack("<4sI2I", b"|u1", 2, 2**32 - 1, 0),
+        b"\x81\xdc\x27\x10" + b"\x01" * 10_001,
+        b"\x81\xc0\x01",
+        b"\x91\x81\xc4\x01a\x01",
+        b"\xd6\xff" + bytes(4),
+        b"\x91\xd6\xff" + bytes(4),
         b"\x92" + 2 * (b"\xc8\x02\x64\x01" + struct.pack("<4sII", b"|u1", 1, 600) + bytes(600)),
     ],
 )
-def test_impossible_arrays_and_nests_are_refused(payload: bytes) -> None:
+def test_impossible_arrays_nests_keys_and_timestamps_are_refused(payload: bytes) -> None:
     for tag in (frames.ARRAY, frames.GENERIC):
         with pytest.raises(frames.BadReplyError):
             frames.action(tag, payload)
