@@ -13,15 +13,13 @@ from pathlib import Path
 import msgspec
 
 from evopolicy_common.errors import DECODE_ERRORS, ProtocolError
-from evopolicy_common.messages.bounds import Int, Many, Named, Number, Text, Word
+from evopolicy_common.messages.bounds import LARGEST, Int, Many, Named, Number, Text, Word
 from evopolicy_common.records.run_files import read_regular
 
 FORMAT = "evopolicy rescore 1"
 FOLDER = "rescore"
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 _MAX_BYTES = 64 << 20
-LARGEST = 1e100
-"""Bound on every number of a run, so that sums of squares over many runs stay finite."""
 
 
 class Rescored(msgspec.Struct, frozen=True, kw_only=True):

@@ -179,7 +179,7 @@ class Bad(Glider):
         elif self.how == "interrupt":
             raise KeyboardInterrupt
         elif self.how == "huge":
-            reward = 1e308
+            reward = 1e200
         elif self.how == "component":
             info = {"fuel": float("nan")}
         elif self.how == "success in words":

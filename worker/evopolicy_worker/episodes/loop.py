@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import math
 import sys
 import threading
 import time
@@ -37,6 +36,7 @@ from evopolicy_common.errors import (
     SlotDiedError,
     WorkerError,
 )
+from evopolicy_common.messages.bounds import LARGEST
 from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_common.messages.episode import (
     LARGEST_LIMITS,
@@ -526,10 +526,10 @@ class _Episode:
                 raise CancelledJobError
             obs = next_obs
         for name, value in (("reward", total), *sums.items()):
-            if not math.isfinite(value):
+            if not abs(value) <= LARGEST:
                 raise BrokenEnvironmentError(
                     f"environment {self._job.env}, {name}: its sum over {t} steps is {value}; rewards, their components, and"
-                    " their sums have to be finite"
+                    f" their sums have to be finite, at most {LARGEST:g}"
                 )
         return total, sums, t, terminated, truncated, success
 

@@ -17,8 +17,8 @@ from typing import Any
 import msgspec
 
 from evopolicy_common.errors import ProtocolError
+from evopolicy_common.messages.bounds import LARGEST
 from evopolicy_common.records.policies.checkpoints import policy_folder, read_meta
-from evopolicy_common.records.rescores import LARGEST
 from evopolicy_common.records.run_files import read_regular, run_folders, submit_folders
 from evopolicy_common.records.run_record import RunRecord, decode_run_record
 from evopolicy_common.records.summary import Summary, decode_summary

@@ -10,15 +10,14 @@ Rules that this module owns:
   try. If a worker that was silent for long reports that a limit ended the attempt, its actions do not stand.
 - An attempt that was granted to another worker, or never granted, is ignored and logged, also after a restart: a
   lease's name proves its grant. So is an attempt of a worker that the job's group excludes.
-- An outcome that does not fit the job (wrong episodes, a number that is not finite) is the worker's failure.
+- An outcome that does not fit the job (wrong episodes, a number that is not finite, or beyond 1e100) is the worker's failure.
 - A failure that a policy can cause in its slot is an outcome. A failure that it cannot cause is retried without limit:
   `failed`, or `slot_died` from workers of earlier versions.
 """
 
 from __future__ import annotations
 
-import math
-
+from evopolicy_common.messages.bounds import LARGEST
 from evopolicy_common.messages.episode import TIME_LIMITS, EpisodeOutcome
 from evopolicy_common.messages.worker import JobResult
 from evopolicy_coordinator.core.leasing import fleet, groups, leases
@@ -127,8 +126,8 @@ def _fault(job: JobState, episodes: tuple[EpisodeOutcome, ...]) -> str | None:
         ]
         if outcome.failure is not None:
             numbers += [outcome.failure.limit or 0.0, outcome.failure.used or 0.0]
-        if not all(math.isfinite(number) for number in numbers):
-            return f"episode {outcome.index} has a number that is not finite: {numbers}"
+        if not all(abs(number) <= LARGEST for number in numbers):
+            return f"episode {outcome.index} has a number that is not finite or beyond {LARGEST:g}: {numbers}"
         if outcome.length < 0:
             return f"episode {outcome.index} has length {outcome.length}"
     return None

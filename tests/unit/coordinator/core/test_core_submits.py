@@ -220,6 +220,7 @@ def test_outcomes_that_do_not_fit_the_job_are_the_workers_failure() -> None:
         (outcome_of(1),),
         (),
         (outcome_of(0, float("nan")),),
+        (outcome_of(0, 1.7e308),),  # the sum of two is not finite
         (outcome_of(0), outcome_of(0)),
         (msgspec.structs.replace(outcome_of(0), policy_cpu_s=float("inf")),),
         (msgspec.structs.replace(outcome_of(0), failure=endless),),
