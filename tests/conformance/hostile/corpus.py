@@ -154,6 +154,14 @@ def document() -> str:
     rows.append(
         ("a packed bundle with `..` or a root in a path", "the worker refuses it", "by a plain write")
     )
+    rows.append(
+        (
+            "a package `policy/`, or an extension module of that name, beside `policy.py`",
+            "`policy.py` is played",
+            "with Python's own order of modules",
+        )
+    )
+    rows.append(("a packed bundle with compiled code", "the worker refuses it", "by a plain write"))
     lines = [f"| {what} | {verdict} | {off} |" for what, verdict, off in rows]
     table = "\n".join(["| attack | verdict | succeeds |", "|---|---|---|", *lines])
     return Path(__file__).with_name("document.md").read_text().replace("{table}", table)

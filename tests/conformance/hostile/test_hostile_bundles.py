@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib.util
+import py_compile
 from pathlib import Path
 
 import pytest
@@ -10,6 +12,7 @@ from bundle_attacks import BUNDLES, PATHS, SECRET, BundleAttack, packed
 from evopolicy_common.errors import BundleError
 from evopolicy_common.records.blobs import BlobStore
 from evopolicy_common.records.policies import bundles
+from evopolicy_common.records.policies.bundles import BundleFile
 from evopolicy_gateway.submits.snapshots import take
 
 
@@ -53,6 +56,30 @@ def test_a_packed_bundle_writes_nothing_outside_its_folder(tmp_path: Path, path:
     with pytest.raises(BundleError, match="plain relative path"):
         bundles.unpack(bundle, tmp_path / "a" / "bundle")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_packed_bundle_with_compiled_code_is_refused(tmp_path: Path) -> None:
+    # Compiled code of this kind is loaded without a look at the source beside it.
+    source, decoy = tmp_path / "policy.py", tmp_path / "decoy.py"
+    source.write_text("WHO = 'policy.py'")
+    decoy.write_text("WHO = 'a decoy'")
+    compiled = py_compile.compile(
+        str(decoy),
+        importlib.util.cache_from_source(str(source)),
+        invalidation_mode=py_compile.PycInvalidationMode.UNCHECKED_HASH,
+    )
+    spec = importlib.util.spec_from_file_location("policy", source)
+    assert spec is not None
+    assert spec.loader is not None
+    policy = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(policy)
+    assert policy.WHO == "a decoy"
+    name = str(Path(compiled).relative_to(tmp_path))
+    bundle = bundles.pack(
+        [BundleFile(path, False, (tmp_path / path).read_bytes()) for path in ("policy.py", name)]
+    )
+    with pytest.raises(BundleError, match="compiled code"):
+        bundles.load(bundle.packed, bundle.digest)
 
 
 def test_a_plain_write_goes_outside(tmp_path: Path) -> None:

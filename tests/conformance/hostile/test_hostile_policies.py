@@ -10,6 +10,13 @@ import socket
 import threading
 import zlib
 from collections.abc import Callable, Iterable, Iterator
+from importlib.machinery import (
+    EXTENSION_SUFFIXES,
+    SOURCE_SUFFIXES,
+    ExtensionFileLoader,
+    FileFinder,
+    SourceFileLoader,
+)
 from pathlib import Path
 from typing import Any
 
@@ -403,6 +410,21 @@ def test_a_bundle_of_thousands_of_files_is_played(slots: Slots) -> None:
     files["policy.py"] = HONEST + "\nimport os\nprint(sum(len(files) for _, _, files in os.walk('.')))"
     outcome = slots.play(files)
     assert (outcome.failure, outcome.stdout) == (None, b"2000\n")
+
+
+@pytest.mark.parametrize(
+    "decoy", ["policy/__init__.py", f"policy{EXTENSION_SUFFIXES[0]}", f"policy{EXTENSION_SUFFIXES[-1]}"]
+)
+def test_policy_py_is_played_whatever_else_has_its_name(slots: Slots, decoy: str) -> None:
+    files: dict[str, str | bytes] = {"policy.py": HONEST, decoy: "print('a decoy is played')"}
+    outcome = slots.play(files)
+    assert (outcome.failure, outcome.stdout) == (None, b"")
+    # Python itself prefers the decoy.
+    folder = str(slots.bundle(files))
+    usual = [(ExtensionFileLoader, EXTENSION_SUFFIXES), (SourceFileLoader, SOURCE_SUFFIXES)]
+    spec = FileFinder(folder, *usual).find_spec("policy")
+    assert spec is not None
+    assert spec.origin == f"{folder}/{decoy}"
 
 
 def test_a_link_in_an_unpacked_bundle_is_never_followed(slots: Slots, target: dict[str, Any]) -> None:

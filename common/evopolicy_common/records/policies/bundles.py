@@ -30,6 +30,8 @@ IGNORED_FOLDERS = frozenset(
     {"__pycache__", ".git", ".mypy_cache", ".ruff_cache", ".pytest_cache", ".ipynb_checkpoints"}
 )
 """Folders that tools create; never part of a bundle."""
+COMPILED = ".pyc"
+"""How compiled code ends, which Python may load in place of the source that readers see; never part of a bundle either."""
 
 
 class BundleFile(msgspec.Struct, frozen=True, array_like=True):
@@ -137,7 +139,7 @@ class _Reader:
                 raise BundleError(
                     f"{path} is a {_kind(mode)}; system/ may hold regular files and folders only: remove it"
                 )
-            elif not name.endswith(".pyc"):
+            elif not name.endswith(COMPILED):
                 self.files.append(self._read(name, fd, path))
 
     def _read(self, name: str, folder_fd: int, path: PurePosixPath) -> BundleFile:
@@ -190,6 +192,8 @@ def _check(files: tuple[BundleFile, ...]) -> None:
         raise BundleError(f"bundle holds {total:,} bytes, limit {MAX_BYTES:,}")
     for file in files:
         _check_path(file.path)
+        if file.path.endswith(COMPILED):
+            raise BundleError(f"{file.path!a} is compiled code, which may differ from its source; remove it")
     names = [file.path for file in files]
     if len(set(names)) != len(names):
         raise BundleError("bundle names a path twice")

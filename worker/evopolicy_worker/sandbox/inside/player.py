@@ -20,7 +20,7 @@ import sys
 import traceback
 import types
 from collections.abc import Callable
-from importlib import machinery
+from importlib import machinery, util
 from typing import Any, NoReturn
 
 import numpy as np
@@ -83,6 +83,24 @@ def play(init: dict[str, Any]) -> NoReturn:
     os._exit(0)
 
 
+class PolicyFinder(machinery.FileFinder):
+    """Finds the module `policy` in `policy.py` alone, the file that readers take for the policy.
+
+    Python prefers a package and an extension module of the same name.
+    """
+
+    def __init__(self, path: str, *loaders: Any) -> None:
+        super().__init__(path, *loaders)
+        # Here once for all policies.
+        file = f"{path}/policy.py"
+        self.policy = util.spec_from_file_location(
+            "policy", file, loader=machinery.SourceFileLoader("policy", file)
+        )
+
+    def find_spec(self, fullname: str, target: Any = None) -> machinery.ModuleSpec | None:
+        return self.policy if fullname == "policy" else super().find_spec(fullname, target)
+
+
 def live_in(folder: str) -> None:
     """Home, temporary files and modules are in this folder, which need not be there yet."""
     os.environ.pop("PWD", None)
@@ -90,7 +108,7 @@ def live_in(folder: str) -> None:
     os.environ["TMPDIR"] = folder + "/tmp"
     system = folder + "/system"
     sys.path.insert(0, system)
-    sys.path_importer_cache[system] = machinery.FileFinder(
+    sys.path_importer_cache[system] = PolicyFinder(
         system,
         (machinery.ExtensionFileLoader, machinery.EXTENSION_SUFFIXES),
         (machinery.SourceFileLoader, machinery.SOURCE_SUFFIXES),
