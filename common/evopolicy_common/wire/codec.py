@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cache
-from typing import TypeVar, get_args
+from typing import Annotated, TypeVar, get_args
 
 import msgspec
 
@@ -49,7 +49,9 @@ gateway_requests: msgspec.msgpack.Decoder[GatewayRequest] = msgspec.msgpack.Deco
 gateway_replies: msgspec.msgpack.Decoder[GatewayReply] = msgspec.msgpack.Decoder(GatewayReply)
 operator_requests: msgspec.msgpack.Decoder[OperatorRequest] = msgspec.msgpack.Decoder(OperatorRequest)
 operator_replies: msgspec.msgpack.Decoder[OperatorReply] = msgspec.msgpack.Decoder(OperatorReply)
-_outcomes = msgspec.msgpack.Decoder(tuple[EpisodeOutcome, ...])
+_outcomes: msgspec.msgpack.Decoder[tuple[EpisodeOutcome, ...]] = msgspec.msgpack.Decoder(
+    Annotated[tuple[EpisodeOutcome, ...], msgspec.Meta(max_length=1 << 16)]
+)
 
 T = TypeVar("T")
 

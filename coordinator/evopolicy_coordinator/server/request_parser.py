@@ -240,6 +240,12 @@ class RequestParser:
         """Returns the result with its outcomes unpacked when they came as a blob."""
         if result.packed is None:
             return result
+        # Checked before they are read: a blob may have a gigabyte.
+        if result.packed.size > codec.MAX_PACKED_BYTES:
+            raise RefusedError(
+                Refusal.BAD_BLOB,
+                f"outcomes of {result.packed.size:,} bytes; {codec.MAX_PACKED_BYTES:,} are the limit",
+            )
         self._check_stored(result.packed)
         try:
             outcomes = codec.unpack_outcomes(self._blobs.read(result.packed.digest))
@@ -250,6 +256,11 @@ class RequestParser:
     def _check_stored(self, ref: BlobRef) -> None:
         if not is_digest(ref.digest) or not self._blobs.has(ref.digest):
             raise RefusedError(Refusal.MISSING_BLOB, f"blob {ref.digest[:64]!r} is not stored here")
+        size = self._blobs.size(ref.digest)
+        if size != ref.size:
+            raise RefusedError(
+                Refusal.BAD_BLOB, f"blob {ref.digest} has {size:,} bytes, and not {ref.size:,} as announced"
+            )
 
     # Gateways.
 

@@ -10,7 +10,8 @@ Rules that this module owns:
   try. If a worker that was silent for long reports that a limit ended the attempt, its actions do not stand.
 - An attempt that was granted to another worker, or never granted, is ignored and logged, also after a restart: a
   lease's name proves its grant. So is an attempt of a worker that the job's group excludes.
-- An outcome that does not fit the job (wrong episodes, a number that is not finite, or beyond 1e100) is the worker's failure.
+- An outcome that does not fit the job (wrong episodes, a number that is not finite, or beyond 1e100) or a page for its
+  gateway is the worker's failure.
 - A failure that a policy can cause in its slot is an outcome. A failure that it cannot cause is retried without limit:
   `failed`, or `slot_died` from workers of earlier versions.
 """
@@ -26,6 +27,11 @@ from evopolicy_coordinator.core.model import JobState, Lease, Worker, outcome_di
 from evopolicy_coordinator.core.records import BegunRow, OutcomeRow
 from evopolicy_coordinator.core.state import State
 from evopolicy_coordinator.core.step import EpisodesDone, ResultsDiffered, ResultsPersisted, Step
+
+MAX_OUTCOME_BYTES = 2 << 20
+"""Largest sum of an outcome's texts, names and bytes. A worker uploads larger recordings as blobs. A page has at least one
+episode, whatever its size, so a run with a larger outcome could never tell its gateway."""
+MAX_LENGTH = 2**31 - 1
 
 
 def take(state: State, news: ResultsPersisted, step: Step) -> None:
@@ -126,11 +132,25 @@ def _fault(job: JobState, episodes: tuple[EpisodeOutcome, ...]) -> str | None:
         ]
         if outcome.failure is not None:
             numbers += [outcome.failure.limit or 0.0, outcome.failure.used or 0.0]
-        if not all(abs(number) <= LARGEST for number in numbers):
-            return f"episode {outcome.index} has a number that is not finite or beyond {LARGEST:g}: {numbers}"
-        if outcome.length < 0:
+        wrong = [number for number in numbers if not abs(number) <= LARGEST]
+        if wrong:
+            return (
+                f"episode {outcome.index} has a number that is not finite or beyond {LARGEST:g}: {wrong[0]}"
+            )
+        if not 0 <= outcome.length <= MAX_LENGTH:
             return f"episode {outcome.index} has length {outcome.length}"
+        size = _size(outcome)
+        if size > MAX_OUTCOME_BYTES:
+            return f"episode {outcome.index} takes {size:,} bytes; {MAX_OUTCOME_BYTES:,} are the limit"
     return None
+
+
+def _size(outcome: EpisodeOutcome) -> int:
+    parts: list[str | bytes] = [outcome.stdout, outcome.stderr, *outcome.reward_components]
+    parts += [ref.inline or b"" for ref in (outcome.trajectory, outcome.video) if ref is not None]
+    if outcome.failure is not None:
+        parts += [outcome.failure.message, outcome.failure.traceback]
+    return sum(map(len, parts))
 
 
 def _done(

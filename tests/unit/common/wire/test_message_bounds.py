@@ -207,5 +207,8 @@ def test_outcomes_in_a_blob_are_held_to_the_same_bounds() -> None:
     ):
         with pytest.raises(ProtocolError):
             codec.unpack_outcomes(msgspec.msgpack.encode([wrong]))
+    # A blob of the greatest size could hold millions, each of which takes more in memory.
+    with pytest.raises(ProtocolError, match="length"):
+        codec.unpack_outcomes(msgspec.msgpack.encode([outcome] * ((1 << 16) + 1)))
     with pytest.raises(ProtocolError, match="not the outcomes"):
         codec.unpack_outcomes(b"\xc1")

@@ -8,6 +8,7 @@ import msgspec
 import pytest
 from rigs.asking import asked
 from rigs.core_rig import BUNDLE, Rig, done, outcome_of, result
+from rigs.store_rows import blob
 
 from evopolicy_common.messages import gateway, operator
 from evopolicy_common.messages.episode import PolicyFailure, ResourceLimits
@@ -216,6 +217,7 @@ def test_outcomes_that_do_not_fit_the_job_are_the_workers_failure() -> None:
     rig, session = started()
     rig.submit(0)
     endless = PolicyFailure(category="act_error", step_index=0, message="", used=float("inf"))
+    wordy = PolicyFailure(category="act_error", step_index=0, message="", traceback="x" * (3 << 20))
     bad = [
         (outcome_of(1),),
         (),
@@ -224,9 +226,15 @@ def test_outcomes_that_do_not_fit_the_job_are_the_workers_failure() -> None:
         (outcome_of(0), outcome_of(0)),
         (msgspec.structs.replace(outcome_of(0), policy_cpu_s=float("inf")),),
         (msgspec.structs.replace(outcome_of(0), failure=endless),),
+        (msgspec.structs.replace(outcome_of(0), length=2**40),),
+        # A page with them could not be sent to the gateway, which would ask for it for ever.
+        (msgspec.structs.replace(outcome_of(0), stdout=bytes(9 << 20), stderr=bytes(9 << 20)),),
+        (msgspec.structs.replace(outcome_of(0), trajectory=blob(bytes(3 << 20))),),
+        (msgspec.structs.replace(outcome_of(0), failure=wordy),),
+        (msgspec.structs.replace(outcome_of(0), reward_components={f"{k:1024}": 0.0 for k in range(3000)}),),
     ]
     for episodes in bad:
-        for _ in range(4):
+        for _ in range(7):
             rig.pass_time(10.0)
             rig.beat(session)
         (lease,) = rig.poll(session, 1, wait_s=0.5)

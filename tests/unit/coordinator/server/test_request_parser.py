@@ -244,9 +244,27 @@ def test_results_must_hold_or_have_stored_the_blobs_they_name(
     assert refused(parser, key, report_results(trajectory=named)).status == "missing_blob"
     blobs.put(data)
     assert event(parser, key, report_results(trajectory=named)).message == report_results(trajectory=named)
+    # Somebody who fetches it relies on the size.
+    small = BlobRef(digest=named.digest, size=1)
+    assert refused(parser, key, report_results(trajectory=small)).status == "bad_blob"
     wrong = BlobRef(digest=named.digest, size=len(data), inline=b"trajectorY")
     assert refused(parser, key, report_results(video=wrong)).status == "bad_blob"
     assert refused(parser, key, report_results(video=BlobRef(digest="../x", size=1))).status == "missing_blob"
+
+
+def test_a_blob_that_is_too_large_for_outcomes_or_begun_actions_is_never_read(
+    parser: RequestParser, blobs: BlobStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(codec, "MAX_PACKED_BYTES", 1000)
+    digest = blobs.put(bytes(1001))
+    monkeypatch.setattr(blobs, "read", None)
+    result = worker.JobResult(lease_id="l", job_id="j", attempt=1, kind="done")
+    for size in (1001, 1000):  # as it is, and as a liar says
+        ref = BlobRef(digest=digest, size=size)
+        for part in ("packed", "begun"):
+            results = (msgspec.structs.replace(result, **{part: ref}),)
+            message = worker.ReportResults(worker="w", session="s", results=results)
+            assert refused(parser, keys.worker_key("c", "done"), message).status == "bad_blob"
 
 
 @pytest.mark.parametrize(
