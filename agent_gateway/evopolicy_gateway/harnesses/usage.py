@@ -7,7 +7,7 @@ reported.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Annotated, Any
 
 import msgspec
 
@@ -18,14 +18,17 @@ KINDS = ("input_noncached", "cache_read", "cache_creation", "output")
 """Kinds of tokens; each token counts in exactly one."""
 
 
+Price = Annotated[float, msgspec.Meta(ge=0.0, le=1e6)]
+
+
 class Prices(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """US dollars per million tokens."""
 
-    input: float
+    input: Price
     """Price of `input_noncached`."""
-    output: float
-    cache_read: float = 0.0
-    cache_creation: float = 0.0
+    output: Price
+    cache_read: Price = 0.0
+    cache_creation: Price = 0.0
 
 
 class Usage(msgspec.Struct, frozen=True, kw_only=True):

@@ -31,6 +31,7 @@ MAX_TASK_CHARACTERS = 64 << 10
 MAX_FILE_BYTES = 1 << 20
 _ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*([/:][A-Za-z0-9][A-Za-z0-9_.-]*){0,3}")
 _MAX_ID = 120
+_MAX_REWARD_TEXT = 1000
 
 
 class Wrapper(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -195,6 +196,9 @@ def _task(where: str, path: Path, fields: dict[str, Any], task_file: object) -> 
 def _faults(entry: Entry) -> list[tuple[bool, str]]:
     """Possible faults of a foreign definition: whether each is present, and its error text."""
     unknown = sorted(entry.reward_weights.keys() - set(entry.reward_vector))
+    names = (entry.success, *entry.reward_components, *entry.reward_vector)
+    long_name = next((name for name in names if len(name) > _MAX_ID or not name.isprintable()), "")
+    long_text = next((text for text in entry.reward_components.values() if len(text) > _MAX_REWARD_TEXT), "")
     return [
         (
             not valid_id(entry.id),
@@ -215,6 +219,15 @@ def _faults(entry: Entry) -> list[tuple[bool, str]]:
         (
             not all(re.fullmatch(r"[a-z0-9_]{1,40}", name) for name in (entry.family,)),
             f"family {entry.family[:80]!r}: lowercase letters, digits and '_', 40 at most",
+        ),
+        (
+            bool(long_name),
+            f"key of info {long_name[:80]!r}: one line of {_MAX_ID} characters at most, in success, reward_components and"
+            " reward_vector",
+        ),
+        (
+            bool(long_text),
+            f"reward_components, text {long_text[:80]!r}…: {_MAX_REWARD_TEXT:,} characters at most; shorten it",
         ),
         (bool(unknown), f"reward_weights names {', '.join(unknown)}, which reward_vector does not have"),
         (

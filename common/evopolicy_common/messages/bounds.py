@@ -5,6 +5,7 @@ They are wide enough for everything that earlier versions stored. `codec.MAX_MES
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Iterable, Iterator
 from functools import cache
@@ -99,6 +100,9 @@ def _items(part: object) -> Iterable[object]:
         return part.values()
     if isinstance(part, list | tuple):
         return part
+    if isinstance(part, float) and not math.isfinite(part):
+        # JSON would have null in its place, so a digest would not tell them apart.
+        raise ValueError(f"a number in it is {part}; JSON has no such number")
     if part is None or isinstance(part, str | int | float):
         return ()
     raise ValueError(f"a value in it is of type {type(part).__name__}; JSON has no such value")

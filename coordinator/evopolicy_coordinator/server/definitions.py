@@ -8,7 +8,8 @@ Rules that this module owns:
 - Any other environment needs the operator's approval of its definition: with the request (`ID@DIGEST`), or
   permanently (`approve`, stored in the state folder).
 - A coordinator that trusts its workers, such as that of a local command, accepts their announcements.
-- The texts of a definition are bounded and have no unprintable characters.
+- The texts of a definition are bounded and have no unprintable characters. So are those that its digest does not cover.
+- The size of a description is bounded in any case: every state of a run has it, and a gateway gets it in one message.
 """
 
 from __future__ import annotations
@@ -29,6 +30,9 @@ from evopolicy_coordinator.core.model import Worker
 
 MAX_TEXT = 64 << 10
 MAX_SPACE_BYTES = 1 << 20
+MAX_DESCRIPTION_BYTES = 4 << 20
+MAX_PACKAGES_BYTES = 64 << 10
+MAX_LINE = 1000
 MAX_NAME = 120
 LEAST_DIGITS = 8
 """Minimum length of a digest that an operator names, hex digits."""
@@ -58,6 +62,8 @@ class Definitions:
         return tuple(each for each in announced if each.env not in refused), refused
 
     def _fault(self, description: EnvironmentDescription) -> str:
+        if fault := _too_large(description):
+            return fault
         if self._trusting:
             return ""
         if fault := _unreadable(description):
@@ -185,22 +191,43 @@ def digits(description: EnvironmentDescription) -> str:
 
 def _unreadable(description: EnvironmentDescription) -> str:
     """Describes a part that is too large or unprintable; empty when there is none."""
-    texts = {
-        "task text": description.task_text,
-        "title": description.title,
-        "family": description.family,
-        **{f"text of {name[:40]!r}": text for name, text in description.reward_texts.items()},
-    }
-    for name, text in texts.items():
-        most = MAX_TEXT if name == "task text" else MAX_NAME if name in ("title", "family") else 1000
-        if len(text) > most:
-            return f"{name} has {len(text):,} characters; {most:,} are the limit"
-        if not all(each.isprintable() or each in "\n\t" for each in text):
-            return f"{name} has characters that cannot be seen; write it without control characters"
+    components = (*description.reward_components, *description.reward_texts, *description.reward_weights)
+    parts: list[tuple[str, int, str, Iterable[str]]] = [
+        ("task text", MAX_TEXT, "\n\t", (description.task_text,)),
+        ("title", MAX_NAME, "", (description.title,)),
+        ("family", MAX_NAME, "", (description.family,)),
+        ("key of success", MAX_NAME, "", (description.success,)),
+        ("list of reward components", MAX_NAME, "", components),
+        *(
+            (f"text of {name[:40]!r}", MAX_LINE, "\n\t", (text,))
+            for name, text in description.reward_texts.items()
+        ),
+        ("version", MAX_LINE, "", (description.env_version,)),
+        ("adapter", MAX_LINE, "", (description.adapter,)),
+        ("list of packages", MAX_LINE, "", (*description.packages, *description.packages.values())),
+    ]
+    for name, most, also, texts in parts:
+        for text in texts:
+            if len(text) > most:
+                return f"{name} has {len(text):,} characters; {most:,} are the limit"
+            if not all(each.isprintable() or each in also for each in text):
+                return f"{name} has characters that cannot be seen; write it without control characters"
     if not catalogue.valid_id(description.env):
         return "id is not one: letters, digits, '_', '.', '-', parts joined by '/' or ':'"
-    for name in ("obs_space", "action_space", "definition"):
-        size = len(msgspec.msgpack.encode(getattr(description, name)))
-        if size > MAX_SPACE_BYTES:
-            return f"{name} takes {size:,} bytes; {MAX_SPACE_BYTES:,} are the limit"
+    return ""
+
+
+def _too_large(description: EnvironmentDescription) -> str:
+    """Describes a part that is too large, or the whole; empty when there is none."""
+    parts = {
+        "obs_space": (description.obs_space, MAX_SPACE_BYTES),
+        "action_space": (description.action_space, MAX_SPACE_BYTES),
+        "definition": (description.definition, MAX_SPACE_BYTES),
+        "list of packages": (description.packages, MAX_PACKAGES_BYTES),
+        "description": (description, MAX_DESCRIPTION_BYTES),
+    }
+    for name, (part, most) in parts.items():
+        size = len(msgspec.msgpack.encode(part))
+        if size > most:
+            return f"its {name} takes {size:,} bytes; {most:,} are the limit"
     return ""

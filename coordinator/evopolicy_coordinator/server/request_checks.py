@@ -8,6 +8,7 @@ from typing import Any
 
 import msgspec
 
+from evopolicy_common import catalogue
 from evopolicy_common.errors import RefusedError
 from evopolicy_common.messages import worker
 from evopolicy_common.messages.environment import Case
@@ -24,6 +25,10 @@ MAX_HIDDEN = 10_000
 """Validation or held-out cases of a run. The report of a finished run must fit into one message."""
 MAX_JOB_BYTES = 8 << 20
 MAX_AGENT_BYTES = 256 << 10
+MAX_FINGERPRINT_BYTES = 64 << 10
+"""Every finished run's message has one."""
+MAX_ENVIRONMENTS = 10_000
+"""Of one worker, undescribed."""
 _MAX_WAIT_S = 60.0
 _MAX_NAME = 200
 
@@ -125,7 +130,18 @@ def check_registration(message: worker.Register) -> None:
         )
     if not 1 <= message.slots <= 4096:
         raise RefusedError(Refusal.BAD_MESSAGE, f"{message.slots} slots: a worker has 1 to 4096")
-    check_place(message.boot_id, message.machine_id, message.host)
+    size = len(msgspec.msgpack.encode(message.fingerprint))
+    if size > MAX_FINGERPRINT_BYTES:
+        raise RefusedError(
+            Refusal.BAD_MESSAGE,
+            f"the worker's fingerprint takes {size:,} bytes; {MAX_FINGERPRINT_BYTES:,} are the limit",
+        )
+    if len(message.undescribed) > MAX_ENVIRONMENTS or not all(map(catalogue.valid_id, message.undescribed)):
+        raise RefusedError(
+            Refusal.BAD_MESSAGE,
+            f"{len(message.undescribed):,} environments without a description: {MAX_ENVIRONMENTS:,} valid ids are the limit",
+        )
+    check_place(message.boot_id, message.machine_id, message.host, message.installation)
 
 
 def check_packages(message: worker.Register, allowed: tuple[str, ...]) -> None:
@@ -142,9 +158,15 @@ def check_packages(message: worker.Register, allowed: tuple[str, ...]) -> None:
         )
 
 
-def check_place(boot_id: str, machine_id: str, host: str) -> None:
-    """Checks the lengths of a boot id, a machine id and a host name."""
-    for name, value in (("boot id", boot_id), ("machine id", machine_id), ("host name", host)):
+def check_place(boot_id: str, machine_id: str, host: str, installation: str = "") -> None:
+    """Checks the lengths of a boot id, a machine id, a host name and an installation's name."""
+    places = {
+        "boot id": boot_id,
+        "machine id": machine_id,
+        "host name": host,
+        "installation": installation,
+    }
+    for name, value in places.items():
         if len(value) > _MAX_NAME or not value.isprintable():
             raise RefusedError(
                 Refusal.BAD_MESSAGE, f"{name} {value[:64]!r}: at most {_MAX_NAME} printable characters"

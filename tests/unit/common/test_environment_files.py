@@ -81,6 +81,14 @@ def test_a_file_may_define_several(tmp_path: Path) -> None:
         ('id = "acme/x"\ngymnasium_id = "a:B-v0"\n[kwargs]\nreach = inf', "kwargs: finite numbers"),
         ('id = "acme/x"\ngymnasium_id = "a:B-v0"\n[kwargs]\nseed = 99999999999999999999', "kwargs: finite"),
         ('id = "acme/x"\ngymnasium_id = "a:B-v0"\ntitle = "a\\nb"', "title 'a.*b': one line"),
+        (
+            f'id = "acme/x"\ngymnasium_id = "a:B-v0"\nsuccess = "{"x" * 200}"',
+            "key of info 'xx.*one line of 120",
+        ),
+        (
+            f'id = "acme/x"\ngymnasium_id = "a:B-v0"\nreward_components = {{fuel = "{"x" * 2000}"}}',
+            "text 'xx.*1,000 characters at most",
+        ),
         ('id = "acme/x"\ngymnasium_id = "a:B-v0"\ntask_file = 3', "task_file is 3: the name of a text file"),
         ('id = "acme/x"\ngymnasium_id = "a:B-v0"\nfamily = "../x"', "family '../x': lowercase"),
         (

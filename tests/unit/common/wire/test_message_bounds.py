@@ -110,6 +110,8 @@ def beyond(found: inspect.Type) -> list[Any]:
                 {"a": nested(50_000)},
                 {"a": [{1: 2}]},
                 {"a": [b"b"]},
+                {"a": [math.nan]},
+                {"a": {"b": math.inf}},
                 {"a": msgspec.msgpack.Ext(5, b"b")},
             ]
         case inspect.StrType(max_length=int(n)):

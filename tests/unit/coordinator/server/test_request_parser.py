@@ -10,6 +10,7 @@ import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from rigs.core_rig import fingerprint
 from rigs.finished_run import finished
 from rigs.store_rows import blob
 
@@ -276,6 +277,10 @@ def test_a_blob_that_is_too_large_for_outcomes_or_begun_actions_is_never_read(
         ({"worker": "a/b"}, "bad_name"),
         ({"worker": ""}, "bad_name"),
         ({"slots": 0}, "bad_message"),
+        ({"fingerprint": fingerprint(packages={"numpy": "1" * 70_000})}, "bad_message"),
+        ({"undescribed": ("toy/line",) * 10_001}, "bad_message"),
+        ({"undescribed": ("../\x1b[2J",)}, "bad_message"),
+        ({"installation": "x" * 1000}, "bad_message"),
     ],
 )
 def test_wrong_registration_is_refused(parser: RequestParser, changes: dict[str, Any], status: str) -> None:

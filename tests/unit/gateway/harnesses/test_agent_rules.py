@@ -329,6 +329,9 @@ def test_agents_files_refuse_what_they_do_not_know(tmp_path: Path) -> None:
     path.write_text('harness = "codex"\nbackoff_s = 0.0\n')
     with pytest.raises(ConfigError, match="backoff_s"):
         read_agent(path)
+    path.write_text('harness = "codex"\nprices = {input = nan, output = 1.0}\n')
+    with pytest.raises(ConfigError, match=r"prices\.input"):
+        read_agent(path)
     path.write_text('harness = "gemini"\n')
     with pytest.raises(ConfigError, match=r"\[cli\]"):
         make(f"file:{path}", tmp_path)
