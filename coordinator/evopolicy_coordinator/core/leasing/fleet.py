@@ -72,6 +72,8 @@ def register(state: State, event: WorkerRegistered, kernel: Kernel, step: Step) 
     state.workers[message.worker] = worker
     state.sessions[worker.session] = worker.name
     count_in(state, worker)
+    if old is not None and old.profile is not profile:
+        _drop_profiles(state)
     if worker.benched_until > step.now:
         state.timers.arm(("bench", worker.name), worker.benched_until)
     state.timers.arm(("worker", worker.name), step.now + state.settings.adoption_s)
@@ -90,6 +92,14 @@ def _profile(state: State, event: WorkerRegistered) -> Profile:
         profile = Profile(key, message.fingerprint, descriptions, fingerprints, classes)
         queue.add_profile(state, profile)
     return profile
+
+
+def _drop_profiles(state: State) -> None:
+    """Forget profiles that no worker has. A worker may come with another one each time."""
+    used = {worker.profile for worker in state.workers.values()}
+    for profile in list(state.profiles.values()):
+        if profile not in used and not any(profile.hidden):
+            queue.drop_profile(state, profile)
 
 
 def count_in(state: State, worker: Worker) -> None:
@@ -143,6 +153,7 @@ def forget(state: State, worker: Worker) -> None:
     """Remove a worker that was lost long ago."""
     del state.workers[worker.name]
     state.sessions.pop(worker.session, None)
+    _drop_profiles(state)
 
 
 def answer_beat(state: State, worker: Worker, stop: tuple[str, ...], step: Step) -> None:

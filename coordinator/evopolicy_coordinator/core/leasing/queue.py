@@ -61,6 +61,13 @@ def add_profile(state: State, profile: Profile) -> None:
         _join(profile, lane)
 
 
+def drop_profile(state: State, profile: Profile) -> None:
+    """Forget a profile without workers."""
+    del state.profiles[profile.key]
+    for lane in profile.lanes.values():
+        del lane.profiles[profile]
+
+
 def place(state: State, flow: Flow, pin: str) -> Lane:
     """Move a flow with its waiting jobs into the lane of class `pin`."""
     old = flow.lane

@@ -486,3 +486,19 @@ def test_an_environment_that_an_operator_asks_for_is_described_by_those_that_off
     again = rig.register("w1", envs=("my/a",), undescribed=("my/b",))
     assert not rig.core.state.awaited
     assert rig.beat(again).describe == ()
+
+
+def test_a_worker_that_comes_with_another_profile_each_time_leaves_none_behind() -> None:
+    rig = Rig()
+    rig.create()
+    for k in range(5):
+        rig.register("w1", version=f"{k}")
+        rig.register("w2", version="0")
+    (lane,) = rig.core.state.lanes.values()
+    assert len(rig.core.state.profiles) == 2
+    assert len(lane.profiles) == 1  # its run is pinned to version 0
+    rig.pass_time(10 * rig.settings.lease_ttl_s)
+    rig.pass_time(FORGET_S)
+    assert rig.core.state.workers == rig.core.state.profiles == lane.profiles == {}
+    assert rig.register("w1", version="0")
+    assert len(lane.profiles) == 1
