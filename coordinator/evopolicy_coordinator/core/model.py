@@ -73,6 +73,17 @@ def outcome_digest(outcome: EpisodeOutcome) -> OutcomeDigest:
     )
 
 
+def mean(returns: tuple[float, ...]) -> float:
+    """Mean, summed exactly, so that the order of arrival has no influence."""
+    try:
+        return math.fsum(returns) / len(returns)
+    except OverflowError:
+        # Of returns beyond `bounds.LARGEST`, which earlier versions stored: the sum is not finite, but the mean is.
+        from fractions import Fraction
+
+        return float(sum(map(Fraction, returns)) / len(returns))
+
+
 @dataclass(slots=True, frozen=True, kw_only=True)
 class Template:
     """The parameters that all jobs of a group share."""
@@ -238,8 +249,7 @@ class JobGroup:
         return tuple(self.solved[index] for index in range(self.n)) if len(self.solved) == self.n else ()
 
     def mean_return(self) -> float:
-        """Mean of the returns, summed exactly, so that the order of arrival has no influence."""
-        return math.fsum(self.returns()) / self.n
+        return mean(self.returns())
 
     def failed(self) -> int:
         """Episodes in which the policy failed."""

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from typing import Literal
 
 from evopolicy_common.messages import operator
 from evopolicy_common.wire.refusals import Refusal
 from evopolicy_coordinator.core import events
-from evopolicy_coordinator.core.model import Run
+from evopolicy_coordinator.core.model import Run, mean
 from evopolicy_coordinator.core.reasons import Reason, because
 from evopolicy_coordinator.core.records import (
     SubmitRow,
@@ -124,11 +123,6 @@ def result(
         installations=stored.installations,
         committed=row.committed,
     )
-
-
-def mean(returns: tuple[float, ...]) -> float:
-    """Mean, summed exactly."""
-    return math.fsum(returns) / len(returns)
 
 
 def _submit_record(row: SubmitRow) -> operator.SubmitRecord:

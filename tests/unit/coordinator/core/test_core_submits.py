@@ -14,7 +14,7 @@ from evopolicy_common.messages import gateway, operator
 from evopolicy_common.messages.episode import PolicyFailure, ResourceLimits
 from evopolicy_common.messages.worker import Refused
 from evopolicy_coordinator.core.effects import ReadResults
-from evopolicy_coordinator.core.records import SubmitRow, submit_done
+from evopolicy_coordinator.core.records import OutcomeRow, SubmitRow, submit_done
 
 
 def started(**settings: Any) -> tuple[Rig, str]:
@@ -241,6 +241,23 @@ def test_outcomes_that_do_not_fit_the_job_are_the_workers_failure() -> None:
         rig.report_results(session, result(lease, "done", episodes=episodes))
         assert rig.core.state.groups["r1/s0/train"].done == 0
     assert rig.core.state.runs["r1"].state.infrastructure_retries == len(bad)
+
+
+def test_returns_that_an_earlier_version_stored_have_a_mean_even_if_their_sum_is_not_finite() -> None:
+    rig, session = started()
+    rig.submit(0, 1, 2)
+    for lease in rig.poll(session, 2):
+        rig.report_results(session, done(lease))
+    for index in range(2):
+        row = rig.row(OutcomeRow, "r1/s0/train", index)
+        large = msgspec.structs.replace(row.outcome, episode_return=1.7e308)
+        rig.rows[OutcomeRow, "r1/s0/train", index] = msgspec.structs.replace(row, outcome=large)
+    rig.load()
+    session = rig.register()
+    rig.pass_time(rig.settings.adoption_s)
+    (last,) = rig.poll(session, 2)
+    rig.report_results(session, done(last))
+    assert rig.row(SubmitRow, "r1", 0).mean_return == pytest.approx(2 / 3 * 1.7e308)
 
 
 def test_a_cancelled_run_refunds_its_open_submit_and_answers_who_waits() -> None:
