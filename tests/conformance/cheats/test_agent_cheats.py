@@ -22,6 +22,7 @@ STOPPED = (
     *("connect to a port of this machine", "connect to an abstract socket", "ask the proxy for another port"),
     *("import a simulator", "find a simulator's files", "send to the world", "list the runs"),
     *("open a socket to the machine below", "open a ring that makes sockets"),
+    "open a socket by a system call of 32-bit programs",
     *("read another process's variables", "change the kernel's settings"),
     *("read a key of the operator's login", "leave a note for other runs in a keyring"),
     *("read what is hidden from the jail's own command", "find a process of the jail that no filter holds"),
@@ -40,6 +41,7 @@ NEEDS_MORE_THAN_NO_JAIL = {
         "read the gateway's memory",
         "open a socket to the machine below",
         "open a ring that makes sockets",
+        "open a socket by a system call of 32-bit programs",
     ),
 }
 """Whether they succeed without a jail depends on the machine: on root, on a route, on what processes keep to themselves."""

@@ -7,6 +7,7 @@ environment's own process (`undefended.py`).
 from __future__ import annotations
 
 import platform
+from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -34,6 +35,8 @@ class Breaker(msgspec.Struct, frozen=True, kw_only=True):
     """Whether it succeeds when the policy's process is not sealed (its numbers are bounded, so the machine is safe)."""
     packages: tuple[str, ...] = ()
     """Packages besides numpy that it imports."""
+    possible: bool = True
+    """Whether this machine's kernel has the calls that it makes, so that it can be seen to succeed."""
     harmless_anywhere: bool = False
     """Whether there is nothing to defend against, as the corpus is to show."""
 
@@ -376,6 +379,16 @@ BREAKERS = (
                 act="ctypes.CDLL(None).syscall(0x40000027)",
                 verdict="killed",
                 unsealed=True,
+            ),
+            Breaker(
+                name="a system call of 32-bit programs, from machine code of its own",
+                act="import mmap; m = mmap.mmap(-1, 4096, mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS, 7)\n"
+                "            m.write(bytes.fromhex('b814000000cd80c3'))  # mov eax, 20; int 0x80; ret\n"
+                "            pid = ctypes.CFUNCTYPE(ctypes.c_int)(ctypes.addressof(ctypes.c_char.from_buffer(m)))\n"
+                "            if pid() != os.getpid(): raise OSError('no such call')",
+                verdict="killed",
+                unsealed=True,
+                possible=Path("/proc/sys/abi/vsyscall32").exists(),
             ),
         )
         if platform.machine() == "x86_64"
