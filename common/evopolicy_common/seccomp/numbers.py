@@ -11,7 +11,6 @@ mkdir=83 mkdirat=258 rmdir=84 unlink=87 unlinkat=263 rename=82 renameat=264 rena
 linkat=265 symlink=88 symlinkat=266 chmod=90 fchmod=91 fchmodat=268 truncate=76 ftruncate=77
 fallocate=285 fsync=74 fdatasync=75 utime=132 utimes=235 utimensat=280 futimesat=261 umask=95
 fadvise64=221 readahead=187 sendfile=40 copy_file_range=326 poll=7 ppoll=271 select=23 pselect6=270
-epoll_create=213 epoll_create1=291 epoll_ctl=233 epoll_wait=232 epoll_pwait=281 epoll_pwait2=441
 eventfd=284 eventfd2=290 timerfd_create=283 timerfd_settime=286 timerfd_gettime=287 mmap=9 munmap=11
 mremap=25 mprotect=10 madvise=28 brk=12 msync=26 futex=202 set_robust_list=273
 get_robust_list=274 rseq=334 set_tid_address=218 restart_syscall=219 rt_sigaction=13 rt_sigprocmask=14
@@ -33,8 +32,8 @@ lseek=62 close=57 close_range=436 dup=23 dup3=24 pipe2=59 openat=56 openat2=437 
 faccessat2=439 fstat=80 newfstatat=79 statx=291 statfs=43 fstatfs=44 readlinkat=78 getdents64=61
 getcwd=17 chdir=49 fchdir=50 mkdirat=34 unlinkat=35 renameat=38 renameat2=276 linkat=37 symlinkat=36
 fchmod=52 fchmodat=53 truncate=45 ftruncate=46 fallocate=47 fsync=82 fdatasync=83 utimensat=88 umask=166
-fadvise64=223 readahead=213 sendfile=71 copy_file_range=285 ppoll=73 pselect6=72 epoll_create1=20
-epoll_ctl=21 epoll_pwait=22 epoll_pwait2=441 eventfd2=19 timerfd_create=85 timerfd_settime=86
+fadvise64=223 readahead=213 sendfile=71 copy_file_range=285 ppoll=73 pselect6=72
+eventfd2=19 timerfd_create=85 timerfd_settime=86
 timerfd_gettime=87 mmap=222 munmap=215 mremap=216 mprotect=226 madvise=233 brk=214 msync=227
 futex=98 set_robust_list=99 get_robust_list=100 rseq=293 set_tid_address=96
 restart_syscall=128 rt_sigaction=134 rt_sigprocmask=135 rt_sigreturn=139 rt_sigpending=136

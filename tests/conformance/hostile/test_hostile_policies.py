@@ -329,7 +329,7 @@ def test_a_policy_finds_nothing_in_memory_of_the_policies_before_it(slots: Slots
 
 
 USEFUL = """
-import ctypes, mmap, os, pathlib, queue, shutil, sys, tempfile, threading, time
+import ctypes, mmap, os, pathlib, queue, selectors, shutil, sys, tempfile, threading, time
 import numpy as np
 
 class Policy:
@@ -348,7 +348,9 @@ class Policy:
         assert sorted(answers.queue) == [0, 1, 2]
         np.linalg.svd(np.random.default_rng().random((300, 300)))
         assert ctypes.CDLL("libm.so.6").floor is not None
-        time.sleep(0.001); os.eventfd(0); sys.stdout.flush()
+        selector = selectors.DefaultSelector(); selector.register(os.eventfd(1), selectors.EVENT_READ)
+        assert len(selector.select(1.0)) == 1
+        time.sleep(0.001); sys.stdout.flush()
 
     def reset(self, episode_index):
         pass

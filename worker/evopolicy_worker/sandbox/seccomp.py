@@ -7,6 +7,7 @@ Rules of the policy's filter, which this module owns:
 - Signals to other processes are refused. So are those to itself that could not be told from signals from outside:
   SIGKILL and the stop signals, also by a timer or a limit of its own. `endings` depends on this.
 - No sockets, mounts, namespaces, keyrings, shared memory, `memfd` (not counted against any limit) or CPU affinity.
+- No `epoll`: its watches are kernel memory that no limit counts. Python's `selectors` uses `poll`.
 - No `membarrier`: it interrupts other cores, and takes longer if they run a process that asked for it.
 - No call may change or show a machine-wide number: pipes and shared memory without a file (inode numbers), free blocks
   and huge pages, and mount ids, which `statx` always shows. `sync` calls do nothing, because the time that they take
