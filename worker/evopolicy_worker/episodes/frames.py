@@ -22,7 +22,7 @@ from evopolicy_common.errors import DECODE_ERRORS, WorkerError
 from evopolicy_common.messages.environment import SpaceSchema
 from evopolicy_worker.environments.actions import MAX_ITEMS
 
-INIT, LOAD, RESET, ACT, FLUSH, END = 1, 2, 3, 4, 5, 6
+INIT, LOAD, RESET, ACT, FLUSH, END, COMPILE = 1, 2, 3, 4, 5, 6, 7
 OK, INT, FLOAT, ARRAY, FLOATS, GENERIC, FAILED, FAULT = 0, 1, 2, 3, 4, 5, 6, 7
 REQUEST_HEADER = struct.Struct("<IBxxxq")
 REPLY_HEADER = struct.Struct("<IBxxx")

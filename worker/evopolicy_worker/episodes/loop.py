@@ -84,6 +84,8 @@ MAX_ENDS = 5
 the job."""
 MAX_WARM_ENVIRONMENTS = 4
 """Environments kept for later jobs: all sixteen in one process would take 230 MB."""
+MAX_CODES = 8
+"""Policies whose compiled code is kept, at most 1 MiB each."""
 
 
 _ACTING = messages.framed(messages.Acting())
@@ -138,6 +140,7 @@ class Player:
         self._scratch = scratch
         self._environments: OrderedDict[str, Environment] = OrderedDict()
         self._prepared: Child | None = None
+        self._codes: dict[bytes, bytes] = {}
         self._n_policies = 0
         self._folders: list[Path] = []
         self._oom_kills = oom_kills()
@@ -253,6 +256,32 @@ class Player:
             self._zygote, child, self._monitor, self._jail, limits, str(folder), self._oom_kills
         )
 
+    @property
+    def compiles(self) -> bool:
+        """Whether policies have the same folder, whose path is in their code."""
+        return self._jail.home is not None
+
+    def code(
+        self, source: bytes, limits: ResourceLimits, env_meta: dict[str, Any], progress: Progress
+    ) -> bytes:
+        """The code of this `policy.py`, compiled once for all episodes by a process of its own.
+
+        All policies load the same code, the first too, which could otherwise tell by its memory that it is the first.
+        """
+        code = self._codes.get(source)
+        if code is None:
+            compiler = progress.policy = self.new_policy(limits)
+            try:
+                code = compiler.compiled(source, env_meta)
+            finally:
+                compiler.end()
+            if progress.cancelled:
+                raise CancelledJobError
+            while len(self._codes) >= MAX_CODES:
+                del self._codes[next(iter(self._codes))]
+            self._codes[source] = code
+        return code
+
     def _bury(self) -> None:
         """The processes of the policies so far are gone after this, and so are their folders."""
         self._zygote.bury()
@@ -308,7 +337,8 @@ class _Policies:
             self._policy.begin_episode(first=False)
             return self._policy
         self._end()
-        if not any(name == "policy.py" for name, _, _ in files.names):
+        source = files.policy()
+        if source is None:
             raise PolicyFailedError(
                 PolicyFailure(
                     category="missing_policy",
@@ -316,8 +346,11 @@ class _Policies:
                     message="there is no policy.py in system/; it must hold a top-level class Policy",
                 )
             )
-        policy = self._policy = progress.policy = self._player.new_policy(job.limits)
-        policy.init(files, spec.policy_seed, self._env_meta, job.observations)
+        player, limits = self._player, job.limits
+        code = player.code(source, limits, self._env_meta, progress) if player.compiles else b""
+        policy = self._policy = progress.policy = player.new_policy(limits)
+        policy.seal(files, spec.policy_seed, self._env_meta, job.observations)
+        policy.load(code)
         return policy
 
     def release(self) -> Ended:

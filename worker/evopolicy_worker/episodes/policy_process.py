@@ -88,6 +88,15 @@ class BundleFiles(NamedTuple):
     data: bytes
     """Their contents, one after another."""
 
+    def policy(self) -> bytes | None:
+        """The contents of `policy.py`; None without such a file."""
+        at = 0
+        for name, _, size in self.names:
+            if name == "policy.py":
+                return self.data[at : at + size]
+            at += size
+        return None
+
 
 class Ended(NamedTuple):
     """The remains of a policy after its end."""
@@ -135,17 +144,37 @@ class PolicyProcess:
         self._replies = child.replies
         self.dead = False
 
-    def init(
+    def compiled(self, source: bytes, env_meta: dict[str, Any]) -> bytes:
+        """The code of a `policy.py`, for the `load` of other processes; nothing where they are to compile it themselves.
+
+        Only Python's compiler reads it here: this process runs none of it.
+        """
+        self.seal(BundleFiles([("policy.py", False, len(source))], source), bytes(16), env_meta, "arrays")
+        try:
+            return self._expect_ok(
+                [frames.REQUEST_HEADER.pack(0, frames.COMPILE, 0)], "init", self._limits.init_wall_s
+            )
+        except PolicyFailedError:
+            # As the process that plays will find again, and report.
+            return b""
+
+    def load(self, code: bytes) -> None:
+        """Imports the bundle, with the code of its `policy.py` if that is known, and builds its Policy.
+
+        Raises PolicyFailedError with a category of NO_POLICY.
+        """
+        frame = [frames.REQUEST_HEADER.pack(len(code), frames.LOAD, 0), code]
+        self._watch.spent_s = 0.0
+        self._expect_ok(frame, "init", self._limits.init_wall_s)
+
+    def seal(
         self,
         bundle: BundleFiles,
         seed: bytes,
         env_meta: dict[str, Any],
         observations: str,
     ) -> None:
-        """Seal the process, import the bundle and build its Policy.
-
-        Raises PolicyFailedError with a category of NO_POLICY.
-        """
+        """Gives the process its bundle and its limits, and takes its rights away."""
         limits = self._limits
         needed = 16 * frames.elements(env_meta["action_space"])
         self._action_bytes = limits.action_bytes + needed
@@ -179,9 +208,6 @@ class PolicyProcess:
         self._write = frames.compile_writer(env_meta["obs_space"])
         self._monitor.watch(self._watch)
         self._expect_ok(frames.init_frame(init, bundle.data), "seal", _SEAL_S)
-        frame = [frames.REQUEST_HEADER.pack(0, frames.LOAD, 0)]
-        self._watch.spent_s = 0.0
-        self._expect_ok(frame, "init", limits.init_wall_s)
 
     def begin_episode(self, *, first: bool) -> None:
         """Wall, CPU time and output count from here; the first episode's include the import."""
@@ -280,12 +306,13 @@ class PolicyProcess:
 
     # Requests and replies.
 
-    def _expect_ok(self, parts: list[bytes], what: str, limit_s: float) -> None:
+    def _expect_ok(self, parts: list[bytes], what: str, limit_s: float) -> bytes:
         self._watch.what = what
         self._watch.answer_limit_s = limit_s
         tag, payload = self._exchange(parts, sum(map(len, parts)))
         if tag != frames.OK:
             raise self._reported_failure(tag, payload, what)
+        return payload
 
     def _exchange(self, parts: list[Any], total: int) -> tuple[int, bytes]:
         watch = self._watch

@@ -13,7 +13,7 @@ from types import ModuleType
 
 import numpy as np
 import pytest
-from slots import Slots
+from slots import HONEST, Slots
 
 from evopolicy_worker.sandbox.jail import INSIDE
 
@@ -39,6 +39,23 @@ SEES = """
 """
 
 
+LOOKS = """
+    import gc, sys
+
+    HERE = [id(object()), id([]), id({}), sys.getrefcount(None), sys.getallocatedblocks(), len(gc.get_objects())]
+
+    class Policy:
+        def __init__(self, *spaces):
+            print(HERE, id(self), id(object()), sys.getallocatedblocks(), sys.getrefcount("a constant of this file"))
+
+        def reset(self, episode_index):
+            pass
+
+        def act(self, obs):
+            return [0.0]
+"""
+
+
 @pytest.fixture(scope="module")
 def player() -> ModuleType:
     spec = importlib.util.spec_from_file_location("_player_here", INSIDE / "player.py")
@@ -49,6 +66,7 @@ def player() -> ModuleType:
     return found
 
 
+@pytest.mark.parametrize("copies", [True, False])
 @pytest.mark.parametrize(
     "seed",
     [
@@ -61,10 +79,15 @@ def player() -> ModuleType:
         b"sixteen bytes and more",
     ],
 )
-def test_a_policys_generators_begin_as_numpy_seeds_them(player: ModuleType, seed: bytes) -> None:
+def test_a_policys_generators_begin_as_numpy_seeds_them(
+    player: ModuleType, seed: bytes, copies: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     kept = random.getstate(), np.random.get_state(), np.random.bit_generator.randbits  # type: ignore[attr-defined]
     try:
-        np.random.standard_normal()  # leaves a second number behind, which a seed discards
+        player.find_numpy_key()
+        assert player.numpy_key
+        if not copies:
+            monkeypatch.setattr(player, "numpy_key", 0)
         player.seed_generators(seed)
         found = np.random.standard_normal(3).tolist(), np.random.randint(1 << 30, size=3).tolist()
         np.random.seed(list(struct.unpack("<4I", seed[:16])))
@@ -89,6 +112,42 @@ def test_a_policy_finds_its_own_process_as_if_it_had_been_made_for_it(slots: Slo
     assert left == [1, ["system", "tmp"], ["policy.py"], []]
     again = json.loads(slots.play(SEES, tier=tier).stdout)
     assert (drawn, numpys) == (again[6], again[7])
+
+
+def test_all_policies_of_a_slot_load_the_same_code(slots: Slots) -> None:
+    """The first could otherwise tell that it is the first: its memory would hold what the compiler leaves behind."""
+    slot = slots.new()
+    slots.run(slot.start())
+    try:
+        found = [slots.play(LOOKS, slot=slot).stdout for _ in range(3)]
+    finally:
+        slots.run(slot.close())
+    assert found[0]
+    assert found == found[:1] * 3
+
+
+@pytest.mark.parametrize(
+    ("source", "category", "says"),
+    [
+        (HONEST + "\nassert 1 is 1\n", None, b"SyntaxWarning"),
+        (HONEST + "\nthis is no Python\n", "import_error", b""),
+        (HONEST + "\nx = " + "-" * 100_000 + "1\n", "import_error", b""),
+        ("# coding: latin-1\n" + HONEST + "\nassert len('\u00e9') == 2\n", None, b""),
+        (HONEST + "\nraise KeyError('here')\n", "import_error", b""),
+    ],
+)
+def test_a_policy_is_compiled_alike_in_each_episode(
+    slots: Slots, source: str, category: str | None, says: bytes
+) -> None:
+    first, second = slots.play_all(source, n=2)
+    for outcome in (first, second):
+        assert (outcome.failure and outcome.failure.category) == category
+        assert says in outcome.stderr
+    assert first.stderr == second.stderr
+    if first.failure is not None and second.failure is not None:
+        assert first.failure.message == second.failure.message
+        assert first.failure.traceback == second.failure.traceback
+        assert "importlib" not in first.failure.traceback
 
 
 HEAP = """

@@ -79,7 +79,7 @@ def test_a_child_that_does_not_seal_itself_is_killed(tmp_path: Path, monkeypatch
         description = environments.describe("toy/line")
         meta = {"obs_space": description.obs_space, "action_space": description.action_space}
         with pytest.raises(SandboxError, match="could not seal itself"):
-            policy.init(BundleFiles([], b""), bytes(16), meta, "arrays")
+            policy.seal(BundleFiles([], b""), bytes(16), meta, "arrays")
         assert policy.dead
         policy.end()
 

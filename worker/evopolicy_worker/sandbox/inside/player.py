@@ -6,12 +6,13 @@ u8 tag, 3 pad>` and its payload; a question, then its answer, on two pipes. `evo
 Standard library and numpy only: the sandbox shows nothing else.
 """
 
+import _random
 import contextlib
 import ctypes
 import errno
 import functools
-import importlib
 import json
+import marshal
 import math
 import os
 import random
@@ -19,14 +20,15 @@ import struct
 import sys
 import traceback
 import types
+import warnings
 from collections.abc import Callable
-from importlib import machinery, util
+from importlib import machinery
 from typing import Any, NoReturn
 
 import numpy as np
 
 REQUESTS, REPLIES = 3, 4
-INIT, LOAD, RESET, ACT, FLUSH, END = 1, 2, 3, 4, 5, 6
+INIT, LOAD, RESET, ACT, FLUSH, END, COMPILE = 1, 2, 3, 4, 5, 6, 7
 OK, INT, FLOAT, ARRAY, FLOATS, GENERIC, FAILED, FAULT = 0, 1, 2, 3, 4, 5, 6, 7
 REQUEST_HEADER = struct.Struct("<IBxxxq")
 REPLY_HEADER = struct.Struct("<IBxxx")
@@ -37,6 +39,7 @@ VALUE_BYTES = 16
 MAX_USED = 1 << 53
 """Largest size that is reported for an action."""
 MAX_TEXT = 16_000
+MAX_CODE_BYTES = 1 << 20
 
 _REHEARSED = 32
 """Steps: more than the interpreter needs to adapt its code."""
@@ -49,6 +52,12 @@ action_bytes = 16 << 10
 """Maximum size of one action, bytes; received with the policy."""
 home = ""
 """The policy's own folder; received with the policy."""
+
+copy_words = ctypes.memmove
+numpy_key = 0
+"""Address of numpy's 624 words of state, which lie before their place; 0 where it is not known."""
+PYTHON_KEY = object.__basicsize__ + 4
+"""Of Python's generator: where its words begin, after their place."""
 
 VARYING = ("Sequence", "Graph", "OneOf")
 NONE = 0xFFFFFFFF
@@ -66,10 +75,20 @@ def play(init: dict[str, Any]) -> NoReturn:
     seed_generators(bytes.fromhex(init["seed"]))
     # From here on what this process says may be the policy's.
     reply(OK, b"")
-    read_exactly(bytearray(REQUEST_HEADER.size))
+    header = bytearray(REQUEST_HEADER.size)
+    read_exactly(header)
+    length, kind, _ = REQUEST_HEADER.unpack(header)
+    path = init["home"] + "/system/policy.py"
+    if kind == COMPILE:
+        reply(OK, compiled(path))
+        read_exactly(header)
+        reply(OK, b"")
+        os._exit(0)
+    code = bytearray(length)
+    read_exactly(code)
     stage = "import"
     try:
-        module = importlib.import_module("policy")
+        module = imported_policy(path, code)
         if not isinstance(getattr(module, "Policy", None), type):
             raise ImportError("policy.py has no top-level class named Policy")
         stage = "init"
@@ -83,22 +102,39 @@ def play(init: dict[str, Any]) -> NoReturn:
     os._exit(0)
 
 
-class PolicyFinder(machinery.FileFinder):
-    """Finds the module `policy` in `policy.py` alone, the file that readers take for the policy.
+def compiled(path: str) -> bytes:
+    """The file's code for other processes, in which it is the same as if they had compiled it; nothing where they are to
+    compile it themselves, because that fails or warns. Runs none of it."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            code = marshal.dumps(compile(source_of(path), path, "exec", dont_inherit=True))
+    except BaseException:
+        return b""
+    return code if len(code) <= MAX_CODE_BYTES else b""
 
-    Python prefers a package and an extension module of the same name.
+
+def imported_policy(path: str, code: bytes | bytearray) -> types.ModuleType:
+    """The module of this file, from its code where that is given.
+
+    Without the finder, which would prefer a folder or an extension module of that name beside the file.
     """
+    module = types.ModuleType("policy")
+    loader = machinery.SourceFileLoader("policy", path)
+    spec = machinery.ModuleSpec("policy", loader, origin=path)
+    spec.has_location = True
+    module.__dict__.update(__file__=path, __spec__=spec, __loader__=loader, __package__="")
+    sys.modules["policy"] = module
+    program = marshal.loads(code) if code else compile(source_of(path), path, "exec", dont_inherit=True)
+    exec(program, module.__dict__)
+    return sys.modules["policy"]
 
-    def __init__(self, path: str, *loaders: Any) -> None:
-        super().__init__(path, *loaders)
-        # Here once for all policies.
-        file = f"{path}/policy.py"
-        self.policy = util.spec_from_file_location(
-            "policy", file, loader=machinery.SourceFileLoader("policy", file)
-        )
 
-    def find_spec(self, fullname: str, target: Any = None) -> machinery.ModuleSpec | None:
-        return self.policy if fullname == "policy" else super().find_spec(fullname, target)
+def source_of(path: str) -> bytes:
+    fd = os.open(path, os.O_RDONLY)
+    source = os.read(fd, os.fstat(fd).st_size)
+    os.close(fd)
+    return source
 
 
 def live_in(folder: str) -> None:
@@ -108,7 +144,7 @@ def live_in(folder: str) -> None:
     os.environ["TMPDIR"] = folder + "/tmp"
     system = folder + "/system"
     sys.path.insert(0, system)
-    sys.path_importer_cache[system] = PolicyFinder(
+    sys.path_importer_cache[system] = machinery.FileFinder(
         system,
         (machinery.ExtensionFileLoader, machinery.EXTENSION_SUFFIXES),
         (machinery.SourceFileLoader, machinery.SOURCE_SUFFIXES),
@@ -123,7 +159,7 @@ def rehearse() -> None:
     then, and each policy's process would have its own copies made.
     """
     global REQUESTS, REPLIES
-    np.random.seed(0)
+    find_numpy_key()
     space = {"type": "Box", "shape": (2,), "dtype": "float64"}
     usual, pipes = (REQUESTS, REPLIES), (os.pipe(), os.pipe())
     REQUESTS, REPLIES = pipes[0][0], pipes[1][1]
@@ -156,18 +192,39 @@ def rehearse() -> None:
 
 def seed_generators(seed: bytes) -> None:
     random.seed(seed)
-    number = int.from_bytes(seed[:16], "little")
-    if number >> 96:
-        # As `np.random.seed` with the seed's four words sets it: Python's generator begins from the same words in the
-        # same way, and the state is passed on in a tenth of the time.
-        *words, place = random.Random(number).getstate()[1]
-        np.random.set_state({"bit_generator": "MT19937", "state": {"key": words, "pos": place}})
-    else:
-        # Python leaves zeros at the end out.
+    if not (numpy_key and copy_key(seed)):
         np.random.seed(list(struct.unpack("<4I", seed[:16])))
     # Sources of system entropy in numpy: unseeded default_rng(), SeedSequence(), bit generators.
     entropy = random.Random(seed + b"numpy")
     vars(np.random.bit_generator)["randbits"] = entropy.getrandbits
+
+
+def copy_key(seed: bytes) -> bool:
+    """Sets numpy's generator as `np.random.seed` with the seed's four words does; False where they end with zeros, which
+    Python leaves out.
+
+    Python's generator, made from the same words, has the same 624 words of state. Passed on as Python's numbers, they
+    would touch ten times as much memory, which each policy's process has to copy. For a generator that has drawn nothing yet.
+    """
+    number = int.from_bytes(seed[:16], "little")
+    if number >> 96:
+        generator = _random.Random(number)
+        copy_words(numpy_key, id(generator) + PYTHON_KEY, 4 * 624)
+    return bool(number >> 96)
+
+
+def find_numpy_key() -> None:
+    """Finds where numpy's generator has its words; leaves it unknown where the two are not laid out as usual."""
+    global numpy_key
+    seed = bytes(range(16))
+    np.random.seed(list(struct.unpack("<4I", seed)))
+    wanted = np.random.standard_normal(999).tolist()
+    np.random.seed(0)
+    numpy_key = vars(np.random)["get_bit_generator"]().ctypes.state_address
+    copy_key(seed)
+    if np.random.standard_normal(999).tolist() != wanted:
+        numpy_key = 0
+    np.random.seed(0)
 
 
 def answer(policy: Any, reader: tuple[Callable[[], Any], Reader]) -> None:
