@@ -7,7 +7,6 @@ They hold hidden scores, so `write` is called only when the agent and all its ch
 from __future__ import annotations
 
 import asyncio
-import math
 import os
 from collections.abc import Mapping, Sequence
 from importlib.metadata import version
@@ -22,6 +21,7 @@ from evopolicy_common.messages.environment import Split
 from evopolicy_common.messages.gateway import CANCELLED
 from evopolicy_common.messages.operator import RunFinished, SubmitRecord
 from evopolicy_common.processes.scratch import give_back_rights, remove_tree
+from evopolicy_common.records.aggregates import mean, std
 from evopolicy_common.records.blobs import BlobStore, write_atomically
 from evopolicy_common.records.policies import bundles, checkpoints
 from evopolicy_common.records.policies.bundles import Bundle
@@ -222,13 +222,13 @@ def _outcome(
         best_submit_index=best,
         val_scores={str(index): mean for index, mean in finished.val_scores.items()} if completed else None,
         heldout_mean_return=finished.final_score if completed else None,
-        heldout_std_return=_std(heldout) if completed and heldout else None,
+        heldout_std_return=std(heldout) if completed and heldout else None,
         heldout_returns=heldout if completed else (),
         heldout_successes=finished.heldout_successes if completed else (),
         quarantined_submits=tuple(sorted(finished.validation_ineligible)),
         random_reference=ReferenceScore(
-            mean_return=math.fsum(reference) / len(reference),
-            std_return=_std(reference),
+            mean_return=mean(reference),
+            std_return=std(reference),
             returns=reference,
             seeded_by="case" if finished.reference_by_case else "run",
         )
@@ -260,12 +260,6 @@ def _versions(finished: RunFinished, staged: Staged | None) -> Versions:
         initial_policy_hash=sha256_text(staged.initial_policy_hash) if staged else None,
         env_deterministic=finished.deterministic,
     )
-
-
-def _std(values: Sequence[float]) -> float:
-    """Population standard deviation."""
-    mean = math.fsum(values) / len(values)
-    return math.sqrt(math.fsum((value - mean) * (value - mean) for value in values) / len(values))
 
 
 async def _bundle(folder: RunFolder, digest: str, operations: Operations) -> Bundle:
@@ -339,8 +333,8 @@ def _env_log(finished: RunFinished) -> bytes:
                 "mean_return": submit.mean_return,
             }
         )
-    for index, mean in finished.val_scores.items():
-        lines.append({"event": "validation", "submit_index": index, "mean_return": mean})
+    for index, score in finished.val_scores.items():
+        lines.append({"event": "validation", "submit_index": index, "mean_return": score})
     for index, why in finished.validation_ineligible.items():
         lines.append({"event": "not_eligible", "submit_index": index, "reason": why})
     if finished.heldout_returns:

@@ -5,16 +5,15 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Any
 
 import msgspec
-import numpy as np
 
 from evopolicy_common.messages.environment import ObservationForm
 from evopolicy_common.messages.episode import NO_POLICY, TIME_LIMITS, PolicyFailure
 from evopolicy_common.messages.gateway import SubmitDone
+from evopolicy_common.records.aggregates import mean, std
 from evopolicy_common.records.json_text import json_bytes, plain
 from evopolicy_common.records.summary import SCHEMA_VERSION, Summary, utc_text
 
@@ -138,12 +137,12 @@ def _summary(
         submit_completed_at=utc_text(done.completed_at),
         wall_time_seconds=round(max(0.0, done.completed_at - done.started_at), 6),
         returns=returns if ok else None,
-        mean_return=_mean(returns) if ok else None,
-        std_return=_std(returns) if ok else None,
+        mean_return=mean(returns) if ok else None,
+        std_return=std(returns) if ok else None,
         min_return=min(returns) if ok else None,
         max_return=max(returns) if ok else None,
         episode_lengths=lengths if ok else None,
-        mean_episode_length=_mean(lengths) if ok else None,
+        mean_episode_length=mean(lengths) if ok else None,
         timeouts=_where(ordered, TIME_LIMITS) if ok else None,
         errors=_where(ordered, None) if ok else None,
         reward_components_mean=_component_means(components) if with_components else None,
@@ -184,26 +183,7 @@ def _where(scores: Sequence[EpisodeScore], categories: frozenset[str] | None) ->
 
 def _component_means(components: Sequence[dict[str, float]]) -> dict[str, float]:
     names = list(dict.fromkeys(name for parts in components for name in parts))
-    return {name: _mean([parts.get(name, 0.0) for parts in components]) for name in names}
-
-
-def _mean(values: Sequence[float]) -> float:
-    """Arithmetic mean, correctly rounded; NaN or infinite if a value is."""
-    return _exact_sum(values) / len(values)
-
-
-def _std(values: Sequence[float]) -> float:
-    """Population standard deviation (divides by n)."""
-    mean = _mean(values)
-    deviations = [value - mean for value in values]
-    return math.sqrt(_exact_sum([deviation * deviation for deviation in deviations]) / len(values))
-
-
-def _exact_sum(values: Sequence[float]) -> float:
-    try:
-        return math.fsum(values)
-    except (ValueError, OverflowError):  # infinities of both signs, or a sum beyond the range of floats
-        return float(np.sum(np.asarray(values, dtype=np.float64)))
+    return {name: mean([parts.get(name, 0.0) for parts in components]) for name in names}
 
 
 def _fitting(line: dict[str, Any]) -> bytes:

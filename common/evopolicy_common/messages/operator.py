@@ -211,6 +211,8 @@ class EnvironmentState(Message, frozen=True, kw_only=True, tag="environment_stat
     """The class of each of `fingerprints`; empty from coordinators of earlier versions."""
     awaited: bool = False
     """No worker has described the environment yet, and one does so now: ask again."""
+    result: Bytes = b""
+    """The result of the finished run (`records.journal.Result`, JSON); empty without one, and from earlier versions."""
 
 
 class RecordedRequest(Message, frozen=True, kw_only=True, tag="recorded"):

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import Any, TypeVar
 
 from evopolicy_common.errors import BundleError, ProtocolError
 from evopolicy_common.records import journal
+from evopolicy_common.records.aggregates import mean
 from evopolicy_common.records.episodes.trajectory import Trajectory, decode
 from evopolicy_common.records.journal import Ended, Opened, Opening, Result, Revealed
 from evopolicy_common.records.policies import bundles
@@ -25,6 +25,7 @@ from evopolicy_coordinator.publish.findings import (
 )
 from evopolicy_coordinator.splits import FILE_STEMS, SPLITS, cases_hash, overlaps
 from evopolicy_coordinator.verify.compare import same
+from evopolicy_coordinator.verify.numbers import outcome_pairs
 
 T = TypeVar("T")
 
@@ -137,7 +138,7 @@ def _result(run: PublishedRun, history: History) -> Iterator[Fault]:
 def _record(run: PublishedRun) -> Iterator[Fault]:
     """`run.json`, compared with the committed documents."""
     record, opening, result = run.record, run.opening, run.result
-    settings, dimensions, outcome = opening.settings, record.experiment_dimensions, record.outcome
+    settings, dimensions = opening.settings, record.experiment_dimensions
     staged = dimensions.n_train > 0
     pairs: list[tuple[str, Any, Any]] = [
         ("run", record.run, opening.run),
@@ -184,30 +185,7 @@ def _record(run: PublishedRun) -> Iterator[Fault]:
     for name, here, fixed in pairs:
         if here != fixed:
             yield Fault("record", f"run.json tells {name} {_short(here)}; committed to was {_short(fixed)}")
-    completed = result.status == "completed"
-    given_up = outcome.status == "error" and result.status == "cancelled"
-    heldout, reference = result.heldout_returns, outcome.random_reference
-    score = result.final_score if completed else 0.0 if result.status == "no_ok_submit" else None
-    val_scores = {
-        str(each.submit_index): each.val_mean for each in result.submits if each.val_mean is not None
-    }
-    came: list[tuple[str, Any, Any]] = [
-        ("status", outcome.status, outcome.status if given_up else result.status),
-        ("final_score", outcome.final_score, score),
-        ("best_submit_index", outcome.best_submit_index, result.best_submit_index if completed else None),
-        ("heldout_returns", outcome.heldout_returns, heldout if completed else ()),
-        ("heldout_successes", outcome.heldout_successes, result.heldout_successes if completed else ()),
-        ("heldout_mean_return", outcome.heldout_mean_return, result.final_score if completed else None),
-        ("heldout_std_return", outcome.heldout_std_return, _std(heldout) if completed and heldout else None),
-        ("val_scores", outcome.val_scores, val_scores if completed else None),
-        ("budget_used", outcome.budget_used, result.budget_used),
-        ("quarantined_submits", outcome.quarantined_submits, result.validation_ineligible),
-        ("random returns", () if reference is None else reference.returns, result.random_heldout_returns),
-    ]
-    if reference is not None and reference.returns:
-        came.append(("mean of random actions", reference.mean_return, _mean(reference.returns)))
-        came.append(("standard deviation of random actions", reference.std_return, _std(reference.returns)))
-    for name, here, fixed in came:
+    for name, here, fixed in outcome_pairs(record.outcome, result):
         if here != fixed:
             yield Fault(
                 "record", f"run.json tells {name} {_short(here)}; what came of the run is {_short(fixed)}"
@@ -279,12 +257,12 @@ def _scores(run: PublishedRun) -> Iterator[Fault]:
                 yield Fault("scores", f"the returns of {name} are not those of the result")
         else:
             submit = submits[index]
-            mean = submit.mean_return if split == "train" else submit.val_mean
-            if returns and _mean(returns) != mean:
-                yield Fault("scores", f"the returns of {name} have the mean {_mean(returns)!r}, not {mean!r}")
+            told = submit.mean_return if split == "train" else submit.val_mean
+            if returns and mean(returns) != told:
+                yield Fault("scores", f"the returns of {name} have the mean {mean(returns)!r}, not {told!r}")
     if result.status == "completed":
         n_heldout = len(result.heldout_returns)
-        if n_heldout != len(opening.heldout) or result.final_score != _mean(result.heldout_returns):
+        if n_heldout != len(opening.heldout) or result.final_score != mean(result.heldout_returns):
             yield Fault("scores", "the score is not the mean return of all held-out cases")
 
 
@@ -370,15 +348,6 @@ def _checkpoints(files: Files, run: PublishedRun, damaged: set[str], checked: Ch
         checked.add("checkpoints", "open", f"{withheld} policies were withheld", name)
     elif fine:
         checked.add("checkpoints", "ok", f"{there} policies", name)
-
-
-def _mean(values: Sequence[float]) -> float:
-    return math.fsum(values) / len(values) if values else math.nan
-
-
-def _std(values: Sequence[float]) -> float:
-    mean = _mean(values)
-    return math.sqrt(math.fsum((value - mean) * (value - mean) for value in values) / len(values))
 
 
 def _short(value: Any) -> str:

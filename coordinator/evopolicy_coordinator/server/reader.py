@@ -34,6 +34,7 @@ from evopolicy_common.messages.operator import (
 )
 from evopolicy_common.messages.status import DiskUse
 from evopolicy_common.messages.worker import BlobAck, BlobChunk, BlobGet, BlobPut, Message, Refused
+from evopolicy_common.records import journal
 from evopolicy_common.records.blobs import BlobStore, digest_of, is_digest
 from evopolicy_common.wire import codec
 from evopolicy_common.wire.refusals import Refusal
@@ -136,6 +137,10 @@ class ServiceReader:
                 f"there is no finished run {run[:64]!r} here: it is still open, or another coordinator played it",
             )
         return row, result
+
+    def result(self, run: str) -> bytes:
+        """A finished run's result as a document. Reads the database. Raises RefusedError for any other run."""
+        return journal.document(journal.result_of(self.finished_with_result(run)[1]))
 
     def revealed(self) -> frozenset[str]:
         """Epochs whose cases are public. Reads the database."""

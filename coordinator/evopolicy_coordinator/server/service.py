@@ -294,6 +294,7 @@ class Service:
                 fingerprints=fingerprints,
                 classes=classes,
                 awaited=awaited,
+                result=b"" if row is None else self._reader.result(message.run),
             )
 
         return read

@@ -4,6 +4,7 @@ Rules that this module owns:
 - The exact check replays recorded actions in the environment, without a policy. The actions are the coordinator's
   stored ones if it still has them, otherwise those of the feedback files. The results must equal, bit for bit, the
   stored record, the feedback files, and the returns in `summary.json` and `run.json`.
+- All other numbers of the directory are checked without playing (`numbers`), whatever the sample.
 - The advisory check: the checkpoint's policy plays the same cases again. A policy may read clocks, so this proves
   nothing.
 - The cases must be the run's: split hashes are compared before any episode is played.
@@ -13,7 +14,7 @@ from __future__ import annotations
 
 import contextlib
 import uuid
-from collections.abc import AsyncIterator, Callable, Sequence
+from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from typing import Any
 
 import msgspec
@@ -21,6 +22,7 @@ import msgspec
 from evopolicy_common.errors import BundleError, ConfigError
 from evopolicy_common.messages.environment import Split
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome, Record, ResourceLimits, Tier
+from evopolicy_common.messages.gateway import CANCELLED
 from evopolicy_common.messages.operator import (
     DescribeEnvironment,
     EnvironmentState,
@@ -31,10 +33,13 @@ from evopolicy_common.records.blobs import digest_of
 from evopolicy_common.records.episodes.rendered import decode
 from evopolicy_common.records.episodes.trajectory import Trajectory
 from evopolicy_common.records.fingerprints import comparable
+from evopolicy_common.records.journal import Result
 from evopolicy_common.records.policies.checkpoints import bundle_of
+from evopolicy_common.records.summary import Summary
 from evopolicy_common.wire.operator_client import TIMEOUT_S, OperatorClient
 from evopolicy_common.wire.transport import Link
 from evopolicy_coordinator.verify import compare as verify_compare
+from evopolicy_coordinator.verify import numbers as verify_numbers
 from evopolicy_coordinator.verify.source import RANDOM, Played, RunUnderTest
 
 _SPLITS: tuple[Split, ...] = ("train", "validation", "heldout")
@@ -116,17 +121,31 @@ class Verifier:
         for split in _SPLITS:
             ours = versions.cases_hash(split).removeprefix("sha256:")
             theirs = state.split_hashes.get(split, "")
-            if ours and ours != theirs:
+            if not ours:
+                text = "run.json has no hash of them: they may be others"
+                self.report.not_checked.append(Finding(episode=f"{split} cases", difference=text))
+            elif ours != theirs:
                 raise ConfigError(
                     f"this cluster's {split} cases of {self._run.record.env} are not the run's (SHA-256 {theirs[:12]}…"
                     f" here, {ours[:12]}… in run.json): use the coordinator that made the run, its --state, or its --data"
                 )
         self._knows_run = state.knows_run
+        self._check_numbers(state.result)
         if not versions.env_deterministic:
             self.report.notes.append(
                 "this environment is marked as not deterministic: differences are to be expected"
             )
         return self._knows_run
+
+    def _check_numbers(self, data: bytes) -> None:
+        result = msgspec.json.decode(data, type=Result) if data else None
+        for name, difference in verify_numbers.differences(self._run, result):
+            self.report.differs(name, difference)
+        for submit in self._run.submits:
+            for name, content in (("summary.json", submit.summary), ("_meta.json", submit.meta)):
+                if content is None and submit.status != CANCELLED:
+                    finding = Finding(episode=f"submit {submit.index}", difference=f"it has no {name}")
+                    self.report.not_checked.append(finding)
 
     async def replay(self, played: Played, indexes: Sequence[int]) -> None:
         """Makes the exact check of these episodes of a list."""
@@ -170,11 +189,11 @@ class Verifier:
         try:
             bundle = bundle_of(played.checkpoint)
         except BundleError as error:
-            self.report.differs(name, f"its checkpoint cannot be read: {error}")
-            return
+            if not played.digest:
+                self.report.differs(name, f"its checkpoint cannot be read: {error}")
+            return  # otherwise a difference that the check of numbers has found
         if bundle.digest != played.digest:
-            self.report.differs(name, "its checkpoint does not hold the policy that _meta.json names")
-            return
+            return  # a difference that the check of numbers has found
         await self._ask.upload(bundle.digest, bundle.packed)
         message = self._evaluate(played, indexes, "full", bundle=bundle.digest)
         async for outcome in self._outcomes(message):
@@ -279,6 +298,9 @@ class Verifier:
             )
         if played.lengths is not None and played.lengths[index] != outcome.length:
             self.report.differs(name, f"{played.lengths[index]} steps are told, {outcome.length} came")
+        for what, told, came in _summarised(played.summary, index, outcome, recording.outcome):
+            if told != came:
+                self.report.differs(name, f"{what} {told!r} is told, {came!r} came")
 
     def _files_difference(self, played: Played, recording: _Recording, replayed: Trajectory) -> str | None:
         if not recording.files:
@@ -356,6 +378,22 @@ class Verifier:
                 self._tell(self._came, waits_for)
                 if outcome is not None:
                     yield outcome
+
+
+def _summarised(
+    summary: Summary | None, index: int, again: EpisodeOutcome, stored: EpisodeOutcome | None
+) -> Iterator[tuple[str, Any, Any]]:
+    """What a submit's summary tells of one episode besides return and length, and what came."""
+    if summary is None:
+        return
+    parts, solved = summary.reward_components_per_episode, summary.successes
+    if parts is not None and index < len(parts):
+        yield "reward components", parts[index], again.reward_components
+    if stored is not None:
+        # A replay has no policy that could fail.
+        yield "policy failed", index in (summary.errors or ()), stored.failure is not None
+        if solved is not None and index < len(solved):
+            yield "success", solved[index], stored.success
 
 
 def _of_files(played: Played, index: int, episode: Trajectory, *, actions: bool) -> str | None:

@@ -15,6 +15,7 @@ import msgspec
 from evopolicy_common.errors import ConfigError, ProtocolError
 from evopolicy_common.messages.environment import Split
 from evopolicy_common.records.policies.checkpoints import CheckpointMeta, read_meta
+from evopolicy_common.records.run_files import submit_folders
 from evopolicy_common.records.run_record import RunRecord, decode_run_record
 from evopolicy_common.records.summary import Summary, decode_summary
 
@@ -37,6 +38,8 @@ class Played(msgspec.Struct, frozen=True, kw_only=True):
     returns: tuple[float, ...] | None
     """As recorded in the run directory; None when it records only `mean`."""
     lengths: tuple[int, ...] | None = None
+    summary: Summary | None = None
+    """Of a submit's train episodes."""
     mean: float | None = None
     folders: tuple[Path, ...] = ()
     """Each train episode's folder; empty for hidden ones, and where the agent was shown scores alone."""
@@ -61,11 +64,39 @@ class Played(msgspec.Struct, frozen=True, kw_only=True):
         return math.fsum(returns.values()) / len(returns) != self.mean
 
 
+class SubmitFiles(msgspec.Struct, frozen=True, kw_only=True):
+    """What the directory has of one submit."""
+
+    index: int
+    """By the name of its folders."""
+    summary: Summary | None
+    meta: CheckpointMeta | None
+    feedback: Path
+    """`feedback/submit_NNN`, whether or not it exists."""
+    checkpoint: Path
+
+    @property
+    def status(self) -> str:
+        """Its verdict; empty where no file has it."""
+        if self.summary is not None:
+            return self.summary.status
+        return "" if self.meta is None else self.meta.validation_status
+
+    @property
+    def n_episodes(self) -> int:
+        """Episodes charged."""
+        if self.summary is not None:
+            return self.summary.n_episodes
+        return 0 if self.meta is None else self.meta.n_episodes_requested
+
+
 class RunUnderTest(msgspec.Struct, frozen=True, kw_only=True):
     """A finished run directory and its replayable episodes."""
 
     root: Path
     record: RunRecord
+    submits: tuple[SubmitFiles, ...]
+    """In order of their index."""
     train: tuple[Played, ...]
     hidden: tuple[Played, ...]
 
@@ -82,45 +113,57 @@ def read_run(root: Path) -> RunUnderTest:
         ) from error
     except ProtocolError as error:
         raise ConfigError(f"{path}: {error}") from error
-    train = [
-        played
-        for folder in sorted((root / "workspace" / "feedback").glob("submit_*"))
-        if (played := _train(root, record, folder))
-    ]
+    submits = _submits(root, record)
+    train = [played for submit in submits if (played := _train(record, submit))]
     return RunUnderTest(
         root=root,
         record=record,
+        submits=submits,
         train=tuple(train),
         hidden=tuple(_hidden(record, {one.submit_index: one for one in train})),
     )
 
 
-def _train(root: Path, record: RunRecord, folder: Path) -> Played | None:
+def _submits(root: Path, record: RunRecord) -> tuple[SubmitFiles, ...]:
+    feedback, checkpoints = root / "workspace" / "feedback", root / "checkpoints"
+    found = []
+    for index, folder in sorted({**submit_folders(checkpoints), **submit_folders(feedback)}.items()):
+        of_feedback, checkpoint = feedback / folder.name, checkpoints / folder.name
+        found.append(
+            SubmitFiles(
+                index=index,
+                summary=_summary(of_feedback),
+                meta=_meta(checkpoint, record.experiment_dimensions.episode_budget),
+                feedback=of_feedback,
+                checkpoint=checkpoint,
+            )
+        )
+    return tuple(found)
+
+
+def _train(record: RunRecord, submit: SubmitFiles) -> Played | None:
     """The episodes of an `ok` submit; None for any other."""
-    summary = _summary(folder)
+    summary, folder, meta = submit.summary, submit.feedback, submit.meta
     if summary is None or summary.env_instances is None or summary.first_global_episode is None:
         return None
     width = max(3, len(str(record.experiment_dimensions.episode_budget)))
-    first = summary.first_global_episode
-    checkpoint = root / "checkpoints" / folder.name
-    meta = _meta(checkpoint, record.experiment_dimensions.episode_budget)
+    first, n = summary.first_global_episode, len(summary.env_instances)
     return Played(
         split="train",
-        submit_index=summary.submit_index,
+        submit_index=submit.index,
         env_instances=summary.env_instances,
-        modulo=len(summary.env_instances),
+        modulo=n,
         remaining_budget_after=summary.remaining_budget,
-        returns=summary.returns,
-        lengths=summary.episode_lengths,
+        # Other numbers of them are a difference by themselves.
+        returns=summary.returns if len(summary.returns or ()) == n else None,
+        lengths=summary.episode_lengths if len(summary.episode_lengths or ()) == n else None,
+        summary=summary,
         # At the level `scores` the feedback has no trajectories.
         folders=()
         if record.experiment_dimensions.feedback == "scores"
-        else tuple(
-            folder / "episodes" / f"ep_{first + index:0{width}d}"
-            for index in range(len(summary.env_instances))
-        ),
+        else tuple(folder / "episodes" / f"ep_{first + index:0{width}d}" for index in range(n)),
         pictures=record.experiment_dimensions.feedback == "pictures",
-        checkpoint=checkpoint,
+        checkpoint=submit.checkpoint,
         digest="" if meta is None else meta.bundle,
     )
 
@@ -137,6 +180,7 @@ def _hidden(record: RunRecord, train: dict[int, Played]) -> list[Played]:
                 env_instances=tuple(range(n)),
                 returns=returns,
                 lengths=None,
+                summary=None,
                 mean=mean,
                 folders=(),
             )

@@ -159,6 +159,26 @@ def test_a_tampered_reward_is_found(played: Played, tmp_path: Path) -> None:
     assert "step 4: reward" in found["difference"]
 
 
+def test_numbers_that_no_episode_shows_are_compared_with_the_coordinators(
+    played: Played, tmp_path: Path
+) -> None:
+    """A raised score with everything that follows from it, and a summary with fewer returns than episodes."""
+    run = Path(shutil.copytree(played.run("gym/acrobot"), tmp_path / "run"))
+    record = json.loads((run / "run.json").read_text())
+    outcome = record["outcome"]
+    outcome |= {"final_score": -1.0, "heldout_mean_return": -1.0, "heldout_returns": [-1.0, -1.0]}
+    outcome["heldout_std_return"] = 0.0
+    (run / "run.json").write_text(json.dumps(record))
+    path = run / "workspace" / "feedback" / "submit_000" / "summary.json"
+    path.chmod(0o644)
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"returns": [-1.0]}))
+    done = played.verify(run, "--no-policy", "--sample", "1")
+    assert done.returncode == 1, done.stdout + done.stderr
+    found = [one["difference"] for one in json.loads(done.stdout)["differences"]]
+    assert any(text.startswith("final_score is -1.0; the coordinator has") for text in found), found
+    assert any(text.startswith("number of returns is 1") for text in found), found
+
+
 def test_without_the_coordinators_records_a_tampered_action_shows_in_what_comes_of_it(
     played: Played, tmp_path: Path
 ) -> None:

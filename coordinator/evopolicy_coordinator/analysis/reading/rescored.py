@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import msgspec
 
 from evopolicy_common.errors import ConfigError, ProtocolError
 from evopolicy_common.messages.environment import Split
+from evopolicy_common.records.aggregates import mean, std
 from evopolicy_common.records.rescores import RescoreRecord, read_rescore
 from evopolicy_common.records.run_record import PolicyFailureRecord, ReferenceScore
 from evopolicy_coordinator.analysis.reading.records import Run
@@ -63,7 +63,7 @@ def _replaced(run: Run, record: RescoreRecord, best: int) -> Run:
     )
     random = record.random_returns
     reference = ReferenceScore(
-        mean_return=_mean(random), std_return=_std(random), returns=tuple(random), seeded_by="case"
+        mean_return=mean(random), std_return=std(random), returns=tuple(random), seeded_by="case"
     )
     replaced = msgspec.structs.replace(
         run.record,
@@ -71,7 +71,7 @@ def _replaced(run: Run, record: RescoreRecord, best: int) -> Run:
             outcome,
             final_score=played.mean,
             heldout_mean_return=played.mean,
-            heldout_std_return=_std(played.returns),
+            heldout_std_return=std(played.returns),
             heldout_returns=tuple(played.returns),
             # As in a run's own result: a rate over the episodes that report it would leave failed ones out.
             heldout_successes=() if None in played.successes else tuple(map(bool, played.successes)),
@@ -88,12 +88,3 @@ def _replaced(run: Run, record: RescoreRecord, best: int) -> Run:
         ),
     )
     return msgspec.structs.replace(run, record=replaced, rescore=record)
-
-
-def _mean(values: Sequence[float]) -> float:
-    return math.fsum(values) / len(values)
-
-
-def _std(values: Sequence[float]) -> float:
-    mean = _mean(values)
-    return math.sqrt(math.fsum((value - mean) ** 2 for value in values) / len(values))

@@ -101,6 +101,7 @@ def verify(
 ) -> None:
     """Replay a run's recorded actions, and compare rewards, observations and returns bit for bit.
 
+    Also checks all other numbers of the run directory against each other, and against the coordinator's own result if it has the run.
     Exit codes: 0 identical, 1 something differs, 2 wrong usage or other cases than the run's, 3 could not be checked.
     """
     order = _Order(
