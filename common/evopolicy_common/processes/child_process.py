@@ -40,8 +40,11 @@ class ChildProcess:
         self.log = log
 
     @classmethod
-    async def start(cls, program: Sequence[str], log: Path, *, talks: bool = False) -> Self:
-        """Starts `program` with stderr appended to `log`. `talks`: its stdin and stdout are pipes to this process."""
+    async def start(
+        cls, program: Sequence[str], log: Path, *, talks: bool = False, keeps: Sequence[int] = ()
+    ) -> Self:
+        """Starts `program` with stderr appended to `log`. `talks`: its stdin and stdout are pipes to this process.
+        `keeps`: file descriptors that stay open in it."""
         log.parent.mkdir(parents=True, exist_ok=True)
         pipe = asyncio.subprocess.PIPE if talks else asyncio.subprocess.DEVNULL
         with log.open("ab") as out:
@@ -51,6 +54,7 @@ class ChildProcess:
                     stdin=pipe,
                     stdout=pipe,
                     stderr=out,
+                    pass_fds=keeps,
                     start_new_session=True,
                     limit=_LINE_LIMIT,
                     env={

@@ -41,6 +41,9 @@ _SOON_S = 60.0
 
 WORKERS_ENDED = "workers-ended"
 """File in a kept state folder: all workers of its last command have ended; the next coordinator expects none."""
+PROCESSES = "processes"
+"""File in a kept state folder that the last command and its processes lock as long as one of them lives. A coordinator
+removes it when it starts, since workers that no local command started may join."""
 
 
 class Workers(NamedTuple):
@@ -154,11 +157,17 @@ async def local_cluster(
         root.mkdir(mode=0o700, parents=True, exist_ok=True)
         # Named after this process: the folder may be in use, and another command's file in it.
         ready_file = root / f"{kind}-{os.getpid()}.json"
-        for left in root.glob(f"{kind}-[0-9]*.json"):
+        for left in root.glob(f"{kind}-[0-9]*.*"):
             if not Path("/proc", left.stem.rpartition("-")[2]).exists():
                 left.unlink(missing_ok=True)
         ready_file.unlink(missing_ok=True)
         folders.callback(ready_file.unlink, missing_ok=True)
+        if (root / PROCESSES).exists() and not _is_held(root / PROCESSES):
+            write_atomically(root / WORKERS_ENDED, b"", mode=0o600)
+        lock = ready_file.with_suffix(".lock")
+        lock_fd = _locked(lock)
+        folders.callback(os.close, lock_fd)
+        folders.callback(lock.unlink, missing_ok=True)
         coordinator = [
             *_module("evopolicy_coordinator.cli"),
             *("--state", str(root), "--ready-file", str(ready_file), "--trust-workers"),
@@ -174,8 +183,7 @@ async def local_cluster(
         worker_options = [*packages, *(["--browser", str(browser)] if browser is not None else [])]
         if hidden_isolation is not None:
             coordinator += ["--hidden-isolation", hidden_isolation]
-        processes = _Processes(root / "logs", kind)
-        served = False
+        processes = _Processes(root / "logs", kind, lock_fd)
         try:
             await processes.keep_up("coordinator", coordinator)
             if workers is not None:
@@ -196,7 +204,8 @@ async def local_cluster(
                 raise ConfigError(
                     f"the local coordinator did not start within {START_TIMEOUT_S:g} s: {why}"
                 ) from error
-            served = True
+            # Not earlier: the folder could have been another command's.
+            lock.rename(root / PROCESSES)
             kept = None if state is None else root / "open"
             if kept is not None:
                 kept.mkdir(mode=0o700, exist_ok=True)
@@ -207,9 +216,6 @@ async def local_cluster(
         finally:
             with notify_if_slow("the local cluster to end"):
                 await processes.end()
-            # Only if the coordinator served: otherwise the folder may be another command's, with live workers.
-            if served and state is not None:
-                write_atomically(root / WORKERS_ENDED, b"", mode=0o600)
 
 
 async def _end_permits_of_killed(kept: Path, operator_file: Path) -> None:
@@ -228,6 +234,13 @@ async def _end_permits_of_killed(kept: Path, operator_file: Path) -> None:
             if run in alive:
                 await operator.agent_gone(run)
             (kept / run).unlink()
+
+
+def _locked(new: Path) -> int:
+    new.unlink(missing_ok=True)
+    fd = os.open(new, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+    fcntl.flock(fd, fcntl.LOCK_EX)
+    return fd
 
 
 def _is_held(lock: Path) -> bool:
@@ -261,8 +274,10 @@ async def unless_failed(work: asyncio.Task[None], failed: asyncio.Future[None] |
 class _Processes:
     """Programs that are restarted until all of them are ended."""
 
-    def __init__(self, logs: Path, kind: str) -> None:
+    def __init__(self, logs: Path, kind: str, lock_fd: int) -> None:
+        """`lock_fd`: stays open in all of them, so that its lock outlives this process if they do."""
         self.failed: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        self._lock_fd = lock_fd
         self._logs = logs
         self._kind = kind
         self._running: list[ChildProcess] = []
@@ -303,7 +318,7 @@ class _Processes:
             child = await self._start(name, program)
 
     async def _start(self, name: str, program: Sequence[str]) -> ChildProcess:
-        child = await ChildProcess.start(program, self.log(name))
+        child = await ChildProcess.start(program, self.log(name), keeps=(self._lock_fd,))
         self._running.append(child)
         return child
 

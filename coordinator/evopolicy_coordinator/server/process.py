@@ -16,7 +16,7 @@ from evopolicy_common import catalogue
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.logs import structlog
 from evopolicy_common.processes import host
-from evopolicy_common.processes.local_cluster import WORKERS_ENDED
+from evopolicy_common.processes.local_cluster import PROCESSES, WORKERS_ENDED
 from evopolicy_common.records.blobs import BlobStore
 from evopolicy_common.simulators import SIMULATORS
 from evopolicy_common.wire import credentials, transport
@@ -76,6 +76,7 @@ async def run(options: Options, stop: asyncio.Event, on_ready: Callable[[Ready],
         listen, remote = _listen(state, options, machines)
         store = Store(state.database)
         opened.callback(store.close)
+        (state.root / PROCESSES).unlink(missing_ok=True)
         ended = state.root / WORKERS_ENDED
         if ended.exists():
             # Otherwise the first agent would wait for `silent_bar_s`, as a worker of the last command might still

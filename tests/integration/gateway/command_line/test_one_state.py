@@ -129,6 +129,7 @@ def known_hash(secret: bytes, split: Split, hashes: dict[str, str]) -> str:
 
 
 def test_a_second_command_beside_the_first_is_told_what_to_do(tmp_path: Path) -> None:
+    state = tmp_path / "xdg" / "evopolicy" / "local"
     waits = agent(tmp_path, "submit([0])\nopen('here', 'w')\ntime.sleep(1000)")
     words = ["local", "--env", "toy/line", "--agent", waits, "--entry", "waits", "--exp-id", "t", *SMALL]
     with command(tmp_path, *words) as running:
@@ -137,14 +138,16 @@ def test_a_second_command_beside_the_first_is_told_what_to_do(tmp_path: Path) ->
         assert code == 2
         assert "--fresh" in err
         assert "--state" in err
-        assert not (tmp_path / "xdg" / "evopolicy" / "local" / WORKERS_ENDED).exists()
+        assert not (state / WORKERS_ENDED).exists()
         words = ["random", "--env", "toy/line", "--split", "train", "--cases", "0", "--fresh"]
         code, out, err = done(tmp_path, *words)
         assert code == 0, err
         assert "the next call has others under the same ids" in out
         running.kill()
-    # What was killed keeps nobody from the state, and no later run waits for its agent.
+    # What was killed keeps nobody from the state, and no later run waits for its agent or its workers.
+    assert len(kernels(state)) == 1
     played(tmp_path, "after")
+    assert len(kernels(state)) == 1
 
 
 def test_state_and_fresh_do_not_go_together(tmp_path: Path) -> None:

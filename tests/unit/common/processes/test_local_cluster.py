@@ -85,8 +85,8 @@ def test_a_local_coordinator_that_does_not_start_is_reported_and_killed(
     started: list[ChildProcess] = []
     start = ChildProcess.start
 
-    async def once_it_is_stubborn(program: Sequence[str], log: Path) -> ChildProcess:
-        child = await start(program, log, talks=True)
+    async def once_it_is_stubborn(program: Sequence[str], log: Path, **more: Any) -> ChildProcess:
+        child = await start(program, log, talks=True, **more)
         assert child._process.stdout is not None
         await child._process.stdout.readline()
         started.append(child)
@@ -122,22 +122,45 @@ def test_what_a_killed_command_left_in_the_state_folder_is_removed(
     assert list(tmp_path.glob("*.json")) == [others]
 
 
-def test_only_the_command_whose_cluster_served_says_that_its_workers_have_ended(
+def test_workers_count_as_ended_once_no_process_of_the_last_command_lives(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    ended = tmp_path / local_cluster.WORKERS_ENDED
+    ended, lock = tmp_path / local_cluster.WORKERS_ENDED, tmp_path / local_cluster.PROCESSES
+
+    def says_so() -> bool:
+        async def main() -> bool:
+            async with local_cluster.local_cluster("test", state=tmp_path) as cluster:
+                await cluster.start_workers(["toy/line"], slots=1)
+                assert local_cluster._is_held(lock)
+                return ended.exists()
+
+        return asyncio.run(main())
+
     programs(monkeypatch, "import sys; print('error: in use', file=sys.stderr); sys.exit(2)")
     assert bring_up(tmp_path) == "in use"
-    assert not ended.exists()
+    assert not lock.exists()  # the folder may be that of a living command
     programs(monkeypatch, SERVES)
+    monkeypatch.setattr(local_cluster, "END_GRACE_S", SOON_S)
+    assert not says_so()
+    assert says_so()
+    ended.unlink()
+    held = local_cluster._locked(lock)  # as a worker does that outlives its command
+    assert not says_so()
+    os.close(held)
+
+
+def test_a_worker_keeps_the_lock_of_its_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    programs(monkeypatch, SERVES)
+    monkeypatch.setattr(local_cluster, "END_GRACE_S", SOON_S)
 
     async def main() -> None:
         async with local_cluster.local_cluster("test", state=tmp_path) as cluster:
             await cluster.start_workers(["toy/line"], slots=1)
-            assert not ended.exists()
+            for child in cluster._processes._running:
+                held = [fd.resolve() for fd in Path(f"/proc/{child.pid}/fd").iterdir()]
+                assert tmp_path / local_cluster.PROCESSES in held, child.log
 
     asyncio.run(main())
-    assert ended.exists()
 
 
 def test_a_worker_that_dies_again_and_again_is_given_up(
