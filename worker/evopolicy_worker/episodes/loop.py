@@ -86,7 +86,9 @@ MAX_WARM_ENVIRONMENTS = 4
 """Environments kept for later jobs: all sixteen in one process would take 230 MB."""
 MAX_CODES = 8
 """Policies whose compiled code is kept, at most 1 MiB each."""
-
+_COUNT_S = 1.0
+"""Interval at which the processes are counted that the machine ended for want of memory. The kernel's list of counters takes it
+50 µs and more."""
 
 _ACTING = messages.framed(messages.Acting())
 
@@ -143,7 +145,7 @@ class Player:
         self._codes: dict[bytes, bytes] = {}
         self._n_policies = 0
         self._folders: list[Path] = []
-        self._oom_kills = oom_kills()
+        self._oom_kills, self._counted = oom_kills(), time.monotonic()
         self._videos = VideoRecorder()
 
     def play(
@@ -237,17 +239,13 @@ class Player:
 
     def prepare(self) -> None:
         """Bury the last policy and fork the process for the next; to be called while there is nothing else to do."""
-        self._bury()
         if self._prepared is None:
-            self._prepared = self._zygote.spawn()
-        self._oom_kills = oom_kills()
+            self._prepared = self._spawn()
 
     def new_policy(self, limits: ResourceLimits) -> PolicyProcess:
         child, self._prepared = self._prepared, None
         if child is None:
-            self._bury()
-            child = self._zygote.spawn()
-            self._oom_kills = oom_kills()
+            child = self._spawn()
         self._n_policies += 1
         folder = self._scratch / "policies" / str(self._n_policies)
         if self._jail.home is None:
@@ -255,6 +253,14 @@ class Player:
         return PolicyProcess(
             self._zygote, child, self._monitor, self._jail, limits, str(folder), self._oom_kills
         )
+
+    def _spawn(self) -> Child:
+        self._bury()
+        child = self._zygote.spawn()
+        now = time.monotonic()
+        if now - self._counted > _COUNT_S:
+            self._oom_kills, self._counted = oom_kills(), now
+        return child
 
     @property
     def compiles(self) -> bool:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from slots import HONEST, Slots, make_job, rows
+from slots import HONEST, Slots, make_job, misbehaving, rows
 
 from evopolicy_common.messages.environment import Case
 from evopolicy_common.processes.proc import descendants
@@ -132,6 +132,11 @@ def test_the_policy_is_given_spaces_and_env_meta_and_nothing_of_the_case(slots: 
     assert reset[0] == 1
     assert reset[1] == reset[2] == "/home/policy/system"
     assert reset[3] == sorted({*ENVIRONMENT, "TMPDIR"})
+
+
+def test_a_policy_may_change_the_spaces_that_it_is_given(slots: Slots) -> None:
+    outcome = slots.play(misbehaving(init="[each.clear() for each in spaces]"))
+    assert (outcome.failure, outcome.stdout) == (None, b"")
 
 
 def test_dicts_texts_and_ints_arrive_as_the_space_says(slots: Slots) -> None:

@@ -86,6 +86,8 @@ def play(init: dict[str, Any]) -> NoReturn:
         os._exit(0)
     code = bytearray(length)
     read_exactly(code)
+    # Before the policy can change the spaces, which are its own.
+    reader = observation_reader(init["obs_space"], init["observations"] == "lists")
     stage = "import"
     try:
         module = imported_policy(path, code)
@@ -98,7 +100,7 @@ def play(init: dict[str, Any]) -> NoReturn:
         flush_output()
         os._exit(0)
     reply(OK, b"")
-    answer(policy, observation_reader(init["obs_space"], init["observations"] == "lists"))
+    answer(policy, reader)
     os._exit(0)
 
 
