@@ -46,8 +46,13 @@ class AgentLog:
         self.note(document)
 
     def note(self, document: dict[str, Any]) -> None:
-        """Logs a line of our own, such as a prompt."""
-        self._write(orjson.dumps(document))
+        """Logs a line of our own, such as a prompt. It may hold parts of an agent's message."""
+        try:
+            line = orjson.dumps(document)
+        except TypeError:
+            # An agent's message may nest deeper than can be written.
+            line = orjson.dumps({"type": str(document.get("type")), "text": "nested too deeply to be kept"})
+        self._write(line)
 
     def close(self) -> None:
         self._file.close()

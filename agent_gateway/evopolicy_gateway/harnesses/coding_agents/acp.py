@@ -357,7 +357,10 @@ def _refusal(error: Exception) -> TurnFailure | None:
 
     if not isinstance(error, RequestError):
         return None
-    details = "" if error.data is None else f" {orjson.dumps(error.data, default=str).decode()}"
+    try:
+        details = "" if error.data is None else f" {orjson.dumps(error.data).decode()}"
+    except TypeError:  # nested too deeply
+        details = ""
     if error.code == _AUTH_REQUIRED:
         return TurnFailure(kind="final", message=f"not logged in: {error}{details}", provider=True)
     return turn_failure_of(f"{error}{details}")

@@ -125,6 +125,13 @@ def test_a_failing_provider_is_asked_again_over_the_same_connection(tmp_path: Pa
     assert kept(found, "requests").count("initialize") == 1
 
 
+def test_messages_that_nest_too_deeply_to_be_written_end_no_run(tmp_path: Path) -> None:
+    found = played(tmp_path, "deeperror,deep")
+    assert found.ending is not None
+    assert (found.ending.reason, found.ending.turns, found.ending.retries) == ("agent_stopped", 2, 1)
+    assert {"type": "assistant", "text": "nested too deeply to be kept"} in found.log
+
+
 def test_an_agent_that_is_not_logged_in_ends_the_run(tmp_path: Path) -> None:
     found = played(tmp_path, "login")
     assert found.ending is not None
