@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import logging
 import secrets
 import socket
 from collections.abc import AsyncIterator, Iterator
@@ -98,6 +99,8 @@ async def serving(app: ASGIApp, sock: socket.socket) -> AsyncIterator[asyncio.Ta
         timeout_graceful_shutdown=CLOSE_GRACE_S,
         h11_max_incomplete_event_size=32 << 10,
     )
+    # It warns of every request that it cannot read, of which an agent can send thousands a second.
+    logging.getLogger("uvicorn.error").setLevel(logging.ERROR)
     server = _Server(config)
     sock.listen(config.backlog)  # connections queue from here on, before the server accepts them
     task = asyncio.create_task(server.serve(sockets=[sock]), name="http")

@@ -17,6 +17,8 @@ from evopolicy_gateway.jail.settings import Host
 PROXY_PORT = 3128
 MAX_CONNECTIONS = 256
 """Most simultaneous connections of one program."""
+MAX_DENIED_LOGGED = 100
+"""Most different hosts that are logged as not allowed."""
 _MAX_HEAD_BYTES = 16 << 10
 _HEAD_TIMEOUT_S = 30.0
 _CONNECT_TIMEOUT_S = 60.0
@@ -37,6 +39,7 @@ class JailProxy:
         self.proxy_port = free
         self._servers: list[asyncio.Server] = []
         self._connections: set[asyncio.Task[None]] = set()
+        self._denied: set[str] = set()
 
     @property
     def ports(self) -> tuple[int, ...]:
@@ -100,15 +103,21 @@ class JailProxy:
             await _refuse(writer, "405 Method Not Allowed", "only CONNECT is served here")
             return
         name, _, port = words[1].rpartition(":")
-        wanted = (name.lower(), int(port) if port.isdecimal() and port.isascii() else 0)
+        wanted = (name.lower(), int(port) if port.isdecimal() and port.isascii() and len(port) <= 5 else 0)
         if wanted not in self._hosts:
-            log.warning("the agent asked for a host that it may not reach", host=words[1][:200])
+            self._log_denied(words[1][:200])
             await _refuse(writer, "403 Forbidden", f"{words[1][:200]} is not allowed in this run")
             return
         try:
             await _join(reader, writer, wanted, b"HTTP/1.1 200 Connection established\r\n\r\n")
         except _UnreachableError as error:
             await _refuse(writer, "502 Bad Gateway", str(error))
+
+    def _log_denied(self, host: str) -> None:
+        # Once: an agent can ask thousands of times a second, and the log is not in its jail.
+        if host not in self._denied and len(self._denied) < MAX_DENIED_LOGGED:
+            self._denied.add(host)
+            log.warning("the agent asked for a host that it may not reach", host=host)
 
 
 class _UnreachableError(OSError):

@@ -250,6 +250,16 @@ def test_a_huge_query_and_odd_headers_change_nothing(tmp_path: Path) -> None:
     play(tmp_path, script)
 
 
+def test_requests_that_cannot_be_read_fill_no_log(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    async def script(w: Wire) -> None:
+        for _ in range(20):
+            assert status(await w.send(b"\x1b[2J\r\n\r\n")) == 400
+        assert caplog.records == []
+        await w.submit_honestly(0)
+
+    play(tmp_path, script)
+
+
 def test_one_request_with_two_keys_is_one_submit(tmp_path: Path) -> None:
     async def script(w: Wire) -> None:
         head = f"Idempotency-Key: one\r\nIdempotency-Key: two\r\nContent-Length: {len(BODY)}\r\n"

@@ -43,12 +43,26 @@ async def ask(request: bytes, hosts: frozenset[Host] = frozenset(), *, then: byt
         ("CONNECT example.org.evil:443 HTTP/1.1", b"403"),
         ("CONNECT example.org HTTP/1.1", b"403"),
         ("CONNECT 127.0.0.1:443 HTTP/1.1", b"403"),
+        (f"CONNECT example.org:{'4' * 5000} HTTP/1.1", b"403"),
     ],
 )
 def test_what_is_not_a_named_host_and_port_is_refused(request_line: str, status: bytes) -> None:
     hosts = frozenset({("example.org", 443)})
     answer = asyncio.run(ask(request_line.encode() + b"\r\n\r\n", hosts))
     assert answer.split()[1] == status
+
+
+def test_a_host_that_is_not_allowed_is_logged_once_and_not_without_end(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    logged: list[str] = []
+    monkeypatch.setattr(proxy.log, "warning", lambda text, host: logged.append(host))
+    found = JailProxy({}, frozenset())
+    for k in range(300):
+        found._log_denied("example.org:443")
+        found._log_denied(f"{k}.example.org:443")
+    assert logged[:2] == ["example.org:443", "0.example.org:443"]
+    assert len(logged) == len(set(logged)) == proxy.MAX_DENIED_LOGGED
 
 
 def test_a_named_host_gets_the_bytes_and_answers() -> None:
