@@ -23,6 +23,13 @@ _ClickError: Any = next(base for base in typer.BadParameter.__mro__ if base.__na
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 _SETTINGS = {"help_option_names": ["-h", "--help"]}
+_WRONG = {
+    "int_parsing": "is not a whole number",
+    "float_parsing": "is not a number",
+    "greater_than_equal": "is less than {ge}",
+    "less_than_equal": "is more than {le}",
+}
+"""What typer's library finds wrong with an option's value, by its name of the error; its own texts do not tell the value."""
 _METAVARS = {"str": "TEXT", "int": "N", "float": "X", "path": "PATH", "file": "PATH", "directory": "DIR"}
 """How help shows values, by the name of their type."""
 
@@ -164,6 +171,9 @@ def _value_names(text: str) -> str:
 
 
 def _usage_text(error: Any) -> str:
+    found: list[Any] = getattr(error.__cause__, "errors", list)()
+    if found and found[0]["type"] in _WRONG:
+        error.message = f"{found[0]['input']!r} {_WRONG[found[0]['type']].format(**found[0].get('ctx', {}))}"
     text = " ".join(str(error.format_message()).split()).replace("Value error, ", "") or "wrong usage"
     context = getattr(error, "ctx", None)
     return text if context is None else f"{text.rstrip('.')}; see {context.command_path} --help"

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import os
+import socket
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 from documents import APPS, commands
+from invented.run_dirs import write_run
 
 pytestmark = pytest.mark.slow
 
@@ -54,9 +56,12 @@ getattr(importlib.import_module(module), function)()
 """Starts a program in which some modules cannot be imported, as where their extra is not installed."""
 
 
-def started(words: list[str], **environment: str) -> subprocess.CompletedProcess[str]:
+def started(
+    words: list[str], cwd: Path | None = None, **environment: str
+) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
         [BIN / words[0], *words[1:]],
+        cwd=cwd,
         capture_output=True,
         text=True,
         check=False,
@@ -125,6 +130,50 @@ def test_choices_are_shown_and_a_wrong_one_is_reported_with_those_that_are() -> 
     assert done.stderr == (
         "error: Invalid value for '--tier': 'x' is not one of 'bwrap', 'landlock', 'none'; see evopolicy run --help\n"
     )
+
+
+LOCAL = ["evopolicy", "local", "--env", "toy", "--agent"]
+
+
+@pytest.mark.parametrize(
+    ("words", "problem"),
+    [
+        ([*LOCAL, "evolve", "--budget", "ten"], "'--budget': 'ten' is not a whole number"),
+        ([*LOCAL, "evolve", "--budget", "0"], "'--budget': '0' is less than 1"),
+        ([*LOCAL, "evolve", "--audit", "2"], "'--audit': '2' is more than 1.0"),
+        ([*LOCAL, "mine.toml"], "write --agent file:mine.toml"),
+        ([*LOCAL, "run.py 3"], "write --agent 'command:python3 run.py 3'"),
+        ([*LOCAL, "sh run"], "write --agent 'command:sh run'"),
+        ([*LOCAL, "/usr"], "write --agent replay:/usr"),
+        ([*LOCAL, "evolv"], "the forms are evolve, random, "),
+        (["evopolicy", "export", "RUNS", "--to", "csv", "--out", "FILE"], "choose another folder with --out"),
+        (
+            ["evopolicy", "report", "EMPTY", "--out", "new"],
+            "no finished run in EMPTY; nothing written. Name run",
+        ),
+        (["evopolicy", "disk", "--state", "EMPTY"], "it has no coordinator.sqlite; name one with --state"),
+        (["evopolicy", "web", "--tls-certificate", "FILE", "--tls-key", "FILE"], "both in PEM"),
+        (
+            ["evopolicy", "web", "--act", "--action-log", "FILE/log"],
+            "choose another folder with --action-log",
+        ),
+        (["evopolicy-coordinator", "--state", "new", "--listen", "tcp/127.0.0.1:IN USE"], "with --listen"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+)
+def test_a_wrong_value_is_named_with_the_remedy(words: list[str], problem: str, tmp_path: Path) -> None:
+    write_run(tmp_path / "RUNS", [])
+    (tmp_path / "EMPTY").mkdir()
+    (tmp_path / "FILE").write_text("text\n")
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = str(taken.getsockname()[1])
+        words = [word.replace("IN USE", port) for word in words]
+        done = started(words, cwd=tmp_path, XDG_STATE_HOME=str(tmp_path / "state"))
+    assert done.returncode in (1, 2), done.stdout
+    assert problem in done.stderr
+    assert done.stderr.splitlines()[-1].startswith("error: ")
+    assert "Traceback" not in done.stderr
+    assert ".rs:" not in done.stderr
 
 
 def test_the_help_of_local_is_in_groups_and_fits_a_narrow_terminal() -> None:

@@ -13,6 +13,7 @@ import typer
 from evopolicy_common.cli import fail_on_our_errors
 from evopolicy_common.commands import App
 from evopolicy_common.errors import ConfigError, EvopolicyError
+from evopolicy_common.processes.preflight import check_writable
 from evopolicy_common.terminal import say, say_lines
 
 if TYPE_CHECKING:
@@ -97,6 +98,7 @@ def _write(runs: list[Path], to: Format, out: Path) -> None:
     found = load_runs(*runs)
     for folder, why in found.left_out:
         say(f"{folder}: left out: {why}", err=True)
+    check_writable(out, "--out")
     out.mkdir(parents=True, exist_ok=True)
     say_lines(map(str, writers[to](found, out)))
 

@@ -122,9 +122,11 @@ def suite(
         expanded = suite_file.expand(wanted, root, Path.cwd(), tuple(only or ()))
         where = Cluster(connect=tuple(connect or ()), file=credentials_file)
         if local:
+            kept = state or root / SWEEP_STATE
+            new = not kept.exists()  # then a dry run keeps none
             where = Cluster(
                 local_slots=slots,
-                state=state or root / SWEEP_STATE,
+                state=None if new and dry_run else kept,
                 data=data,
                 audit=audit,
                 hidden_isolation=hidden_isolation,

@@ -73,7 +73,23 @@ def make(agent: str, started_in: Path, config: AgentConfig | None = None) -> Har
         return CommandHarness(
             "command", _program(agent, words, started_in), hint=_no_files(words, started_in)
         )
+    if (meant := _meant(agent, started_in)) is not None:
+        raise ConfigError(f"--agent {agent!r} is not an agent; write --agent {shlex.quote(meant)}")
     raise ConfigError(f"--agent {agent!r} is not an agent; the forms are {FORMS}")
+
+
+def _meant(agent: str, started_in: Path) -> str | None:
+    """The form of `--agent` that a file or program without its prefix was meant for; None if it is neither."""
+    words = agent.split()
+    if not words or ":" in agent:
+        return None
+    if agent.endswith(".toml"):
+        return f"file:{agent}"
+    if words[0].endswith(".py"):
+        return f"command:python3 {agent}"
+    if (started_in / words[0]).is_file() or (len(words) > 1 and shutil.which(words[0])):
+        return f"command:{agent}"
+    return f"replay:{agent}" if (started_in / agent).is_dir() else None
 
 
 def config_of(agent: str, started_in: Path) -> AgentConfig | None:

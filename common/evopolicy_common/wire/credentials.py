@@ -123,6 +123,8 @@ def check_endpoints(credentials: Credentials) -> None:
                     f" `evopolicy-coordinator certs issue {credentials.role} NAME`"
                 )
         elif not (stays_on_machine(endpoint) or (protocol == "tcp" and credentials.insecure_tcp)):
+            if protocol not in ("tcp", "unixsock-stream"):
+                raise ConfigError(f"{endpoint!r} is not an endpoint; use the form tls/HOST:PORT")
             raise ConfigError(
                 f"{endpoint} would send tokens unencrypted; use tls/HOST:PORT and a folder made by"
                 f" `evopolicy-coordinator certs issue {credentials.role} NAME`"
@@ -192,6 +194,15 @@ def _read_private(path: Path) -> bytes:
             f"credentials {path} may be read by others (mode {stat.S_IMODE(mode):04o}): chmod 600 it"
         )
     return data
+
+
+def no_state(root: Path, missing: str) -> ConfigError:
+    """The error of a command that reads the coordinator's state folder, where `root` is none."""
+    local = local_state_dir()
+    of_local = f"; that of `evopolicy local` is {local}" if local != root and local.exists() else ""
+    return ConfigError(
+        f"{root} is not a coordinator's state folder: it has no {missing}; name one with --state{of_local}"
+    )
 
 
 def state_home() -> Path:

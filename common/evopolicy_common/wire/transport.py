@@ -16,6 +16,7 @@ import asyncio
 import contextlib
 import json
 import queue
+import re
 import threading
 import time
 from collections import deque
@@ -240,7 +241,9 @@ async def serve(
     try:
         session = await asyncio.to_thread(zenoh.open, config)
     except zenoh.ZError as error:
-        raise TransportError(f"cannot listen: {error}") from error
+        # Zenoh adds the places in its own source, one after each cause.
+        why = re.sub(r" at \S+\.rs:\d+\.?", "", str(error))
+        raise TransportError(f"cannot listen: {why}; choose another address with --listen") from error
     server = Server(session, asyncio.get_running_loop(), on_queries)
     try:
         yield server

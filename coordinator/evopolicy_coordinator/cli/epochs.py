@@ -18,7 +18,7 @@ from evopolicy_common.errors import ConfigError
 from evopolicy_common.records import journal
 from evopolicy_common.records.blobs import write_atomically
 from evopolicy_common.terminal import say, say_json
-from evopolicy_common.wire.credentials import default_state_dir
+from evopolicy_common.wire.credentials import default_state_dir, no_state
 from evopolicy_coordinator import splits
 from evopolicy_coordinator.pki.identity import HEAD, public_key, sign
 from evopolicy_coordinator.publish.contents import Countersignature, document, head_digest
@@ -69,7 +69,7 @@ def new(state: State = None) -> None:
     root = state or default_state_dir()
     with fail_on_our_errors():
         if not (root / "identity.json").is_file():
-            raise ConfigError(f"{root} is no coordinator's state folder: it holds no identity.json")
+            raise no_state(root, "identity.json")
         opened = StateFolder.open(root)
         try:
             before = _current(root)
@@ -135,7 +135,7 @@ def _current(root: Path) -> str:
 def _journal(root: Path) -> list[bytes]:
     database = root / "coordinator.sqlite"
     if not database.is_file():
-        raise ConfigError(f"{root} is not a coordinator's state folder: it has no {database.name}")
+        raise no_state(root, database.name)
     entries: list[bytes] = []
     with contextlib.closing(Reader(database)) as reader:
         while page := reader.journal(len(entries), _PAGE_BYTES):

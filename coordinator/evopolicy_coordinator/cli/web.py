@@ -8,6 +8,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import ipaddress
+import ssl
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -17,6 +18,7 @@ import typer
 from evopolicy_common.cli import Connect, CredentialsFile, end_on_sigterm, fail_on_our_errors, setup_logging
 from evopolicy_common.commands import App
 from evopolicy_common.errors import ConfigError, EvopolicyError
+from evopolicy_common.processes.preflight import check_writable
 from evopolicy_common.records.blobs import write_atomically
 from evopolicy_common.terminal import say
 from evopolicy_common.wire import credentials, transport
@@ -108,12 +110,15 @@ def web(
         for path in (tls_certificate, tls_key, report):
             if path is not None and not path.exists():
                 raise ConfigError(f"{path} does not exist")
+        if tls_certificate is not None and tls_key is not None:
+            _check_certificate(tls_certificate, tls_key)
         roots = _roots(runs)
         tokens = Tokens.drawn() if token_file is None else kept_tokens(token_file)
         names = [host, *(name or ())]
         found = _credentials(tuple(connect or ()), file)
         book = (action_log or credentials.state_home() / "web-actions.jsonl") if act else None
-
+        if book is not None:
+            check_writable(book.parent, "--action-log")
         view = _Order(
             roots=roots,
             tokens=tokens,
@@ -129,6 +134,16 @@ def web(
         finally:
             if url_file is not None:
                 url_file.unlink(missing_ok=True)
+
+
+def _check_certificate(certificate: Path, key: Path) -> None:
+    try:
+        ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(certificate, key)
+    except OSError as error:
+        raise ConfigError(
+            f"--tls-certificate {certificate} with --tls-key {key}: {error.strerror or error}; name a certificate and its key,"
+            " both in PEM"
+        ) from error
 
 
 @dataclass(frozen=True, kw_only=True)

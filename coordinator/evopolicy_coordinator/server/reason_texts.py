@@ -1,7 +1,7 @@
 """Texts of the core's reasons for operators, gateways and, through them, agents.
 
 Rule that this module owns: agents learn nothing of audits and of hidden results. Of the reasons why a submit waits,
-an agent learns at most that hidden cases of another run are being scored.
+an agent learns at most that it waits for hidden cases of another run to be scored.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ TEXTS: Mapping[Code, str | Callable[..., str]] = {
     "unknown_class": _unknown_class,
     "workers": _workers,
     "description": "a connected worker to describe {env}, as it does before its first episode",
-    "scoring": "hidden cases of another run are being scored",
+    "scoring": "hidden cases of another run to be scored",
     "being_put_off": "hidden cases on this machine to be postponed",
     "to_report": "workers of this machine to report that they play no hidden cases",
     "agent_alive": _agent_alive,

@@ -21,6 +21,7 @@ import msgspec
 
 from evopolicy_common.errors import ConfigError, StorageError
 from evopolicy_common.records.blobs import BlobStore, fsync_directory, write_atomically
+from evopolicy_common.wire.credentials import no_state
 from evopolicy_coordinator.pki.identity import SIGNING_KEY
 
 KEPT_FILES = (
@@ -53,7 +54,7 @@ def back_up(state: Path, target: Path) -> Backup:
     is damaged; nothing is then left at `target`.
     """
     if not (state / DATABASE).is_file():
-        raise ConfigError(f"{state} is not a coordinator's state folder: it has no {DATABASE}")
+        raise no_state(state, DATABASE)
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
         raise ConfigError(f"{target} already exists; name a new folder for the backup")
     partial = target.with_name(f".{target.name}.partial")

@@ -21,9 +21,9 @@ from pathlib import Path
 
 import msgspec
 
-from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.status import DiskUse
 from evopolicy_common.records.blobs import BlobStore
+from evopolicy_common.wire.credentials import no_state
 from evopolicy_coordinator.core.records import (
     AuditRow,
     BegunRow,
@@ -186,7 +186,7 @@ def estimate(state: Path, planned: dict[str, int]) -> Estimate:
 def _database(state: Path) -> Iterator[sqlite3.Connection]:
     path = state / DATABASE
     if not path.is_file():
-        raise ConfigError(f"{state} is not a coordinator's state folder: it has no {DATABASE}")
+        raise no_state(state, DATABASE)
     uri = f"{path.absolute().as_uri()}?mode=rw"
     with (
         storage_errors(path),

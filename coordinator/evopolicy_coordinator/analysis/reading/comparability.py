@@ -44,7 +44,7 @@ class MixedRunsError(EvopolicyError):
 
     def __init__(self, mixtures: Sequence[Mixture]) -> None:
         super().__init__(
-            "these runs are no one comparison:\n" + "\n".join(f"  {mixture}" for mixture in mixtures)
+            "these runs cannot be compared:\n" + "\n".join(f"  {mixture}" for mixture in mixtures)
         )
         self.mixtures = tuple(mixtures)
 

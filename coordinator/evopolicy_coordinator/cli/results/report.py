@@ -10,12 +10,12 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NoReturn
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from evopolicy_common.cli import code_of
+from evopolicy_common.cli import code_of, fail
 from evopolicy_common.commands import App
 from evopolicy_common.console import terminal
 from evopolicy_common.errors import ConfigError
@@ -110,12 +110,12 @@ def report(
         )
         same = dict.fromkeys(REMEDIES[one.what] for one in error.mixtures if one.what in REMEDIES)
         advice = f"\nRuns compare that were played with {'; '.join(same)}." if same else ""
-        _fail(
-            f"{error}{advice}\nGive runs that agree, or {' '.join(options)} to compare them all the same.",
+        fail(
+            f"{error}{advice}\nGive the folders of runs that agree, or {' '.join(options)} to compare them all the same.",
             MIXED,
         )
     except ConfigError as error:
-        _fail(str(error), code_of(error))
+        fail(str(error), code_of(error))
     if unknown := sum(
         run.record.hidden_isolation == "unknown" and not run.is_published for run in study.runs
     ):
@@ -139,7 +139,11 @@ def report(
                 f"{len(study.runs)} run{'s' * (len(study.runs) != 1)}, {len(study.left_out)} left out: {index}"
             )
     if index is None:
-        _fail("no complete run among what was given; nothing written", NOTHING)
+        fail(
+            f"no finished run in {', '.join(map(str, runs))}; nothing written. Name run directories, such as"
+            " runs/evolve/gym_acrobot/first, or folders that contain them",
+            NOTHING,
+        )
 
 
 def _study(
@@ -186,8 +190,3 @@ def _progress() -> Iterator[Tell]:
             progress.update(tasks[what], completed=done, total=total)
 
         yield tell
-
-
-def _fail(message: str, code: int) -> NoReturn:
-    say(f"evopolicy report: {message}", err=True)
-    raise typer.Exit(code)

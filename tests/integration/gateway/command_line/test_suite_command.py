@@ -120,6 +120,14 @@ def test_a_sweep_killed_twice_goes_on_where_it_was(tmp_path: Path) -> None:
         assert "feedback takes" not in after.text
 
 
+def test_a_dry_run_of_a_new_sweep_keeps_no_cluster(tmp_path: Path) -> None:
+    write_suite(tmp_path)
+    with sweep(tmp_path, "--local", "--dry-run") as plan:
+        assert plan.wait() == 0, plan.text
+        assert "3 runs: 3 new" in plan.text
+    assert not (tmp_path / "runs" / "t" / ".cluster").exists()
+
+
 def _starts(folder: Path) -> int:
     """How often the fake CLI of a run has been started: its scenario goes on with each."""
     try:

@@ -135,7 +135,7 @@ def test_submits_that_wait_for_hidden_cases_say_so() -> None:
     assert split_of(hidden.job) == "validation"
     keep_alive(rig, session, 10.0, hidden)
     state = rig.tell(asked(gateway.StateRequest, request=rig.request(), run="r1")).state
-    assert state.in_flight.waits_for == "hidden cases of another run are being scored"
+    assert state.in_flight.waits_for == "hidden cases of another run to be scored"
     assert 7.0 <= state.in_flight.held_s <= 11.0
     assert state.held_s == state.in_flight.held_s
     page = rig.results(run="r1", cursor=1)

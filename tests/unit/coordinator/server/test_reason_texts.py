@@ -80,5 +80,5 @@ def test_what_an_open_submit_waits_for_stands_in_the_state_of_its_run() -> None:
     text = message(Reply(request=1, message=gateway.StateReply(state=state), waits_for=because("scoring")))
     assert isinstance(text, gateway.StateReply)
     assert text.state.in_flight is not None
-    assert text.state.in_flight.waits_for == "hidden cases of another run are being scored"
+    assert text.state.in_flight.waits_for == "hidden cases of another run to be scored"
     assert text.state.in_flight.n_episodes == 2
