@@ -25,6 +25,8 @@ MAX_HIDDEN = 10_000
 """Validation or held-out cases of a run. The report of a finished run must fit into one message."""
 MAX_JOB_BYTES = 8 << 20
 MAX_AGENT_BYTES = 256 << 10
+MAX_REASON = 200
+"""Characters of a run's close reason."""
 MAX_FINGERPRINT_BYTES = 64 << 10
 """Every finished run's message has one."""
 MAX_ENVIRONMENTS = 10_000

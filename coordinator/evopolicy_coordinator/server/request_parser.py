@@ -37,6 +37,7 @@ from evopolicy_coordinator.server.definitions import Definitions
 from evopolicy_coordinator.server.request_checks import (
     MAX_COUNT,
     MAX_EPISODES_PER_SUBMIT,
+    MAX_REASON,
     bounded_agent,
     check_begun,
     check_counts,
@@ -290,7 +291,8 @@ class RequestParser:
         return m
 
     def _checked_close(self, m: gateway.CloseRun) -> gateway.CloseRun:
-        return replace(m, agent=bounded_agent(m.agent))
+        # Its end's message, in which the reason stands too, must be able to carry it.
+        return replace(m, reason=m.reason[:MAX_REASON], agent=bounded_agent(m.agent))
 
     # Operators.
 

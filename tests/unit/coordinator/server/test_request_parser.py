@@ -171,6 +171,12 @@ def test_what_an_agent_is_said_to_have_done_is_bounded_and_closes_its_run_all_th
         )
 
 
+def test_a_close_reason_fits_into_the_message_of_the_runs_end(parser: RequestParser) -> None:
+    close = gateway.CloseRun(run="r", token="capable", reason="x" * (1 << 18))
+    made = event(parser, keys.gateway_key("c", "r", "close"), close)
+    assert made.message.reason == "x" * 200
+
+
 def test_a_submits_episodes_fit_into_one_lease_with_policy_scope_submit() -> None:
     cases = [Case(seed=k, options={"map": "x" * 4000}) for k in range(5)]
     request_checks.check_job(cases, 1000)
