@@ -12,6 +12,7 @@ Rules that this module owns:
   lease's name proves its grant. So is an attempt of a worker that the job's group excludes.
 - An outcome that does not fit the job (wrong episodes, a number that is not finite, or beyond 1e100) or a page for its
   gateway is the worker's failure.
+- The time that an episode took counts for the fair share only up to the time for which its worker had the lease.
 - A failure that a policy can cause in its slot is an outcome. A failure that it cannot cause is retried without limit:
   `failed`, or `slot_died` from workers of earlier versions.
 """
@@ -49,12 +50,14 @@ def take(state: State, news: ResultsPersisted, step: Step) -> None:
     live = lease is not None and lease.live and job.lease is lease
     counts = live or (lease is not None and lease.parting)
     silent = lease is None or _silent(state, lease, step.now)
+    leased_s = None if lease is None else step.now - lease.granted_at
     if result.kind != "done":
         _goes_on(job, lease, result, step, silent=silent)
     if lease is not None:
         leases.release(state, worker, lease, step, f"reported: {result.kind}", sure=True)
     if result.kind == "done":
-        _done(state, worker, job, result, step, live=live, silent=silent or not counts)
+        silent = silent or not counts
+        _done(state, worker, job, result, step, live=live, silent=silent, leased_s=leased_s)
     elif live:
         if result.kind != "returned" and not result.environment_fault:
             fleet.failed(state, worker, step)
@@ -137,8 +140,8 @@ def _fault(job: JobState, episodes: tuple[EpisodeOutcome, ...]) -> str | None:
             return (
                 f"episode {outcome.index} has a number that is not finite or beyond {LARGEST:g}: {wrong[0]}"
             )
-        if not 0 <= outcome.length <= MAX_LENGTH:
-            return f"episode {outcome.index} has length {outcome.length}"
+        if not 0 <= outcome.length <= MAX_LENGTH or outcome.wall_s < 0.0:
+            return f"episode {outcome.index} has length {outcome.length} and took {outcome.wall_s} s"
         size = _size(outcome)
         if size > MAX_OUTCOME_BYTES:
             return f"episode {outcome.index} takes {size:,} bytes; {MAX_OUTCOME_BYTES:,} are the limit"
@@ -154,7 +157,15 @@ def _size(outcome: EpisodeOutcome) -> int:
 
 
 def _done(
-    state: State, worker: Worker, job: JobState, result: JobResult, step: Step, *, live: bool, silent: bool
+    state: State,
+    worker: Worker,
+    job: JobState,
+    result: JobResult,
+    step: Step,
+    *,
+    live: bool,
+    silent: bool,
+    leased_s: float | None,
 ) -> None:
     fault = _fault(job, result.episodes)
     if fault is not None:
@@ -171,11 +182,13 @@ def _done(
             )
         return
     worker.failures = 0
-    commit(state, worker, job, result, step)
+    _commit(state, worker, job, result, step, leased_s)
 
 
-def commit(state: State, worker: Worker, job: JobState, result: JobResult, step: Step) -> None:
-    """Make the outcomes durable, and close the job."""
+def _commit(
+    state: State, worker: Worker, job: JobState, result: JobResult, step: Step, leased_s: float | None
+) -> None:
+    """Make the outcomes durable, and close the job. `leased_s`: how long the worker has had it; None: unknown."""
     group = job.group
     groups.close_job(state, job, step, "done by another attempt")
     if job.begun is not None:
@@ -196,8 +209,9 @@ def commit(state: State, worker: Worker, job: JobState, result: JobResult, step:
         if outcome.success is not None:
             group.solved[outcome.index] = outcome.success
         step.persist(row)
-        if group.kind != "audit":
-            group.flow.observe(outcome.wall_s)
+        if group.kind != "audit" and leased_s is not None:
+            # The fair share counts in this time, so a worker must not be able to make it up.
+            group.flow.observe(min(outcome.wall_s, max(leased_s, 1.0)))
     state.trace.add(
         step.now, step.stimulus_id, job.job_id, f"committed attempt {result.attempt} of {worker.name}"
     )

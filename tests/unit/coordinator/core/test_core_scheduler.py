@@ -7,9 +7,10 @@ from collections import Counter
 from pathlib import Path
 from typing import Any, Literal
 
+import msgspec
 import pytest
 from rigs.asking import asked
-from rigs.core_rig import BUNDLE, ENV, Rig, describe, result, split_of
+from rigs.core_rig import BUNDLE, ENV, Rig, describe, outcome_of, result, split_of
 
 from evopolicy_common.messages import operator
 from evopolicy_common.messages import worker as wire
@@ -64,6 +65,26 @@ def test_two_runs_share_the_slots_whatever_they_have_waiting() -> None:
         leases = rig.poll(session, 2)
         got.update(lease.job.job_id.split("/")[0] for lease in leases)
         rig.play(session, *leases)
+    assert got == {"r1": 8, "r2": 8}
+
+
+def test_a_worker_cannot_make_up_the_time_that_the_fair_share_counts_in() -> None:
+    rig = Rig()
+    session = rig.register(slots=2)
+    rig.create("r1", budget=64, most=64)
+    rig.create("r2", budget=64, most=64)
+    rig.submit(*range(40), run="r1")
+    rig.submit(*range(40), run="r2", key="x")
+    got: Counter[str] = Counter()
+    for _ in range(8):
+        for lease in rig.poll(session, 2):
+            run = lease.job.job_id.split("/")[0]
+            got[run] += 1
+            wall_s = 1e99 if run == "r1" else 1.0
+            outcomes = tuple(
+                msgspec.structs.replace(outcome_of(spec.index), wall_s=wall_s) for spec in lease.job.episodes
+            )
+            rig.report_results(session, result(lease, "done", episodes=outcomes))
     assert got == {"r1": 8, "r2": 8}
 
 

@@ -227,6 +227,7 @@ def test_outcomes_that_do_not_fit_the_job_are_the_workers_failure() -> None:
         (msgspec.structs.replace(outcome_of(0), policy_cpu_s=float("inf")),),
         (msgspec.structs.replace(outcome_of(0), failure=endless),),
         (msgspec.structs.replace(outcome_of(0), length=2**40),),
+        (msgspec.structs.replace(outcome_of(0), wall_s=-1.0),),
         # A page with them could not be sent to the gateway, which would ask for it for ever.
         (msgspec.structs.replace(outcome_of(0), stdout=bytes(9 << 20), stderr=bytes(9 << 20)),),
         (msgspec.structs.replace(outcome_of(0), trajectory=blob(bytes(3 << 20))),),
@@ -234,7 +235,7 @@ def test_outcomes_that_do_not_fit_the_job_are_the_workers_failure() -> None:
         (msgspec.structs.replace(outcome_of(0), reward_components={f"{k:1024}": 0.0 for k in range(3000)}),),
     ]
     for episodes in bad:
-        for _ in range(7):
+        for _ in range(8):
             rig.pass_time(10.0)
             rig.beat(session)
         (lease,) = rig.poll(session, 1, wait_s=0.5)
