@@ -208,10 +208,19 @@ async def begun(
     slot: Slot, slots: Slots, policy: str, **options: object
 ) -> asyncio.Task[tuple[EpisodeOutcome, ...]]:
     """A job that is being played: its policy's process is there and has begun to work."""
-    before = len(family(pid_of(slot)))
+    before, taken = len(family(pid_of(slot))), 0
     job = make_job(**options)  # type: ignore[arg-type]
-    task = asyncio.create_task(slot.play(job, slots.bundle(policy), lambda episodes, steps: None))
-    while len(family(pid_of(slot))) < before:
-        await asyncio.sleep(0.01)
-    await asyncio.sleep(0.2)
+
+    def note(episodes: int, steps: int) -> None:
+        nonlocal taken
+        taken = steps
+
+    task = asyncio.create_task(slot.play(job, slots.bundle(policy), note))
+    # Another process may compile the policy first, so without a step yet, the same one has to be there for a while.
+    last, same = 0, 0
+    while not taken and same < 50:
+        await asyncio.sleep(0.02)
+        now = family(pid_of(slot))
+        same = same + 1 if now[-1] == last and len(now) >= before else 0
+        last = now[-1]
     return task

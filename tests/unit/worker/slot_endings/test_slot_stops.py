@@ -34,7 +34,6 @@ def stopped(
     async def work() -> tuple[EpisodeOutcome, ...]:
         task = await begun(slot, slots, source, **options)
         pids = family(pid_of(slot))
-        await asyncio.sleep(0.3)
         env = place_of_env(pids)
         chosen = {
             "policy": pids[-1:],
