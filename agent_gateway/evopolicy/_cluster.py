@@ -11,6 +11,7 @@ import shlex
 import sys
 import uuid
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Mapping, Sequence
+from operator import index
 from pathlib import Path
 from typing import Any, Literal, Self, TypeVar
 
@@ -230,6 +231,10 @@ class Cluster:
     ) -> Evaluation:
         if not cases:
             raise ConfigError("cases is empty: name train ids, such as range(8)")
+        try:
+            cases = tuple(map(index, cases))  # numpy's integers too
+        except TypeError as error:
+            raise ConfigError(f"cases {cases!r}: name train ids, such as range(8) or [0, 3]") from error
         env = one_environment(env)
         bundle = await asyncio.to_thread(policy_bundle, shipped.found(Path(policy), Path.cwd()))
         message = Evaluate(

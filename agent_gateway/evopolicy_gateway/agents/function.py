@@ -82,6 +82,9 @@ def main() -> None:
     JSON."""
     import cloudpickle
 
+    # The function knows this module's classes by these names, such as `evopolicy.SubmitRefusedError`.
+    for name in ("evopolicy", "evopolicy_gateway.agents.function"):
+        sys.modules[name] = sys.modules[__name__]
     try:
         function = cloudpickle.loads(Path(sys.argv[1]).read_bytes())
     except ModuleNotFoundError as error:

@@ -12,6 +12,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import evopolicy as evp
@@ -78,6 +79,9 @@ def test_a_failing_policy_is_a_result(cluster: evp.Cluster, policy: Path) -> Non
         cluster.evaluate(policy.parent, env="toy/line")
     with pytest.raises(evp.ConfigError, match="no environment or suite matches"):
         cluster.evaluate(policy, env="toy/none")
+    with pytest.raises(evp.ConfigError, match="such as range"):
+        cluster.evaluate(policy, env="toy/line", cases=["0-3"])  # type: ignore[list-item]
+    assert len(cluster.evaluate(policy, env="toy/line", cases=np.arange(2))) == 2
 
 
 def test_a_function_plays_a_run_from_inside_its_jail(cluster: evp.Cluster, tmp_path: Path) -> None:
@@ -89,7 +93,7 @@ def test_a_function_plays_a_run_from_inside_its_jail(cluster: evp.Cluster, tmp_p
         refused = ""
         try:
             workspace.submit([0] * 99)
-        except Exception as error:
+        except evp.SubmitRefusedError as error:
             refused = str(error)
         workspace.write(POLICY.replace("{gain}", "0.3"))
         summary = workspace.submit([0, 1])

@@ -31,12 +31,12 @@ def test_the_tutorial_works_as_written(tmp_path: Path) -> None:
             continue
         for line in code.splitlines():
             if line == "make install":
-                continue
+                line = ".venv/bin/evopolicy demo"  # as the README has it; its run is in the tutorial's report
             words = [os.path.expandvars(word.replace("$PWD", str(tmp_path))) for word in shlex.split(line)]
             done = subprocess.run(
                 words, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
             )
             assert done.returncode == 0, f"{line}\n{done.stdout}{done.stderr}"
             ran.append(words[1])
-    assert ran == ["try", "local", "local", "report", "verify"]
+    assert ran == ["demo", "try", "local", "local", "report", "verify"]
     assert (tmp_path / "report" / "index.html").is_file()
