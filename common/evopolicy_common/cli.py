@@ -163,13 +163,11 @@ def run_to_end(work: Coroutine[Any, Any, T]) -> T:
 def end_on_sigterm() -> None:
     """Makes SIGTERM cancel the calling task, so that the command ends in order, as with Ctrl-C.
 
-    So does SIGHUP, which a closed terminal sends, unless it is ignored (nohup).
+    Not so SIGHUP: after a lost terminal a run can be resumed, as after a kill.
     """
     import asyncio
 
     main = asyncio.current_task()
     assert main is not None
-    for number in (signal.SIGTERM, signal.SIGHUP):
-        if signal.getsignal(number) != signal.SIG_IGN:
-            with contextlib.suppress(RuntimeError, ValueError):  # no signal handlers outside the main thread
-                asyncio.get_running_loop().add_signal_handler(number, main.cancel)
+    with contextlib.suppress(RuntimeError, ValueError):  # no signal handlers outside the main thread
+        asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, main.cancel)

@@ -9,7 +9,7 @@ import msgspec
 import typer
 
 from evopolicy_common import catalogue
-from evopolicy_common.cli import Connect, CredentialsFile, fail_on_our_errors, run_to_end
+from evopolicy_common.cli import Connect, CredentialsFile, fail, fail_on_our_errors, run_to_end
 from evopolicy_common.commands import App
 from evopolicy_common.console import terminal
 from evopolicy_common.errors import ConfigError
@@ -339,7 +339,10 @@ def _play(plans: list[Plan], where: Cluster, parallel: int, as_json: bool, *, we
     if web:
         where = msgspec.structs.replace(where, web=plans[0].runs)
     console = terminal(stderr=as_json)
-    played = run_to_end(plain_runs.play(plans, where, parallel, console))
+    try:
+        played = run_to_end(plain_runs.play(plans, where, parallel, console))
+    except KeyboardInterrupt:
+        fail("interrupted; runs that had begun are cancelled and cannot be resumed", 130)
     if as_json:
         say_json(plain_runs.documents(played))
     else:

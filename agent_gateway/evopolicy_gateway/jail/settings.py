@@ -91,7 +91,12 @@ def check_bubblewrap() -> None:
     command = [program, *flags, "--ro-bind", "/", "/", "--proc", "/proc", "--dev", "/dev", "true"]
     try:
         tried = subprocess.run(
-            command, stdin=subprocess.DEVNULL, capture_output=True, timeout=_TIMEOUT_S, check=False
+            command,
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            timeout=_TIMEOUT_S,
+            check=False,
+            start_new_session=True,  # Ctrl-C would end it too, which looks like a machine that refuses
         )
     except (OSError, subprocess.TimeoutExpired) as error:
         raise ConfigError(f"the agent's jail cannot be built here ({error}): {_remedy()}") from error

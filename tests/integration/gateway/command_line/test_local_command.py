@@ -61,7 +61,7 @@ def test_video_all_leaves_a_video_beside_each_trajectory(tmp_path: Path) -> None
         assert (folder / "video.mp4").read_bytes()[4:8] == b"ftyp"
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_an_interrupted_local_command_takes_everything_down(tmp_path: Path, number: signal.Signals) -> None:
     waits = agent(tmp_path, "submit([0])\nopen('here', 'w')\ntime.sleep(1000)")
     arguments = ["local", "--env", "toy/line", "--agent", waits, "--exp-id", "t", *SMALL]
@@ -70,6 +70,10 @@ def test_an_interrupted_local_command_takes_everything_down(tmp_path: Path, numb
         running.process.send_signal(number)
         code, _, err = running.finish()
         assert code == 130
+        assert (
+            err.splitlines()[-1]
+            == "error: interrupted; runs that had begun are cancelled and cannot be resumed"
+        )
         assert "Traceback" not in err
         assert running.alive() == []
     outcome = record_in(run_dir(tmp_path)).outcome

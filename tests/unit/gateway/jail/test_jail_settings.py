@@ -75,6 +75,18 @@ def test_a_bubblewrap_that_fails_is_quoted(tmp_path: Path, monkeypatch: pytest.M
         check_bubblewrap()
 
 
+def test_ctrl_c_does_not_reach_a_bubblewrap_that_is_tried(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    program = tmp_path / "bwrap"
+    program.write_text(
+        '#!/bin/sh\nread -r pid name state parent group rest < /proc/$$/stat\n[ "$group" = $$ ]\n'
+    )
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    check_bubblewrap()
+
+
 def test_what_is_recorded_tells_the_modes_apart() -> None:
     modes = [JailSettings(mode=mode).recorded for mode in ("bwrap", "open-network", "none")]
     assert modes == ["bwrap", "bwrap, open network", "none"]
