@@ -3,7 +3,8 @@
 Rules that this module owns:
 - A worker that replays an episode gets its actions and none of their results.
 - A player's report is never trusted to be a valid recording. An unreadable recording is the player's fault; one lost
-  by the store is not.
+  by the store is not. What cannot be compared differs: otherwise odd content would evade the audit.
+- A difference is described in at most `MAX_TEXT` characters, as the message of a run's end has many.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from evopolicy_coordinator.core.events import AuditCompared, AuditEvent, AuditPr
 from evopolicy_coordinator.storage.store import Reader
 from evopolicy_coordinator.verify import compare
 
+MAX_TEXT = 500
 _LOST = "its record is not in the store any more"
 
 
@@ -36,7 +38,7 @@ def _prepare(effect: PrepareAudit, reader: Reader, blobs: BlobStore) -> AuditPre
     error, at_fault = "", False
     try:
         recorded = _recording(_outcome(reader, effect.group, effect.index), blobs)
-        packed = compare.recorded_actions(recorded)
+        packed = _actions(recorded)
         actions = BlobRef(digest=blobs.put(packed), size=len(packed))
     except ProtocolError as caught:
         error, at_fault = f"its recording cannot be read: {caught}", True
@@ -47,7 +49,7 @@ def _prepare(effect: PrepareAudit, reader: Reader, blobs: BlobStore) -> AuditPre
         run=effect.run,
         audit=effect.audit,
         actions=actions,
-        error=error,
+        error=error[:MAX_TEXT],
         at_fault=at_fault,
     )
 
@@ -89,7 +91,20 @@ def outcome_difference(ours: EpisodeOutcome, theirs: EpisodeOutcome, blobs: Blob
     left, right = recordings
     if (left.record, left.observations) != (right.record, right.observations):
         return f"records of {left.record}, {left.observations} and of {right.record}, {right.observations}"
-    return compare.episode_difference(ours, left, theirs, right)
+    try:
+        found = compare.episode_difference(ours, left, theirs, right)
+    except Exception as error:
+        # Their content may be anything that a worker makes up.
+        found = f"the recordings cannot be compared: {type(error).__name__}: {error}"
+    return None if found is None else found[:MAX_TEXT]
+
+
+def _actions(recorded: Trajectory) -> bytes:
+    """The recorded actions by themselves. Raises ProtocolError when they cannot be written again."""
+    try:
+        return compare.recorded_actions(recorded)
+    except Exception as error:
+        raise ProtocolError(f"its actions: {type(error).__name__}: {error}") from error
 
 
 def _outcome(reader: Reader, group: str, index: int) -> EpisodeOutcome:

@@ -15,6 +15,7 @@ from rigs.store_rows import blob, outcome_row, run_row, state_row
 
 from evopolicy_common.messages.episode import EpisodeOutcome
 from evopolicy_common.records.blobs import BlobStore
+from evopolicy_common.records.episodes.rendered import MAGIC
 from evopolicy_common.records.episodes.trajectory import Recorder, decode
 from evopolicy_coordinator.core.effects import CompareAudit, PrepareAudit
 from evopolicy_coordinator.core.events import AuditCompared, AuditPrepared
@@ -40,6 +41,14 @@ def played(data: bytes, **changes: Any) -> EpisodeOutcome:
     outcome = outcome_row(GROUP, 0, 0, blob(data)).outcome
     values = {"episode_return": 3.0, "length": 2, **changes}
     return msgspec.structs.replace(outcome, **values)
+
+
+def rendered(rows: bytes) -> bytes:
+    """An honest log beside made-up feedback files."""
+    file = {"name": "trajectory.jsonl", "size": len(rows), "packed": "as it is"}
+    header = msgspec.msgpack.encode({"observations": "arrays", "n": 2, "files": [file]})
+    parts = (header, recording(1.0, 2.0), rows)
+    return MAGIC + b"".join(len(part).to_bytes(4, "little") + part for part in parts)
 
 
 class Shelf:
@@ -124,6 +133,15 @@ def test_what_the_store_has_lost_is_nobodys_fault(shelf: Shelf) -> None:
         (played(recording(1.0, 2.0, 3.0)), "step 1: terminated"),
         (played(compare.action_log([1, 2])), "records of actions, arrays and of full, arrays"),
         (played(b"nonsense"), "cannot be read"),
+        # Its return is forged, and a comparison of its rows fails.
+        *(
+            (played(rendered(rows), episode_return=9.0), "cannot be compared")
+            for rows in (b"", b"1\n", b"{}\n{}\n", b"]\n]\n")
+        ),
+        (
+            played(recording(1.0, 2.0), reward_components={f"{k:1000}": 1.0 for k in range(9)}),
+            "reward components",
+        ),
     ],
 )
 def test_whatever_differs_is_reported(shelf: Shelf, forged: EpisodeOutcome, difference: str | None) -> None:
@@ -136,6 +154,7 @@ def test_whatever_differs_is_reported(shelf: Shelf, forged: EpisodeOutcome, diff
     else:
         assert compared.with_player is not None
         assert difference in compared.with_player
+        assert len(compared.with_player) <= auditing.MAX_TEXT
 
 
 def test_a_third_opinion_is_held_against_both(shelf: Shelf) -> None:
