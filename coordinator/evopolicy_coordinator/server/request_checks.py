@@ -30,7 +30,7 @@ MAX_REASON = 200
 MAX_FINGERPRINT_BYTES = 64 << 10
 """Every finished run's message has one."""
 MAX_ENVIRONMENTS = 10_000
-"""Of one worker, undescribed."""
+"""Of one worker. The status for operators lists them."""
 _MAX_WAIT_S = 60.0
 _MAX_NAME = 200
 
@@ -138,10 +138,10 @@ def check_registration(message: worker.Register) -> None:
             Refusal.BAD_MESSAGE,
             f"the worker's fingerprint takes {size:,} bytes; {MAX_FINGERPRINT_BYTES:,} are the limit",
         )
-    if len(message.undescribed) > MAX_ENVIRONMENTS or not all(map(catalogue.valid_id, message.undescribed)):
+    n = len(message.environments) + len(message.undescribed)
+    if n > MAX_ENVIRONMENTS or not all(map(catalogue.valid_id, message.undescribed)):
         raise RefusedError(
-            Refusal.BAD_MESSAGE,
-            f"{len(message.undescribed):,} environments without a description: {MAX_ENVIRONMENTS:,} valid ids are the limit",
+            Refusal.BAD_MESSAGE, f"{n:,} environments; {MAX_ENVIRONMENTS:,} with valid ids are the limit"
         )
     check_place(message.boot_id, message.machine_id, message.host, message.installation)
 

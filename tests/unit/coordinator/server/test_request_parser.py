@@ -10,7 +10,7 @@ import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from rigs.core_rig import fingerprint
+from rigs.core_rig import describe, fingerprint
 from rigs.finished_run import finished
 from rigs.store_rows import blob
 
@@ -285,6 +285,7 @@ def test_a_blob_that_is_too_large_for_outcomes_or_begun_actions_is_never_read(
         ({"slots": 0}, "bad_message"),
         ({"fingerprint": fingerprint(packages={"numpy": "1" * 70_000})}, "bad_message"),
         ({"undescribed": ("toy/line",) * 10_001}, "bad_message"),
+        ({"environments": (describe(),) * 10_001}, "bad_message"),
         ({"undescribed": ("../\x1b[2J",)}, "bad_message"),
         ({"installation": "x" * 1000}, "bad_message"),
     ],
