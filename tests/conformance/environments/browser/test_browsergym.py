@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
+import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -15,7 +17,7 @@ from evopolicy_worker.environments import Environment
 from evopolicy_worker.environments.browser.browsergym_calls import SIGNATURES, calls
 from evopolicy_worker.environments.browser.browsergym_env import BrowserGymEnv
 from evopolicy_worker.environments.browser.page import shared
-from evopolicy_worker.environments.checks import conformance
+from evopolicy_worker.environments.checks import conformance, episodes
 
 Warm = Callable[[str], Environment]
 SAMPLE = (
@@ -106,6 +108,64 @@ def test_an_episode_leaves_nothing_in_its_page(warm: Warm, name: str, act: str) 
     environment.reset(Case(seed=2))
     environment.step(act)
     assert seen() == undisturbed
+
+
+@pytest.mark.parametrize(
+    ("before", "then"),
+    [
+        # The mouse moves the focus, and a ring shows the next one or does not.
+        ("mouse_click(100, 100)", "focus('15')"),
+        ("mouse_click(100, 100)", "keyboard_press('Tab')"),
+        ("focus('15') keyboard_down('Space')", "mouse_move(80, 135)"),
+        ("mouse_down(200, 200, 'middle') mouse_down(100, 200)", "mouse_move(80, 135)"),
+    ],
+)
+def test_a_reused_page_looks_like_a_fresh_one(before: str, then: str) -> None:
+    environment = BrowserGymEnv("enter-text", screenshot=True)
+
+    def seen() -> str:
+        state = hashlib.sha256()
+        episodes.add(state, environment.reset(seed=1)[0])
+        episodes.add(state, environment.step(then)[0])
+        return state.hexdigest()
+
+    shared().lose()
+    fresh = seen()
+    for _ in range(4):
+        environment.reset(seed=2)
+        environment.step(before)
+        assert seen() == fresh
+
+
+def test_the_mouse_does_not_rest_on_a_scrollbar(warm: Warm) -> None:
+    warm("browsergym/miniwob.enter-text").reset(Case(seed=1))
+    assert shared().run("document.documentElement.scrollWidth > innerWidth")
+    shared().rest()
+    time.sleep(0.4)
+    assert shared().run("scrollX") == 0
+
+
+@pytest.mark.parametrize("button", ["left", "middle", "right"])
+@pytest.mark.parametrize("way", ["click", "hold", "drag"])
+def test_a_press_on_a_scrollbar_does_nothing(warm: Warm, way: str, button: str) -> None:
+    for name, x, y in (("enter-time", 492, 312), ("email-inbox", 212, 276)):
+        environment = warm(f"browsergym/miniwob.{name}")
+        environment.reset(Case(seed=1))
+        act = {
+            "click": f"mouse_click({x}, {y}, {button!r})",
+            "hold": f"mouse_down({x}, {y}, {button!r})",
+            "drag": f"mouse_down({x}, {y - 100}, {button!r}) mouse_up({x}, {y}, {button!r})",
+        }[way]
+        assert shared().run(f"__evopolicy.bar({x}, {y})")
+        step = environment.step(act)
+        time.sleep(0.6)
+        assert step.obs["last_action_error"] == ""
+        assert json.loads(environment.step("noop()").obs["extra_element_properties"]) == json.loads(
+            step.obs["extra_element_properties"]
+        )
+        assert not shared().run(
+            "[...document.querySelectorAll('*')].some((e) => e.scrollTop || e.scrollLeft)"
+        )
 
 
 @pytest.mark.parametrize("page", ["copy-paste", "text-editor"])

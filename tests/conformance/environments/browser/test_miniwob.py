@@ -19,7 +19,7 @@ from evopolicy_worker.environments import Environment, make, missing
 from evopolicy_worker.environments.base import Step
 from evopolicy_worker.environments.browser import chromium
 from evopolicy_worker.environments.browser import page as page_module
-from evopolicy_worker.environments.browser.miniwob_env import ACTIONS, KEYS
+from evopolicy_worker.environments.browser.miniwob_env import ACTIONS, KEYS, MiniWoBEnv
 from evopolicy_worker.environments.browser.page import shared
 from evopolicy_worker.environments.checks import conformance, episodes
 from evopolicy_worker.environments.settings import BROWSER
@@ -200,6 +200,29 @@ def test_an_environment_keeps_what_the_interface_promises(env_id: str) -> None:
 )
 def test_a_drag_and_a_lost_focus_are_waited_for(env_id: str, seed: int, steps: int, warm: Warm) -> None:
     assert len({episodes.digest(warm(env_id), seed, steps) for _ in range(5)}) == 1
+
+
+# Pages that the end of an episode leaves in the middle of an animation.
+@pytest.mark.parametrize(
+    ("page", "act"),
+    [
+        ("click-collapsible-2", action("CLICK_COORDS", coords=np.array([80, 75], np.float32))),
+        ("choose-date-easy", action("CLICK_COORDS", coords=np.array([95, 77], np.float32))),
+    ],
+)
+def test_an_animation_that_an_episode_leaves_is_not_in_the_next(page: str, act: dict[str, Any]) -> None:
+    environment = MiniWoBEnv(page)
+
+    def seen() -> str:
+        first = environment.reset(seed=1)[0]
+        return str((first, *(environment.step(each)[0] for each in (act, action("NONE"), action("NONE")))))
+
+    shared().lose()
+    fresh = seen()
+    for _ in range(2):
+        environment.reset(seed=2)
+        environment.step(act)
+        assert seen() == fresh
 
 
 @pytest.mark.parametrize("env_id", SAMPLE)

@@ -67,6 +67,7 @@ _FLAGS = (
     "--disable-gpu-vsync",
     "--disable-frame-rate-limit",
     "--disable-lcd-text",
+    "--disable-partial-raster",
     "--disable-smooth-scrolling",
     "--font-render-hinting=none",
     "--force-color-profile=srgb",

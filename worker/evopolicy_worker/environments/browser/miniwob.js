@@ -6,6 +6,8 @@
   const MAX_ELEMENTS = 8192;
   const READY_ROUNDS = 20;
   const READY_MS = 50;
+  // Time that the last episode's animations have to end: libraries that wait for a timer that was dropped start no other.
+  const DRAIN_MS = 3000;
   const clip = (text) => {
     const whole = String(text ?? "");
     return whole.length > MAX_CHARACTERS ? Array.from(whole).slice(0, MAX_CHARACTERS).join("") : whole;
@@ -56,8 +58,10 @@
   const begin = async (seed, mode, limit, ms) => {
     clock.guarded = false;
     if (location.hash) history.replaceState(null, "", location.pathname + location.search);
+    await advance(DRAIN_MS);
     forget();
     if (document.activeElement instanceof HTMLElement) document.activeElement.blur();
+    getSelection().removeAllRanges();
     for (const element of document.querySelectorAll("[data-wob_ref], [data-wob_eps], [data-tampered]")) {
       delete element.dataset.wob_ref; delete element.dataset.wob_eps; delete element.dataset.tampered;
     }

@@ -205,6 +205,11 @@
   };
   for (const name of ["mousemove", "pointermove", "pointerrawupdate"]) window.addEventListener(name, own, true);
 
+  // A caret that blinks would be in a picture or not, as the time has it.
+  const still = new CSSStyleSheet();
+  still.replaceSync("* { caret-animation: manual } @supports not (caret-animation: manual) { * { caret-color: transparent } }");
+  document.adoptedStyleSheets = [still];
+
   // A page that still waits for an answer is not ready to be looked at.
   const send = XMLHttpRequest.prototype.send;
   define(XMLHttpRequest.prototype, "send", function (...args) {
@@ -301,6 +306,25 @@
   // The browser scrolls some frames after the wheel has turned, or a drag has selected text: before the next event, or
   // it depends on the machine's load.
   const moved = async () => { await frame(); await frame(); await frame(); await settle(); };
+  // Whether a place is on a scrollbar: what a press on one does depends on the machine's load.
+  const bar = (x, y, shown = document) => {
+    const view = shown.scrollingElement ?? shown.documentElement;
+    if (x >= view.clientWidth || y >= view.clientHeight) return true;
+    const found = shown.elementFromPoint(x, y);
+    if (found === null || !found.offsetWidth || !found.offsetHeight) return false;
+    const { left, top, width, height } = found.getBoundingClientRect();
+    const [inX, inY] = [
+      (x - left) * found.offsetWidth / width - found.clientLeft, (y - top) * found.offsetHeight / height - found.clientTop,
+    ];
+    if (found instanceof HTMLIFrameElement) return found.contentDocument !== null && bar(inX, inY, found.contentDocument);
+    const style = getComputedStyle(found);
+    const within = (at, inner, whole, one, other) => {
+      const thick = whole - inner - parseFloat(one) - parseFloat(other);
+      return thick > 2 && at >= inner && at < inner + thick;
+    };
+    return within(inX, found.clientWidth, found.offsetWidth, style.borderLeftWidth, style.borderRightWidth)
+      || within(inY, found.clientHeight, found.offsetHeight, style.borderTopWidth, style.borderBottomWidth);
+  };
   // Timers that are due, in order, up to `ms` later; between them, what they promised.
   const advance = async (ms) => {
     if (!VIRTUAL) return;
@@ -324,7 +348,16 @@
     clock.now = end;
     animate();
   };
+  // Between two episodes the mouse is pressed on a button of this script's, so that nothing of the page is under it, and so
+  // that what has the focus last has it from the mouse: the ring around what is focused next depends on that.
+  const cover = document.createElement("button");
+  cover.style = "position: fixed; inset: 0; opacity: 0; z-index: 2147483647";
+  for (const name of ["focus", "focusin", "blur", "focusout"]) {
+    window.addEventListener(name, (event) => { if (event.target === cover) event.stopImmediatePropagation(); }, true);
+  }
+  const rest = () => { document.documentElement.append(cover); };
   const forget = () => {
+    cover.remove();
     for (const store of native.Object.values(stores)) store.held.clear();
     cookies.clear();
     clock.timers.clear();
@@ -332,5 +365,5 @@
     clock.now = 0; clock.next = 1; clock.left = ""; clock.error = "";
     clock.mouse = null;
   };
-  define(window, "__evopolicy", { clock, advance, settle, forget, clickable, moved, preload, json: native.json });
+  define(window, "__evopolicy", { clock, advance, settle, forget, clickable, moved, preload, bar, rest, json: native.json });
 })();

@@ -32,6 +32,8 @@ CALL_S = 10.0
 LOAD_S = 30.0
 _LOOK_EVERY = 64
 """Number of episodes between two checks of the browser's memory."""
+_MARGIN = 20
+"""Distance of the resting mouse from the window's right and lower edge, CSS pixels: more than a scrollbar is wide."""
 _NO_REASON = "BlockedByClient"
 _HALF_PAIR = re.compile(r"(?<!\\)((?:\\\\)*)\\ud[89a-f][0-9a-f]{2}")
 
@@ -87,6 +89,7 @@ class Page:
         self._identity: dict[str, str] | None = None
         self._buttons = 0
         self._held = "none"
+        self._down: dict[str, Key] = {}
         self.mouse_at = (0.0, 0.0)
         """Position of the mouse, CSS pixels."""
 
@@ -105,10 +108,11 @@ class Page:
             self._begin_context()
             for method, params in _first(address):
                 self._send(method, wanted=False, **params)
-        elif self._script:
+        else:
+            self.release()
+        if self._script:
             self._send("Page.removeScriptToEvaluateOnNewDocument", wanted=False, identifier=self._script)
         self.opened = address
-        self._buttons, self._held, self.mouse_at = 0, "none", (-1.0, -1.0)
         self._loaded = False
         added = self._send(
             "Page.addScriptToEvaluateOnNewDocument", source=_script(seed, virtual=address.virtual)
@@ -132,6 +136,7 @@ class Page:
     def _open_context(self) -> None:
         self.opened = None
         self._script = ""
+        self._buttons, self._held, self._down = 0, "none", {}
         devtools = self.browser.devtools
         if self._context:
             devtools.send("Target.disposeBrowserContext", wanted=False, browserContextId=self._context)
@@ -185,18 +190,25 @@ class Page:
 
     def mouse(self, *events: tuple[str, float, float, Button, int], modifiers: int = 0) -> None:
         """Mouse events in order, each a type (`mouseMoved`, `mousePressed`, `mouseReleased`), a place in CSS pixels, a
-        button and the number of clicks. `modifiers`: the keys held meanwhile."""
-        numbers = []
+        button and the number of clicks. `modifiers`: the keys held meanwhile. A press on a scrollbar is left out."""
+        numbers: list[int] = []
         shown: str
         for kind, x, y, button, clicks in events:
+            self.mouse_at = x, y
             if kind == "mouseMoved":
                 shown = self._held
             else:
                 shown = button
                 bit = _BITS[button]
-                self._buttons = self._buttons | bit if kind == "mousePressed" else self._buttons & ~bit
+                if kind == "mousePressed":
+                    self._await(numbers)
+                    numbers.clear()
+                    if self.run(f"__evopolicy.bar({x}, {y})"):
+                        continue
+                    self._buttons |= bit
+                else:
+                    self._buttons &= ~bit
                 self._held = button if self._buttons else "none"
-            self.mouse_at = x, y
             event: dict[str, Any] = {
                 "type": kind,
                 "x": x,
@@ -223,6 +235,10 @@ class Page:
         numbers = []
         for kind, pressed, modifiers in events:
             key = shifted(pressed) if modifiers & SHIFT else pressed
+            if kind == "down":
+                self._down[pressed.code] = pressed
+            else:
+                self._down.pop(pressed.code, None)
             event: dict[str, Any] = {
                 "key": key.key,
                 "code": key.code,
@@ -285,15 +301,23 @@ class Page:
                     strings[value] = ""
         return found
 
+    def release(self) -> None:
+        """Lets go of keys and of the mouse's buttons."""
+        self.keys(*(("up", key, 0) for key in tuple(self._down.values())))
+        held = [button for button, bit in _BITS.items() if self._buttons & bit]
+        self.mouse(*(("mouseReleased", *self.mouse_at, button, 1) for button in held))
+
     def rest(self) -> None:
-        """Lets go of the mouse's buttons, and moves it to the window's lower right corner, where a task has nothing."""
+        """Clicks where there is neither a task nor a scrollbar: the page keeps nothing of earlier places of mouse and keyboard."""
         assert self.opened is not None
-        corner = float(self.opened.width - 1), float(self.opened.height - 1)
-        if self.mouse_at != corner or self._buttons:
-            self.mouse(
-                *((kind, *corner, "left", 1) for kind in ("mouseMoved", "mousePressed", "mouseReleased"))
-            )
-            self._buttons, self._held = 0, "none"
+        self.release()
+        self.run("__evopolicy.rest()")
+        place = float(self.opened.width - _MARGIN), float(self.opened.height - _MARGIN)
+        self.mouse(
+            ("mouseMoved", *place, "left", 0),
+            ("mousePressed", *place, "left", 1),
+            ("mouseReleased", *place, "left", 1),
+        )
 
     def keep_small(self) -> None:
         """Between episodes: ends a browser that has grown too large. It is looked at now and then."""
@@ -391,7 +415,7 @@ class Page:
 
 
 _CODE = ("SCRIPT", "STYLE")
-_BITS = {"left": 1, "right": 2, "middle": 4}
+_BITS: dict[Button, int] = {"left": 1, "right": 2, "middle": 4}
 
 
 def _first(address: Address) -> list[tuple[str, dict[str, Any]]]:
