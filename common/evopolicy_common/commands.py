@@ -139,6 +139,8 @@ def run_app(app: typer.Typer, extra: str | None = None) -> NoReturn:
         fail(_usage_text(error), USAGE_ERROR)
     except (typer.Abort, KeyboardInterrupt):
         fail("interrupted", 130)
+    if code == 130:  # newer typers turn KeyboardInterrupt into this
+        fail("interrupted", 130)
     raise SystemExit(code if isinstance(code, int) else 0)
 
 

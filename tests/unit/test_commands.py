@@ -185,6 +185,19 @@ def test_the_help_of_local_is_in_groups_and_fits_a_narrow_terminal() -> None:
     assert max(map(len, output.splitlines())) <= 60
 
 
+def test_ctrl_c_is_told_whatever_a_command_was_doing() -> None:
+    program = """
+from evopolicy_common.commands import App, run_app
+app = App()
+@app.command()
+def interrupted() -> None:
+    raise KeyboardInterrupt
+run_app(app)
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "error: interrupted\n")
+
+
 def test_a_mistyped_command_is_answered_with_the_nearest() -> None:
     assert "Did you mean 'status'?" in started(["evopolicy", "statsu"]).stderr
 
