@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import base64
 import html
-import math
 import os
-import stat
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,8 +13,14 @@ import msgspec
 
 from evopolicy._records import Records, bars, table
 from evopolicy_common.errors import DECODE_ERRORS, ConfigError, ProtocolError
-from evopolicy_common.records.run_files import run_folders, submit_folders
-from evopolicy_common.records.run_record import RunRecord, decode_run_record
+from evopolicy_common.records.run_files import (
+    open_regular,
+    read_record,
+    read_regular,
+    run_folders,
+    submit_folders,
+)
+from evopolicy_common.records.run_record import RunRecord
 from evopolicy_common.records.summary import Summary, decode_summary
 from evopolicy_gateway.agents.function import RESULT
 
@@ -295,7 +299,7 @@ def load_runs(*paths: str | os.PathLike[str]) -> Runs:
 
 def read_run(folder: Path) -> Run:
     """Reads the run in `folder`. Raises ProtocolError or OSError when it holds no finished run."""
-    record = decode_run_record((folder / "run.json").read_bytes())
+    record = read_record(folder)
     feedback = folder / "workspace" / "feedback"
     return Run(folder, record, list(summaries_in(feedback)))
 
@@ -303,26 +307,21 @@ def read_run(folder: Path) -> Run:
 def summaries_in(feedback: Path) -> Iterator[Summary]:
     """The readable summaries of a run's submits, in order. Raises ProtocolError for a damaged one."""
     for folder in submit_folders(feedback).values():
-        path = folder / "summary.json"
-        if path.is_file():
-            summary = decode_summary(path.read_bytes())
-            if all(map(math.isfinite, summary.returns or ())):
-                yield summary
+        try:
+            yield decode_summary(read_regular(folder / "summary.json"))
+        except FileNotFoundError:
+            continue
 
 
 def _bounded(path: Path) -> bytes | None:
     """Reads a regular file that an agent may have written; None when missing. Raises ConfigError for anything else."""
     try:
-        fd = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+        with open_regular(path) as file:
+            data = file.read(_MAX_RESULT_BYTES + 1)
     except FileNotFoundError:
         return None
     except OSError as error:
         raise ConfigError(f"{path} is no regular file: {error.strerror}") from error
-    if not stat.S_ISREG(os.fstat(fd).st_mode):
-        os.close(fd)
-        raise ConfigError(f"{path} is no regular file")
-    with os.fdopen(fd, "rb") as file:
-        data = file.read(_MAX_RESULT_BYTES + 1)
     if len(data) > _MAX_RESULT_BYTES:
         raise ConfigError(
             f"{path} is larger than {_MAX_RESULT_BYTES:,} bytes, the most that an agent function may return"

@@ -7,8 +7,6 @@ skipped. An agent may write anything there, so reading takes linear time and bou
 
 from __future__ import annotations
 
-import os
-import stat
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
@@ -17,6 +15,7 @@ from typing import Any, Literal
 import msgspec
 
 from evopolicy_common.errors import DECODE_ERRORS
+from evopolicy_common.records.run_files import open_regular
 
 MAX_LOG_BYTES = 64 << 20
 """Later bytes of a log are not read; a last step says so."""
@@ -71,9 +70,7 @@ def read_steps(path: Path) -> list[Step]:
     log = _Log()
     try:
         # A run directory may be untrusted: a link would quote another file, and reading a pipe would block.
-        with open(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
-            if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
-                return []
+        with open_regular(path) as file:
             for line in file.read(MAX_LOG_BYTES).splitlines():
                 log.read(line)
             if file.read(1):

@@ -24,8 +24,8 @@ import msgspec
 from evopolicy._runs import summaries_in
 from evopolicy_common.errors import DECODE_ERRORS, ConfigError, ProtocolError
 from evopolicy_common.records.blobs import write_atomically
-from evopolicy_common.records.run_files import run_folders
-from evopolicy_common.records.run_record import RunRecord, decode_run_record
+from evopolicy_common.records.run_files import RUN_JSON, read_record, read_regular, run_folders
+from evopolicy_common.records.run_record import RunRecord
 from evopolicy_common.records.suite_folder import INDEX, Index
 from evopolicy_common.records.summary import Summary
 
@@ -110,7 +110,7 @@ def track(paths: list[Path], tracker: Tracker, *, follow: bool) -> Iterator[str]
             for folder in folders:
                 if folder in done:
                     continue
-                curve = Curve(folder, _record(folder), list(summaries_in(folder / "workspace" / "feedback")))
+                curve = _curve(folder)
                 _send(curve, tracker)
                 if curve.record is not None:
                     done.add(folder)
@@ -126,7 +126,7 @@ def _awaited(paths: list[Path]) -> bool:
     """Whether a sweep in one of these folders has runs that are not finished."""
     for path in paths:
         try:
-            index = msgspec.json.decode((path / INDEX).read_bytes(), type=Index)
+            index = msgspec.json.decode(read_regular(path / INDEX), type=Index)
         except FileNotFoundError:
             continue
         except (OSError, *DECODE_ERRORS) as error:
@@ -202,12 +202,11 @@ def _unix(text: str) -> float:
         return 0.0
 
 
-def _record(folder: Path) -> RunRecord | None:
+def _curve(folder: Path) -> Curve:
     try:
-        return decode_run_record((folder / "run.json").read_bytes())
-    except FileNotFoundError:
-        return None
-    except ProtocolError as error:
+        record = read_record(folder) if os.path.lexists(folder / RUN_JSON) else None
+        return Curve(folder, record, list(summaries_in(folder / "workspace" / "feedback")))
+    except (ProtocolError, OSError) as error:
         raise ConfigError(f"{folder}: {error}") from error
 
 

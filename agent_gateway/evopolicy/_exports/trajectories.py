@@ -19,7 +19,9 @@ from typing import Any
 
 from evopolicy._runs import Run, Runs
 from evopolicy_common.errors import ConfigError
-from evopolicy_common.records.run_files import submit_folders
+from evopolicy_common.records.episodes.npz import MAX_BYTES, read_arrays
+from evopolicy_common.records.episodes.rendered import MAX_OBSERVATIONS_BYTES, MAX_ROWS_BYTES
+from evopolicy_common.records.run_files import read_regular, submit_folders
 from evopolicy_common.terminal import say
 
 _LAST = "The observation after an episode's last step is a copy of the one before it."
@@ -101,7 +103,6 @@ def _slug(text: str) -> str:
 
 def _episodes(run: Run) -> Iterator[tuple[Any, dict[str, Any]]]:
     """A buffer and its metadata for each recorded train episode."""
-    import numpy as np
     from minari.data_collector import EpisodeBuffer
 
     returns = {(one.submit, one.episode): one for one in run.episodes if one.split == "train"}
@@ -112,11 +113,10 @@ def _episodes(run: Run) -> Iterator[tuple[Any, dict[str, Any]]]:
             path = folder / "trajectory.jsonl"
             if not path.is_file():
                 continue
-            rows = [json.loads(line) for line in path.open(encoding="utf-8")]
+            rows = [json.loads(line) for line in read_regular(path, MAX_ROWS_BYTES).splitlines()]
             pictures = path.with_name("observations.npz")
             if rows and rows[0]["obs"] is None and pictures.is_file():
-                with np.load(pictures, allow_pickle=False) as arrays:
-                    observations = {name: arrays[name] for name in arrays.files}
+                observations = read_arrays(read_regular(pictures, MAX_OBSERVATIONS_BYTES), MAX_BYTES)
                 columns: Any = (
                     observations["observations"] if list(observations) == ["observations"] else observations
                 )

@@ -21,6 +21,8 @@ INSPECT = 2
 """The version of Inspect's log format that is written, as JSON."""
 _STATES = {"cancelled": "cancelled", "error": "error"}
 """Inspect's state of a log by the run's status; any other is a success."""
+_MAX_NAME = 100
+"""Characters of an environment's name in a file's name."""
 _MAX_ERROR = 500
 """Characters of a failed call's result that Inspect shows as its error; the whole result is the message's content."""
 
@@ -36,7 +38,7 @@ def write_inspect(runs: Runs, out: Path) -> list[Path]:
     def path(run: Run) -> Path:
         # Inspect lists the JSON files whose names begin with a time, and shows the next parts as task and id.
         begun = _utc(run._record.timing.start_time).strftime("%Y-%m-%dT%H-%M-%S+00-00")
-        task = re.sub(r"[^A-Za-z0-9]+", "-", run.summary.env)
+        task = re.sub(r"[^A-Za-z0-9]+", "-", run.summary.env[:_MAX_NAME])
         return out / f"{begun}_{task}_{_id(run)}.json"
 
     return [*_each(runs, _inspect, path)]

@@ -17,7 +17,7 @@ from evopolicy_common.messages.episode import LARGEST_LIMIT, LARGEST_LIMITS, Res
 from evopolicy_common.messages.gateway import Profile
 from evopolicy_common.messages.run_settings import PUBLISHED, RunSettings
 from evopolicy_common.processes.packages import packages_in, policy_versions
-from evopolicy_common.records.run_record import decode_run_record
+from evopolicy_common.records.run_files import read_record
 from evopolicy_common.wire.credentials import local_state_dir
 from evopolicy_gateway.http.submit_request import Bounds, ids_in
 
@@ -284,7 +284,7 @@ def packages_for(policy: Path, requested: Sequence[str] | None) -> tuple[str, ..
     folder = policy.absolute()
     for run in (folder, *list(folder.parents)[:2]):
         with contextlib.suppress(OSError, ProtocolError):
-            found = packages_in(decode_run_record((run / "run.json").read_bytes()).versions.fingerprint)
+            found = packages_in(read_record(run).versions.fingerprint)
             try:
                 policy_versions(found)
             except ConfigError as error:

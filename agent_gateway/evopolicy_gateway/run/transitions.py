@@ -9,6 +9,7 @@ from pathlib import Path
 import msgspec
 
 from evopolicy_common.processes.left_files import left_files
+from evopolicy_common.records.run_files import open_regular
 
 MAX_READ_BYTES = 8 << 30
 """Larger feedback is not counted: an agent without a jail may leave sparse files of any size."""
@@ -48,7 +49,7 @@ def count_transitions(feedback: Path) -> Transitions | None:
 def _count(path: Path) -> tuple[int, int]:
     steps = invalid = 0
     # The file may have become a link or a pipe since it was found.
-    with open(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK), "rb") as file:
+    with open_regular(path) as file:
         rest = b""
         while chunk := file.read(_CHUNK_BYTES):
             lines = (rest + chunk).split(b"\n")

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator
 from functools import cache
 from typing import Annotated, Any, TypeVar
 
-from msgspec import Meta, Struct, inspect
+from msgspec import Meta, Struct, inspect, to_builtins
 
 T = TypeVar("T")
 
@@ -35,6 +35,20 @@ Named = Annotated[dict[Word, T], Meta(max_length=1 << 16)]
 Numbered = Annotated[dict[Int, T], Meta(max_length=1 << 20)]
 Plain = Annotated[dict[str, Any], Meta(max_length=1 << 16, extra={"plain": True})]
 """Data of JSON's kinds; `check_plain` checks and bounds its content."""
+
+
+def check_plausible(record: object) -> None:
+    """Raises ValueError naming the field of a decoded record with a number beyond `LARGEST`, which JSON allows: sums, texts and
+    conversions of such numbers fail."""
+    queue: list[tuple[str, Any]] = [("", to_builtins(record))]
+    while queue:
+        name, value = queue.pop()
+        if isinstance(value, dict):
+            queue += [(f"{name}.{key}" if name else str(key), inner) for key, inner in value.items()]
+        elif isinstance(value, list | tuple):
+            queue += [(name, inner) for inner in value]
+        elif isinstance(value, int | float) and not -LARGEST <= value <= LARGEST:
+            raise ValueError(f"{name}: a number beyond {LARGEST:g} is not plausible in a run")
 
 
 def plain_parts(message: Struct) -> Iterator[object]:

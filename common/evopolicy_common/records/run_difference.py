@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from evopolicy_common.processes.left_files import left_files
+from evopolicy_common.records.run_files import MAX_BYTES, RUN_JSON, read_regular
 from evopolicy_common.records.run_record import upgraded
 
 EXCLUDED_FILES: Mapping[str, str] = {
@@ -60,7 +61,7 @@ OLD_FIELDS: Mapping[str, tuple[str, ...]] = {
 
 _OLD_SYSTEM = re.compile(r"^(checkpoints/[^/]+/)system/")
 
-MAX_PARSED_BYTES = 64 << 20
+MAX_PARSED_BYTES = MAX_BYTES
 """Files above this size (bytes) were written by an agent, whatever their names, and are compared as plain bytes."""
 MAX_COMPARED_BYTES = 1 << 30
 """Larger files, in bytes, are not compared: an agent may leave huge sparse files."""
@@ -107,7 +108,7 @@ def shortened(found: Sequence[str], left: Path, right: Path) -> list[str]:
 def _is_old(root: Path) -> bool:
     """Whether an earlier version wrote the run."""
     try:
-        record = json.loads((root / "run.json").read_bytes())
+        record = json.loads(read_regular(root / RUN_JSON))
     except (OSError, ValueError, RecursionError):
         return False
     return isinstance(record, dict) and record.get("schema_version") == 1
@@ -137,7 +138,7 @@ def _file_differences(name: str, left: Path, right: Path, old: bool) -> list[str
         return [f"{name}: {sizes[0]} and {sizes[1]} bytes that are not the same"]
     excluded = (*EXCLUDED_FIELDS[file], *(OLD_FIELDS.get(file, ()) if old else ()))
     try:
-        ours, theirs = (_parse(name, path.read_bytes()) for path in (left, right))
+        ours, theirs = (_parse(name, read_regular(path)) for path in (left, right))
         return [
             f"{name}: {path or 'content'}: {_short(a)} and {_short(b)}"
             for path, a, b in _value_differences("", ours, theirs)

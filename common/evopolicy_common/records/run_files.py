@@ -1,4 +1,8 @@
-"""Finds finished runs below folders and the submits of a run's folder, and reads files that others wrote."""
+"""Finds finished runs below folders and the submits of a run's folder, and reads files that others wrote.
+
+Rules that this module owns: a file of a run is a regular one of a bearable size. No link is followed below a run directory, which
+could lead to files of the reader's machine, and pipes and devices are not opened.
+"""
 
 from __future__ import annotations
 
@@ -8,18 +12,67 @@ import re
 import stat
 from collections.abc import Iterable
 from pathlib import Path
+from typing import BinaryIO
 
-_SUBMIT = re.compile(r"submit_([0-9]{1,9})")
+import msgspec
+
+from evopolicy_common.errors import ProtocolError
+from evopolicy_common.records.run_record import Artifacts, RunRecord, decode_run_record
+
+_SUBMIT = re.compile(r"submit_([0-9]{3,9})")
 
 
-def read_regular(path: Path) -> bytes:
-    """The bytes of a file that others wrote. Raises OSError, also when it is no regular file: to open a pipe would wait
-    for its writer forever."""
-    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
-    with open(descriptor, "rb") as file:
-        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-            raise OSError(errno.EINVAL, "not a regular file", str(path))
-        return file.read()
+MAX_BYTES = 64 << 20
+"""Limit of records, sources and logs, bytes."""
+RUN_JSON = "run.json"
+_PLACES = ("workspace/feedback", "checkpoints", "logs")
+"""Folders of a run directory whose files are read, whatever `run.json` names."""
+
+
+def open_regular(path: Path | str, dir_fd: int | None = None) -> BinaryIO:
+    """Opens a file that others wrote. Raises OSError for anything but a regular file: to open a pipe would wait for its writer
+    forever, and a link may lead anywhere. Links among the folders on the way are the caller's."""
+    try:
+        fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW | os.O_CLOEXEC, dir_fd=dir_fd)
+    except OSError as error:
+        if error.errno == errno.ELOOP:
+            raise OSError(errno.ELOOP, "a link; put the file itself in its place", str(path)) from error
+        raise
+    if not stat.S_ISREG(os.fstat(fd).st_mode):
+        os.close(fd)
+        raise OSError(errno.EINVAL, "not a regular file", str(path))
+    return os.fdopen(fd, "rb")
+
+
+def read_regular(path: Path, most: int = MAX_BYTES) -> bytes:
+    """The bytes of a file that others wrote. Raises OSError as `open_regular`, and for one of more than `most` bytes."""
+    with open_regular(path) as file:
+        # The file may have holes, and may grow while it is read.
+        size = os.fstat(file.fileno()).st_size
+        data = file.read(most + 1) if size <= most else b""
+    if max(size, len(data)) > most:
+        raise OSError(errno.EFBIG, f"larger than {most >> 20} MiB, which no run has", str(path))
+    return data
+
+
+def read_record(folder: Path) -> RunRecord:
+    """The record of a finished run. Raises OSError when `run.json` cannot be read, ProtocolError when it is damaged or a folder that
+    it names is outside the run directory."""
+    record = decode_run_record(read_regular(folder / RUN_JSON))
+    check_places(folder, record.artifacts)
+    return record
+
+
+def check_places(folder: Path, artifacts: Artifacts) -> None:
+    """Raises ProtocolError when a place of a run's files is outside its directory, also by a link: a report quotes and copies what it
+    finds there."""
+    named = msgspec.structs.asdict(artifacts)
+    places = {f"artifacts.{name}": place for name, place in named.items() if place is not None}
+    for name, place in {**dict(zip(_PLACES, _PLACES, strict=True)), **places}.items():
+        parts = Path(place).parts
+        links = any(folder.joinpath(*parts[: n + 1]).is_symlink() for n in range(len(parts)))
+        if Path(place).is_absolute() or ".." in parts or links:
+            raise ProtocolError(f"{name} is outside the run directory: {place[:200]!r}")
 
 
 def run_folders(paths: Iterable[Path]) -> tuple[list[Path], list[Path]]:
@@ -54,7 +107,9 @@ def submit_folders(folder: Path) -> dict[int, Path]:
 
     NNN has at least three digits, more if the budget has more.
     """
-    if not folder.is_dir():
+    if not folder.is_dir() or folder.is_symlink():
         return {}
-    matches = ((_SUBMIT.fullmatch(child.name), child) for child in folder.iterdir())
-    return dict(sorted((int(match[1]), child) for match, child in matches if match))
+    found = [(match, child) for child in folder.iterdir() if (match := _SUBMIT.fullmatch(child.name))]
+    # Of several spellings of one index, the shortest. Links are left out.
+    found.sort(key=lambda each: (int(each[0][1]), -len(each[1].name)))
+    return {int(match[1]): child for match, child in found if not child.is_symlink()}

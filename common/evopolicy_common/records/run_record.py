@@ -17,6 +17,7 @@ import msgspec
 
 from evopolicy_common.errors import DECODE_ERRORS, ProtocolError
 from evopolicy_common.messages.audit import AuditRecord
+from evopolicy_common.messages.bounds import check_plausible
 from evopolicy_common.messages.environment import ObservationForm, PolicyScope, Split, StepLimit
 from evopolicy_common.messages.episode import FailureCategory, ResourceLimits, Tier
 from evopolicy_common.messages.gateway import FeedbackDetail, FinishRule, Profile, SimulationRule, VideoOption
@@ -358,9 +359,9 @@ def decode_run_record(data: bytes) -> RunRecord:
     try:
         header = _headers.decode(data)
         if header.schema_version == 1:
-            return msgspec.convert(upgraded(msgspec.json.decode(data)), RunRecord)
+            return _plausible(msgspec.convert(upgraded(msgspec.json.decode(data)), RunRecord))
         if header.schema_version == PUBLISHED_SCHEMA and header.record_version == RECORD_VERSION:
-            return _runs.decode(data)
+            return _plausible(_runs.decode(data))
     except (*DECODE_ERRORS, AttributeError, TypeError, ValueError) as error:
         raise ProtocolError(f"not a run record: {error}") from error
     if header.schema_version == PUBLISHED_SCHEMA and header.record_version is None:
@@ -371,6 +372,11 @@ def decode_run_record(data: bytes) -> RunRecord:
         f"run.json has schema_version {header.schema_version} and record_version {header.record_version}; this version"
         f" reads {PUBLISHED_SCHEMA} and {RECORD_VERSION}: update evopolicy"
     )
+
+
+def _plausible(record: RunRecord) -> RunRecord:
+    check_plausible(record)
+    return record
 
 
 def sha256_text(digest: str) -> str:

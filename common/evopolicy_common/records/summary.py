@@ -13,6 +13,7 @@ from datetime import UTC, datetime
 import msgspec
 
 from evopolicy_common.errors import DECODE_ERRORS, ProtocolError
+from evopolicy_common.messages.bounds import check_plausible
 from evopolicy_common.messages.gateway import SubmitStatus
 from evopolicy_common.records.policies.code_metrics import PUBLISHED_SCHEMA
 
@@ -74,7 +75,8 @@ def decode_summary(data: bytes) -> Summary:
     """The summary in `data`; unknown fields are skipped. Raises ProtocolError when this version cannot read it."""
     try:
         summary = _decoder.decode(data)
-    except DECODE_ERRORS as error:
+        check_plausible(summary)
+    except (*DECODE_ERRORS, ValueError) as error:
         raise ProtocolError(f"not a submit summary: {error}") from error
     if summary.schema_version not in _READ:
         raise ProtocolError(

@@ -27,7 +27,8 @@ from evopolicy_common.records.episodes.rendered import decode
 from evopolicy_common.records.episodes.trajectory import Recorder, Trajectory
 from evopolicy_common.records.journal import Result, SubmitResult
 from evopolicy_common.records.policies.checkpoints import bundle_of
-from evopolicy_common.records.run_record import RunRecord, decode_run_record, encode_run_record
+from evopolicy_common.records.run_files import read_record, read_regular
+from evopolicy_common.records.run_record import RunRecord, encode_run_record
 from evopolicy_common.wire.operator_client import TIMEOUT_S, OperatorClient
 from evopolicy_common.wire.transport import Link
 from evopolicy_coordinator.publish import contents, scrub
@@ -72,7 +73,9 @@ def find_runs(paths: Sequence[Path]) -> list[tuple[Path, RunRecord]]:
             raise ConfigError(f"{root} holds no finished run: there is no run.json in it or below")
         for path in files:
             try:
-                record = decode_run_record(path.read_bytes())
+                record = read_record(path.parent)
+            except OSError as error:
+                raise ConfigError(f"{path} cannot be read: {error.strerror}") from error
             except ProtocolError as error:
                 raise ConfigError(f"{path}: {error}") from error
             if record.committed is None:
@@ -244,13 +247,13 @@ class Publisher:
         """The agent's log without what the search finds; None where there is none to publish."""
         path = folder / (record.artifacts.logs_agent or "logs/agent.jsonl")
         what = f"{place}/{contents.LOG}"
-        if not path.resolve().is_relative_to(folder.resolve()) or not path.is_file():
+        try:
+            data, counts = scrub.redact(read_regular(path, contents.MAX_DOCUMENT_BYTES), self._needles)
+        except FileNotFoundError:
             return None
-        if path.stat().st_size > contents.MAX_DOCUMENT_BYTES:
-            why = f"longer than {contents.MAX_DOCUMENT_BYTES >> 20} MiB"
-            self._removed.append(Removed(what=what, why=why))
+        except OSError as error:
+            self._removed.append(Removed(what=what, why=error.strerror or "it cannot be read"))
             return None
-        data, counts = scrub.redact(path.read_bytes(), self._needles)
         for found, n in sorted(counts.items()):
             self._removed.append(Removed(what=f"{what}: {n} places", why=f"they held {found}"))
         self._must_be_clean(what, data)

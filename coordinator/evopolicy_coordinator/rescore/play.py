@@ -36,7 +36,8 @@ from evopolicy_common.records.rescores import (
     read_rescore,
     rescore_path,
 )
-from evopolicy_common.records.run_record import RunRecord, decode_run_record
+from evopolicy_common.records.run_files import RUN_JSON, read_record
+from evopolicy_common.records.run_record import RunRecord
 from evopolicy_common.wire.operator_client import DESCRIPTION_S, OperatorClient
 from evopolicy_common.wire.refusals import WRONG_SETTINGS, Refusal
 from evopolicy_common.wire.transport import Link
@@ -93,9 +94,9 @@ def read_finished(folders: Sequence[Path]) -> tuple[list[Finished], list[str]]:
     """The runs in these directories, and why others cannot be re-scored. ConfigError for damaged or unfinished ones."""
     found, without = [], []
     for folder in folders:
-        path = folder / "run.json"
+        path = folder / RUN_JSON
         try:
-            record = decode_run_record(path.read_bytes())
+            record = read_record(folder)
         except FileNotFoundError:
             raise ConfigError(
                 f"{folder} has no run.json: the run is not finished; re-score it when it is"

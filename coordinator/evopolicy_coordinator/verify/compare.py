@@ -11,7 +11,6 @@ Rules that this module owns:
 
 from __future__ import annotations
 
-import io
 import json
 import struct
 from collections.abc import Iterable
@@ -23,11 +22,22 @@ import numpy as np
 from evopolicy_common.messages.environment import ObsStorage
 from evopolicy_common.messages.episode import EpisodeOutcome
 from evopolicy_common.records.episodes.columns import leaves
-from evopolicy_common.records.episodes.rendered import OBSERVATIONS, ROWS, SINGLE, files_of
+from evopolicy_common.records.episodes.npz import MAX_BYTES, read_arrays
+from evopolicy_common.records.episodes.rendered import (
+    MAX_OBSERVATIONS_BYTES,
+    MAX_ROWS_BYTES,
+    OBSERVATIONS,
+    ROWS,
+    SINGLE,
+    files_of,
+)
 from evopolicy_common.records.episodes.trajectory import Recorder, Trajectory
+from evopolicy_common.records.run_files import read_regular
 
 _NAMES = {"NaN": float("nan"), "Inf": float("inf"), "-Inf": float("-inf")}
 _MARKS = frozenset({"policy_failed"})
+_HEADER_BYTES = 1 << 16
+"""More than the header of an array in a file takes."""
 
 
 def recorded_actions(recording: Trajectory) -> bytes:
@@ -94,15 +104,10 @@ def _rendered_difference(recorded: Trajectory, replayed: Trajectory) -> str | No
                 return f"step {t}: the observations differ"
             if not same(*_comparable(left["info"], right["info"])):
                 return f"step {t}: the infos differ"
-    found, expected = (_arrays(files.get(OBSERVATIONS)) for files in (ours, theirs))
+    found, expected = (
+        read_arrays(file, MAX_BYTES) if (file := files.get(OBSERVATIONS)) else {} for files in (ours, theirs)
+    )
     return "the observations differ" if not same(found, expected) else None
-
-
-def _arrays(file: bytes | None) -> dict[str, Any]:
-    if file is None:
-        return {}
-    with np.load(io.BytesIO(file), allow_pickle=False) as arrays:
-        return {name: arrays[name] for name in arrays.files}
 
 
 def outcome_difference(ours: EpisodeOutcome, theirs: EpisodeOutcome) -> str | None:
@@ -140,7 +145,7 @@ def same(left: Any, right: Any) -> bool:
 def read_rows(folder: Path) -> list[dict[str, Any]]:
     """The rows of an episode's `trajectory.jsonl`. Raises ValueError or OSError when it cannot be read."""
     try:
-        rows = [json.loads(line) for line in (folder / "trajectory.jsonl").read_bytes().splitlines()]
+        rows = [json.loads(line) for line in read_regular(folder / ROWS, MAX_ROWS_BYTES).splitlines()]
     except RecursionError:
         raise ValueError("a row is nested too deeply") from None
     if not all(isinstance(row, dict) and {"action", "reward"} <= row.keys() for row in rows):
@@ -192,7 +197,7 @@ def _written_difference(
 ) -> str | None:
     """`files_difference` for a rendered episode: compares its files' bytes first, then their content."""
     lines = episode.files[ROWS].splitlines()
-    if (folder / ROWS).read_bytes() != episode.files[ROWS]:
+    if read_regular(folder / ROWS, MAX_ROWS_BYTES) != episode.files[ROWS]:
         for t, (written, line) in enumerate(zip(rows, lines, strict=False)):
             ours = json.loads(line)
             for name in ("t", "reward", "terminated", "truncated", *(("action",) if actions else ()), "obs"):
@@ -207,10 +212,12 @@ def _written_difference(
         return None
     if not stored.exists():
         return "there is no file of observations"
-    data = stored.read_bytes()
-    if data != expected and not same(_arrays(data), _arrays(expected)):
-        return f"{OBSERVATIONS} differs"
-    return None
+    data = read_regular(stored, MAX_OBSERVATIONS_BYTES)
+    if data == expected:
+        return None
+    arrays = read_arrays(expected, MAX_BYTES)
+    most = sum(array.nbytes + _HEADER_BYTES for array in arrays.values())
+    return None if same(read_arrays(data, most), arrays) else f"{OBSERVATIONS} differs"
 
 
 def reads_as(text: Any, value: Any) -> bool:
@@ -265,12 +272,7 @@ def _pictures_difference(folder: Path, rows: list[dict[str, Any]], episode: Traj
     )
     if path is None:
         return "there is no file of observations"
-    stored = np.load(path, allow_pickle=False)
-    if isinstance(stored, np.ndarray):
-        found = {"": stored}
-    else:
-        with stored:
-            found = {name: stored[name] for name in stored.files}
+    found = read_arrays(read_regular(path, MAX_OBSERVATIONS_BYTES), MAX_BYTES)
     if list(columns) == [""] and list(found) == [SINGLE]:
         found = {"": found[SINGLE]}
     if found.keys() != columns.keys():

@@ -15,8 +15,8 @@ import msgspec
 from evopolicy_common.errors import ConfigError, ProtocolError
 from evopolicy_common.messages.environment import Split
 from evopolicy_common.records.policies.checkpoints import CheckpointMeta, read_meta
-from evopolicy_common.records.run_files import submit_folders
-from evopolicy_common.records.run_record import RunRecord, decode_run_record
+from evopolicy_common.records.run_files import RUN_JSON, read_record, read_regular, submit_folders
+from evopolicy_common.records.run_record import RunRecord
 from evopolicy_common.records.summary import Summary, decode_summary
 
 RANDOM = -1
@@ -104,15 +104,14 @@ class RunUnderTest(msgspec.Struct, frozen=True, kw_only=True):
 def read_run(root: Path) -> RunUnderTest:
     """Reads a run directory. Raises ConfigError when `root` is no finished run's directory, or one of its files is
     damaged."""
-    path = root / "run.json"
     try:
-        record = decode_run_record(path.read_bytes())
+        record = read_record(root)
     except OSError as error:
         raise ConfigError(
-            f"{root} is not the directory of a finished run: {path.name}: {error.strerror}"
+            f"{root} is not the directory of a finished run: {RUN_JSON}: {error.strerror}"
         ) from error
     except ProtocolError as error:
-        raise ConfigError(f"{path}: {error}") from error
+        raise ConfigError(f"{root / RUN_JSON}: {error}") from error
     submits = _submits(root, record)
     train = [played for submit in submits if (played := _train(record, submit))]
     return RunUnderTest(
@@ -214,7 +213,7 @@ def _hidden(record: RunRecord, train: dict[int, Played]) -> list[Played]:
 def _summary(folder: Path) -> Summary | None:
     path = folder / "summary.json"
     try:
-        return decode_summary(path.read_bytes())
+        return decode_summary(read_regular(path))
     except FileNotFoundError:
         return None
     except (OSError, ProtocolError) as error:

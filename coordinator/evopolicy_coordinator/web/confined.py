@@ -11,10 +11,11 @@ import stat
 from pathlib import Path
 from typing import NamedTuple
 
+from evopolicy_common.records.run_files import open_regular
+
 _MAX_DEPTH = 64
 _MAX_NAMES = 5000
 _FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
-_FILE = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
 
 
 class NotThereError(Exception):
@@ -42,15 +43,12 @@ class Confined:
         *folders, name = _parts(path)
         folder = self._folder(folders)
         try:
-            fd = os.open(name, _FILE, dir_fd=folder)
+            with open_regular(name, dir_fd=folder) as file:
+                return os.dup(file.fileno())
         except (OSError, ValueError) as error:
             raise NotThereError(path) from error
         finally:
             os.close(folder)
-        if not stat.S_ISREG(os.fstat(fd).st_mode):
-            os.close(fd)
-            raise NotThereError(path)
-        return fd
 
     def read(self, path: str, limit: int, offset: int = 0) -> bytes:
         """At most `limit` bytes of a regular file."""

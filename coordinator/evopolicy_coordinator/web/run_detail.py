@@ -6,7 +6,6 @@ an open run is in its gateway's folder, found by the gateway's journal; that of 
 
 from __future__ import annotations
 
-import io
 import os
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping
@@ -18,7 +17,9 @@ import msgspec
 import numpy as np
 
 from evopolicy_common.errors import DECODE_ERRORS, BundleError
+from evopolicy_common.messages.bounds import LARGEST
 from evopolicy_common.records.blobs import is_digest
+from evopolicy_common.records.episodes.npz import read_arrays
 from evopolicy_common.records.json_lines import objects
 from evopolicy_common.records.policies import bundles
 from evopolicy_common.records.policies.checkpoints import METADATA
@@ -37,6 +38,7 @@ MAX_WORDS = 150
 MAX_STEPS = 20_000
 """Steps of an episode that are read for its plots."""
 _MAX_TRAJECTORY = 64 << 20
+_MAX_UNPACKED = 512 << 20
 _MAX_SERIES = 8
 """Components of an observation or action that are drawn."""
 IMAGES = {
@@ -224,7 +226,9 @@ class Detail:
             if len(rewards) == MAX_STEPS:
                 break
             reward = row.get("reward")
-            rewards.append(float(reward) if isinstance(reward, int | float) else float("nan"))
+            # Others wrote it: an integer may be too large for a float.
+            is_number = isinstance(reward, int | float) and abs(reward) <= LARGEST
+            rewards.append(float(reward or 0.0) if is_number else float("nan"))
             actions.append(row.get("action"))
             inline.append(row.get("obs"))
         observed: Any = inline if any(each is not None for each in inline) else self._arrays(folder)
@@ -242,9 +246,9 @@ class Detail:
         for name in ("observations.npy", "observations.npz"):
             try:
                 data = self.files.read(f"{folder}/{name}", _MAX_TRAJECTORY)
-                found = np.load(io.BytesIO(data), allow_pickle=False)
-                return found if isinstance(found, np.ndarray) else {key: found[key] for key in found.files}
-            except (NotThereError, OSError, ValueError, KeyError, EOFError, MemoryError):
+                found = read_arrays(data, _MAX_UNPACKED)
+                return found.get("", found)
+            except (NotThereError, OSError, ValueError):
                 continue
         return None
 
@@ -351,7 +355,7 @@ def _series(columns: Any, n: int, name: str) -> tuple[tuple[Series, ...], str]:
         return _series({key: [row.get(key) for row in rows] for key in names}, n, name)
     try:
         array = np.asarray(columns, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         return (), f"{name} is not made of numbers of one shape, so it is not drawn."
     if array.ndim == 0 or not len(array):
         return (), ""

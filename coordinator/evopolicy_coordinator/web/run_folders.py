@@ -22,16 +22,15 @@ import msgspec
 from evopolicy_common.errors import DECODE_ERRORS, ProtocolError
 from evopolicy_common.messages.run_settings import RunSettings
 from evopolicy_common.messages.status import RunStatus
-from evopolicy_common.records.run_record import RunRecord, decode_run_record
+from evopolicy_common.records.run_files import RUN_JSON, read_record, read_regular
+from evopolicy_common.records.run_record import RunRecord
 from evopolicy_common.records.suite_folder import INDEX, PAUSED, Entry, Index
 from evopolicy_common.records.summary import Summary, decode_summary
 from evopolicy_coordinator.analysis.reading.reader import find_run_dirs
 from evopolicy_coordinator.analysis.scoring.scores import learn_names
 from evopolicy_coordinator.web.confined import Confined, NotThereError
 
-_MAX_RECORD_BYTES = 64 << 20
 _MAX_SUMMARY_BYTES = 8 << 20
-_MAX_INDEX_BYTES = 64 << 20
 
 
 class _Intended(msgspec.Struct, frozen=True, kw_only=True):
@@ -206,15 +205,14 @@ class Reader:
 
     def run(self, folder: Path, entry: Entry | None, by_run: Mapping[str, RunStatus]) -> RunFacts:
         """One run with a folder."""
-        record = folder / "run.json"
         try:
-            info = record.stat()
+            info = (folder / RUN_JSON).stat()
         except OSError:
             return self._open(folder, entry, by_run)
         stamp = (info.st_mtime_ns, info.st_size)
         known = self._records.get(folder)
         if known is None or known[0] != stamp:
-            known = self._records[folder] = stamp, _finished(folder, record)
+            known = self._records[folder] = stamp, _finished(folder)
         return known[1] if entry is None else msgspec.structs.replace(known[1], repeat=entry.repeat)
 
     def submits(self, folder: Path) -> list[SubmitFacts]:
@@ -318,11 +316,10 @@ def _submit(summary: Summary) -> SubmitFacts:
     )
 
 
-def _finished(folder: Path, path: Path) -> RunFacts:
+def _finished(folder: Path) -> RunFacts:
     """From `run.json`; a record that cannot be read is a run with that error."""
     try:
-        with path.open("rb") as file:
-            record = decode_run_record(file.read(_MAX_RECORD_BYTES))
+        record = read_record(folder)
     except (OSError, ProtocolError) as error:
         return RunFacts(
             key=key_of(str(folder)),
@@ -450,8 +447,7 @@ def _sweep_folders(roots: Iterable[Path]) -> list[tuple[Path, Index | None]]:
 
 def _index(root: Path) -> Index | None:
     try:
-        with (root / INDEX).open("rb") as file:
-            return msgspec.json.decode(file.read(_MAX_INDEX_BYTES), type=Index)
+        return msgspec.json.decode(read_regular(root / INDEX), type=Index)
     except (OSError, *DECODE_ERRORS):
         return None
 

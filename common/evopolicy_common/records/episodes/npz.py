@@ -1,4 +1,4 @@
-"""`.npz` files for `numpy.load`, written while their arrays' rows arrive.
+"""`.npz` files for `numpy.load`, written while their arrays' rows arrive, and files of arrays that others wrote.
 
 Rules that this module owns:
 - Rows are compressed at once; memory never holds a whole array. With one zlib, the same rows give the same bytes.
@@ -112,6 +112,26 @@ class _Member:
         )
         crc = crc_of_both(zlib.crc32(header), self._crc, self._n_bytes)
         return crc, len(header) + self._n_bytes, packed
+
+
+def read_arrays(data: bytes, most: int) -> dict[str, NDArray[Any]]:
+    """The arrays of an `.npz` file by name, or that of an `.npy` file under the empty name. Nothing is unpickled.
+
+    Raises ValueError for anything else, and for a file that unpacks to more than `most` bytes, before it is unpacked.
+    """
+    try:
+        found = np.load(io.BytesIO(data), allow_pickle=False)
+        if isinstance(found, np.ndarray):
+            return {"": found}
+        with found:
+            size = sum(member.file_size for member in found.zip.infolist())
+            if size > most:
+                raise ValueError(f"its arrays unpack to {size:,} bytes; {most:,} are allowed")
+            return {name: found[name] for name in found.files}
+    except ValueError:
+        raise
+    except Exception as error:  # damaged archives raise anything
+        raise ValueError(f"no file of arrays: {type(error).__name__}: {error}") from error
 
 
 def crc_of_both(first: int, second: int, n: int) -> int:

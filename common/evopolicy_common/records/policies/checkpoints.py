@@ -14,6 +14,7 @@ from typing import Any
 import msgspec
 
 from evopolicy_common.errors import DECODE_ERRORS, BundleError, ProtocolError
+from evopolicy_common.messages.bounds import check_plausible
 from evopolicy_common.records.blobs import write_atomically
 from evopolicy_common.records.policies import bundles
 from evopolicy_common.records.policies.bundles import Bundle, BundleFile
@@ -25,6 +26,8 @@ META = "_meta.json"
 METRICS = "metrics.json"
 METADATA = frozenset({META, METRICS})
 """Files in a checkpoint's folder besides the policy's."""
+_MAX_META_BYTES = 2 * bundles.MAX_BYTES
+"""Base64 of the policy's own files with these names is in `_meta.json`."""
 
 
 class ImportScan(msgspec.Struct, frozen=True, kw_only=True):
@@ -121,9 +124,11 @@ def read_meta(folder: Path, episode_budget: int) -> CheckpointMeta | None:
     """The metadata of the checkpoint in `folder`; None when it has none. Raises ProtocolError when they are damaged."""
     for name in (META, METRICS):
         try:
-            data = read_regular(folder / name)
+            data = read_regular(folder / name, _MAX_META_BYTES)
             if name == META:
-                return _meta.decode(data)
+                meta = _meta.decode(data)
+                check_plausible(meta)
+                return meta
             if _header.decode(data).schema_version == PUBLISHED_SCHEMA:
                 return None  # the current `metrics.json`, without its `_meta.json`
             return _upgraded(_old_metrics.decode(data), episode_budget)
@@ -131,7 +136,7 @@ def read_meta(folder: Path, episode_budget: int) -> CheckpointMeta | None:
             continue
         except OSError as error:
             raise ProtocolError(f"{name} cannot be read: {error.strerror}") from error
-        except DECODE_ERRORS as error:
+        except (*DECODE_ERRORS, ValueError) as error:
             raise ProtocolError(f"{name} is not a checkpoint's: {error}") from error
     return None
 

@@ -27,6 +27,7 @@ import msgspec
 
 from evopolicy_common.errors import DECODE_ERRORS
 from evopolicy_common.records.json_lines import objects
+from evopolicy_common.records.run_files import open_regular
 from evopolicy_coordinator.analysis.reading.records import Submit
 
 MAX_LOG_BYTES = 64 << 20
@@ -165,7 +166,7 @@ def _evidence(events: Iterable[LogEvent]) -> Evidence:
 
 def _lines(path: Path) -> Iterator[bytes]:
     left = MAX_LOG_BYTES
-    with path.open("rb") as stream:
+    with open_regular(path) as stream:
         while left > 0:
             line = stream.readline(left)
             if not line:

@@ -8,7 +8,6 @@ observations, no simulation outside submits, its step limits, no early finish, p
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 from typing import Any
@@ -193,8 +192,8 @@ def _number(value: Any) -> float:
 
 
 def decode(data: bytes) -> Any:
-    """`run.json` as plain values; None when it is not JSON."""
+    """`run.json` as plain values. Raises ProtocolError when it is not JSON, which has no NaN, half characters or numbers beyond floats."""
     try:
-        return json.loads(data)
-    except (ValueError, RecursionError):
-        return None
+        return msgspec.json.decode(data)
+    except DECODE_ERRORS as error:
+        raise ProtocolError(f"not a run record: {error}") from error

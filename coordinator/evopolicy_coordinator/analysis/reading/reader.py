@@ -17,9 +17,15 @@ from typing import Any
 import msgspec
 
 from evopolicy_common.errors import ProtocolError
-from evopolicy_common.messages.bounds import LARGEST
+from evopolicy_common.messages.bounds import check_plausible
 from evopolicy_common.records.policies.checkpoints import policy_folder, read_meta
-from evopolicy_common.records.run_files import read_regular, run_folders, submit_folders
+from evopolicy_common.records.run_files import (
+    RUN_JSON,
+    check_places,
+    read_regular,
+    run_folders,
+    submit_folders,
+)
 from evopolicy_common.records.run_record import RunRecord, decode_run_record
 from evopolicy_common.records.summary import Summary, decode_summary
 from evopolicy_coordinator.analysis.behaviour.line_diff import n_changed
@@ -38,7 +44,6 @@ Files = Mapping[str, bytes]
 _MAX_REASON_CHARS = 1000
 _PARALLEL_FROM = 40
 """Number of runs from which parallel reading outweighs the start of its processes."""
-_MAX_RUN_JSON_BYTES = 64 << 20
 
 
 class Loaded(msgspec.Struct, frozen=True, kw_only=True):
@@ -136,7 +141,10 @@ def read_run(folder: Path) -> Run:
     if not run.simulation_allowed:
         run = msgspec.structs.replace(run, simulator_flags=_simulators(run))
     run = msgspec.structs.replace(run, signals=_signals(run))
-    _check_numbers({"run.json": run.record, "submits": run.submits})
+    try:
+        check_plausible({"run.json": run.record, "submits": run.submits})
+    except ValueError as error:
+        raise UnreadableRunError(str(error)) from error
     return run
 
 
@@ -167,39 +175,20 @@ def _simulators(run: Run) -> tuple[Flag, ...]:
     return flags_of(((submit.index, files_of(submit)) for submit in run.submits), workspace, log, run.env)
 
 
-def _check_numbers(record: Any) -> None:
-    """Raises UnreadableRunError for a number too large for means over runs: JSON allows any size."""
-    queue: list[tuple[str, Any]] = [("", msgspec.to_builtins(record))]
-    while queue:
-        name, value = queue.pop()
-        if isinstance(value, dict):
-            queue += [(f"{name}.{key}" if name else str(key), inner) for key, inner in value.items()]
-        elif isinstance(value, list | tuple):
-            queue += [(name, inner) for inner in value]
-        elif isinstance(value, int | float) and not -LARGEST <= value <= LARGEST:
-            raise UnreadableRunError(f"{name}: a number beyond {LARGEST:g} is not plausible in a run")
-
-
 def _read_record(folder: Path) -> RunRecord:
-    path = folder / "run.json"
-    if not path.is_file():
-        raise UnreadableRunError("unfinished: run.json is missing")
-    if path.stat().st_size > _MAX_RUN_JSON_BYTES:
-        raise UnreadableRunError(f"run.json is larger than {_MAX_RUN_JSON_BYTES >> 20} MiB")
-    data = read_regular(path)
     try:
+        data = read_regular(folder / RUN_JSON)
         value = published.decode(data)
         record = (
             published.read_record(folder, value) if published.is_published(value) else decode_run_record(data)
         )
+        check_places(folder, record.artifacts)
+    except FileNotFoundError as error:
+        raise UnreadableRunError("unfinished: run.json is missing") from error
+    except OSError as error:
+        raise UnreadableRunError(f"run.json: {error.strerror}") from error
     except ProtocolError as error:
         raise UnreadableRunError(f"run.json: {error}") from error
-    for name, place in msgspec.structs.asdict(record.artifacts).items():
-        # A report copies and quotes what it finds there, and run directories come from others, too.
-        if place is not None and (Path(place).is_absolute() or ".." in Path(place).parts):
-            raise UnreadableRunError(
-                f"run.json: artifacts.{name} is outside the run directory: {place[:200]!r}"
-            )
     return record
 
 
@@ -212,8 +201,14 @@ def _read_submits(folder: Path, record: RunRecord) -> tuple[Submit, ...]:
     previous: Files | None = None
     consumed = 0
     for index in indices:
-        summary = _read_summary(checkpoint_folder(feedback.parent, "feedback", index), record)
         checkpoint = checkpoint_folder(folder, record.artifacts.checkpoints or "checkpoints", index)
+        shown = checkpoint_folder(feedback.parent, "feedback", index)
+        for place in (checkpoint, shown):
+            if place.is_symlink():
+                raise UnreadableRunError(
+                    f"{place.relative_to(folder)} is a link; put the folder itself in its place"
+                )
+        summary = _read_summary(shown, record)
         try:
             meta = read_meta(checkpoint, budget)
         except ProtocolError as error:

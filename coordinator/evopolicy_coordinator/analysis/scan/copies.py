@@ -7,7 +7,6 @@ are not copied from a trajectory: an open-loop policy's own plan comes back in i
 from __future__ import annotations
 
 import ast
-import io
 import itertools
 import json
 import math
@@ -16,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from evopolicy_common.records.episodes.npz import read_arrays
 from evopolicy_common.records.policies.code_metrics import parse
 from evopolicy_coordinator.analysis.scan.signals import Files, Signal, Trajectories, signal
 
@@ -135,7 +135,11 @@ def _sequences(path: str, data: bytes) -> Iterator[list[float]]:
         except (ValueError, RecursionError):
             return
     elif path.endswith((".npy", ".npz")):
-        for array in _stored_arrays(data):
+        try:
+            arrays = read_arrays(data, _MAX_UNPACKED)
+        except ValueError:
+            return
+        for array in arrays.values():
             if array.dtype.kind in "fiu" and array.size <= _MAX_NUMBERS:
                 yield [_rounded(value) for value in array.astype(np.float64).reshape(-1)]
     elif path.endswith((".csv", ".txt")):
@@ -147,21 +151,6 @@ def _sequences(path: str, data: bytes) -> Iterator[list[float]]:
                 continue
         if _WINDOW <= len(numbers) <= _MAX_NUMBERS:
             yield numbers
-
-
-def _stored_arrays(data: bytes) -> Iterator[np.ndarray[Any, Any]]:
-    """The arrays of a `.npy` or `.npz` file, one at a time. None of an archive that unpacks to more than `_MAX_UNPACKED`."""
-    try:
-        loaded = np.load(io.BytesIO(data), allow_pickle=False)
-        if isinstance(loaded, np.ndarray):
-            yield loaded
-            return
-        if sum(member.file_size for member in loaded.zip.infolist()) > _MAX_UNPACKED:
-            return
-        for name in loaded.files:
-            yield loaded[name]
-    except Exception:
-        return  # damaged archives raise anything
 
 
 def _numbers(node: ast.expr) -> list[float]:

@@ -10,6 +10,7 @@ import msgspec
 
 from evopolicy_common.errors import DECODE_ERRORS
 from evopolicy_common.processes.left_files import left_files
+from evopolicy_common.records.run_files import open_regular, read_regular
 from evopolicy_coordinator.analysis.scan.code import code_signals
 from evopolicy_coordinator.analysis.scan.copies import copied_actions
 from evopolicy_coordinator.analysis.scan.log import log_signals
@@ -74,7 +75,7 @@ def policy_files(folder: Path) -> dict[str, bytes]:
         searched = path.suffix in _SEARCHED and path.name not in ("_meta.json", "metrics.json")
         if searched and size <= _MAX_FILE_BYTES:
             try:
-                found[path.relative_to(folder).as_posix()] = path.read_bytes()
+                found[path.relative_to(folder).as_posix()] = read_regular(path, _MAX_FILE_BYTES)
             except OSError:
                 continue
             if len(found) >= _MAX_FILES:
@@ -85,17 +86,12 @@ def policy_files(folder: Path) -> dict[str, bytes]:
 def log_lines(path: Path | None) -> Iterator[bytes]:
     """The lines of an agent's log; none for a missing or huge file, or for anything but a regular file."""
     try:
-        if path is None or not _is_file(path):
+        if path is None or path.stat().st_size > _MAX_LOG_BYTES:
             return
-        with path.open("rb") as lines:
+        with open_regular(path) as lines:
             yield from lines
     except OSError:
         return
-
-
-def _is_file(path: Path) -> bool:
-    """Whether it is a file of a bearable size. An agent may leave links and pipes, and to open a pipe blocks."""
-    return not path.is_symlink() and path.is_file() and path.stat().st_size <= _MAX_LOG_BYTES
 
 
 class _Row(msgspec.Struct):
@@ -111,9 +107,9 @@ def feedback_actions(submit: Path) -> Iterator[list[Any]]:
     for path in sorted(submit.glob("episodes/*/trajectory.jsonl")):
         actions = []
         try:
-            if not _is_file(path):
+            if path.stat().st_size > _MAX_LOG_BYTES:
                 continue
-            with path.open("rb") as lines:
+            with open_regular(path) as lines:
                 for line in lines:
                     actions.append(_rows.decode(line).action)
                     left -= 1

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import re
 from collections import OrderedDict
 from collections.abc import Iterable, Iterator, Mapping
@@ -16,6 +17,7 @@ from typing import Any
 import msgspec
 
 from evopolicy_common.processes.left_files import left_files
+from evopolicy_common.records.run_files import open_regular, read_regular
 from evopolicy_coordinator.analysis.reading.sources import MAX_FILE_BYTES
 from evopolicy_coordinator.analysis.simulators.code import Code
 from evopolicy_coordinator.analysis.simulators.signs import FLAGGED, Kind, Sign, signs_of, with_numbers
@@ -132,7 +134,7 @@ def _left(workspace: Path) -> dict[str, bytes]:
         name = path.relative_to(workspace).as_posix()
         if path.suffix == ".py" and size <= MAX_FILE_BYTES and not name.startswith("feedback/"):
             try:
-                found[name] = path.read_bytes()
+                found[name] = read_regular(path, MAX_FILE_BYTES)
             except OSError:
                 continue
             if len(found) >= _MAX_FILES:
@@ -142,10 +144,14 @@ def _left(workspace: Path) -> dict[str, bytes]:
 
 def _pieces(log: Path) -> Iterator[tuple[int, bytes]]:
     """Python in an agent's log, with its line number: here-documents, and texts that are code as a whole."""
-    if not log.is_file() or log.is_symlink() or log.stat().st_size > _MAX_LOG_BYTES:
-        return
     seen: set[str] = set()
-    with log.open("rb") as lines:
+    try:
+        lines = open_regular(log)
+    except OSError:
+        return
+    with lines:
+        if os.fstat(lines.fileno()).st_size > _MAX_LOG_BYTES:
+            return
         for number, line in enumerate(lines, start=1):
             if (
                 len(line) > _MAX_LOG_LINE

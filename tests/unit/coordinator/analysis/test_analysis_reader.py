@@ -165,7 +165,7 @@ def damage(folder: Path, how: str) -> None:
         ("selected submit is gone", "selected submit 77"),
         ("truncated summary", "submit_000/summary.json"),
         ("damaged metrics", "_meta.json"),
-        ("run.json is a folder", "unfinished"),
+        ("run.json is a folder", "not a regular file"),
         ("deeply nested", "run.json"),
     ],
 )
