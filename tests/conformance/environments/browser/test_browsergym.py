@@ -351,6 +351,23 @@ def test_options_of_a_list_are_clicked_also_several_with_a_key_held(warm: Warm) 
     assert len(selected(environment.step(above))) == 1
 
 
+def test_keys_find_an_option_by_the_episode_s_time(warm: Warm) -> None:
+    environment = warm("browsergym/miniwob.choose-list")
+
+    def chosen(pause_s: float, steps: int) -> str:
+        (box,) = nodes(environment.reset(Case(seed=2)), "combobox")
+        shared().run(
+            "document.querySelector('select').innerHTML = '<option>x</option><option>ab</option><option>b</option>'"
+        )
+        environment.step(f"focus({bid(box)!r}) keyboard_press('a')")
+        time.sleep(pause_s)
+        for _ in range(steps):
+            environment.step("mouse_move(5, 5)")
+        return str(nodes(environment.step("keyboard_press('b')").obs, "combobox")[0]["value"]["value"])
+
+    assert [chosen(0.0, 0), chosen(1.2, 0), chosen(0.0, 5)] == ["ab", "ab", "b"]
+
+
 def test_nothing_is_typed_elsewhere_when_a_field_cannot_be_filled(warm: Warm) -> None:
     environment = warm("browsergym/miniwob.enter-password")
     one, other = nodes(environment.reset(Case(seed=1)), "textbox")

@@ -92,6 +92,8 @@ class Page:
         self._down: dict[str, Key] = {}
         self.mouse_at = (0.0, 0.0)
         """Position of the mouse, CSS pixels."""
+        self.keys_ms = 1
+        """Time of the next key, which only grows: a list finds an option by keys that are typed within a second."""
 
     @property
     def browser(self) -> Chromium:
@@ -251,6 +253,8 @@ class Page:
                 event |= {"type": "keyDown", "text": key.text, "unmodifiedText": key.text}
             else:
                 event["type"] = "rawKeyDown" if kind == "down" else "keyUp"
+            self.keys_ms += 1
+            event["timestamp"] = self.keys_ms / 1000
             numbers.append(self._send("Input.dispatchKeyEvent", **event))
         self._await(numbers)
 
@@ -311,6 +315,7 @@ class Page:
         """Clicks where there is neither a task nor a scrollbar: the page keeps nothing of earlier places of mouse and keyboard."""
         assert self.opened is not None
         self.release()
+        self.keys_ms += 2000
         self.run("__evopolicy.rest()")
         place = float(self.opened.width - _MARGIN), float(self.opened.height - _MARGIN)
         self.mouse(

@@ -186,6 +186,7 @@ class PageEnv(gymnasium.Env[Any, Any]):
 
     def _pass(self) -> dict[str, Any]:
         """Lets a step's time pass; then what there is to see."""
+        self.page.keys_ms += STEP_MS
         found: dict[str, Any] = self.page.tell(
             f"__evopolicy.pass({STEP_MS}, {list(self.page.mouse_at)}).then({self._look})"
         )
