@@ -36,6 +36,22 @@ def one_line(text: str) -> str:
     return harmless(text.replace("\n", " ").replace("\t", " "))
 
 
+# A number, or two as in an interval: `-1.5`, `-1.5 to +2e3`.
+_NUMBERS = re.compile(r"[-+]?[0-9][0-9.]*(?:e[-+]?[0-9]+)?(?: to [-+]?[0-9][0-9.]*(?:e[-+]?[0-9]+)?)?")
+
+
+def csv_cell(value: Any) -> Any:
+    """The value for a CSV file: a text is `harmless`, with an apostrophe in front where a spreadsheet would take it for a
+    formula; empty for None."""
+    if value is None:
+        return ""
+    if not isinstance(value, str):
+        return value
+    text = harmless(value)
+    formula = text.lstrip().startswith(("=", "+", "-", "@")) and not _NUMBERS.fullmatch(text)
+    return f"'{text}" if formula else text
+
+
 def number(value: float | None) -> str:
     """Formats a number for a table: four digits, or a dash for None."""
     return "–" if value is None else f"{value:.4g}"

@@ -9,6 +9,7 @@ from typing import Any
 
 from evopolicy._records import Records
 from evopolicy._runs import Runs
+from evopolicy_common.terminal import csv_cell
 
 
 def _tables(runs: Runs) -> Iterator[tuple[str, Records[Any]]]:
@@ -25,16 +26,9 @@ def write_csv(runs: Runs, out: Path) -> list[Path]:
         with path.open("w", encoding="utf-8", newline="") as file:
             writer = csv.writer(file)
             writer.writerow(records.columns)
-            writer.writerows([_cell(getattr(one, column)) for column in records.columns] for one in records)
+            writer.writerows([csv_cell(getattr(one, column)) for column in records.columns] for one in records)
         written.append(path)
     return written
-
-
-def _cell(value: Any) -> Any:
-    # A spreadsheet takes a text that begins so for a formula, and agents choose some of these texts.
-    if isinstance(value, str) and value.startswith(("=", "+", "-", "@", "\t", "\r")):
-        return f"'{value}"
-    return value
 
 
 def write_parquet(runs: Runs, out: Path) -> list[Path]:

@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 import msgspec
 
-from evopolicy_common.terminal import harmless, one_line
+from evopolicy_common.terminal import csv_cell, one_line
 
 Kind = Literal["text", "integer", "number", "percent"]
 DASH = "–"
@@ -74,22 +74,8 @@ def to_csv(table: Table) -> str:
     writer.writerow([column.key for column in table.columns])
     for row in table.rows:
         values = [row.get(column.key) for column in table.columns]
-        writer.writerow([_csv_cell(value) for value in values])
+        writer.writerow([csv_cell(value) for value in values])
     return out.getvalue()
-
-
-# A number, or two as in an interval: `-1.5`, `-1.5 to +2e3`.
-_NUMBERS = re.compile(r"[-+]?[0-9][0-9.]*(?:e[-+]?[0-9]+)?(?: to [-+]?[0-9][0-9.]*(?:e[-+]?[0-9]+)?)?")
-
-
-def _csv_cell(value: Any) -> Any:
-    if value is None:
-        return ""
-    if not isinstance(value, str):
-        return value
-    text = harmless(value)
-    formula = text.lstrip().startswith(("=", "+", "-", "@")) and not _NUMBERS.fullmatch(text)
-    return f"'{text}" if formula else text
 
 
 def to_markdown(table: Table) -> str:

@@ -55,7 +55,7 @@ def export(*words: str | Path, **environment: str) -> subprocess.CompletedProces
 
 
 def test_csv_holds_every_record_and_no_formula(tmp_path: Path) -> None:
-    write_run(tmp_path / "runs", VERSIONS, entry="=HYPERLINK(1)")
+    write_run(tmp_path / "runs", VERSIONS, entry=" =HYPERLINK(1)")
     done = export(tmp_path / "runs", "--to", "csv", "--out", tmp_path / "tables")
     assert done.returncode == 0, done.stderr
     rows = {
@@ -64,7 +64,7 @@ def test_csv_holds_every_record_and_no_formula(tmp_path: Path) -> None:
         )
         for name in ("runs", "submits", "episodes")
     }
-    assert [row["entry"] for row in rows["runs"]] == ["'=HYPERLINK(1)"]
+    assert [row["entry"] for row in rows["runs"]] == ["' =HYPERLINK(1)"]
     assert [row["mean_return"] for row in rows["submits"]] == ["1.5", "4.0", ""]
     assert [row["episode_return"] for row in rows["episodes"] if row["split"] == "train"] == [
         "1.0",
