@@ -87,11 +87,11 @@ BUGS = (
     Bug(
         "keep a job open when it is done",
         results,
-        "commit",
+        "_commit",
         'groups.close_job(state, job, step, "done by another attempt")',
         "pass",
     ),
-    Bug("answer for outcomes that were not stored", results, "commit", "step.persist(row)", "pass"),
+    Bug("answer for outcomes that were not stored", results, "_commit", "step.persist(row)", "pass"),
     Bug("count attempts from one after a restart", State, "__init__", "(incarnation - 1) *", "0 *"),
     Bug("show episodes before the gate", result_polls, "_released", "if 0 in group.digests", "if True"),
     Bug("let ties go to the earlier submit", finished, "select", ">= best_mean", "> best_mean"),

@@ -26,7 +26,9 @@ def write_csv(runs: Runs, out: Path) -> list[Path]:
         with path.open("w", encoding="utf-8", newline="") as file:
             writer = csv.writer(file)
             writer.writerow(records.columns)
-            writer.writerows([csv_cell(getattr(one, column)) for column in records.columns] for one in records)
+            writer.writerows(
+                [csv_cell(getattr(one, column)) for column in records.columns] for one in records
+            )
         written.append(path)
     return written
 

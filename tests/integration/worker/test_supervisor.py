@@ -203,7 +203,8 @@ def test_a_slot_that_dies_or_fails_changes_no_result(tmp_path: Path) -> None:
         assert failed
         assert results[0] == results[1]
 
-    run(scenario)
+    # Half a minute of it are pauses before a slot is started again.
+    run(scenario, 180.0)
 
 
 def test_slots_are_prepared_before_there_is_work(coordinator: Coordinator, tmp_path: Path) -> None:

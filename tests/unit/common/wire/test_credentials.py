@@ -76,7 +76,7 @@ def test_tokens_leave_the_machine_inside_tls_only(tmp_path: Path, endpoint: str)
     path = tmp_path / "worker.json"
     credentials.write(worker(), path)
     assert not stays_on_machine(endpoint)
-    with pytest.raises(ConfigError, match="unencrypted; use tls/HOST:PORT"):
+    with pytest.raises(ConfigError, match="tls/HOST:PORT"):
         credentials.find("worker", (endpoint,), path)
 
 
