@@ -15,6 +15,7 @@ import hashlib
 import json
 import mimetypes
 import re
+from collections.abc import Sequence
 from importlib.resources import files
 from pathlib import Path
 from typing import Any, Literal
@@ -89,6 +90,8 @@ class Page:
         self._identity: dict[str, str] | None = None
         self._buttons = 0
         self._held = "none"
+        self._touched = True
+        """Whether mouse or keyboard were used since the mouse rests."""
         self._down: dict[str, Key] = {}
         self.mouse_at = (0.0, 0.0)
         """Position of the mouse, CSS pixels."""
@@ -115,7 +118,7 @@ class Page:
         if self._script:
             self._send("Page.removeScriptToEvaluateOnNewDocument", wanted=False, identifier=self._script)
         self.opened = address
-        self._loaded = False
+        self._loaded, self._touched = False, True
         added = self._send(
             "Page.addScriptToEvaluateOnNewDocument", source=_script(seed, virtual=address.virtual)
         )
@@ -193,6 +196,19 @@ class Page:
     def mouse(self, *events: tuple[str, float, float, Button, int], modifiers: int = 0) -> None:
         """Mouse events in order, each a type (`mouseMoved`, `mousePressed`, `mouseReleased`), a place in CSS pixels, a
         button and the number of clicks. `modifiers`: the keys held meanwhile. A press on a scrollbar is left out."""
+        pressed = dict.fromkeys((x, y) for kind, x, y, _, _ in events if kind == "mousePressed")
+        # Asked before the first event: to wait for a mouse that moves is to wait for the next frame.
+        bars = [place for place in pressed if self.run("__evopolicy.bar({}, {})".format(*place))]
+        self._point(events, modifiers, bars)
+
+    def _point(
+        self,
+        events: Sequence[tuple[str, float, float, Button, int]],
+        modifiers: int = 0,
+        bars: Sequence[tuple[float, float]] = (),
+    ) -> None:
+        """`bars`: where a press is left out."""
+        self._touched = True
         numbers: list[int] = []
         shown: str
         for kind, x, y, button, clicks in events:
@@ -203,9 +219,7 @@ class Page:
                 shown = button
                 bit = _BITS[button]
                 if kind == "mousePressed":
-                    self._await(numbers)
-                    numbers.clear()
-                    if self.run(f"__evopolicy.bar({x}, {y})"):
+                    if (x, y) in bars:
                         continue
                     self._buttons |= bit
                 else:
@@ -229,12 +243,14 @@ class Page:
 
     def wheel(self, x: float, y: float, delta_x: float, delta_y: float) -> None:
         """Turns the mouse's wheel at a place, CSS pixels."""
+        self._touched = True
         self.send("Input.dispatchMouseEvent", type="mouseWheel", x=x, y=y, deltaX=delta_x, deltaY=delta_y)
         self.run("__evopolicy.moved()")
 
     def keys(self, *events: tuple[Literal["down", "up"], Key, int]) -> None:
         """Keys pressed and released in order, each with the modifiers held (1 Alt, 2 Control, 4 Meta, 8 Shift)."""
         numbers = []
+        self._touched = self._touched or bool(events)
         for kind, pressed, modifiers in events:
             key = shifted(pressed) if modifiers & SHIFT else pressed
             if kind == "down":
@@ -314,15 +330,20 @@ class Page:
     def rest(self) -> None:
         """Clicks where there is neither a task nor a scrollbar: the page keeps nothing of earlier places of mouse and keyboard."""
         assert self.opened is not None
+        if not self._touched:
+            return
         self.release()
         self.keys_ms += 2000
         self.run("__evopolicy.rest()")
-        place = float(self.opened.width - _MARGIN), float(self.opened.height - _MARGIN)
-        self.mouse(
-            ("mouseMoved", *place, "left", 0),
-            ("mousePressed", *place, "left", 1),
-            ("mouseReleased", *place, "left", 1),
+        x, y = float(self.opened.width - _MARGIN), float(self.opened.height - _MARGIN)
+        self._point(
+            (
+                ("mouseMoved", x, y, "left", 0),
+                ("mousePressed", x, y, "left", 1),
+                ("mouseReleased", x, y, "left", 1),
+            )
         )
+        self._touched = False
 
     def keep_small(self) -> None:
         """Between episodes: ends a browser that has grown too large. It is looked at now and then."""
