@@ -214,7 +214,9 @@ class BlobStore:
             old.unlink(missing_ok=True)
 
     def _finish(self, part: Path, digest: str) -> None:
-        if digest_of(part.read_bytes()) != digest:
+        with part.open("rb") as file:
+            found = hashlib.file_digest(file, "sha256").hexdigest()
+        if found != digest:
             part.unlink()
             raise StorageError(f"uploaded bytes are not blob {digest}; upload it again")
         path = self.path(digest)

@@ -71,6 +71,8 @@ class WorkerRegistered(Requested[Register], frozen=True, kw_only=True):
     """Machine whose credentials the worker joined with; empty for the state folder's own credentials."""
     refused_environments: dict[str, str] = {}
     """Refused environment to the reason. They are already removed from the message."""
+    size: int = 0
+    """Size of the description of its environments, bytes."""
 
 
 class LivenessLost(Event, frozen=True, kw_only=True):

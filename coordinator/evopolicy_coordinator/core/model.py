@@ -424,6 +424,8 @@ class Profile:
     """Of each environment by itself."""
     classes: dict[str, str]
     """Environment to the class that its runs are pinned to; see `Fingerprint.class_name`."""
+    size: int = 0
+    """Size of the descriptions, bytes."""
     lanes: dict[LaneKey, Lane] = field(default_factory=dict)
     busy: dict[Lane, None] = field(default_factory=dict)
     """Its lanes with waiting jobs."""
@@ -605,6 +607,8 @@ class Worker:
     benched_until: float = 0.0
     undescribed: frozenset[str] = frozenset()
     """Environments that it offers and describes only when a run waits for them."""
+    undescribed_size: int = 0
+    """Characters of their ids."""
 
     def numerics(self, env: str) -> str:
         """Identifies what its numbers in an environment depend on, the processor's features included: equal for workers
@@ -638,6 +642,8 @@ class Run:
     """The submit in flight."""
     hidden_failures: dict[str, int] = field(default_factory=dict)
     """Group id to number of hidden episodes in which the policy failed, of finished groups."""
+    places: set[tuple[str, str]] = field(default_factory=set)
+    """Machine id and boot id of each place for which its gateway has requested a permit from this core."""
     hidden_returns: dict[str, tuple[float, ...]] = field(default_factory=dict)
     """Held-out and random group id to returns, of finished groups."""
     hidden_successes: dict[str, tuple[bool, ...]] = field(default_factory=dict)

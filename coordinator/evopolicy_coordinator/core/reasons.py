@@ -33,8 +33,10 @@ Code = Literal[
     "over_budget",
     "no_worker_yet",
     "may_not_start",
+    "too_many_places",
     # Refused: workers.
     "name_taken",
+    "no_room",
     "unknown_session",
     "forger",
     "quarantined",

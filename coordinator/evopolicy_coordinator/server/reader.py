@@ -10,7 +10,7 @@ Rules that this module owns:
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
@@ -85,14 +85,22 @@ class ServiceReader:
         """Reads and compares recordings, one audit after another; calls `tell` from its thread."""
         self._audits.submit(self._audit, effect, tell)
 
-    def put(self, sender: str, run: str | None, message: BlobPut, max_bytes: int, answer: Answer) -> None:
+    def put(
+        self,
+        sender: str,
+        run: str | None,
+        message: BlobPut,
+        max_bytes: int,
+        answer: Answer,
+        submitted: Collection[str | None] = (),
+    ) -> None:
         """Stores one chunk of a blob of at most `max_bytes`. The caller must check the sender's right to upload.
 
         With `run`, the gateway's own, the reply does not reveal which bytes others have stored: all bytes are
-        requested, then recorded.
+        requested, then recorded. `submitted`: the bundles that its submits name.
         """
         self._lane(message.digest).submit(
-            self._answer, lambda: self._put(sender, run, message, max_bytes), answer
+            self._answer, lambda: self._put(sender, run, message, max_bytes, submitted), answer
         )
 
     def get(self, run: str | None, message: BlobGet, answer: Answer) -> None:
@@ -166,8 +174,8 @@ class ServiceReader:
     def _answer(self, work: Callable[[], Message], answer: Answer) -> None:
         try:
             answer(work())
-        except DamagedStoreError as error:
-            refused = damaged(error)
+        except (DamagedStoreError, RefusedError) as error:
+            refused = damaged(error) if isinstance(error, DamagedStoreError) else error
             answer(Refused(status=refused.status, message=refused.message))
         except StorageError as error:
             # Our own fault: the client retries.
@@ -281,13 +289,22 @@ class ServiceReader:
         key, signature = identity.sign(self._database.parent, message.digest)
         return Signed(key=key, signature=signature)
 
-    def _put(self, sender: str, run: str | None, message: BlobPut, max_bytes: int) -> Message:
+    def _put(
+        self,
+        sender: str,
+        run: str | None,
+        message: BlobPut,
+        max_bytes: int,
+        submitted: Collection[str | None],
+    ) -> Message:
         if not is_digest(message.digest):
             return Refused(status=Refusal.BAD_BLOB, message=f"{message.digest[:80]!r} is no SHA-256 digest")
         if not 0 <= message.size <= max_bytes:
             return Refused(
                 status=Refusal.BAD_BLOB, message=f"blob of {message.size:,} bytes, {max_bytes:,} are allowed"
             )
+        if run is not None:
+            self._uploads.begin(run, message.digest, message.size, submitted)
         on_whole = None
         if run is not None and not self._uploads.has_sent(run, message.digest):
             on_whole = partial(self._uploads.note, run, message.digest)

@@ -80,7 +80,11 @@ TEXTS: Mapping[Code, str | Callable[..., str]] = {
     "over_budget": "{n} episodes asked for; {left} of the budget remain",
     "no_worker_yet": "the run waits for {waits_for}",
     "may_not_start": "the run's agent may not start yet; it waits for {waits_for}",
+    "too_many_places": "the agent of run {run!r} has been on {n} kernels, which is the limit; if it is to start on another,"
+    " run `evopolicy runs agent-gone {run}` first",
     "name_taken": "a worker of another machine has the name {worker!r}; choose another --name",
+    "no_room": "{n:,} workers, with {size:,} bytes of environments, may join with one token: stop some, wait an hour for lost"
+    " ones to be forgotten, or give other machines a folder of their own (`evopolicy-coordinator certs issue worker NAME`)",
     "unknown_session": "the session of worker {worker!r} is unknown; register again",
     "forger": _forger,
     "quarantined": "{worker} is quarantined: {why}",

@@ -220,6 +220,7 @@ class RequestParser:
             request=request,
             message=replace(m, environments=admitted),
             refused_environments=refused,
+            size=len(msgspec.msgpack.encode(admitted)),
             session=secrets.token_urlsafe(16) if machines is None else machines.session_for(m.token),
             machine="" if holder is None else holder.name,
         )

@@ -324,7 +324,7 @@ class Service:
         query.reply(answer_bytes(answer))
 
     def _serve_put(self, core: Core, query: IncomingQuery, parsed: Parsed, message: BlobPut) -> None:
-        most = MAX_BUNDLE_BYTES
+        most, run_id, submitted = MAX_BUNDLE_BYTES, None, frozenset[str | None]()
         if parsed.room == "work":
             _check_session(core, parsed.asker, message.token)
             most = codec.MAX_BLOB_BYTES
@@ -332,9 +332,9 @@ class Service:
             run = core.state.runs.get(parsed.asker)
             if run is None or run.state.phase != "open":
                 raise RefusedError(*_over(core, parsed.asker))
-        run_id = parsed.asker if parsed.room == "gw" else None
+            run_id, submitted = run.id, frozenset(row.bundle for row in run.submits)
         answer = answer_to(query, parsed.asker)
-        self._reader.put(f"{parsed.room}/{parsed.asker}", run_id, message, most, answer)
+        self._reader.put(f"{parsed.room}/{parsed.asker}", run_id, message, most, answer, submitted)
 
     def _serve_get(self, core: Core, query: IncomingQuery, parsed: Parsed, message: BlobGet) -> None:
         if parsed.room == "work":

@@ -1,20 +1,40 @@
-"""Bundles that each run's gateway has uploaded itself: it may submit only these.
+"""The bundles that each run's gateway uploads: it may submit only these.
 
 The blobs of all runs share one folder, by digest. A digest is not secret (reports print those of bundles), and the
 presence of a blob would reveal other runs and hidden recordings. So an upload counts only when the gateway has sent
 every byte during this coordinator's lifetime, and the gateway is not told which bytes were stored before. A forgotten
 upload is requested and sent again.
+
+A gateway submits each bundle right after its upload. The number and size of the uploads that no submit names are
+limited, as nobody is charged for them: otherwise an agent with its gateway's capability could fill the disk.
+`evopolicy-coordinator gc` deletes what remains of them.
 """
 
 from __future__ import annotations
 
 import threading
 from collections import OrderedDict
+from collections.abc import Collection
+from dataclasses import dataclass, field
+
+from evopolicy_common.errors import RefusedError
+from evopolicy_common.wire.refusals import Refusal
 
 MAX_RUNS = 10_000
 """Beyond this number, the runs with the oldest uploads are forgotten. Only open runs are recorded, so no gateway can
 crowd out others."""
 MAX_OF_A_RUN = 64
+MAX_UNCLAIMED = 16
+"""Uploads of a run, unfinished ones too, that no submit names."""
+MAX_UNCLAIMED_BYTES = 256 << 20
+"""Their size together."""
+
+
+@dataclass(slots=True)
+class _OfRun:
+    sent: OrderedDict[str, None] = field(default_factory=OrderedDict)
+    unclaimed: dict[str, int] = field(default_factory=dict)
+    """Digest to announced size, from the first chunk on."""
 
 
 class Uploads:
@@ -22,20 +42,44 @@ class Uploads:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._runs: OrderedDict[str, OrderedDict[str, None]] = OrderedDict()
+        self._runs: OrderedDict[str, _OfRun] = OrderedDict()
+
+    def begin(self, run: str, digest: str, size: int, submitted: Collection[str | None]) -> None:
+        """Admits a chunk of a blob of `size` bytes. `submitted`: the bundles that the run's submits name.
+
+        Raises RefusedError when the run has too many uploads, or too large ones, that no submit names.
+        """
+        with self._lock:
+            unclaimed = self._of(run).unclaimed
+            if size <= unclaimed.get(digest, -1) or digest in submitted:
+                return
+            for each in [each for each in unclaimed if each in submitted or each == digest]:
+                del unclaimed[each]
+            total = size + sum(unclaimed.values())
+            if len(unclaimed) >= MAX_UNCLAIMED or total > MAX_UNCLAIMED_BYTES:
+                raise RefusedError(
+                    Refusal.TOO_LARGE,
+                    f"run {run!r} would have {len(unclaimed) + 1} uploads of {total:,} bytes that no submit names;"
+                    f" {MAX_UNCLAIMED} of {MAX_UNCLAIMED_BYTES:,} bytes are the limit: submit one of them",
+                )
+            unclaimed[digest] = size
 
     def note(self, run: str, digest: str) -> None:
         """Records that the run's gateway has sent the whole blob."""
         with self._lock:
-            digests = self._runs.setdefault(run, OrderedDict())
-            self._runs.move_to_end(run)
-            digests[digest] = None
-            digests.move_to_end(digest)
-            while len(digests) > MAX_OF_A_RUN:
-                digests.popitem(last=False)
-            while len(self._runs) > MAX_RUNS:
-                self._runs.popitem(last=False)
+            sent = self._of(run).sent
+            sent[digest] = None
+            sent.move_to_end(digest)
+            while len(sent) > MAX_OF_A_RUN:
+                sent.popitem(last=False)
 
     def has_sent(self, run: str, digest: str) -> bool:
         with self._lock:
-            return digest in self._runs.get(run, ())
+            return run in self._runs and digest in self._runs[run].sent
+
+    def _of(self, run: str) -> _OfRun:
+        found = self._runs.setdefault(run, _OfRun())
+        self._runs.move_to_end(run)
+        while len(self._runs) > MAX_RUNS:
+            self._runs.popitem(last=False)
+        return found

@@ -19,6 +19,9 @@ from . import permits
 
 ASK_AGAIN_S = 10.0
 """A declined permit request is kept for this long, until the gateway repeats it."""
+MAX_PLACES = 16
+"""Kernels that a run's gateway may name: enough for an agent that moves, and for machines that start anew. With more, a
+hostile gateway could keep hidden jobs from every kernel, and add rows without end."""
 
 
 def requested(state: State, event: events.Requested[gateway.RequestPermit], step: Step) -> None:
@@ -28,6 +31,11 @@ def requested(state: State, event: events.Requested[gateway.RequestPermit], step
     if run is None or run.state.phase != "open":
         step.refuse(event.request, *over(state, message.run))
         return
+    place = message.machine_id, message.boot_id
+    if place not in run.places and len(run.places) >= MAX_PLACES:
+        step.refuse(event.request, Refusal.BAD_REQUEST, because("too_many_places", run=run.id, n=MAX_PLACES))
+        return
+    run.places.add(place)
     permits.booted(state, message.machine_id, message.boot_id, step)
     kernel = permits.place(run, message.boot_id)
     if kernel is None:
@@ -85,6 +93,8 @@ def agent_gone(state: State, event: events.Requested[operator.AgentGone], step: 
         step.refuse(event.request, Refusal.UNKNOWN_RUN, because("unknown_run", run=message.run))
         return
     permits.end(state, message.run, step, "by an operator's word", boot_id=message.boot_id)
+    if message.run in state.runs:
+        state.runs[message.run].places.clear()
     step.reply(event.request, operator.Done())
 
 

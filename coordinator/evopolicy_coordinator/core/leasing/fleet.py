@@ -25,6 +25,10 @@ from . import queue
 
 BENCH_AFTER = 3
 """Consecutive failures after which a worker is benched."""
+MAX_WORKERS = 4096
+"""Workers that join with the same token, lost ones too until they are forgotten."""
+MAX_DESCRIBED_BYTES = 256 << 20
+"""Size of what they tell of their environments; workers that tell the same share it."""
 
 
 def of_session(state: State, name: str, session: str, now: float) -> Worker | None:
@@ -37,6 +41,19 @@ def of_session(state: State, name: str, session: str, now: float) -> Worker | No
     if worker.state == "lost":
         count_in(state, worker)
     return worker
+
+
+def has_room(state: State, event: WorkerRegistered) -> bool:
+    """Whether another worker may join with the token of this one."""
+    others = [
+        each
+        for each in state.workers.values()
+        if each.machine == event.machine and each.name != event.message.worker
+    ]
+    size = event.size + sum(map(len, event.message.undescribed))
+    size += sum(profile.size for profile in {each.profile for each in others})
+    size += sum(each.undescribed_size for each in others)
+    return len(others) < MAX_WORKERS and size <= MAX_DESCRIBED_BYTES
 
 
 def register(state: State, event: WorkerRegistered, kernel: Kernel, step: Step) -> Worker:
@@ -58,6 +75,7 @@ def register(state: State, event: WorkerRegistered, kernel: Kernel, step: Step) 
         installation=message.installation,
         state="lost",
         undescribed=frozenset(message.undescribed),
+        undescribed_size=sum(map(len, message.undescribed)),
     )
     if old is not None:
         count_out(old)
@@ -89,7 +107,7 @@ def _profile(state: State, event: WorkerRegistered) -> Profile:
     key = frozenset(classes.items()), frozenset[Tier](message.tiers)
     profile = state.profiles.get(key)
     if profile is None:
-        profile = Profile(key, message.fingerprint, descriptions, fingerprints, classes)
+        profile = Profile(key, message.fingerprint, descriptions, fingerprints, classes, event.size)
         queue.add_profile(state, profile)
     return profile
 

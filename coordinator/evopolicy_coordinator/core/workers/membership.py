@@ -5,6 +5,7 @@ Rules that this module owns:
 - The reply to a heartbeat may be delayed; it is sent at once when there is a lease to stop.
 - A lost liveliness token is a hint: it only brings the worker's deadline forward.
 - A worker name stays bound to its machine while the worker is connected.
+- A token lets a limited number of workers join, with a limited size of descriptions.
 - Every request of a quarantined worker is refused with the reason; other workers play its jobs, and its later reports
   are not accepted. An operator may reinstate it.
 - Draining, pausing and quarantine outlive restarts. An operator's change of a run's fingerprint class is recorded in
@@ -38,6 +39,10 @@ def registered(state: State, event: events.WorkerRegistered, step: Step) -> None
     if old is not None and old.state != "lost" and old.machine != event.machine:
         # Otherwise one machine could play under another's name, and the other would be blamed.
         step.refuse(event.request, Refusal.NAME_TAKEN, because("name_taken", worker=message.worker))
+        return
+    if not fleet.has_room(state, event):
+        reason = because("no_room", n=fleet.MAX_WORKERS, size=fleet.MAX_DESCRIBED_BYTES)
+        step.refuse(event.request, Refusal.TOO_LARGE, reason)
         return
     if old is not None:
         fleet.drop_poll(state, old, step)

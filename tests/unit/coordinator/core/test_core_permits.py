@@ -453,3 +453,18 @@ def test_families_are_forgotten_with_the_last_that_is_of_them() -> None:
     rig.work_off(session)
     families = rig.core.state.families
     assert (families._known, families._of_case) == ({}, {})
+
+
+def test_a_gateway_may_name_only_so_many_kernels() -> None:
+    rig = Rig()
+    rig.register()
+    rig.create(agent=None)
+    answers = [rig.permit("r1", f"kernel-{n}", machine_id=f"m{n}") for n in range(20)]
+    granted = [isinstance(each, gateway.Permit) for each in answers]
+    assert granted == [True] * 16 + [False] * 4
+    assert answers[-1].status == "bad_request"
+    assert "agent-gone" in answers[-1].message
+    # Where it was it may be, and the operator can let it go on.
+    assert rig.permit("r1", "kernel-3", machine_id="m3").granted
+    gone(rig)
+    assert rig.permit("r1", "kernel-16").granted

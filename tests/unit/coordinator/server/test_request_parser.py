@@ -303,6 +303,7 @@ def test_wrong_registration_is_refused(parser: RequestParser, changes: dict[str,
     key = keys.worker_key("c", "register")
     made = event(parser, key, worker.Register(**values))
     assert len(made.session) >= 16
+    assert made.size > 0
     assert refused(parser, key, worker.Register(**{**values, **changes})).status == status
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import queue
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -44,8 +44,11 @@ class Rig:
     def results(self, cursor: int, upto: int | None) -> Any:
         return self.page(ReadResults(request=1, run="r-1", submit_index=0, cursor=cursor, upto=upto))
 
-    def put(self, message: BlobPut, most: int = 1 << 20, run: str | None = None) -> Any:
-        self.reader.put(f"gw/{run}" if run else "sender", run, message, most, self._answered.put)
+    def put(
+        self, message: BlobPut, most: int = 1 << 20, run: str | None = None, submitted: Collection[str] = ()
+    ) -> Any:
+        sender = f"gw/{run}" if run else "sender"
+        self.reader.put(sender, run, message, most, self._answered.put, submitted)
         return self._answered.get(timeout=10)
 
     def get(self, run: str | None, digest: str, offset: int = 0) -> Any:
@@ -164,6 +167,30 @@ def test_a_gateway_is_not_told_whether_others_have_stored_a_blob(rig: Rig) -> No
     assert not rig.uploads.has_sent("r-2", digest)
     # What it has sent once it need not send again.
     assert rig.put(put(data, data=b""), run="r-1") == BlobAck(have=size)
+
+
+def test_uploads_of_a_run_that_no_submit_names_are_limited_in_number_and_size(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(uploads_module, "MAX_UNCLAIMED", 3)
+    monkeypatch.setattr(uploads_module, "MAX_UNCLAIMED_BYTES", 100)
+    bundles = [b"a", b"bb", b"ccc", b"dddd"]
+    digests = [blob(each).digest for each in bundles]
+    for each in bundles[:3]:
+        assert rig.put(put(each), run="r-1") == BlobAck(have=len(each))
+        assert rig.put(put(each), run="r-1") == BlobAck(have=len(each))  # a repeated one is no further upload
+    answer = rig.put(put(bundles[3]), run="r-1")
+    assert answer.status == "too_large"
+    assert "submit one of them" in answer.message
+    assert not rig.blobs.has(digests[3])
+    # Another run has its own, and submits make room.
+    assert rig.put(put(bundles[3]), run="r-2") == BlobAck(have=4)
+    assert rig.put(put(bundles[3]), run="r-1", submitted=digests[:1]) == BlobAck(have=4)
+    # The size counts from the first chunk on, and is the largest that was announced.
+    small, large = put(b"e" * 99, size=1, data=b"e"), put(b"e" * 99, data=b"e")
+    assert rig.put(small, run="r-3").status == "bad_blob"
+    assert rig.put(large, run="r-3") == BlobAck(have=1)
+    assert rig.put(put(b"ff"), run="r-3").status == "too_large"
 
 
 def test_what_a_run_has_sent_is_remembered_within_bounds(monkeypatch: pytest.MonkeyPatch) -> None:
