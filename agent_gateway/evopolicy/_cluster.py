@@ -11,27 +11,28 @@ import shlex
 import sys
 import uuid
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Mapping, Sequence
-from operator import index
 from pathlib import Path
-from typing import Any, Literal, Self, TypeVar
+from typing import Any, NamedTuple, Self, TypeVar
 
 from rich.progress import Progress
 
+from evopolicy._arguments import RULES, check_names, take, taken
 from evopolicy._evaluation import Episode, Evaluation, episode_of
 from evopolicy._loop import awaited, call, loop
 from evopolicy._runs import Run, read_run
 from evopolicy_common.console import terminal
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.episode import EpisodeOutcome, Tier
-from evopolicy_common.messages.gateway import FeedbackDetail, VideoOption
 from evopolicy_common.messages.operator import Evaluate
 from evopolicy_common.processes.local_cluster import unless_failed
+from evopolicy_common.processes.packages import policy_versions
 from evopolicy_common.processes.preflight import check_installed
 from evopolicy_common.processes.scratch import scratch_folder
+from evopolicy_common.records.policies.bundles import Bundle
 from evopolicy_common.wire.credentials import local_state_dir
 from evopolicy_gateway import shipped
 from evopolicy_gateway.agents.function import Workspace
-from evopolicy_gateway.cli.options import default_exp_id, limits_of, one_environment, packages_for
+from evopolicy_gateway.cli.options import default_exp_id, limits_from, one_environment, packages_for
 from evopolicy_gateway.cli.run_options import RunOptions
 from evopolicy_gateway.http.listener import Listener
 from evopolicy_gateway.jail.settings import JailSettings
@@ -39,7 +40,7 @@ from evopolicy_gateway.operator import cluster as operator
 from evopolicy_gateway.operator.trials import policy_bundle
 from evopolicy_gateway.operator.watch import RunView
 from evopolicy_gateway.run.lifecycle import RunLifecycle
-from evopolicy_gateway.run.plan import WALL_S, Plan
+from evopolicy_gateway.run.plan import Plan
 
 T = TypeVar("T")
 
@@ -78,20 +79,23 @@ class Cluster:
         `slots`: episodes played at once for each environment, at least 1. `state`: folder of the cluster's stored
         state, by default the folder that all local commands share, so that equal ids name equal cases. `fresh`: use a
         temporary state, deleted at the end. `data`: folder of split files. `policy_packages`: installed packages that
-        policies may import besides numpy, such as `("scipy",)`. Raises ConfigError for `slots` below 1, and for `fresh`
-        together with `state`.
+        policies may import besides numpy, such as `("scipy",)`. Raises ConfigError for wrong
+        arguments, and for `fresh` together with `state`.
         """
-        if slots < 1:
-            raise ConfigError(f"slots is {slots}: at least 1")
+        given = taken(slots=slots, state=state, fresh=fresh, data=data, policy_packages=policy_packages)
         if fresh and state is not None:
-            raise ConfigError(f"fresh and state {os.fspath(state)}: give only one of them")
-        kept = None if fresh else Path(state) if state is not None else local_state_dir()
+            raise ConfigError(f"fresh and state {given['state']}: give only one of them")
+        if given["data"] is not None and not given["data"].is_dir():
+            raise ConfigError(
+                f"data {given['data']} is not a folder: give one that `evopolicy data make` wrote"
+            )
+        policy_versions(given["policy_packages"])
         return cls(
             operator.Cluster(
-                local_slots=slots,
-                state=kept,
-                data=None if data is None else Path(data),
-                policy_packages=_names(policy_packages),
+                local_slots=given["slots"],
+                state=None if fresh else given["state"] or local_state_dir(),
+                data=given["data"],
+                policy_packages=given["policy_packages"],
             )
         )
 
@@ -102,9 +106,8 @@ class Cluster:
         `credentials`: the folder written by `evopolicy-coordinator certs issue operator`. Without arguments it is the
         cluster of this machine.
         """
-        return cls(
-            operator.Cluster(connect=endpoints, file=None if credentials is None else Path(credentials))
-        )
+        connect = tuple(take("endpoint", endpoint) for endpoint in endpoints)
+        return cls(operator.Cluster(connect=connect, file=take("credentials", credentials)))
 
     def open(self) -> Self:
         """Starts or connects to the cluster, for notebooks. `close` ends it, and so does the end of the process."""
@@ -149,7 +152,7 @@ class Cluster:
 
         Raises ConfigError, with the remedy, for wrong arguments and for missing requirements on this machine.
         """
-        return call(self._evaluate(policy, env, tuple(cases), tier, limits or {}, progress))
+        return call(self._evaluate(trial_of(policy, env, cases, tier, limits), take("progress", progress)))
 
     async def evaluate_async(
         self,
@@ -162,7 +165,8 @@ class Cluster:
         progress: bool = True,
     ) -> Evaluation:
         """Async twin of `evaluate`."""
-        return await awaited(self._evaluate(policy, env, tuple(cases), tier, limits or {}, progress))
+        trial = trial_of(policy, env, cases, tier, limits)
+        return await awaited(self._evaluate(trial, take("progress", progress)))
 
     def run(self, *, env: str, agent: str | AgentFunction, **options: Any) -> Run:
         """Plays one run on this cluster; arguments as for `evopolicy.run` without `slots` and `policy_packages`."""
@@ -220,41 +224,15 @@ class Cluster:
         await unless_failed(asyncio.create_task(kept()), failed)
         return results[0]
 
-    async def _evaluate(
-        self,
-        policy: str | os.PathLike[str],
-        env: str,
-        cases: tuple[int, ...],
-        tier: Tier,
-        limits: Limits,
-        progress: bool,
-    ) -> Evaluation:
-        if not cases:
-            raise ConfigError("cases is empty: name train ids, such as range(8)")
-        try:
-            cases = tuple(map(index, cases))  # numpy's integers too
-        except TypeError as error:
-            raise ConfigError(f"cases {cases!r}: name train ids, such as range(8) or [0, 3]") from error
-        env = one_environment(env)
-        bundle = await asyncio.to_thread(policy_bundle, shipped.found(Path(policy), Path.cwd()))
-        message = Evaluate(
-            token="",
-            key=uuid.uuid4().hex,
-            env=env,
-            bundle=bundle.digest,
-            split="train",
-            cases=cases,
-            sandbox_tier=tier,
-            limits=limits_of([f"{name}={value}" for name, value in limits.items()]),
-            step_limit="published",
-        )
+    async def _evaluate(self, trial: Trial, progress: bool) -> Evaluation:
+        env, cases, bundle = trial.message.env, trial.message.cases or (), trial.bundle
 
         async def work(reached: operator.Reached) -> Evaluation:
             await reached.operations.upload(bundle.digest, bundle.packed)
             outcomes: list[EpisodeOutcome] = []
             with _bar(progress) as bar:
                 task = bar.add_task(env, total=len(cases))
-                async for outcome, _, _ in reached.operations.evaluate(message):
+                async for outcome, _, _ in reached.operations.evaluate(trial.message):
                     if outcome is not None:
                         outcomes.append(outcome)
                         bar.update(task, completed=len(outcomes))
@@ -265,26 +243,35 @@ class Cluster:
                 episodes.append(await asyncio.to_thread(episode_of, case, outcome, packed))
             return Evaluation(env, episodes)
 
-        return await self._on(env, tier, work)
+        return await self._on(env, trial.message.sandbox_tier, work)
 
     async def _run(
         self, env: str, agent: str | AgentFunction, *, progress: bool = True, **options: Any
     ) -> Run:
-        check_installed("gateway")
+        take("progress", progress)
         with contextlib.ExitStack() as stack:
-            if callable(agent):
-                options["entry"] = options.get("entry") or _name_of(agent)
-                folder = stack.enter_context(scratch_folder("function"))
-                agent = await asyncio.to_thread(_pickled, agent, folder / "function.pickle")
-            plan = plan_of(env, agent, **options)
-            await asyncio.to_thread(plan.check)
+            plan = await self._planned(stack, env, agent, options)
             return await self._play(plan, progress)
+
+    async def _planned(
+        self, stack: contextlib.ExitStack, env: str, agent: str | AgentFunction, options: dict[str, Any]
+    ) -> Plan:
+        """The checked plan of a run; `stack` holds the folder of an agent's function."""
+        check_installed("gateway")
+        take("agent", agent)
+        if callable(agent):
+            options["entry"] = options.get("entry") or _name_of(agent)
+            folder = stack.enter_context(scratch_folder("function"))
+            agent = await asyncio.to_thread(_pickled, agent, folder / "function.pickle")
+        plan = plan_of(env, agent, **options)
+        self._where.check_cases([plan.settings])
+        await asyncio.to_thread(plan.check)
+        return plan
 
     async def _play(
         self, plan: Plan, progress: bool, started: Callable[[RunLifecycle], None] = lambda _: None
     ) -> Run:
         """Plays a run; `started` is called before its first step."""
-        self._where.check_cases([plan.settings])
 
         async def work(reached: operator.Reached) -> Run:
             with RunView(terminal(stderr=True) if progress else None).shown() as watch:
@@ -296,48 +283,48 @@ class Cluster:
         return await self._on(plan.settings.env, plan.settings.sandbox_tier, work)
 
 
+class Trial(NamedTuple):
+    """A policy to be played on train cases."""
+
+    bundle: Bundle
+    message: Evaluate
+
+
+def trial_of(
+    policy: str | os.PathLike[str], env: str, cases: Iterable[int], tier: Tier, limits: Limits | None
+) -> Trial:
+    """Reads the policy; arguments as for `evaluate`. Raises ConfigError."""
+    given = taken(policy=policy, env=env, cases=cases, tier=tier, limits=limits)
+    if not given["cases"]:
+        raise ConfigError("cases is empty: name train ids, such as range(8)")
+    env = one_environment(env)
+    bundle = policy_bundle(shipped.found(given["policy"], Path.cwd()))
+    message = Evaluate(
+        token="",
+        key=uuid.uuid4().hex,
+        env=env,
+        bundle=bundle.digest,
+        split="train",
+        cases=given["cases"],
+        sandbox_tier=tier,
+        limits=limits_from(given["limits"] or {}, "limits: "),
+        step_limit="published",
+    )
+    return Trial(bundle, message)
+
+
+OPTIONS = (RULES.keys() & RunOptions.__struct_fields__) - {"agent"}
+"""The options of a run, by their names in `RunOptions`."""
+
+
 def plan_of(
-    env: str,
-    agent: str,
-    *,
-    budget: int | None = None,
-    runs: str | os.PathLike[str] = "runs",
-    exp_id: str | None = None,
-    entry: str | None = None,
-    model: str | None = None,
-    repeat: int = 0,
-    validation: int | None = None,
-    heldout: int | None = None,
-    profile: Literal["published"] | None = None,
-    replays: VideoOption | None = None,
-    tier: Tier = "bwrap",
-    feedback: FeedbackDetail | None = None,
-    prompts: str | os.PathLike[str] | None = None,
-    agents_md: str | os.PathLike[str] | None = None,
-    agent_wall_s: float = WALL_S,
-    overwrite: bool = False,
-    listener: Listener | None = None,
-    agent_host: str = "",
+    env: str, agent: str, *, listener: Listener | None = None, agent_host: str = "", **options: Any
 ) -> Plan:
     """The plan of a run; arguments as for `run`, and for an agent that is started elsewhere as in `Plan`. Raises ConfigError."""
-    env = one_environment(env)
-    given = RunOptions(
-        agent=agent,
-        budget=budget,
-        runs=Path(runs),
-        exp_id=exp_id or default_exp_id(),
-        entry=entry,
-        model=model,
-        repeat=repeat,
-        validation=validation,
-        heldout=heldout,
-        profile=profile,
-        replays=replays,
-        tier=tier,
-        feedback=feedback,
-        prompts=None if prompts is None else Path(prompts),
-        agents_md=None if agents_md is None else Path(agents_md),
-    )
+    check_names(options, OPTIONS)
+    env = one_environment(take("env", env))
+    chosen = {name: value for name, value in taken(**options).items() if value is not None}
+    given = RunOptions(agent=agent, **({"exp_id": default_exp_id()} | chosen))
     texts = given.texts(Path.cwd())
     return Plan(
         settings=given.settings(env, given.exp_id or "", agent_host, texts),
@@ -345,9 +332,9 @@ def plan_of(
         agent=agent,
         runs=given.runs,
         started_in=Path.cwd(),
-        wall_limit_s=agent_wall_s,
+        wall_limit_s=given.agent_wall_s,
         silence_s=given.agent_silence_s,
-        overwrite=overwrite,
+        overwrite=given.overwrite,
         jail=JailSettings() if listener is None else JailSettings(mode="none"),
         listener=listener,
     )
@@ -368,8 +355,8 @@ def evaluate(
 
     `policy_packages`: as for `Cluster.local`; a policy in a run's directory by default gets the packages of its run.
     """
-    wanted = (policy, env, tuple(cases), slots, tier, limits or {}, progress, _names(policy_packages))
-    return call(_evaluated(*wanted))
+    trial = trial_of(policy, env, cases, tier, limits)
+    return call(_evaluated(trial, take("policy", policy), slots, policy_packages, take("progress", progress)))
 
 
 async def evaluate_async(
@@ -384,8 +371,10 @@ async def evaluate_async(
     policy_packages: Iterable[str] = (),
 ) -> Evaluation:
     """Async twin of `evaluate`."""
-    wanted = (policy, env, tuple(cases), slots, tier, limits or {}, progress, _names(policy_packages))
-    return await awaited(_evaluated(*wanted))
+    trial = trial_of(policy, env, cases, tier, limits)
+    return await awaited(
+        _evaluated(trial, take("policy", policy), slots, policy_packages, take("progress", progress))
+    )
 
 
 def run(
@@ -411,7 +400,7 @@ def run(
     Raises ConfigError, with the remedy, for wrong arguments and for missing requirements on this machine. Ctrl-C
     cancels the run, and its folder records that.
     """
-    return call(_ran(slots, _names(policy_packages), env, agent, budget=budget, runs=runs, **options))
+    return call(_ran(slots, policy_packages, env, agent, budget=budget, runs=runs, **options))
 
 
 async def run_async(
@@ -425,31 +414,33 @@ async def run_async(
     **options: Any,
 ) -> Run:
     """Async twin of `run`."""
-    return await awaited(
-        _ran(slots, _names(policy_packages), env, agent, budget=budget, runs=runs, **options)
-    )
+    return await awaited(_ran(slots, policy_packages, env, agent, budget=budget, runs=runs, **options))
 
 
 async def _evaluated(
-    policy: str | os.PathLike[str],
-    env: str,
-    cases: tuple[int, ...],
-    slots: int,
-    tier: Tier,
-    limits: Limits,
-    progress: bool,
-    packages: tuple[str, ...],
+    trial: Trial, policy: Path, slots: int, packages: Iterable[str], progress: bool
 ) -> Evaluation:
-    found = packages_for(shipped.found(Path(policy), Path.cwd()), packages)
+    found = packages_for(shipped.found(policy, Path.cwd()), take("policy_packages", packages))
     async with _opened(Cluster.local(slots, policy_packages=found)) as cluster:
-        return await cluster._evaluate(policy, env, cases, tier, limits, progress)
+        return await cluster._evaluate(trial, progress)
 
 
 async def _ran(
-    slots: int, packages: tuple[str, ...], env: str, agent: str | AgentFunction, **options: Any
+    slots: int,
+    packages: Iterable[str],
+    env: str,
+    agent: str | AgentFunction,
+    *,
+    progress: bool = True,
+    **options: Any,
 ) -> Run:
-    async with _opened(Cluster.local(slots, policy_packages=packages)) as cluster:
-        return await cluster._run(env, agent, **options)
+    take("progress", progress)
+    cluster = Cluster.local(slots, policy_packages=packages)
+    with contextlib.ExitStack() as stack:
+        # Before the cluster is opened: a wrong argument starts no process.
+        plan = await cluster._planned(stack, env, agent, options)
+        async with _opened(cluster):
+            return await cluster._play(plan, progress)
 
 
 @contextlib.asynccontextmanager
@@ -459,14 +450,6 @@ async def _opened(cluster: Cluster) -> AsyncIterator[Cluster]:
         yield cluster
     finally:
         await cluster._close()
-
-
-def _names(packages: Iterable[str]) -> tuple[str, ...]:
-    if isinstance(packages, str):
-        raise ConfigError(
-            f"policy_packages = {packages!r}: give a sequence of names, such as ({packages!r},)"
-        )
-    return tuple(sorted(set(packages)))
 
 
 def _bar(wanted: bool) -> Progress:

@@ -11,6 +11,7 @@ from typing import Any
 
 import msgspec
 
+from evopolicy._arguments import take
 from evopolicy._records import Records, bars, table
 from evopolicy_common.errors import DECODE_ERRORS, ConfigError, ProtocolError
 from evopolicy_common.records.run_files import (
@@ -285,7 +286,7 @@ def load_runs(*paths: str | os.PathLike[str]) -> Runs:
     """
     if not paths:
         raise ConfigError("load_runs needs a folder, such as runs/")
-    found, without = run_folders(map(Path, paths))
+    found, without = run_folders(take("folder", path) for path in paths)
     if without:
         raise ConfigError(f"{without[0]}: no run directory here")
     runs, left_out = [], []

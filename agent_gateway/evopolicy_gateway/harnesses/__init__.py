@@ -25,10 +25,11 @@ from evopolicy_gateway.harnesses.coding_agents.codex import Codex
 from evopolicy_gateway.harnesses.coding_agents.configured import ConfiguredCli
 from evopolicy_gateway.harnesses.coding_agents.dialect import Dialect
 from evopolicy_gateway.harnesses.coding_agents.llm import Llm
-from evopolicy_gateway.harnesses.command import CommandHarness
+from evopolicy_gateway.harnesses.command import CommandHarness, ReplayHarness
 from evopolicy_gateway.harnesses.remote import RemoteHarness
 
 FORMS = "evolve, random, replay:DIR, command:PROGRAM…, codex, codex:MODEL, claude-code, claude-code:MODEL, llm:openai/MODEL, llm:anthropic/MODEL, acp:PROGRAM…, file:AGENT.toml, remote"
+_INTERPRETER = re.compile(r"(python|bash|sh|node|perl|ruby)[\d.]*")
 _DIALECTS: dict[str, type[Dialect]] = {"codex": Codex, "claude-code": ClaudeCode, "llm": Llm}
 
 
@@ -67,7 +68,7 @@ def make(agent: str, started_in: Path, config: AgentConfig | None = None) -> Har
         folder = shipped.found(rest, started_in).resolve()
         if not folder.is_dir():
             raise ConfigError(f"--agent {agent}: {folder} is not a folder")
-        return CommandHarness("replay", [*_ours("replay"), str(folder)], {"folder": str(folder)})
+        return ReplayHarness([*_ours("replay"), str(folder)], folder)
     if kind == "command" and rest.strip():
         words = _split(rest)
         return CommandHarness(
@@ -139,14 +140,26 @@ def _program(agent: str, words: list[str], started_in: Path) -> list[str]:
         raise ConfigError(
             f"--agent {agent}: program {words[0]!r} not found, neither as a file nor on the PATH"
         )
+    lost = _missing_files(words[1:2], started_in)
+    # An interpreter's first argument is its script; the workspace begins with `system/` and has no other scripts.
+    if lost and _INTERPRETER.fullmatch(Path(words[0]).name) and Path(lost[0]).parts[0] != "system":
+        raise ConfigError(
+            f"--agent {agent}: {os.path.abspath(started_in / lost[0])} not found; paths are relative to the folder in which the"
+            " command is started"
+        )
     return resolved
 
 
 def _no_files(words: Sequence[str], started_in: Path) -> str:
     """A hint that names words of a command that look like files but do not exist; empty if there are none."""
-    looks = re.compile(r"(\./|\.\./)?[\w./-]+\.(py|sh|js|ts|rb|pl|toml|yaml|json)")
-    lost = [word for word in words if looks.fullmatch(word) and not (started_in / word).exists()]
+    lost = _missing_files(words, started_in)
     return f"{started_in} has no {', '.join(lost)}: relative paths are looked for there first" if lost else ""
+
+
+def _missing_files(words: Sequence[str], started_in: Path) -> list[str]:
+    """The words that look like files and do not exist."""
+    looks = re.compile(r"(\./|\.\./)?[\w./-]+\.(py|sh|js|ts|rb|pl|toml|yaml|json)")
+    return [word for word in words if looks.fullmatch(word) and not (started_in / word).exists()]
 
 
 def _absolute(words: Sequence[str], started_in: Path) -> list[str]:

@@ -130,8 +130,8 @@ class Harness(ABC):
         others."""
         return {}
 
-    def check(self) -> None:  # noqa: B027
-        """Raises ConfigError when the agent cannot be started on this machine; call it before a run is opened."""
+    def check(self, env: str) -> None:  # noqa: B027
+        """Raises ConfigError when the agent cannot play `env` on this machine; call it before a run is opened."""
 
     @abstractmethod
     async def play(self, stage: Stage) -> AgentEnded:

@@ -9,11 +9,14 @@ whatever it prints. An inactive program is ended (`clock.Activity`).
 from __future__ import annotations
 
 import asyncio
+from pathlib import Path
 from typing import Any
 
 import orjson
 
+from evopolicy_common.errors import ConfigError
 from evopolicy_gateway.agent_supervisor.agent_process import AgentProcess
+from evopolicy_gateway.agents import replay
 from evopolicy_gateway.harnesses import prompts
 from evopolicy_gateway.harnesses.base import Harness, Stage
 from evopolicy_gateway.operator.child_messages import AgentEnded
@@ -83,6 +86,26 @@ async def _silence(stage: Stage) -> str:
         never: asyncio.Future[str] = asyncio.get_running_loop().create_future()
         return await never
     return await stage.activity.silence()
+
+
+class ReplayHarness(CommandHarness):
+    """`replay:DIR`: the policies of a folder."""
+
+    def __init__(self, program: list[str], folder: Path) -> None:
+        super().__init__("replay", program, {"folder": str(folder)})
+        self._folder = folder
+
+    def check(self, env: str) -> None:
+        folder = replay.folder_for(self._folder, env)
+        try:
+            found = replay.policies_in(folder)
+        except OSError as error:
+            raise ConfigError(f"--agent replay: cannot read {folder}: {error.strerror}") from error
+        if not found:
+            raise ConfigError(
+                f"--agent replay: {folder} holds no policy; name a folder with policy.py in it, or with folders that have one,"
+                " such as a run's checkpoints"
+            )
 
 
 class _Talk:

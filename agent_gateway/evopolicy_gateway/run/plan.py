@@ -128,7 +128,7 @@ class Plan(msgspec.Struct, frozen=True, kw_only=True):
         if self.listener is None:
             check_loopback()
         check_agent(self.agent, self.listener)
-        harnesses.make(self.agent, self.started_in, self.config).check()
+        harnesses.make(self.agent, self.started_in, self.config).check(self.settings.env)
         self.jail.check()
         if self.texts.inputs and self.jail.mode == "none":
             raise ConfigError("skills and [mcp] servers are shown by the agent's jail; leave out --jail none")

@@ -196,9 +196,9 @@ def expand(suite: SuiteFile, root: Path, started_in: Path, only: tuple[str, ...]
 
 def check_agents_start(runs: Iterable[Plan]) -> None:
     """Raises ConfigError when an agent of these runs cannot start on this machine, such as a missing CLI."""
-    for run in {run.entry: run for run in runs}.values():
+    for run in {(run.entry, run.settings.env): run for run in runs}.values():
         try:
-            harnesses.make(run.agent, run.started_in, run.config).check()
+            harnesses.make(run.agent, run.started_in, run.config).check(run.settings.env)
         except ConfigError as error:
             raise ConfigError(f"agent {run.entry!r}: {error}") from error
 

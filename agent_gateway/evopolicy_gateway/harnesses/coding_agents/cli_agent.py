@@ -65,7 +65,7 @@ class CliAgent(Harness):
     def take(self, kept: Kept) -> None:
         self._dialect.kept = kept
 
-    def check(self) -> None:
+    def check(self, env: str) -> None:
         environment = os.environ | self._dialect.environment() | self._config.environment
         if (missing := self._missing(environment)) is not None:
             raise ConfigError(missing)

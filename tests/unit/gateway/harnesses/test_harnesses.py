@@ -187,12 +187,27 @@ def test_a_program_that_cannot_be_started_is_reported(tmp_path: Path) -> None:
         "command:",
         "command: ",
         "command:no-such-program-x",
+        "command:python3 no_such_script.py",
         "command:'open",
     ],
 )
 def test_what_is_no_agent_is_refused_with_what_there_is(agent: str, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="--agent"):
         make(agent, tmp_path)
+
+
+def test_a_replay_without_policies_is_refused_before_a_run_is_opened(tmp_path: Path) -> None:
+    (tmp_path / "all" / "gym_acrobot").mkdir(parents=True)
+    (tmp_path / "all" / "other").mkdir()
+    (tmp_path / "all" / "other" / "policy.py").write_text("")
+    harness = make("replay:all", tmp_path)
+    harness.check("gym/racing")
+    with pytest.raises(ConfigError, match=r"gym_acrobot holds no policy; name a folder"):
+        harness.check("gym/acrobot")
+
+
+def test_a_script_of_the_workspace_may_be_missing_here(tmp_path: Path) -> None:
+    make("command:python3 system/policy.py --log out.json", tmp_path)
 
 
 def test_files_in_a_command_are_meant_from_where_it_was_given(tmp_path: Path) -> None:

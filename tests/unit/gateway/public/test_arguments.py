@@ -1,0 +1,118 @@
+"""Arguments of the public functions that cannot be: refused by name and value, before any process starts."""
+
+from __future__ import annotations
+
+import inspect
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import evopolicy as evp
+from evopolicy import _arguments, _cluster
+
+RUN: dict[str, Any] = {"env": "toy/line", "agent": "random"}
+WRONG_RUNS: list[dict[str, Any]] = [
+    {"agent": None},
+    {"agent": ""},
+    {"env": None},
+    {"env": ["toy/line"]},
+    {"budget": 0},
+    {"budget": -1},
+    {"budget": "8"},
+    {"budget": True},
+    {"slots": None},
+    {"slots": 1.5},
+    {"runs": None},
+    {"repeat": -1},
+    {"validation": 0},
+    {"tier": None},
+    {"replays": "some"},
+    {"agent_wall_s": float("nan")},
+    {"exp_id": 3},
+    {"overwrite": "yes"},
+    {"policy_packages": "scipy"},
+    {"policy_packages": (3,)},
+    {"progress": "no"},
+]
+WRONG_EVALUATIONS: list[dict[str, Any]] = [
+    {"policy": None},
+    {"env": 3},
+    {"cases": 3},
+    {"cases": "0-3"},
+    {"tier": "x"},
+    {"limits": {"act_wall_s": None}},
+    {"limits": 3},
+    {"slots": "2"},
+    {"progress": None},
+]
+
+
+@pytest.fixture(autouse=True)
+def _no_cluster(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def opened(_: evp.Cluster) -> None:
+        pytest.fail("a cluster was opened")
+
+    monkeypatch.setattr(evp.Cluster, "_open", opened)
+
+
+@pytest.mark.parametrize("wrong", WRONG_RUNS, ids=str)
+def test_a_wrong_argument_of_run_is_named(wrong: dict[str, Any], tmp_path: Path) -> None:
+    ((name, value),) = wrong.items()
+    with pytest.raises(evp.ConfigError) as error:
+        evp.run(**({"runs": tmp_path / "runs"} | RUN | wrong))
+    assert str(error.value).startswith(f"{name} is {value!r}: give ")
+    assert not (tmp_path / "runs").exists()
+
+
+@pytest.mark.parametrize("wrong", WRONG_EVALUATIONS, ids=str)
+def test_a_wrong_argument_of_evaluate_is_named(wrong: dict[str, Any], tmp_path: Path) -> None:
+    (tmp_path / "policy.py").write_text("class Policy: pass")
+    ((name, value),) = wrong.items()
+    arguments: dict[str, Any] = {"policy": tmp_path, "env": "toy/line"} | wrong
+    with pytest.raises(evp.ConfigError) as error:
+        evp.evaluate(**arguments)
+    assert str(error.value).startswith(f"{name} is {value!r}: give ")
+
+
+@pytest.mark.parametrize(
+    ("wrong", "text"),
+    [
+        ({"env": "gym/nothing"}, "gym/nothing"),
+        ({"budgets": 8}, "unknown argument budgets: did you mean budget"),
+        ({"policy_packages": ("no-such-package",)}, "'no-such-package' is not installed"),
+        ({"agent": "replay:nowhere"}, "is not a folder"),
+        ({"profile": "published"}, "give --data"),
+    ],
+    ids=str,
+)
+def test_a_run_that_cannot_be_played_starts_no_cluster(
+    wrong: dict[str, Any], text: str, tmp_path: Path
+) -> None:
+    with pytest.raises(evp.ConfigError, match=text):
+        evp.run(**({"runs": tmp_path / "runs"} | RUN | wrong))
+
+
+def test_a_missing_folder_of_case_files_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(evp.ConfigError, match="none is not a folder: give one"):
+        evp.Cluster.local(data=tmp_path / "none")
+
+
+@pytest.mark.parametrize("path", [None, 3, ["runs"]], ids=str)
+def test_a_folder_of_runs_is_a_path(path: Any) -> None:
+    with pytest.raises(evp.ConfigError, match="give the path of a folder"):
+        evp.load_runs(path)
+
+
+def test_numbers_of_numpy_are_taken_as_pythons() -> None:
+    assert _arguments.taken(budget=np.int64(8), cases=np.arange(2)) == {"budget": 8, "cases": (0, 1)}
+    assert type(_arguments.take("budget", np.int64(8))) is int
+
+
+def test_every_argument_has_its_rule() -> None:
+    functions = (evp.run, evp.evaluate, evp.Cluster.local, evp.Cluster.connect, evp.Cluster.evaluate)
+    named = {name for each in functions for name in inspect.signature(each).parameters}
+    assert named - {"self", "endpoints", "options"} <= _arguments.RULES.keys()
+    for option in _cluster.OPTIONS:
+        assert f"`{option}`" in (evp.run.__doc__ or ""), option
