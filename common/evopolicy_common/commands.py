@@ -14,6 +14,7 @@ from typer.core import TyperCommand, TyperGroup
 
 import evopolicy_common
 from evopolicy_common.cli import USAGE_ERROR, fail, fail_on_our_errors, setup_notices
+from evopolicy_common.entry import interruptible
 from evopolicy_common.processes.preflight import EXTRAS, missing
 from evopolicy_common.terminal import end_without_reader, open_streams, say
 
@@ -79,6 +80,8 @@ class _Help:
             self.format_commands(ctx, formatter)
 
     def invoke(self, ctx: Any) -> Any:
+        if not isinstance(self, TyperGroup) or self.invoke_without_command:
+            interruptible()
         setup_notices()  # not earlier: help and completion log nothing and do not need structlog
         return super().invoke(ctx)  # type: ignore[misc]
 

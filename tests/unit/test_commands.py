@@ -24,10 +24,10 @@ GROUPS = [
     ["evopolicy-coordinator", "certs"],
 ]
 MODULES = {
-    "evopolicy": "evopolicy_gateway.cli.main:main",
-    "evopolicy-coordinator": "evopolicy_coordinator.cli:program",
-    "evopolicy-gateway": "evopolicy_gateway.cli:gateway_program",
-    "evopolicy-worker": "evopolicy_worker.cli:main",
+    "evopolicy": "evopolicy_common.entry:evopolicy",
+    "evopolicy-coordinator": "evopolicy_common.entry:coordinator",
+    "evopolicy-gateway": "evopolicy_common.entry:gateway",
+    "evopolicy-worker": "evopolicy_common.entry:worker",
 }
 
 WITHOUT = """

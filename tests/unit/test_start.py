@@ -1,4 +1,4 @@
-"""What starting a command imports: help and completion do without whatever a command needs for its work."""
+"""The start of a command: what it imports, and Ctrl-C meanwhile."""
 
 from __future__ import annotations
 
@@ -92,3 +92,44 @@ def test_the_help_of_evopolicy_describes_a_command_as_its_own_help_does(name: st
     command = front.commands[name]  # type: ignore[attr-defined]
     assert command.name == name
     assert PLACES[name].help == command.get_short_help_str(1000)
+
+
+CTRL_C = """
+import os, signal, sys
+
+module, program = sys.argv.pop(1), sys.argv.pop(1)
+
+
+class Finder:
+    def find_spec(self, name, path=None, target=None):
+        if name == module:
+            try:
+                os.kill(os.getpid(), signal.SIGINT)
+            except KeyboardInterrupt:
+                pass  # as in a callback of the import system, which an exception does not leave
+
+
+sys.meta_path.insert(0, Finder())
+from evopolicy_common import entry
+
+getattr(entry, program)()
+"""
+"""Starts a program, and sends it Ctrl-C when it imports a module."""
+
+
+@pytest.mark.parametrize(
+    ("module", "program", "word"),
+    [
+        ("typer", "evopolicy", "--help"),
+        ("typer", "coordinator", "--help"),
+        ("typer", "gateway", "--help"),
+        ("typer", "worker", "--help"),
+        ("evopolicy_coordinator.cli.status", "evopolicy", "status"),
+        ("evopolicy_coordinator.server", "coordinator", "identity"),
+        ("evopolicy_worker.supervisor", "worker", "doctor"),
+    ],
+)
+def test_ctrl_c_during_the_imports_ends_a_program_with_one_line(module: str, program: str, word: str) -> None:
+    command = [sys.executable, "-c", CTRL_C, module, program, word]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "error: interrupted\n")

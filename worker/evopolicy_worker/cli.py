@@ -364,7 +364,7 @@ async def _serve(
 
 
 def main() -> None:
-    """Entry point of the console script."""
+    """The program."""
     # Slots inherit these, such as the thread counts of simulators and numpy; see `environments.process_environment`.
     os.environ.update(environments.process_environment())
     if sys.platform != "linux":

@@ -6,7 +6,7 @@ from evopolicy_common.commands import needed_extras
 
 
 def gateway_program() -> None:
-    """The console script `evopolicy-gateway`: where the extra is not installed, it says so before anything is imported."""
+    """The program `evopolicy-gateway`: where the extra is not installed, it says so before anything is imported."""
     with needed_extras():
         from evopolicy_gateway.cli.serve import main
     main()

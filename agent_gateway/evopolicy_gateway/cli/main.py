@@ -182,7 +182,7 @@ def evopolicy(_: Version = False) -> None:
 
 
 def main() -> None:
-    """The console script."""
+    """The program."""
     processes.become_subreaper()
     command = PLACES.get(next((word for word in sys.argv[1:] if not word.startswith("-")), ""))
     run_app(app, command and command.extra)

@@ -208,7 +208,7 @@ def progress_of(pipeline: SubmitPipeline) -> Progress:
 
 
 def main() -> None:
-    """The console script."""
+    """The program."""
     run_app(app)
 
 

@@ -6,7 +6,7 @@ from evopolicy_common.commands import needed_extras
 
 
 def program() -> None:
-    """The console script: where the extra is not installed, it says so before anything is imported."""
+    """The program: where the extra is not installed, it says so before anything is imported."""
     with needed_extras():
         from evopolicy_coordinator.cli.main import main
     main()

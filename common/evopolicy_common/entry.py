@@ -1,0 +1,49 @@
+"""The console scripts: Ctrl-C while a program imports its modules ends it with one line and exit code 130.
+
+This module imports next to nothing, so that little time passes before it can do so.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import signal
+from types import FrameType
+
+
+def evopolicy() -> None:
+    """`evopolicy`."""
+    _start("evopolicy_gateway.cli.main", "main")
+
+
+def coordinator() -> None:
+    """`evopolicy-coordinator`."""
+    _start("evopolicy_coordinator.cli", "program")
+
+
+def gateway() -> None:
+    """`evopolicy-gateway`."""
+    _start("evopolicy_gateway.cli", "gateway_program")
+
+
+def worker() -> None:
+    """`evopolicy-worker`."""
+    _start("evopolicy_worker.cli", "main")
+
+
+def interruptible() -> None:
+    """From here on Ctrl-C raises KeyboardInterrupt. A command calls it when it has been imported, before it begins."""
+    if signal.getsignal(signal.SIGINT) is _interrupted:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def _start(module: str, function: str) -> None:
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # a shell's background job ignores it
+        signal.signal(signal.SIGINT, _interrupted)
+    getattr(importlib.import_module(module), function)()
+
+
+def _interrupted(_: int, __: FrameType | None) -> None:
+    # No exception: an import may swallow it, and there is nothing yet to clean up.
+    os.write(2, b"error: interrupted\n")
+    os._exit(130)
