@@ -475,7 +475,7 @@ class SubmitPipeline:
             ticket.n_done, ticket.waits_for = len(scores), page.waits_for
             ticket.held_s = self.held_s - held_before
             self._on_change()
-            if done is None:
+            if done is None and not page.more:
                 await asyncio.sleep(linger.pause_s(len(scores), time.monotonic()))
         last_result = time.monotonic()
         committed = await asyncio.to_thread(self._commit, tree, index, done, scores)

@@ -236,6 +236,8 @@ class ResultsPage(Message, frozen=True, kw_only=True, tag="results_page"):
     waits_for: Text = ""
     held_s: Number = 0.0
     """As in `RunState`."""
+    more: bool = False
+    """Whether the next page has episodes already."""
 
 
 class CloseRun(Message, frozen=True, kw_only=True, tag="close_run"):

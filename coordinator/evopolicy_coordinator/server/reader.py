@@ -230,6 +230,7 @@ class ServiceReader:
             done=records.submit_done(row) if page.cursor >= upto else None,
             waits_for=words(effect.waits_for),
             held_s=effect.held_s,
+            more=bool(page.rows) and page.cursor < upto,
         )
 
     def _evaluation(self, effect: ReadEvaluation) -> Message:

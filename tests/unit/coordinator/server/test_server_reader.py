@@ -76,7 +76,9 @@ def test_page_shows_what_is_released_and_no_more(rig: Rig) -> None:
     page = rig.results(0, 2)
     assert isinstance(page, ResultsPage)
     assert [episode.index for episode in page.episodes] == [0, 1]
-    assert (page.cursor, page.done) == (2, None)
+    assert (page.cursor, page.done, page.more) == (2, None, False)
+    # A place that is not written yet does not count as more: the gateway would ask without a pause.
+    assert rig.results(4, 9).more is False
     assert rig.results(2, 2).episodes == ()
 
 
@@ -93,6 +95,7 @@ def test_end_comes_with_the_page_that_reaches_it(rig: Rig) -> None:
             break
     assert [episode.index for page in pages for episode in page.episodes] == [0, 1, 2, 3]
     assert len(pages) > 1
+    assert [page.more for page in pages] == [True] * (len(pages) - 1) + [False]
     assert pages[-1].done.status == "ok"
     assert rig.results(0, None).episodes[0].trajectory == big
 
