@@ -8,9 +8,12 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import mmap
+import tempfile
 from collections.abc import Callable
 from functools import partial
-from typing import Any, TypeVar
+from pathlib import Path
+from typing import Any, TypeVar, cast
 
 from evopolicy_common.errors import ConfigError, RefusedError, TransportError
 from evopolicy_common.logs import structlog
@@ -48,7 +51,8 @@ RENEWAL_S = 5.0
 FIRST_PERMIT_WAIT_S = 3.0
 """Seconds after which the wait for a permit is shown."""
 STATE_TIMEOUT_S = 1.0
-
+LARGE_BYTES = 16 << 20
+"""A larger recording is kept in a file."""
 
 NOT_NOW_PAUSE_S = 0.5
 
@@ -65,7 +69,9 @@ Wanted = TypeVar("Wanted")
 class CoordinatorClient:
     """Client for one run. Its methods raise RefusedError for refusals other than temporary ones (`NOT_NOW`)."""
 
-    def __init__(self, link: Link, run: str) -> None:
+    def __init__(self, link: Link, run: str, scratch: Path | None = None) -> None:
+        """`scratch`: folder of temporary files; None: the system's."""
+        self._scratch = scratch
         self._run = run
         self._token = link.credentials.token
         self._requests: Requester[GatewayReply] = Requester(
@@ -150,8 +156,13 @@ class CoordinatorClient:
         return await self._ask("results", question, ResultsPage, wait_s=wait_s)
 
     async def fetch(self, ref: BlobRef) -> bytes:
-        """Returns the bytes that `ref` names, verified."""
-        return await self._requests.fetch(self._run, self._token, ref)
+        """Returns the bytes that `ref` names, verified. Large ones are in a file that nobody else sees, not in memory."""
+        if ref.inline is not None or ref.size <= LARGE_BYTES:
+            return await self._requests.fetch(self._run, self._token, ref)
+        with tempfile.TemporaryFile(dir=self._scratch) as file:
+            await self._requests.download_to(file, self._run, self._token, ref.digest, ref.size)
+            file.flush()
+            return cast(bytes, memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)))
 
     async def close(self, reason: str, agent: dict[str, Any]) -> None:
         """Closes the run to further submits. Call it only when the agent and all its children are gone."""

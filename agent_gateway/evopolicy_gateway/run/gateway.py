@@ -104,7 +104,7 @@ class Gateway:
                 )
                 if link is None:
                     return False
-                session = CoordinatorClient(link, run)
+                session = CoordinatorClient(link, run, self._folder.state)
                 try:
                     opened = await self._unless_stopped(session.open())
                     if opened is None or not await self._permitted(session):

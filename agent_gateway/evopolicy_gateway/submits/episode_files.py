@@ -10,6 +10,7 @@ import json
 
 import msgspec
 
+from evopolicy_common.errors import ProtocolError
 from evopolicy_common.messages.environment import ObsStorage
 from evopolicy_common.messages.episode import ResourceLimits
 from evopolicy_common.messages.gateway import EpisodeFeedback, FeedbackDetail
@@ -25,6 +26,18 @@ _NO_MESSAGE = "messages of a policy are left out at this run's level of feedback
 
 LEFT_OUT_FIRST = ("video.mp4", "observations.npz", "trajectory.jsonl")
 """Files that are left out, in this order, until the episode's files fit into its share."""
+MUCH_BYTES = 16 << 20
+"""Files of larger episodes are made one after another."""
+MAX_UNPACKED_BYTES = 512 << 20
+"""Limit of an episode that its worker did not render, unpacked, bytes."""
+
+
+def takes_much(packed: bytes) -> bool:
+    """Whether making the files of an episode may need many times the memory that the episode takes packed."""
+    try:
+        return rendered.Container(packed).size > MUCH_BYTES
+    except ProtocolError:
+        return True
 
 
 def episode_share(limits: ResourceLimits, episode_budget: int) -> int:
@@ -76,7 +89,7 @@ def episode_files(
     if rendered.is_rendered(packed):
         files = rendered.checked_files(packed, episode.length, episode.episode_return)
     else:
-        files = rendered.files_of(trajectory.decode(packed), storage)
+        files = rendered.files_of(trajectory.decode(packed, MAX_UNPACKED_BYTES), storage)
     if detail == "trajectories":
         files.pop(rendered.OBSERVATIONS, None)
         files.pop("observations.npy", None)

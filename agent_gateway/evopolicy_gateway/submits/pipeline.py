@@ -10,6 +10,8 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import threading
 import time
 import uuid
 from collections import Counter
@@ -40,6 +42,7 @@ from evopolicy_gateway.submits.episode_files import (
     episode_share,
     set_aside_files,
     shows_texts,
+    takes_much,
 )
 from evopolicy_gateway.submits.feedback import SubmitTree
 from evopolicy_gateway.submits.formatting import EpisodeScore
@@ -161,6 +164,8 @@ class SubmitPipeline:
         """The bundle that the coordinator accepted a submit of last, in this process."""
         self._task: asyncio.Task[None] | None = None
         self._journal_lock = asyncio.Lock()
+        self._much = threading.Lock()
+        """Held while the files of a large episode are made: a hostile worker's may take a gigabyte each."""
         self._deaths: Counter[tuple[str, int | None]] = Counter()
         """Number of gateways that died over an episode of a submit, or (None) over the submit as a whole."""
         self._write_down_deaths()
@@ -546,8 +551,9 @@ class SubmitPipeline:
         """Writes episodes' folders one after another."""
         for each in fetched:
             name = episode_name(first + each.episode.index, self.run.episode_budget)
-            if files := self._files_of(key, each):
-                tree.put_episode(name, files)
+            with self._much if takes_much(each.trajectory) else contextlib.nullcontext():
+                if files := self._files_of(key, each):
+                    tree.put_episode(name, files)
 
     def _files_of(self, key: str, fetched: _Fetched) -> dict[str, bytes]:
         """Returns an episode's files; without its trajectory if that is missing or has another length or return."""

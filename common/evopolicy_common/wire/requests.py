@@ -7,11 +7,13 @@ caller's timeout passes. A refusal counts as a reply.
 from __future__ import annotations
 
 import asyncio
+import hashlib
+import io
 import random
 import time
 from collections.abc import Callable
 from functools import partial
-from typing import Generic, TypeVar
+from typing import IO, Generic, TypeVar
 
 import msgspec
 
@@ -106,28 +108,36 @@ class Requester(Generic[Reply]):
                 return
             offset = ack.have
 
-    async def download(self, sender: str, token: str, digest: str) -> bytes:
-        """Downloads a blob. Raises ProtocolError when it does not match its digest or is too large."""
-        data = bytearray()
+    async def download(self, sender: str, token: str, digest: str, most: int = codec.MAX_BLOB_BYTES) -> bytes:
+        """Returns a blob of at most `most` bytes. Raises ProtocolError as `download_to`."""
+        file = io.BytesIO()
+        await self.download_to(file, sender, token, digest, most)
+        return file.getvalue()
+
+    async def download_to(
+        self, file: IO[bytes], sender: str, token: str, digest: str, most: int = codec.MAX_BLOB_BYTES
+    ) -> None:
+        """Writes a blob of at most `most` bytes to a file. Raises ProtocolError when it does not match its digest or is too
+        large."""
+        hashed, have = hashlib.sha256(), 0
         while True:
             chunk = await self.until_answered(
-                "blob", BlobGet(sender=sender, token=token, digest=digest, offset=len(data)), BlobChunk
+                "blob", BlobGet(sender=sender, token=token, digest=digest, offset=have), BlobChunk
             )
-            if chunk.size > codec.MAX_BLOB_BYTES:
-                raise ProtocolError(
-                    f"blob {digest} of {chunk.size:,} bytes; {codec.MAX_BLOB_BYTES:,} are the limit"
-                )
-            data += chunk.data
-            if len(data) >= chunk.size or not chunk.data:
+            if chunk.size > most:
+                raise ProtocolError(f"blob {digest} of {chunk.size:,} bytes; {most:,} are the limit")
+            file.write(chunk.data)
+            hashed.update(chunk.data)
+            have += len(chunk.data)
+            if have >= chunk.size or not chunk.data:
                 break
-        if len(data) != chunk.size or digest_of(bytes(data)) != digest:
-            raise ProtocolError(f"blob {digest} arrived damaged ({len(data)} of {chunk.size} bytes)")
-        return bytes(data)
+        if have != chunk.size or hashed.hexdigest() != digest:
+            raise ProtocolError(f"blob {digest} arrived damaged ({have} of {chunk.size} bytes)")
 
     async def fetch(self, sender: str, token: str, ref: BlobRef) -> bytes:
         """Returns the bytes of `ref`, from the message or the coordinator, checked against the digest."""
         if ref.inline is None:
-            return await self.download(sender, token, ref.digest)
+            return await self.download(sender, token, ref.digest, ref.size)
         if digest_of(ref.inline) != ref.digest:
             raise ProtocolError(f"blob {ref.digest} arrived damaged inside its message")
         return ref.inline

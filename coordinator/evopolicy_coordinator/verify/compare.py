@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -142,24 +142,41 @@ def same(left: Any, right: Any) -> bool:
 # ---- feedback files ----
 
 
-def read_rows(folder: Path) -> list[dict[str, Any]]:
+class Rows:
+    """The rows of a `trajectory.jsonl`. Each is parsed when it is needed: the objects of all may take gigabytes."""
+
+    def __init__(self, data: bytes) -> None:
+        """Raises ValueError when one is no row."""
+        self._lines = data.splitlines()
+        try:
+            if not all(isinstance(row, dict) and {"action", "reward"} <= row.keys() for row in self):
+                raise ValueError("a row is not one of a trajectory")
+        except RecursionError:
+            raise ValueError("a row is nested too deeply") from None
+
+    def __len__(self) -> int:
+        return len(self._lines)
+
+    def __iter__(self) -> Iterator[dict[str, Any]]:
+        return map(json.loads, self._lines)
+
+    def __getitem__(self, t: int) -> dict[str, Any]:
+        row: dict[str, Any] = json.loads(self._lines[t])
+        return row
+
+
+def read_rows(folder: Path) -> Rows:
     """The rows of an episode's `trajectory.jsonl`. Raises ValueError or OSError when it cannot be read."""
-    try:
-        rows = [json.loads(line) for line in read_regular(folder / ROWS, MAX_ROWS_BYTES).splitlines()]
-    except RecursionError:
-        raise ValueError("a row is nested too deeply") from None
-    if not all(isinstance(row, dict) and {"action", "reward"} <= row.keys() for row in rows):
-        raise ValueError("a row is not one of a trajectory")
-    return rows
+    return Rows(read_regular(folder / ROWS, MAX_ROWS_BYTES))
 
 
-def actions_of(rows: list[dict[str, Any]]) -> list[Any]:
+def actions_of(rows: Rows) -> list[Any]:
     """The actions of feedback rows, as close to the policy's actions as JSON allows."""
     return [_action(row["action"]) for row in rows]
 
 
 def files_difference(
-    folder: Path, rows: list[dict[str, Any]], episode: Trajectory, *, actions: bool, pictures: bool = True
+    folder: Path, rows: Rows, episode: Trajectory, *, actions: bool, pictures: bool = True
 ) -> str | None:
     """Describes the first difference of an episode's feedback files from `episode`; None when they are equal.
 
@@ -193,7 +210,7 @@ def files_difference(
 
 
 def _written_difference(
-    folder: Path, rows: list[dict[str, Any]], episode: Trajectory, *, actions: bool, pictures: bool
+    folder: Path, rows: Rows, episode: Trajectory, *, actions: bool, pictures: bool
 ) -> str | None:
     """`files_difference` for a rendered episode: compares its files' bytes first, then their content."""
     lines = episode.files[ROWS].splitlines()
@@ -262,7 +279,7 @@ def reads_as(text: Any, value: Any) -> bool:
     return bool(text == str(value))
 
 
-def _pictures_difference(folder: Path, rows: list[dict[str, Any]], episode: Trajectory) -> str | None:
+def _pictures_difference(folder: Path, rows: Rows, episode: Trajectory) -> str | None:
     """Describes a difference of observations that are stored beside the rows."""
     if episode.obs is None or not rows or rows[0].get("obs") is not None:
         return None

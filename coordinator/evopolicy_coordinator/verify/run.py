@@ -257,7 +257,7 @@ class Verifier:
         self._kept = {recording.index: recording for recording in found}
         return found
 
-    def _rows(self, played: Played, index: int) -> list[dict[str, Any]] | None:
+    def _rows(self, played: Played, index: int) -> verify_compare.Rows | None:
         if not played.folders:
             return None
         try:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import tracemalloc
 from pathlib import Path
 from typing import Any
 
@@ -161,3 +162,15 @@ def test_a_row_of_any_shape_is_refused_as_one_that_cannot_be_read(tmp_path: Path
 def test_a_number_without_measure_reads_as_no_float() -> None:
     assert not reads_as(10**400, 1.0)
     assert not reads_as(10**400, np.float32(1.0))
+
+
+def test_rows_of_many_values_are_not_all_in_memory_at_once(tmp_path: Path) -> None:
+    line = '{"t":0,"action":0,"reward":0.0,"info":{"x":[%s[]]}}\n' % ("[]," * 30_000)
+    (tmp_path / "trajectory.jsonl").write_text(line * 30)
+    size = 30 * len(line)
+    tracemalloc.start()
+    try:
+        assert actions_of(read_rows(tmp_path)) == [0] * 30
+        assert tracemalloc.get_traced_memory()[1] < 4 * size
+    finally:
+        tracemalloc.stop()
