@@ -210,6 +210,8 @@ def test_mixed_runs_are_refused_unless_told_and_then_marked(tmp_path: Path) -> N
     refused = CliRunner().invoke(app, arguments)
     assert refused.exit_code == 3
     assert "policy scope on core16: episode (1 run), submit (1 run)" in refused.output
+    folders = {each.parent.parent.parent.name: each.parent for each in tmp_path.rglob("run.json")}
+    assert f"    submit: {folders['Other']}\n" in refused.output
     assert not (tmp_path / "report").exists()
     invoked = CliRunner().invoke(app, [*arguments, "--allow-mixed"])
     assert invoked.exit_code == 0

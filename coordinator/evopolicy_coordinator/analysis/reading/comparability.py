@@ -11,7 +11,8 @@ step limit, and videos in feedback. Runs with hidden cases of their own differ i
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from itertools import islice
 
 import msgspec
 
@@ -20,7 +21,7 @@ from evopolicy_common.errors import EvopolicyError
 from evopolicy_common.messages.environment import Split
 from evopolicy_common.records.fingerprints import comparable
 from evopolicy_common.records.run_record import inputs_digest
-from evopolicy_coordinator.analysis.reading.records import Run
+from evopolicy_coordinator.analysis.reading.records import Run, path_text
 from evopolicy_coordinator.analysis.scoring.scores import ordered_environments, suites_of
 
 
@@ -33,20 +34,42 @@ class Mixture(msgspec.Struct, frozen=True, kw_only=True):
     """Suite or environment."""
     values: dict[str, int]
     """Each value as text, to the number of runs with it."""
+    folders: dict[str, tuple[str, ...]] = {}
+    """Each value to the folders of the runs with it; empty if the runs have none, or the value names its run."""
 
     def __str__(self) -> str:
         found = ", ".join(f"{value} ({n} run{'s' * (n != 1)})" for value, n in self.values.items())
-        return f"{self.what} on {self.where}: {found}"
+        return f"{self.what} on {self.where}" + (f": {found}" if found else "")
 
 
 class MixedRunsError(EvopolicyError):
     """The runs are not a fair comparison; `mixtures` lists the differences."""
 
     def __init__(self, mixtures: Sequence[Mixture]) -> None:
-        super().__init__(
-            "these runs cannot be compared:\n" + "\n".join(f"  {mixture}" for mixture in mixtures)
-        )
+        super().__init__("\n".join(["these runs cannot be compared:", *_named(mixtures)]))
         self.mixtures = tuple(mixtures)
+
+
+_MOST_NAMED = 5
+"""Of the values of a setting, and of the runs of a value, in an error."""
+
+
+def _named(mixtures: Sequence[Mixture]) -> Iterator[str]:
+    """Lines with the differences, and with the folders of the runs where another difference has not named them."""
+    told: dict[frozenset[tuple[str, ...]], Mixture] = {}
+    for mixture in mixtures:
+        yield f"  {mixture}"
+        first = told.setdefault(frozenset(mixture.folders.values()), mixture)
+        if first is not mixture and mixture.folders:
+            yield f"    the same runs as for the {first.what}"
+            continue
+        for value, folders in islice(mixture.folders.items(), _MOST_NAMED):
+            more = len(folders) - _MOST_NAMED
+            yield f"    {value}: {', '.join(folders[:_MOST_NAMED])}" + (
+                f" and {more} more" if more > 0 else ""
+            )
+        if (more := len(mixture.folders) - _MOST_NAMED) > 0:
+            yield f"    and {more} more values"
 
 
 IN_QUESTION = "results in dispute, or of a forger,"
@@ -182,10 +205,11 @@ def _in_question(env: str, runs: list[Run]) -> list[Mixture]:
 def _differences(checks: dict[str, Callable[[Run], str]], where: str, runs: list[Run]) -> list[Mixture]:
     found: list[Mixture] = []
     for what, value_of in checks.items():
-        counts: dict[str, int] = {}
+        by_value: dict[str, list[str]] = {}
         for run in runs:
-            value = value_of(run) or "none"
-            counts[value] = counts.get(value, 0) + 1
-        if len(counts) > 1:
-            found.append(Mixture(what=what, where=where, values=dict(sorted(counts.items()))))
+            by_value.setdefault(value_of(run) or "none", []).append(path_text(run.path))
+        if len(by_value) > 1:
+            folders = {value: tuple(those) for value, those in sorted(by_value.items())}
+            counts = {value: len(those) for value, those in folders.items()}
+            found.append(Mixture(what=what, where=where, values=counts, folders=folders))
     return found

@@ -380,6 +380,19 @@ def test_a_run_that_workers_of_other_versions_went_on_with_is_not_like_the_other
     assert mixture.values == {"none": 1, "then a → b: the old workers are gone": 1}
 
 
+def test_an_error_names_five_values_and_five_runs_of_each(tmp_path: Path) -> None:
+    for number in range(7):
+        write_run(tmp_path, VERSIONS, entry=f"same {number}")
+        write_run(tmp_path, VERSIONS, entry=f"other {number}", budget=900 + number)
+    with pytest.raises(MixedRunsError) as error:
+        study([tmp_path])
+    text = str(error.value)
+    assert text.count("    90") == 4
+    assert "    and 3 more values" in text
+    (same,) = (line for line in text.splitlines() if line.endswith(" and 2 more"))
+    assert same.count(str(tmp_path)) == 5
+
+
 def test_runs_from_before_isolation_was_recorded_are_mixed_only_by_name(tmp_path: Path) -> None:
     write_run(tmp_path, VERSIONS)
     old = write_run(tmp_path, VERSIONS, entry="Agent B")
