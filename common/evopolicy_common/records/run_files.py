@@ -49,7 +49,9 @@ def read_regular(path: Path, most: int = MAX_BYTES) -> bytes:
     with open_regular(path) as file:
         # The file may have holes, and may grow while it is read.
         size = os.fstat(file.fileno()).st_size
-        data = file.read(most + 1) if size <= most else b""
+        data = file.read(size + 1) if size <= most else b""
+        if len(data) > size:
+            data += file.read(most + 1 - len(data))
     if max(size, len(data)) > most:
         raise OSError(errno.EFBIG, f"larger than {most >> 20} MiB, which no run has", str(path))
     return data
