@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from evopolicy._records import Records, bars, table
 from evopolicy_common.messages.episode import EpisodeOutcome
+from evopolicy_common.records.aggregates import mean
 from evopolicy_common.records.episodes.trajectory import decode
 
 
@@ -93,7 +94,7 @@ class Evaluation(Sequence[Episode]):
             for one in self.episodes
             if one.failure is None and one.episode_return is not None
         ]
-        return math.fsum(known) / len(known) if known else None
+        return mean(known) if known else None
 
     @property
     def records(self) -> Records[EvaluationRecord]:

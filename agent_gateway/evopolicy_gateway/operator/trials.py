@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import asyncio
-import math
 import uuid
 from collections.abc import Sequence
 from pathlib import Path
-from statistics import pstdev
 
 import msgspec
 from rich.progress import Progress
@@ -21,6 +19,7 @@ from evopolicy_common.messages.operator import Evaluate
 from evopolicy_common.processes.local_cluster import unless_failed
 from evopolicy_common.processes.notices import Waiting
 from evopolicy_common.processes.preflight import check_writable
+from evopolicy_common.records.aggregates import mean, std
 from evopolicy_common.records.episodes import rendered
 from evopolicy_common.records.policies import bundles
 from evopolicy_common.records.policies.checkpoints import bundle_of
@@ -246,11 +245,10 @@ def _result(
     returns = [
         one.episode_return for one in episodes if one.failure is None and one.episode_return is not None
     ]
-    mean = math.fsum(returns) / len(returns) if returns else None
     return TrialResult(
         env=env,
-        mean_return=mean,
-        std_return=None if mean is None else pstdev(returns, mean),
+        mean_return=mean(returns) if returns else None,
+        std_return=std(returns) if returns else None,
         n_failed=sum(one.failure is not None for one in episodes),
         episodes=tuple(episodes),
         folder=None if folder is None else str(folder),

@@ -1,24 +1,34 @@
-"""Mean and standard deviation of returns, as `summary.json` and `run.json` have them: whoever checks them needs the same bits."""
+"""Mean and standard deviation of returns, as the coordinator, `summary.json` and `run.json` have them: whoever checks them needs
+the same bits.
+
+Returns beyond `bounds.LARGEST`, which earlier versions stored, have finite results too, although their sums are not finite.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 
+_SCALE = 520
+"""Exponent by which such returns are divided, so that their squares are finite."""
+
 
 def mean(values: Sequence[float]) -> float:
-    """Arithmetic mean, correctly rounded; NaN without values, NaN or infinite if a value is."""
-    return _exact_sum(values) / len(values) if values else math.nan
+    """Arithmetic mean, correctly rounded, so independent of the order; NaN without values, NaN or infinite if a value is."""
+    try:
+        return math.fsum(values) / len(values) if values else math.nan
+    except (ValueError, OverflowError):
+        if not all(map(math.isfinite, values)):
+            return float(sum(values))
+        from fractions import Fraction
+
+        return float(sum(map(Fraction, values)) / len(values))
 
 
 def std(values: Sequence[float]) -> float:
-    """Population standard deviation (divides by n); NaN without values."""
+    """Population standard deviation (divides by n); NaN without values, or if a value is not finite."""
     centre = mean(values)
-    return math.sqrt(mean([(value - centre) * (value - centre) for value in values]))
-
-
-def _exact_sum(values: Sequence[float]) -> float:
-    try:
-        return math.fsum(values)
-    except (ValueError, OverflowError):  # infinities of both signs, or a sum beyond the range of floats
-        return float(sum(values))
+    square = mean([(value - centre) * (value - centre) for value in values])
+    if math.isinf(square) and math.isfinite(centre):
+        return math.ldexp(std([math.ldexp(value, -_SCALE) for value in values]), _SCALE)
+    return math.sqrt(square)

@@ -6,7 +6,6 @@ so that scores of different cases are never compared. Readers skip unknown field
 
 from __future__ import annotations
 
-import math
 import re
 from pathlib import Path
 
@@ -14,6 +13,7 @@ import msgspec
 
 from evopolicy_common.errors import DECODE_ERRORS, ProtocolError
 from evopolicy_common.messages.bounds import LARGEST, Int, Many, Named, Number, Text, Word
+from evopolicy_common.records.aggregates import mean
 from evopolicy_common.records.run_files import read_regular
 
 FORMAT = "evopolicy rescore 1"
@@ -35,7 +35,7 @@ class Rescored(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def mean(self) -> float:
-        return math.fsum(self.returns) / len(self.returns)
+        return mean(self.returns)
 
 
 class RescoreRecord(msgspec.Struct, frozen=True, kw_only=True):

@@ -7,7 +7,6 @@ records are in one module because they refer to each other, such as a lease to i
 from __future__ import annotations
 
 import heapq
-import math
 from collections import deque
 from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple, TypeVar
@@ -26,6 +25,7 @@ from evopolicy_common.messages.episode import (
 from evopolicy_common.messages.gateway import VideoOption
 from evopolicy_common.messages.status import RetriedJobs
 from evopolicy_common.messages.worker import Fingerprint
+from evopolicy_common.records.aggregates import mean
 
 from .events import RequestId
 from .records import AuditRow, EvaluationRow, PermitRow, RunRow, RunStateRow, SubmitRow
@@ -71,17 +71,6 @@ def outcome_digest(outcome: EpisodeOutcome) -> OutcomeDigest:
         None if outcome.failure is None else outcome.failure.category,
         None if outcome.trajectory is None else outcome.trajectory.digest,
     )
-
-
-def mean(returns: tuple[float, ...]) -> float:
-    """Mean, summed exactly, so that the order of arrival has no influence."""
-    try:
-        return math.fsum(returns) / len(returns)
-    except OverflowError:
-        # Of returns beyond `bounds.LARGEST`, which earlier versions stored: the sum is not finite, but the mean is.
-        from fractions import Fraction
-
-        return float(sum(map(Fraction, returns)) / len(returns))
 
 
 @dataclass(slots=True, frozen=True, kw_only=True)

@@ -6,7 +6,6 @@ trajectory (its submit was not `ok`) is not listed.
 
 from __future__ import annotations
 
-import math
 import random
 from pathlib import Path
 
@@ -14,6 +13,7 @@ import msgspec
 
 from evopolicy_common.errors import ConfigError, ProtocolError
 from evopolicy_common.messages.environment import Split
+from evopolicy_common.records.aggregates import mean
 from evopolicy_common.records.policies.checkpoints import CheckpointMeta, read_meta
 from evopolicy_common.records.run_files import RUN_JSON, read_record, read_regular, submit_folders
 from evopolicy_common.records.run_record import RunRecord
@@ -61,7 +61,7 @@ class Played(msgspec.Struct, frozen=True, kw_only=True):
         """Whether all returns are present and their mean differs from the one in the run directory."""
         if self.mean is None or len(returns) < len(self.env_instances):
             return False
-        return math.fsum(returns.values()) / len(returns) != self.mean
+        return mean(list(returns.values())) != self.mean
 
 
 class SubmitFiles(msgspec.Struct, frozen=True, kw_only=True):
@@ -185,10 +185,10 @@ def _hidden(record: RunRecord, train: dict[int, Played]) -> list[Played]:
             )
         )
 
-    for text, mean in (outcome.val_scores or {}).items():
+    for text, told in (outcome.val_scores or {}).items():
         index = int(text) if text.isdecimal() and len(text) <= _MAX_DIGITS else -1
         if (own := train.get(index)) is not None:
-            add("validation", own, dimensions.n_validation, None, mean)
+            add("validation", own, dimensions.n_validation, None, told)
     if outcome.best_submit_index is not None and (own := train.get(outcome.best_submit_index)) is not None:
         add(
             "heldout", own, len(outcome.heldout_returns), outcome.heldout_returns, outcome.heldout_mean_return

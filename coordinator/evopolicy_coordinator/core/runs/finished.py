@@ -5,9 +5,10 @@ from __future__ import annotations
 from typing import Literal
 
 from evopolicy_common.messages import operator
+from evopolicy_common.records.aggregates import mean
 from evopolicy_common.wire.refusals import Refusal
 from evopolicy_coordinator.core import events
-from evopolicy_coordinator.core.model import Run, mean
+from evopolicy_coordinator.core.model import Run
 from evopolicy_coordinator.core.reasons import Reason, because
 from evopolicy_coordinator.core.records import (
     SubmitRow,
