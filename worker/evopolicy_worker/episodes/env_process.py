@@ -27,9 +27,10 @@ from evopolicy_common.errors import (
 )
 from evopolicy_worker import environments
 from evopolicy_worker.environments import calls
-from evopolicy_worker.episodes.loop import CancelledJobError, Player, Progress, fault_of
+from evopolicy_worker.episodes.loop import Player, fault_of
 from evopolicy_worker.episodes.monitor import Monitor
 from evopolicy_worker.episodes.policy_process import BundleFiles
+from evopolicy_worker.episodes.progress import CancelledJobError, Progress
 from evopolicy_worker.sandbox import env_jail, jail
 from evopolicy_worker.sandbox.zygote import Zygote
 from evopolicy_worker.slots import slot_messages as messages

@@ -18,7 +18,6 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import sys
-import threading
 import time
 from collections import OrderedDict
 from collections.abc import Callable
@@ -48,7 +47,6 @@ from evopolicy_common.messages.episode import (
     PolicyFailure,
     ResourceLimits,
 )
-from evopolicy_common.processes.scratch import remove_tree
 from evopolicy_common.records.blobs import digest_of
 from evopolicy_common.records.episodes.rendered import Renderer
 from evopolicy_common.records.episodes.trajectory import Recorder, decode
@@ -60,15 +58,11 @@ from evopolicy_worker.environments.trial import solved
 from evopolicy_worker.episodes import float_environment
 from evopolicy_worker.episodes.begun import Begun, Returned, is_kept, unpack
 from evopolicy_worker.episodes.monitor import Monitor
-from evopolicy_worker.episodes.policy_process import (
-    BundleFiles,
-    Ended,
-    PolicyFailedError,
-    PolicyProcess,
-    oom_kills,
-)
+from evopolicy_worker.episodes.policies import JobPolicies, Policies
+from evopolicy_worker.episodes.policy_process import BundleFiles, Ended, PolicyFailedError, PolicyProcess
+from evopolicy_worker.episodes.progress import CancelledJobError, Progress
 from evopolicy_worker.sandbox.jail import Jail
-from evopolicy_worker.sandbox.zygote import Child, Zygote
+from evopolicy_worker.sandbox.zygote import Zygote
 from evopolicy_worker.slots import endings
 from evopolicy_worker.slots import slot_messages as messages
 from evopolicy_worker.slots.endings import EndedFromOutsideError, Ending
@@ -84,68 +78,16 @@ MAX_ENDS = 5
 the job."""
 MAX_WARM_ENVIRONMENTS = 4
 """Environments kept for later jobs: all sixteen in one process would take 230 MB."""
-MAX_CODES = 8
-"""Policies whose compiled code is kept, at most 1 MiB each."""
-_COUNT_S = 1.0
-"""Interval at which the processes are counted that the machine ended for want of memory. The kernel's list of counters takes it
-50 µs and more."""
 
 _ACTING = messages.framed(messages.Acting())
-
-
-class CancelledJobError(Exception):
-    """The job was cancelled while it ran."""
-
-
-class Progress:
-    """How far the running job is; written by the loop, read by the monitor's thread."""
-
-    def __init__(self) -> None:
-        self.episodes_done = 0
-        self.steps = 0
-        self.cancelled = False
-        self.policy: PolicyProcess | None = None
-        self._begun: tuple[int, Begun] | None = None
-        self._given_up = False
-        self._lock = threading.Lock()
-
-    def begins(self, place: int, begun: Begun) -> None:
-        """Starts the job's episode at this index; `begun` is reported when the job is stopped."""
-        self._begun = place, begun
-
-    def give_up(self, send: Callable[[messages.Message], None] | None) -> None:
-        """Reports the started episode, once; the report is sent when this returns. With None, nothing more is
-        reported."""
-        with self._lock:
-            if self._given_up:
-                return
-            self._given_up = True
-            if send is not None and self._begun is not None:
-                place, begun = self._begun
-                send(messages.Begun(place=place, begun=begun.packed()))
-
-    def cancel(self) -> None:
-        """Ends the running job at the next step, and the policy at once."""
-        self.cancelled = True
-        policy = self.policy
-        if policy is not None:
-            policy.kill()
 
 
 class Player:
     """Plays jobs one after another with warm environments and a zygote."""
 
     def __init__(self, zygote: Zygote, jail: Jail, monitor: Monitor, scratch: Path) -> None:
-        self._zygote = zygote
-        self._jail = jail
-        self._monitor = monitor
-        self._scratch = scratch
+        self._policies = Policies(zygote, jail, monitor, scratch)
         self._environments: OrderedDict[str, Environment] = OrderedDict()
-        self._prepared: Child | None = None
-        self._codes: dict[bytes, bytes] = {}
-        self._n_policies = 0
-        self._folders: list[Path] = []
-        self._oom_kills, self._counted = oom_kills(), time.monotonic()
         self._videos = VideoRecorder()
 
     def play(
@@ -167,7 +109,7 @@ class Player:
         job = msgspec.structs.replace(job, limits=_within_share(job))
         if job.bundle is not None and files is None:
             raise WorkerError("a job with a bundle came without the bundle")
-        policies = _Policies(self, job, files, environment)
+        policies = JobPolicies(self._policies, job, files, environment)
         before = unpack(job)
         if not job.video:
             self._videos.close()
@@ -203,7 +145,7 @@ class Player:
         k: int,
         job: Job,
         spec: EpisodeSpec,
-        policies: _Policies,
+        policies: JobPolicies,
         progress: Progress,
         tell: Callable[[bytes], None],
         begun: Begun,
@@ -238,68 +180,15 @@ class Player:
                     self._environments.pop(job.env).close()
 
     def prepare(self) -> None:
-        """Bury the last policy and fork the process for the next; to be called while there is nothing else to do."""
-        if self._prepared is None:
-            self._prepared = self._spawn()
-
-    def new_policy(self, limits: ResourceLimits) -> PolicyProcess:
-        child, self._prepared = self._prepared, None
-        if child is None:
-            child = self._spawn()
-        self._n_policies += 1
-        folder = self._scratch / "policies" / str(self._n_policies)
-        if self._jail.home is None:
-            self._folders.append(folder)
-        return PolicyProcess(
-            self._zygote, child, self._monitor, self._jail, limits, str(folder), self._oom_kills
-        )
-
-    def _spawn(self) -> Child:
-        self._bury()
-        child = self._zygote.spawn()
-        now = time.monotonic()
-        if now - self._counted > _COUNT_S:
-            self._oom_kills, self._counted = oom_kills(), now
-        return child
-
-    @property
-    def compiles(self) -> bool:
-        """Whether policies have the same folder, whose path is in their code."""
-        return self._jail.home is not None
-
-    def code(
-        self, source: bytes, limits: ResourceLimits, env_meta: dict[str, Any], progress: Progress
-    ) -> bytes:
-        """The code of this `policy.py`, compiled once for all episodes by a process of its own.
-
-        All policies load the same code, the first too, which could otherwise tell by its memory that it is the first.
-        """
-        code = self._codes.get(source)
-        if code is None:
-            compiler = progress.policy = self.new_policy(limits)
-            try:
-                code = compiler.compiled(source, env_meta)
-            finally:
-                compiler.end()
-            if progress.cancelled:
-                raise CancelledJobError
-            while len(self._codes) >= MAX_CODES:
-                del self._codes[next(iter(self._codes))]
-            self._codes[source] = code
-        return code
-
-    def _bury(self) -> None:
-        """The processes of the policies so far are gone after this, and so are their folders."""
-        self._zygote.bury()
-        while self._folders:
-            remove_tree(self._folders.pop())
+        """Buries the last policy and forks the process for the next; to be called while there is nothing else to do."""
+        self._policies.prepare()
 
     def close(self) -> None:
         for environment in self._environments.values():
             environment.close()
         self._environments.clear()
         self._videos.close()
-        self._zygote.close()
+        self._policies.close()
 
     def describe(self, env_id: str) -> EnvironmentDescription:
         """An environment's description. The environment is created for it and kept for later jobs. Raises WorkerError
@@ -318,78 +207,6 @@ class Player:
         return environment
 
 
-class _Policies:
-    """The policy of each episode of a job: its own, or one for several."""
-
-    def __init__(self, player: Player, job: Job, files: BundleFiles | None, environment: Environment) -> None:
-        self._player = player
-        self._job = job
-        self._files = files
-        description = environment.description
-        self._env_meta = job.env_meta | {
-            "obs_space": description.obs_space,
-            "action_space": description.action_space,
-            "obs_storage": description.obs_storage,
-        }
-        if description.reward_components:
-            self._env_meta["reward_components"] = dict(description.reward_texts)
-        self._policy: PolicyProcess | None = None
-
-    def take(self, k: int, spec: EpisodeSpec, progress: Progress) -> PolicyProcess:
-        """The policy for the job's k-th episode, before its reset. Raises PolicyFailedError."""
-        job, files = self._job, self._files
-        assert files is not None
-        if self._policy is not None and not (job.policy_every and k % job.policy_every == 0):
-            self._policy.begin_episode(first=False)
-            return self._policy
-        self._end()
-        source = files.policy()
-        if source is None:
-            raise PolicyFailedError(
-                PolicyFailure(
-                    category="missing_policy",
-                    step_index=None,
-                    message="there is no policy.py in system/; it must hold a top-level class Policy",
-                )
-            )
-        player, limits = self._player, job.limits
-        code = player.code(source, limits, self._env_meta, progress) if player.compiles else b""
-        policy = self._policy = progress.policy = player.new_policy(limits)
-        policy.seal(files, spec.policy_seed, self._env_meta, job.observations)
-        policy.load(code)
-        return policy
-
-    def release(self) -> Ended:
-        """The policy's output in the ended episode; a policy for one episode ends with it."""
-        policy = self._policy
-        if policy is None:
-            return Ended(b"", b"", 0.0)
-        if self._job.policy_scope == "submit" and not policy.dead:
-            ended = policy.take_output()
-            if not policy.dead:
-                return ended
-        else:
-            ended = policy.end()
-        self._policy = None
-        return ended
-
-    def close(self, progress: Progress) -> None:
-        progress.policy = None
-        self._end()
-
-    def drop(self) -> None:
-        """The policy is lost; the next episode gets another one."""
-        self._end()
-
-    def _end(self) -> None:
-        if self._policy is not None:
-            policy, self._policy = self._policy, None
-            policy.kill()
-            # The job itself has already reported a fault of the sandbox.
-            with contextlib.suppress(EvopolicyError):
-                policy.end()
-
-
 class _Episode:
     """One episode from reset to its end."""
 
@@ -398,7 +215,7 @@ class _Episode:
         job: Job,
         spec: EpisodeSpec,
         environment: Environment,
-        policies: _Policies,
+        policies: JobPolicies,
         progress: Progress,
         videos: VideoRecorder,
         tell: Callable[[bytes], None],

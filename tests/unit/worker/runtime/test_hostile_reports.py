@@ -25,9 +25,10 @@ from evopolicy_worker import environments
 from evopolicy_worker.environments.actions import compile_actions
 from evopolicy_worker.environments.families.toy import Line
 from evopolicy_worker.episodes import frames
-from evopolicy_worker.episodes.loop import Player, Progress
+from evopolicy_worker.episodes.loop import Player
 from evopolicy_worker.episodes.monitor import Monitor
 from evopolicy_worker.episodes.policy_process import BundleFiles, PolicyProcess
+from evopolicy_worker.episodes.progress import Progress
 from evopolicy_worker.sandbox import jail
 from evopolicy_worker.sandbox.zygote import Zygote
 from evopolicy_worker.slots import slot_messages as messages
