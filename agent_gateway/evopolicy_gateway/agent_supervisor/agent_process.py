@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import os
 import signal
 from collections.abc import AsyncIterator, Mapping, Sequence
@@ -69,6 +70,13 @@ class AgentProcess:
         except (BrokenPipeError, ConnectionResetError):
             return False
         return True
+
+    async def drained(self) -> None:
+        """Waits until the program has read most of what was written; not for one that has closed its stdin."""
+        stdin = self._process.stdin
+        if stdin is not None and not stdin.is_closing():
+            with contextlib.suppress(BrokenPipeError, ConnectionResetError):
+                await stdin.drain()
 
     def hang_up(self) -> None:
         """Closes its stdin."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import importlib.util
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Iterator
 from pathlib import PurePosixPath
 from typing import Any
 
@@ -181,7 +181,7 @@ class AcpAgent(CliAgent):
         self, stage: Stage, link: _Link, prompt: str, reader: AcpReader, capped: Capped
     ) -> None:
         """Sends the prompt and reads updates until its answer."""
-        link.clear()
+        link.listens = True
         content = [{"type": "text", "text": prompt}]
         prompt_reply = asyncio.ensure_future(
             link.request("session_prompt", {"sessionId": link.session, "prompt": content})
@@ -198,13 +198,15 @@ class AcpAgent(CliAgent):
                 if not done:
                     raise TimeoutError(f"the agent's program had no output for {self._config.silence_s:g} s")
                 if update in done:
-                    self._read(stage, reader, update.result())
+                    # All of them, as an agent may send them faster than one at a time is read.
+                    for each in (update.result(), *link.arrived()):
+                        self._read(stage, reader, each)
                 if (why := capped(reader)) is not None:
                     reader.failure = TurnFailure(kind="cap", message=why)
                     return
             answer = prompt_reply.result()
-            while not link.updates.empty():
-                self._read(stage, reader, link.updates.get_nowait())
+            for each in link.arrived():
+                self._read(stage, reader, each)
             reader.ended(answer)
             if not reader.done:
                 reason = string(answer.get("stopReason")) or "no reason"
@@ -212,6 +214,8 @@ class AcpAgent(CliAgent):
             elif (why := capped(reader)) is not None:
                 reader.done, reader.failure = False, TurnFailure(kind="cap", message=why)
         finally:
+            link.listens = False
+            list(link.arrived())
             prompt_reply.cancel()
             await asyncio.gather(prompt_reply, return_exceptions=True)
 
@@ -259,6 +263,8 @@ class _Link:
         self.session: str | None = None
         self.version: str | None = None
         self.updates: asyncio.Queue[dict[str, Any]] = asyncio.Queue()
+        self.listens = False
+        """Whether a turn is played; updates at other times, such as those of a loaded session, are dropped."""
         self._stage = stage
         self._connection = Connection(self._handle, _Pipe(process))
 
@@ -294,10 +300,14 @@ class _Link:
         answer = await self._connection.send_request(AGENT_METHODS[method], params)
         return answer if isinstance(answer, dict) else {}
 
-    def clear(self) -> None:
-        """Forgets updates that came before a prompt, such as those of a loaded session."""
+    def _update(self, update: dict[str, Any]) -> None:
+        if self.listens:
+            self.updates.put_nowait(update)
+
+    def arrived(self) -> Iterator[dict[str, Any]]:
+        """Yields the updates that have arrived."""
         while not self.updates.empty():
-            self.updates.get_nowait()
+            yield self.updates.get_nowait()
 
     async def close(self) -> None:
         await self._connection.close()
@@ -311,7 +321,7 @@ class _Link:
         fields = params if isinstance(params, dict) else {}
         if method == CLIENT_METHODS["session_update"]:
             if fields.get("sessionId") == self.session or self.session is None:
-                self.updates.put_nowait(dict(mapping(fields.get("update"))))
+                self._update(dict(mapping(fields.get("update"))))
             return None
         if method == CLIENT_METHODS["session_request_permission"]:
             answer = permission(fields, PurePosixPath(self._stage.workspace))
@@ -319,7 +329,7 @@ class _Link:
             self._stage.log.note({"type": "permission", "title": title, **answer["outcome"]})
             # Some agents tell what they do only here.
             call = mapping(fields.get("toolCall"))
-            self.updates.put_nowait({**call, "sessionUpdate": "tool_call_update", "status": "pending"})
+            self._update({**call, "sessionUpdate": "tool_call_update", "status": "pending"})
             return answer
         if is_notification:
             return None
@@ -334,10 +344,18 @@ class _Pipe:
         self._lines: AsyncIterator[bytes] = process.lines()
 
     async def send(self, message: dict[str, Any]) -> None:
-        if not await self._process.say(orjson.dumps(message)):
+        try:
+            said = await self._process.say(orjson.dumps(message))
+        except TypeError:
+            # An answer repeats its request's id, which may nest deeper than can be written.
+            said = False
+        # The library logs a traceback of every answer that cannot be sent: an agent could fill the disk.
+        if not said and "method" in message:
             raise ConnectionError("the agent's program has closed its input")
 
     async def receive(self) -> dict[str, Any] | None:
+        # A program that sends requests and does not read the answers is not read either.
+        await self._process.drained()
         async for line in self._lines:
             try:
                 message = orjson.loads(line)

@@ -13,6 +13,8 @@ from collections.abc import Mapping
 from pathlib import PurePosixPath
 from typing import Any, NamedTuple
 
+import orjson
+
 from evopolicy_gateway.harnesses.agent_config import AcpTable, AgentConfig
 from evopolicy_gateway.harnesses.coding_agents.dialect import (
     Dialect,
@@ -31,6 +33,12 @@ MODE_THAT_ASKS = "default"
 _CHANGES = ("edit", "delete", "move")
 """Kinds of tools that change files."""
 _MAX_TEXT_CHARS = 1 << 20
+_MAX_CALLS = 64
+"""Tool calls without a result that are remembered; beyond it the oldest is forgotten."""
+_MAX_INPUT_BYTES = 256 << 10
+"""Of a tool call that is remembered, as JSON."""
+_SHOWN_CHUNKS = 64
+"""Chunks of a text in which its first line is looked for."""
 _SKILLS = {"claude-agent-acp": "~/.claude/skills", "qwen": "~/.qwen/skills"}
 """Skill folders of programs that do not read `~/.agents/skills`, by program name."""
 
@@ -61,6 +69,7 @@ class AcpReader(TurnReader):
     def __init__(self) -> None:
         super().__init__()
         self._text: list[str] = []
+        self._text_chars = 0
         self._entries: list[dict[str, Any]] = []
         self._calls: dict[str, dict[str, Any]] = {}
         """Tool calls without a result, by their ids."""
@@ -69,9 +78,12 @@ class AcpReader(TurnReader):
         """A `session/update`."""
         kind, content = event.get("sessionUpdate"), mapping(event.get("content"))
         if kind == "agent_message_chunk":
-            if sum(map(len, self._text)) < _MAX_TEXT_CHARS:
-                self._text.append(string(content.get("text")))
-            self.action = first_line("".join(self._text)) or self.action
+            chunk = string(content.get("text"))
+            if chunk and self._text_chars < _MAX_TEXT_CHARS:
+                self._text.append(chunk)
+                self._text_chars += len(chunk)
+            if len(self._text) <= _SHOWN_CHUNKS:
+                self.action = first_line("".join(self._text)) or self.action
             # Qwen Code's own field: the tokens of one request to its model.
             self.usage += usage_of(mapping(mapping(event.get("_meta")).get("usage")))
             return
@@ -83,8 +95,10 @@ class AcpReader(TurnReader):
         self._whole()
         identity, status = string(event.get("toolCallId")), event.get("status")
         known = self._calls.setdefault(identity, {"title": "", "input": {}})
-        known["title"] = string(event.get("title")) or known["title"]
-        if isinstance(given := event.get("rawInput"), dict):
+        if len(self._calls) > _MAX_CALLS:
+            del self._calls[next(iter(self._calls))]
+        known["title"] = string(event.get("title"))[:_MAX_INPUT_BYTES] or known["title"]
+        if isinstance(given := event.get("rawInput"), dict) and _is_short(given):
             known["input"] = given
         command = string(known["input"].get("command"))
         self.action = f"$ {first_line(command)}" if command else first_line(known["title"]) or self.action
@@ -121,13 +135,20 @@ class AcpReader(TurnReader):
     def _whole(self) -> None:
         """The text so far is one message."""
         text = "".join(self._text).strip()
-        self._text = []
+        self._text, self._text_chars = [], 0
         if text:
             self.text = text
             self._entry("assistant", {"type": "text", "text": text})
 
     def _entry(self, kind: str, block: dict[str, Any]) -> None:
         self._entries.append({"type": kind, "message": {"role": kind, "content": [block]}})
+
+
+def _is_short(given: dict[str, Any]) -> bool:
+    try:
+        return len(orjson.dumps(given)) <= _MAX_INPUT_BYTES
+    except TypeError:  # nested too deeply
+        return False
 
 
 class Choice(NamedTuple):

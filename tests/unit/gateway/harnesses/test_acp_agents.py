@@ -129,7 +129,24 @@ def test_messages_that_nest_too_deeply_to_be_written_end_no_run(tmp_path: Path) 
     found = played(tmp_path, "deeperror,deep")
     assert found.ending is not None
     assert (found.ending.reason, found.ending.turns, found.ending.retries) == ("agent_stopped", 2, 1)
-    assert {"type": "assistant", "text": "nested too deeply to be kept"} in found.log
+    assert {"type": "user", "text": "nested too deeply to be kept"} in found.log
+
+
+def test_requests_that_cannot_be_answered_are_not_logged_one_by_one(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    found = played(tmp_path, "deepid,work")
+    assert found.ending is not None
+    assert (found.ending.reason, found.ending.turns) == ("agent_stopped", 2)
+    assert [record.message for record in caplog.records if record.exc_info] == []
+
+
+def test_an_agent_that_reads_no_answers_is_not_read_either(tmp_path: Path) -> None:
+    found = played(tmp_path, "deaf,work", silence_s=1.0)
+    assert found.ending is not None
+    assert (found.ending.turns, found.ending.retries) == (2, 1)
+    # 20 MB of requests: those that were read stand in the log.
+    assert (tmp_path / "agent.jsonl").stat().st_size < 4 << 20
 
 
 def test_an_agent_that_is_not_logged_in_ends_the_run(tmp_path: Path) -> None:
@@ -223,6 +240,24 @@ def test_odd_updates_are_skipped() -> None:
         reader.read(update)
     reader.ended({"stopReason": "cancelled", "usage": 3, "_meta": []})
     assert (reader.done, reader.text, reader.usage) == (False, "", Usage())
+
+
+def test_what_is_remembered_of_a_turn_is_bounded() -> None:
+    reader = AcpReader()
+    large = {"text": "x" * (300 << 10)}
+    for n in range(1000):
+        reader.read(
+            {"sessionUpdate": "tool_call", "toolCallId": f"t{n}", "title": "Write", "rawInput": large}
+        )
+        reader.read({"sessionUpdate": "agent_message_chunk", "content": {"text": ""}})
+    assert len(reader._calls) == 64
+    assert sum(len(str(call)) for call in reader._calls.values()) < 1 << 20
+    assert reader._text == []
+    # The latest are still known by name.
+    reader.entries()
+    reader.read({"sessionUpdate": "tool_call_update", "toolCallId": "t999", "status": "completed"})
+    used = reader.entries()[0]["message"]["content"][0]
+    assert (used["name"], used["input"]) == ("Write", {"title": "Write"})
 
 
 def test_the_command_line_names_the_program(tmp_path: Path) -> None:
