@@ -20,7 +20,7 @@ from evopolicy_common.console import Terminal, terminal
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.processes.local_cluster import unless_failed
 from evopolicy_common.processes.preflight import check_installed, check_loopback, check_writable
-from evopolicy_common.records.run_record import decode_run_record
+from evopolicy_common.records.run_files import read_record
 from evopolicy_common.records.suite_folder import FINISHED, INDEX, Index
 from evopolicy_common.wire.credentials import SWEEP_STATE
 from evopolicy_gateway.cli import options
@@ -224,10 +224,9 @@ def _tell(order: Order, index: Index, decided: list[Decision], console: Terminal
 def _keep(index: Index, decision: Decision) -> None:
     """Brings the index in line with a finished run's own record."""
     run = decision.run
-    path = run.folder.run_json
     entry = index.runs.get(run.name)
-    if path.exists() and (entry is None or entry.state not in FINISHED):
-        record = decode_run_record(path.read_bytes())
+    if run.folder.run_json.exists() and (entry is None or entry.state not in FINISHED):
+        record = read_record(run.folder.root)
         known = {"digest": run.digest, "settings": msgspec.to_builtins(run.defining)}
         if entry is not None:
             known = {"digest": entry.digest, "settings": entry.settings, "earlier": entry.earlier}

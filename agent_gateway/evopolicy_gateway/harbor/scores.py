@@ -21,7 +21,7 @@ from starlette.routing import Route
 
 from evopolicy_common.errors import ConfigError, EvopolicyError
 from evopolicy_common.records.blobs import write_atomically
-from evopolicy_common.records.run_record import decode_run_record
+from evopolicy_common.records.run_files import read_record
 from evopolicy_gateway.harbor.task import task_files, task_name
 from evopolicy_gateway.http.listener import finish
 from evopolicy_gateway.run.layout import IntendedRun, RunFolder, folder_of, saved
@@ -103,7 +103,7 @@ def _score(folder: RunFolder) -> Response:
             if not folder.run_json.exists():
                 raise
         return PlainTextResponse("the run is being scored\n", 202)
-    outcome = decode_run_record(folder.run_json.read_bytes()).outcome
+    outcome = read_record(folder.root).outcome
     if outcome.score is None:
         why = outcome.error or outcome.status
         return PlainTextResponse(f"the run {folder.root} has no score: {why}\n", 409)

@@ -29,7 +29,8 @@ from evopolicy_common.messages.operator import RunFinished
 from evopolicy_common.processes import child_process, host
 from evopolicy_common.processes.notices import Waiting
 from evopolicy_common.processes.scratch import remove_tree
-from evopolicy_common.records.run_record import RunRecord, decode_run_record
+from evopolicy_common.records.run_files import read_record
+from evopolicy_common.records.run_record import RunRecord
 from evopolicy_common.wire import credentials
 from evopolicy_common.wire.credentials import Credentials
 from evopolicy_gateway import harnesses
@@ -173,7 +174,7 @@ class RunLifecycle:
         if folder.run_json.exists():
             # The command was killed after it wrote `run.json` and before it removed the gateway's folder.
             remove_tree(folder.state)
-            return decode_run_record(folder.run_json.read_bytes())
+            return read_record(folder.root)
         if folder.opened.exists():
             return await self._resume()
         intended = self._plan.intended()

@@ -27,7 +27,7 @@ from evopolicy_common.errors import EvopolicyError
 from evopolicy_common.messages.operator import ClaimState
 from evopolicy_common.processes.local_cluster import unless_failed
 from evopolicy_common.processes.scratch import remove_tree
-from evopolicy_common.records.run_record import decode_run_record
+from evopolicy_common.records.run_files import read_record
 from evopolicy_common.records.suite_folder import FINISHED, PAUSED, Entry, Index
 from evopolicy_common.wire.credentials import Credentials
 from evopolicy_gateway import harnesses
@@ -292,7 +292,7 @@ async def look(run: Plan, index: Index, operations: Operations) -> Found:
     folder = run.folder
     status: str | None = None
     with contextlib.suppress(OSError, EvopolicyError):
-        status = suite_index.state_of(decode_run_record(folder.run_json.read_bytes()))
+        status = suite_index.state_of(read_record(folder.root))
     opened = status is None and folder.opened.exists() and folder.credentials.exists()
     phase: str | None = None
     has_session = False

@@ -39,6 +39,8 @@ from evopolicy_coordinator.verify.source import read_run
 from evopolicy_coordinator.web.confined import NotThereError
 from evopolicy_coordinator.web.run_detail import Detail
 from evopolicy_coordinator.web.run_folders import Reader
+from evopolicy_gateway.harbor import scores
+from evopolicy_gateway.run.layout import RunFolder
 
 VERSIONS = [
     Version(policy(gain=1.0), (-200.0, -100.0), -180.0, says="I start."),
@@ -165,6 +167,11 @@ def _web(run: Path, whole: Path) -> None:
         detail.happened()
 
 
+def _harbor(run: Path, whole: Path) -> None:
+    with contextlib.suppress(OSError):  # its answer to Harbor is the error
+        scores._score(RunFolder(run))
+
+
 READERS: dict[str, Callable[[Path, Path], None]] = {
     "report": _report,
     "verify": _verify,
@@ -174,6 +181,7 @@ READERS: dict[str, Callable[[Path, Path], None]] = {
     "export": _export,
     "track": _track,
     "web": _web,
+    "harbor": _harbor,
 }
 
 
