@@ -59,6 +59,10 @@ class Environment(ABC):
     def step(self, action: Any) -> Step:
         """Play one valid action. Not defined after an episode has ended."""
 
+    def draw(self, rng: np.random.Generator, obs: Observation) -> Any:
+        """A random action after an observation, for checks: of the action space, or one that means more where its family knows."""
+        return self.action_codec.sample(rng)
+
     def render(self) -> Frame:
         """The current state as a picture. WorkerError unless made with `render=True` and `description.renders`.
 

@@ -23,7 +23,7 @@ from evopolicy_common.errors import EvopolicyError, WorkerError
 from evopolicy_common.messages.environment import Case, EnvironmentDescription, SpaceSchema
 from evopolicy_worker.environments import rewards, settings, spaces, trial
 from evopolicy_worker.environments.accelerations import accelerate
-from evopolicy_worker.environments.actions import compile_actions
+from evopolicy_worker.environments.actions import ActionCodec, compile_actions
 from evopolicy_worker.environments.adapters import adapter, versions
 from evopolicy_worker.environments.base import Environment, Frame, Observation, Step
 from evopolicy_worker.environments.calls import current as call
@@ -119,6 +119,10 @@ class GymnasiumFamily:
     def info(self, info: Mapping[str, Any]) -> dict[str, Any]:
         """The plain part of a step's `info`."""
         return plain_info(info) if info else {}
+
+    def draw(self, codec: ActionCodec, rng: np.random.Generator, obs: Any) -> Any:
+        """A random action after an observation, for checks. Override where hardly one of the action space does anything."""
+        return codec.sample(rng)
 
     def render(self, env: gymnasium.Env[Any, Any]) -> Any:
         """A picture of the current state, without changing it."""
@@ -275,6 +279,9 @@ class GymnasiumEnvironment(Environment):
             self._promises.after_step(step, obs)
         call.done()
         return step
+
+    def draw(self, rng: np.random.Generator, obs: Observation) -> Any:
+        return self._family.draw(self.action_codec, rng, obs)
 
     def render(self) -> Frame:
         if not self._render:

@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
+import numpy as np
 import pytest
 from test_environment_task_texts import flags
 
@@ -111,28 +112,35 @@ def test_an_episode_leaves_nothing_in_its_page(warm: Warm, name: str, act: str) 
 
 
 @pytest.mark.parametrize(
-    ("before", "then"),
+    ("page", "seed", "before", "then"),
     [
         # The mouse moves the focus, and a ring shows the next one or does not.
-        ("mouse_click(100, 100)", "focus('15')"),
-        ("mouse_click(100, 100)", "keyboard_press('Tab')"),
-        ("focus('15') keyboard_down('Space')", "mouse_move(80, 135)"),
-        ("mouse_down(200, 200, 'middle') mouse_down(100, 200)", "mouse_move(80, 135)"),
+        ("enter-text", 1, "mouse_click(100, 100)", "focus('15')"),
+        ("enter-text", 1, "mouse_click(100, 100)", "keyboard_press('Tab')"),
+        ("enter-text", 1, "focus('15') keyboard_down('Space')", "mouse_move(80, 135)"),
+        ("enter-text", 1, "mouse_down(200, 200, 'middle') mouse_down(100, 200)", "mouse_move(80, 135)"),
+        # A field remembers what was selected in it.
+        ("use-spinner", 1, "mouse_dblclick(30, 105)", "focus('18')"),
+        # Whether a place between two pixels is in the line above depends on earlier drags.
+        ("click-dialog-2", 31001, "drag_and_drop('17', '23')", "drag_and_drop('17', '23')"),
+        # Boxes with errors of rounding, and a listener that stays.
+        ("click-button", 31001, "mouse_click(230, 16)", "noop()"),
+        ("search-engine", 31001, "click('16')", "noop()"),
     ],
 )
-def test_a_reused_page_looks_like_a_fresh_one(before: str, then: str) -> None:
-    environment = BrowserGymEnv("enter-text", screenshot=True)
+def test_a_reused_page_looks_like_a_fresh_one(page: str, seed: int, before: str, then: str) -> None:
+    environment = BrowserGymEnv(page, screenshot=True, **catalogue.entry(f"browsergym/miniwob.{page}").kwargs)
 
     def seen() -> str:
         state = hashlib.sha256()
-        episodes.add(state, environment.reset(seed=1)[0])
+        episodes.add(state, environment.reset(seed=seed)[0])
         episodes.add(state, environment.step(then)[0])
         return state.hexdigest()
 
     shared().lose()
     fresh = seen()
-    for _ in range(4):
-        environment.reset(seed=2)
+    for other in (seed, seed + 1, seed, seed + 1):
+        environment.reset(seed=other)
         environment.step(before)
         assert seen() == fresh
 
@@ -368,6 +376,25 @@ def test_keys_find_an_option_by_the_episode_s_time(warm: Warm) -> None:
     assert [chosen(0.0, 0), chosen(1.2, 0), chosen(0.0, 5)] == ["ab", "ab", "b"]
 
 
+def test_a_held_arrow_of_a_number_field_counts_by_the_episode_s_clock(warm: Warm) -> None:
+    environment = warm("browsergym/miniwob.guess-number")
+
+    def counted(pause_s: float, then: str) -> list[str]:
+        obs = environment.reset(Case(seed=1))
+        (field,) = nodes(obs, "spinbutton")
+        left, top, width, height = json.loads(obs["extra_element_properties"])[bid(field)]["bbox"]
+        found = []
+        for act in (f"mouse_down({left + width - 12}, {top + height / 4})", "noop(0)", then, "noop(0)"):
+            (field,) = nodes(environment.step(act).obs, "spinbutton")
+            time.sleep(pause_s)
+            found.append(field["value"]["value"])
+        return found
+
+    for pause_s in (0.0, 0.5):
+        assert counted(pause_s, "noop(0)") == ["1", "5", "9", "13"]
+        assert counted(pause_s, "mouse_up(5, 5)") == ["1", "5", "5", "5"]
+
+
 def test_nothing_is_typed_elsewhere_when_a_field_cannot_be_filled(warm: Warm) -> None:
     environment = warm("browsergym/miniwob.enter-password")
     one, other = nodes(environment.reset(Case(seed=1)), "textbox")
@@ -394,6 +421,23 @@ hover(
         ("click", {"bid": "3", "button": "left", "modifiers": []}),
         ("fill", {"bid": "4", "value": "x"}),
     ]
+
+
+@pytest.mark.parametrize("env_id", SAMPLE)
+def test_the_random_actions_of_checks_are_calls_that_do_something(env_id: str, warm: Warm) -> None:
+    rng = np.random.default_rng(1)
+    errors = []
+    for seed in range(6):
+        obs = warm(env_id).reset(Case(seed=seed))
+        for _ in range(5):
+            action = warm(env_id).draw(rng, obs)
+            assert calls(action)
+            step = warm(env_id).step(action)
+            obs = step.obs
+            errors.append(obs["last_action_error"])
+            if step.terminated:
+                break
+    assert errors.count("") > 0.7 * len(errors)
 
 
 @pytest.mark.parametrize("env_id", SAMPLE)

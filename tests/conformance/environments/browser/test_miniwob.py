@@ -187,6 +187,16 @@ def test_an_episode_ends_when_its_page_has_grown_too_large(
     assert str(environment.reset(Case(seed=1))) == first
 
 
+def test_the_random_actions_of_checks_name_elements_that_there_are(warm: Warm) -> None:
+    environment = warm("miniwob/click-checkboxes-v1")
+    obs = environment.reset(Case(seed=1))
+    rng = np.random.default_rng(1)
+    drawn = [environment.draw(rng, obs) for _ in range(20)]
+    refs = {each["ref"] for each in obs["dom_elements"]}
+    assert all(each["ref"] in refs | {0} and not environment.action_codec.repair(each)[1] for each in drawn)
+    assert len({each["ref"] for each in drawn}) > 3
+
+
 @pytest.mark.parametrize("env_id", SAMPLE)
 def test_an_environment_keeps_what_the_interface_promises(env_id: str) -> None:
     played = conformance.play(env_id, 20)

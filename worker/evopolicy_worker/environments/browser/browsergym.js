@@ -3,6 +3,7 @@
   "use strict";
   const { clock, begin, state, clickable } = __evopolicy;
   const ZOOM = 1.4;
+  const UNIT = 1 / 320;  // Of lengths: the browser's own ones are 1/64, zoomed 1.4/64, with errors of rounding.
   const HIDDEN = ["reward-display", "click-canvas", "sync-task-cover"];
   const NAMED = new Set(`a abbr acronym address applet area article aside audio b base basefont bdi bdo big blockquote body br
     button canvas caption center cite code col colgroup data datalist dd del details dfn dialog dir div dl dt em embed
@@ -70,6 +71,14 @@
       seen.add(bid);
     }
   };
+  const whole = (length) => Number((Math.round(length / UNIT) * UNIT).toFixed(6));
+  const boxed = (element) => {
+    const { left, top, right, bottom } = element.getBoundingClientRect();
+    return {
+      left: whole(left), top: whole(top), right: whole(right), bottom: whole(bottom),
+      width: whole(right - left), height: whole(bottom - top),
+    };
+  };
   const hit = (element, box) => {
     const found = document.elementFromPoint((box.left + box.right) / 2, (box.top + box.bottom) / 2);
     return found !== null && (found === element || element.contains(found));
@@ -82,7 +91,7 @@
     if (!known.has(element)) {
       const style = getComputedStyle(element);
       const around = within(element, style, known);
-      known.set(element, style.overflow === "visible" ? around : common(element.getBoundingClientRect(), around));
+      known.set(element, style.overflow === "visible" ? around : common(boxed(element), around));
     }
     return known.get(element);
   };
@@ -99,7 +108,7 @@
     const buttons = [];
     const round = (x) => Math.round(x * 100) / 100;
     for (const element of document.querySelectorAll("[bid]")) {
-      const box = element.getBoundingClientRect();
+      const box = boxed(element);
       const area = box.width * box.height;
       const tag = element.tagName.toLowerCase();
       const style = getComputedStyle(element);
@@ -232,7 +241,7 @@
     && !element.isContentEditable && element.closest("label")?.control) || element;
   const refused = (bid, element) => {
     if (element === null) return `Could not find element with bid "${bid}"`;
-    const box = element.getBoundingClientRect();
+    const box = boxed(element);
     if (box.width === 0 || box.height === 0 || getComputedStyle(element).visibility !== "visible") {
       return `Element with bid "${bid}" is not visible`;
     }
@@ -243,7 +252,7 @@
     element?.scrollIntoView({ block: "nearest", inline: "nearest", behavior: "instant" });
     const error = refused(bid, element);
     if (error) return { error };
-    const box = element.getBoundingClientRect();
+    const box = boxed(element);
     const [x, y] = [box.left + box.width / 2, box.top + box.height / 2];
     const top = document.elementFromPoint(x, y);
     if (top === null || !(top === element || element.contains(top) || top.contains(element)

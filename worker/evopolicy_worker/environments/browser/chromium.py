@@ -108,9 +108,11 @@ _FLAGS = (
     "--disk-cache-size=1",
     "--media-cache-size=1",
     "--enable-blink-features=ComputedAccessibilityInfo",
-    "--disable-features=AutofillServerCommunication,BackForwardCache,CertificateTransparencyComponentUpdater,DialMediaRouteProvider,"
-    "GlobalMediaControls,HttpsUpgrades,InterestFeedContentSuggestions,IsolateOrigins,MediaRouter,OptimizationHints,OverlayScrollbar,"
-    "PaintHolding,Prerender2,RenderDocument,SpareRendererForSitePerProcess,Translate,site-per-process",
+    # DeferRendererTasksAfterInput: after a click or a key, scripts would wait for the next of 60 frames a second.
+    "--disable-features=AutofillServerCommunication,BackForwardCache,CertificateTransparencyComponentUpdater,"
+    "DeferRendererTasksAfterInput,DialMediaRouteProvider,GlobalMediaControls,HttpsUpgrades,InterestFeedContentSuggestions,"
+    "IsolateOrigins,MediaRouter,OptimizationHints,OverlayScrollbar,PaintHolding,Prerender2,RenderDocument,"
+    "SpareRendererForSitePerProcess,Translate,site-per-process",
     "--enable-features=NetworkServiceInProcess2",
     f"--js-flags=--max-old-space-size={MAX_JS_MB} --random-seed=1 --hash-seed=1",
 )

@@ -4,6 +4,8 @@
   const { clock, advance, settle, forget } = __evopolicy;
   const MAX_CHARACTERS = 256;
   const MAX_ELEMENTS = 8192;
+  const FIELDS = ["textarea", "input:not([type])", ...["text", "search", "url", "tel", "email", "password", "number"].map(
+    (type) => `input[type=${type}]`)].join();
   const READY_ROUNDS = 20;
   const READY_MS = 50;
   // Time that the last episode's animations have to end: libraries that wait for a timer that was dropped start no other.
@@ -62,6 +64,11 @@
     forget();
     if (document.activeElement instanceof HTMLElement) document.activeElement.blur();
     getSelection().removeAllRanges();
+    // A field that gets the value which it has keeps what is selected in it.
+    for (const field of document.querySelectorAll(FIELDS)) {
+      field.value = `${field.defaultValue}0`;
+      field.value = field.defaultValue;
+    }
     for (const element of document.querySelectorAll("[data-wob_ref], [data-wob_eps], [data-tampered]")) {
       delete element.dataset.wob_ref; delete element.dataset.wob_eps; delete element.dataset.tampered;
     }

@@ -5,6 +5,7 @@
   "use strict";
   const EPOCH = 1483228800000;  // What the clock shows when a document begins: 2017-01-01, UTC.
   const FRAME_MS = 16;
+  const HELD_MS = { first: 250, then: 50 };  // When a held arrow of a number field counts: the browser's own times.
   const MAX_TYPED = 16384;  // Characters of a field, with its markup.
   const native = {
     Date, Map, Object, Promise, Set, WeakMap, setTimeout: window.setTimeout.bind(window),
@@ -188,14 +189,20 @@
     }
   }, true);
 
-  // Which elements do something when they are clicked.
-  const listening = new WeakSet();
-  const listen = EventTarget.prototype.addEventListener;
-  define(EventTarget.prototype, "addEventListener", function (kind, ...args) {
-    if (["click", "mousedown", "mouseup", "pointerdown"].includes(kind) && this instanceof Element) listening.add(this);
-    return listen.call(this ?? window, kind, ...args);
-  });
-  const clickable = (element) => listening.has(element) || element.onclick !== null || element.onmousedown !== null
+  // Which elements do something when they are clicked: their listeners, by kind.
+  const listening = new WeakMap();
+  const PRESSES = ["click", "mousedown", "mouseup", "pointerdown"];
+  for (const [name, change] of [["addEventListener", "add"], ["removeEventListener", "delete"]]) {
+    const usual = EventTarget.prototype[name];
+    define(EventTarget.prototype, name, function (kind, listener, ...args) {
+      if (PRESSES.includes(kind) && this instanceof Element) {
+        if (!listening.has(this)) listening.set(this, PRESSES.map(() => new native.Set()));
+        listening.get(this)[PRESSES.indexOf(kind)][change](listener);
+      }
+      return usual.call(this ?? window, kind, listener, ...args);
+    });
+  }
+  const clickable = (element) => listening.get(element)?.some((all) => all.size) || element.onclick !== null || element.onmousedown !== null
     || element.matches("a[href], button, input:not([type=hidden]), select, textarea, label, summary, option");
 
   // After a change of layout the browser moves the mouse on its own account, some time later. What is under the mouse is
@@ -204,6 +211,30 @@
     if (event.isTrusted && native.stamp.call(event) > 0) { event.stopImmediatePropagation(); event.preventDefault(); }
   };
   for (const name of ["mousemove", "pointermove", "pointerrawupdate"]) window.addEventListener(name, own, true);
+
+  // The arrow of a number field that is held down counts by the machine's clock. The browser stops when the field may not be
+  // changed for a moment; the episode's clock counts in its place, until mouse or keyboard are used.
+  if (VIRTUAL) {
+    let [field, value, timer] = [null, "", 0];  // The number field that is pressed, and its value before.
+    for (const name of ["mousedown", "mousemove", "mouseup", "keydown", "wheel"]) window.addEventListener(name, (event) => {
+      drop(timer);
+      field = name === "mousedown" && event.target instanceof HTMLInputElement && event.target.type === "number" ? event.target : null;
+      value = field?.value;
+    }, true);
+    window.addEventListener("input", (event) => {
+      if (!event.isTrusted || field === null || event.target !== field || event.inputType !== undefined) return;
+      const pressed = field;
+      const step = Number(pressed.value) > Number(value) ? "stepUp" : "stepDown";
+      pressed.readOnly = true;
+      pressed.readOnly = false;
+      const count = () => {
+        const before = pressed.value;
+        if (!pressed.disabled && !pressed.readOnly) pressed[step]();
+        if (pressed.value !== before) pressed.dispatchEvent(new Event("input", { bubbles: true, composed: true }));
+      };
+      timer = add(() => { timer = add(count, HELD_MS.then, true); count(); }, HELD_MS.first);
+    }, true);
+  }
 
   // A caret that blinks would be in a picture or not, as the time has it.
   const still = new CSSStyleSheet();

@@ -13,6 +13,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
+import math
 import mimetypes
 import re
 from collections.abc import Sequence
@@ -196,6 +197,10 @@ class Page:
     def mouse(self, *events: tuple[str, float, float, Button, int], modifiers: int = 0) -> None:
         """Mouse events in order, each a type (`mouseMoved`, `mousePressed`, `mouseReleased`), a place in CSS pixels, a
         button and the number of clicks. `modifiers`: the keys held meanwhile. A press on a scrollbar is left out."""
+        # Whole pixels, as the page is told: from parts of one the browser selects other characters from time to time.
+        events = tuple(
+            (kind, math.floor(x), math.floor(y), button, clicks) for kind, x, y, button, clicks in events
+        )
         pressed = dict.fromkeys((x, y) for kind, x, y, _, _ in events if kind == "mousePressed")
         # Asked before the first event: to wait for a mouse that moves is to wait for the next frame.
         bars = [place for place in pressed if self.run("__evopolicy.bar({}, {})".format(*place))]

@@ -235,16 +235,16 @@ def _bare_step(environment: GymnasiumEnvironment, steps: int) -> float:
     """Mean seconds per step of the environment without the adapter and without resets."""
     rng = np.random.default_rng(0)
     bare, n, spent = environment.bare, 0, 0.0
-    bare.reset(seed=0)
+    obs, _ = bare.reset(seed=0)
     most = min(steps, _TIMED_STEPS)
     while n < most and spent < _TIMED_S:
-        action = environment.action_codec.sample(rng)
+        action = environment.draw(rng, obs)
         began = time.perf_counter()
-        _, _, terminated, truncated, _ = bare.step(action)
+        obs, _, terminated, truncated, _ = bare.step(action)
         spent += time.perf_counter() - began
         n += 1
         if terminated or truncated or n % environment.description.max_episode_steps == 0:
-            bare.reset(seed=n)
+            obs, _ = bare.reset(seed=n)
     return spent / n
 
 

@@ -15,7 +15,7 @@ from evopolicy_worker.environments.base import Environment, Step
 def rollout(
     environment: Environment, seed: int, steps: int, *, drawn: bool = False
 ) -> Iterator[tuple[Any, Step]]:
-    """Plays at most `steps` steps with random actions drawn from `seed`. Yields each action with its step; the first item is
+    """Plays at most `steps` steps with random actions drawn from `seed` (`Environment.draw`). Yields each action with its step; the first item is
     None with the first observation. `drawn`: draws each state before the action."""
     rng = np.random.default_rng(seed)
     step = Step(environment.reset(Case(seed=seed)), 0.0, False, False, {})
@@ -23,7 +23,7 @@ def rollout(
     for _ in range(steps):
         if drawn:
             environment.render()
-        action = environment.action_codec.sample(rng)
+        action = environment.draw(rng, step.obs)
         step = environment.step(action)
         yield action, step
         if step.terminated or step.truncated:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from evopolicy_worker.environments.actions import ActionCodec
 from evopolicy_worker.environments.families.miniwob import MiniWoBFamily
 
 if TYPE_CHECKING:
@@ -20,6 +23,11 @@ class BrowserGymFamily(MiniWoBFamily):
         from evopolicy_worker.environments.browser.browsergym_env import BrowserGymEnv
 
         return BrowserGymEnv
+
+    def draw(self, codec: ActionCodec, rng: np.random.Generator, obs: Any) -> str:
+        from evopolicy_worker.environments.browser import draws
+
+        return draws.browsergym(obs, rng)
 
 
 FAMILY = BrowserGymFamily()

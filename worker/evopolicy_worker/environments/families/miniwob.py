@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from evopolicy_common.catalogue import Entry
+from evopolicy_worker.environments.actions import ActionCodec
 from evopolicy_worker.environments.adapters import versions
 from evopolicy_worker.environments.browser import chromium, miniwob_pages
 from evopolicy_worker.environments.browser.page import shared
@@ -53,6 +56,11 @@ class MiniWoBFamily(GymnasiumFamily):
         from evopolicy_worker.environments.browser.miniwob_env import MiniWoBEnv
 
         return MiniWoBEnv
+
+    def draw(self, codec: ActionCodec, rng: np.random.Generator, obs: Any) -> Any:
+        from evopolicy_worker.environments.browser import draws
+
+        return codec.repair(draws.miniwob(obs, codec.sample(rng), rng))[0]
 
     def packages(self, entry: Entry) -> dict[str, str]:
         """Also the browser, and what its fonts measure: both decide where elements are."""
