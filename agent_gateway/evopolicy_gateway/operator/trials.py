@@ -261,11 +261,13 @@ def _print(results: Sequence[TrialResult], as_json: bool, console: Terminal) -> 
         say_json(results)
         return
     for result in results:
-        headings = ("case", "return", "steps", "played by", "failure")
-        made = table(*headings, right=("case", "return", "steps"))
+        # Random actions alone have no policy, and no folder.
+        more = () if result.folder is None else ("played by", "failure")
+        made = table("case", "return", "steps", *more, right=("case", "return", "steps"))
         for one in result.episodes:
             shown = "–" if one.episode_return is None else f"{one.episode_return:.4g}"
-            made.add_row(str(one.case), shown, str(one.length), one.played_by, one_line(one.failure or ""))
+            cells = (str(one.case), shown, str(one.length), one.played_by, one_line(one.failure or ""))
+            made.add_row(*cells[: 3 + len(more)])
         console.print(made)
         console.print(_summary(result), soft_wrap=True)
         if result.folder is not None:

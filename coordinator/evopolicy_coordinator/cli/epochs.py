@@ -56,6 +56,8 @@ def list_(state: State = None, as_json: AsJson = False) -> None:
         cases = "secret" if each.revealed_at is None else f"public since {_when(each.revealed_at)}"
         name = f"{each.epoch} (current)" if each.epoch == current else each.epoch
         shown.add_row(name, str(each.opened), str(each.ended), _when(each.began_at), cases)
+    if current and all(each.epoch != current for each in found):
+        shown.add_row(f"{current} (current)", "0", "0", "none yet", "secret")
     terminal().print(shown)
     say(f"journal: {len(entries)} entries, head {head}")
 

@@ -199,8 +199,14 @@ def cancel(
     file: CredentialsFile = None,
 ) -> None:
     """End a run without a score, and stop its episodes."""
-    asking(connect, file, lambda operator: operator.cancel(run))
-    say(f"{run} is cancelled")
+
+    async def cancelled(operator: OperatorClient) -> bool:
+        found = await operator.status()
+        await operator.cancel(run)
+        return any(one.run == run for one in found.runs)
+
+    was_open = asking(connect, file, cancelled)
+    say(f"{run} is cancelled" if was_open else f"{run} had ended before; its result stays as it is")
 
 
 @runs_app.command("agent-gone", epilog="Example: evopolicy runs agent-gone r-0f2e9a7c11d04b35")

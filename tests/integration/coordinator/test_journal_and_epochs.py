@@ -97,6 +97,7 @@ def test_runs_are_committed_to_disclosed_and_followed_by_another_epoch(tmp_path:
     assert command("identity", "--state", str(state)).stdout.strip() == key
     before = listed(state)
     assert command("epoch", "new", "--state", str(state)).returncode == 0
+    assert "(current)  0     0         none yet" in command("epoch", "list", "--state", str(state)).stdout
     back_up(state, tmp_path / "backup")
 
     async def second() -> RunFinished:

@@ -132,7 +132,11 @@ def test_cancelled_run_is_finished_without_a_score(coordinator: Coordinator) -> 
     async def scenario() -> None:
         async with operator_of(coordinator) as operator:
             created = await operator.create("cancel")
-            assert (await called(coordinator, "runs", "cancel", created.run)).exit_code == 0
+            assert (await called(coordinator, "runs", "cancel", created.run)).stdout.endswith(
+                "is cancelled\n"
+            )
+            again = await called(coordinator, "runs", "cancel", created.run)
+            assert "had ended before" in again.stdout
             finished = await operator.finished(created.run)
             assert finished.status == "cancelled"
             assert finished.final_score is None

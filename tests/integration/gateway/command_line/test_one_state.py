@@ -143,6 +143,7 @@ def test_a_second_command_beside_the_first_is_told_what_to_do(tmp_path: Path) ->
         code, out, err = done(tmp_path, *words)
         assert code == 0, err
         assert "the next call has others under the same ids" in out
+        assert "played by" not in out
         running.kill()
     # What was killed keeps nobody from the state, and no later run waits for its agent or its workers.
     assert len(kernels(state)) == 1
