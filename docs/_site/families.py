@@ -65,6 +65,7 @@ def short() -> str:
     half = (len(cells) + 1) // 2
     rows = zip(cells[:half], [*cells[half:], " |  | "], strict=False)
     total, deterministic = _total(families), sum(map(_deterministic, families))
+    played = sum(each in costs for suite in families for each in suite.environments)
     every = (
         "All ids are"
         if deterministic == sum(len(suite.environments) for suite in families)
@@ -78,7 +79,7 @@ def short() -> str:
             "",
             f"The {len(families)} suites hold {total:,} environments; the paper names the families in bold (together `paper13`). The newest version of",
             f"the original has about {newest['profiles']} profiles in {newest['ecosystems']} ecosystems. {every} deterministic: seed and actions determine the",
-            f"episode. `check-env` has confirmed this for {len(costs):,} of them so far.",
+            f"episode. `check-env` has confirmed this for {'all' if played == total else f'{played:,}'} of them.",
         ]
     )
 

@@ -15,6 +15,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import math
 import queue
 import re
 import threading
@@ -445,23 +446,32 @@ def _config(settings: dict[str, Any]) -> zenoh.Config:
     return config
 
 
+_PATIENCE_S = 30.0
+"""A client that waits forever logs possible causes once, after this time, seconds."""
+
+
 async def _open_client(credentials: Credentials, timeout_s: float | None) -> zenoh.Session:
     config = client_config(credentials)
     loop = asyncio.get_running_loop()
-    deadline = None if timeout_s is None else loop.time() + timeout_s
+    patience_s = _PATIENCE_S if timeout_s is None else timeout_s
+    deadline = loop.time() + patience_s
     pause = 0.02
     while True:
         try:
             return await asyncio.to_thread(zenoh.open, config)
         except zenoh.ZError as error:
-            if deadline is not None and loop.time() > deadline:
+            if loop.time() > deadline:
                 doubt = f"are these the {credentials.role} credentials of its state folder?"
                 if credentials.tls is not None:
                     doubt = f"are these credentials in its `certs list` ({credentials.user}), neither expired nor revoked?"
-                raise TransportError(
-                    f"no connection to {', '.join(credentials.endpoints)} within {timeout_s:g} s: is the coordinator up"
+                text = (
+                    f"no connection to {', '.join(credentials.endpoints)} within {patience_s:g} s: is the coordinator up"
                     f" there, and {doubt}"
-                ) from error
+                )
+                if timeout_s is not None:
+                    raise TransportError(text) from error
+                log.warning(text)
+                deadline = math.inf
         await asyncio.sleep(pause)
         pause = min(0.5, pause * 1.5)
 

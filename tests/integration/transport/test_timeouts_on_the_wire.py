@@ -149,3 +149,21 @@ def test_a_session_that_is_stuck_is_given_up(monkeypatch: pytest.MonkeyPatch) ->
 
     asyncio.run(main())
     stuck.released.set()
+
+
+def test_a_worker_that_nobody_answers_is_told_the_causes_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(transport, "_PATIENCE_S", 0.0)
+    found = Credentials(
+        cluster="c", role="worker", endpoints=("tcp/127.0.0.1:9",), user="worker", password="p", token="t"
+    )
+
+    async def scenario() -> None:
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(3.0), transport.connect(found, timeout_s=None):
+                pytest.fail("something listens there")
+
+    with capture_logs() as logs:
+        monkeypatch.setattr(transport, "log", structlog.get_logger())
+        asyncio.run(scenario())
+    told = [entry["event"] for entry in logs if "is the coordinator up there" in entry["event"]]
+    assert len(told) == 1
