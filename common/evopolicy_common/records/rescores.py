@@ -82,6 +82,14 @@ def rescore_path(run: Path, name: str) -> Path:
     return run / FOLDER / f"{name}.json"
 
 
+def rescore_names(run: Path) -> list[str]:
+    """The names of a run directory's re-scores, in order."""
+    folder = run / FOLDER
+    if folder.is_symlink() or not folder.is_dir():
+        return []
+    return sorted(path.stem for path in folder.glob("*.json") if is_name(path.stem))
+
+
 def encode_rescore(record: RescoreRecord) -> bytes:
     """The bytes of `rescore/NAME.json`."""
     return msgspec.json.format(msgspec.json.encode(record), indent=2) + b"\n"

@@ -12,11 +12,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from typing import Any
 
-from evopolicy_common.errors import BundleError
+from evopolicy_common.errors import BundleError, ProtocolError
 from evopolicy_common.messages.gateway import CANCELLED
 from evopolicy_common.records.aggregates import mean, std
 from evopolicy_common.records.journal import Result, SubmitResult
 from evopolicy_common.records.policies.checkpoints import bundle_of
+from evopolicy_common.records.rescores import FOLDER, RescoreRecord, read_rescore, rescore_names
 from evopolicy_common.records.run_record import Outcome
 from evopolicy_common.records.summary import Summary
 from evopolicy_coordinator.verify.source import RunUnderTest, SubmitFiles
@@ -54,6 +55,13 @@ def differences(run: RunUnderTest, result: Result | None) -> Iterator[tuple[str,
         here = [submit.index for submit in run.submits if submit.status != CANCELLED]
         yield from _unlike("run.json", [("submits", here, sorted(stored))], _STORED)
         yield from _unlike("run.json", outcome_pairs(run.record.outcome, result), _STORED)
+    for name in rescore_names(run.root):
+        file = f"{FOLDER}/{name}.json"
+        try:
+            if (record := read_rescore(run.root, name)) is not None:
+                yield from _unlike(file, _rescore(run, name, record))
+        except ProtocolError as error:
+            yield file, str(error)
 
 
 def outcome_pairs(outcome: Outcome, result: Result) -> Iterator[tuple[str, Any, Any]]:
@@ -179,6 +187,24 @@ def _meta(run: RunUnderTest, submit: SubmitFiles) -> Told:
         yield "remaining_budget_after", meta.remaining_budget_after, summary.remaining_budget
         before = summary.remaining_budget + summary.n_episodes
         yield "remaining_budget_before", meta.remaining_budget_before, before
+
+
+def _rescore(run: RunUnderTest, name: str, record: RescoreRecord) -> Told:
+    """A re-score against the run. Nothing in the directory determines its returns."""
+    yield "name", record.name, name
+    yield "run", record.run, run.record.run
+    yield "env", record.env, run.record.env
+    yield "selected", record.selected, run.record.outcome.best_submit_index
+    known = {submit.index for submit in run.submits if submit.status == "ok"}
+    there = sorted(each.submit_index for each in record.checkpoints)
+    yield "submits of checkpoints", there, sorted(known.intersection(there))
+    for each in record.checkpoints:
+        what = f"of submit {each.submit_index}"
+        yield f"number of lengths {what}", len(each.lengths), record.n_cases
+        if each.successes:
+            yield f"number of successes {what}", len(each.successes), record.n_cases
+        places = sorted(map(int, each.failures))
+        yield f"failures {what}", places, [place for place in places if place < record.n_cases]
 
 
 def _stored(submit: SubmitFiles, known: SubmitResult) -> Told:

@@ -35,6 +35,7 @@ from evopolicy_common.records.episodes.trajectory import Trajectory
 from evopolicy_common.records.fingerprints import comparable
 from evopolicy_common.records.journal import Result
 from evopolicy_common.records.policies.checkpoints import bundle_of
+from evopolicy_common.records.rescores import FOLDER, rescore_names
 from evopolicy_common.records.summary import Summary
 from evopolicy_common.wire.operator_client import TIMEOUT_S, OperatorClient
 from evopolicy_common.wire.transport import Link
@@ -146,6 +147,12 @@ class Verifier:
                 if content is None and submit.status != CANCELLED:
                     finding = Finding(episode=f"submit {submit.index}", difference=f"it has no {name}")
                     self.report.not_checked.append(finding)
+        for name in rescore_names(self._run.root):
+            text = (
+                "its returns are not played again: say `evopolicy rescore` with"
+                f" --name {name} for a copy of the run directory without this file, and compare"
+            )
+            self.report.not_checked.append(Finding(episode=f"{FOLDER}/{name}.json", difference=text))
 
     async def replay(self, played: Played, indexes: Sequence[int]) -> None:
         """Makes the exact check of these episodes of a list."""

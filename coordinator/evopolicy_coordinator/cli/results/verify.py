@@ -102,6 +102,8 @@ def verify(
     """Replay a run's recorded actions, and compare rewards, observations and returns bit for bit.
 
     Also checks all other numbers of the run directory against each other, and against the coordinator's own result if it has the run.
+    Without that coordinator, edits that agree with each other are found only where a train episode shows them. Returns of re-scores
+    (rescore/NAME.json) are not played again.
     Exit codes: 0 identical, 1 something differs, 2 wrong usage or other cases than the run's, 3 could not be checked.
     """
     order = _Order(
@@ -145,7 +147,8 @@ async def _verify(order: _Order, where: Where, console: Terminal) -> Report:
             if not knows_run:
                 notes.append(
                     "this coordinator has no record of the run: actions are those of the feedback files, hidden episodes"
-                    " are not checked, and policies get other seeds than they had"
+                    " are not checked, policies get other seeds than they had, and edits that agree with each other are found"
+                    " only where a train episode that is played again shows them"
                 )
             shown.update(
                 total=sum(

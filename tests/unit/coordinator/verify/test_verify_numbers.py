@@ -16,6 +16,7 @@ from invented.run_dirs import write_run
 
 from evopolicy_common.records.journal import Result, SubmitResult
 from evopolicy_common.records.policies.checkpoints import bundle_of
+from evopolicy_common.records.rescores import Rescored, RescoreRecord, encode_rescore, rescore_path
 from evopolicy_coordinator.verify.numbers import differences
 from evopolicy_coordinator.verify.source import read_run
 
@@ -229,3 +230,52 @@ def test_a_consistent_edit_is_found_by_the_coordinators_result(
     assert _found(tmp_path / "run", None) == []
     found = _found(tmp_path / "run", result)
     assert any(text in each for each in found), found
+
+
+RESCORE = "rescore/more.json"
+
+
+def rescored(run: Copy) -> None:
+    record = RescoreRecord(
+        name="more", run=read_run(run.root).record.run, env="gym/acrobot", selected=2, n_cases=2, cases_hash="sha256:0",
+        cases_from="secret", cases_secret=True, random_returns=(-500.0, -500.0),
+        checkpoints=(Rescored(submit_index=2, returns=(-90.0, -91.0), lengths=(90, 91), failures={"1": "act_error"}),),
+    )  # fmt: skip
+    path = rescore_path(run.root, "more")
+    path.parent.mkdir()
+    path.write_bytes(encode_rescore(record))
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "named"),
+    [
+        (("run",), "r-another", "run is"),
+        (("env",), "gym/pendulum", "env is"),
+        (("selected",), 0, "selected is"),
+        (("name",), "less", "name is"),
+        (("checkpoints", 0, "submit_index"), 1, "submits of checkpoints"),
+        (("checkpoints", 0, "lengths"), [90], "number of lengths"),
+        (("checkpoints", 0, "successes"), [True], "number of successes"),
+        (("checkpoints", 0, "failures"), {"2": "act_error"}, "failures of submit 2"),
+        (("checkpoints", 0, "returns"), [1.0], "does not have 2 returns"),
+        (("checkpoints", 0, "returns"), [1e300, 1.0], "not plausible"),
+    ],
+)
+def test_an_edited_rescore_is_found_where_it_contradicts_the_run(
+    whole: Path, tmp_path: Path, path: tuple[str | int, ...], value: Any, named: str
+) -> None:
+    run = Copy(shutil.copytree(whole, tmp_path / "run"))
+    rescored(run)
+    assert list(differences(read_run(run.root), None)) == []
+    run.put(RESCORE, *path, value=value)
+    found = list(differences(read_run(run.root), None))
+    assert any(file == RESCORE and named in text for file, text in found), found
+
+
+def test_a_rescore_that_is_a_link_is_a_difference(whole: Path, tmp_path: Path) -> None:
+    run = Copy(shutil.copytree(whole, tmp_path / "run"))
+    rescored(run)
+    (run.root / RESCORE).rename(tmp_path / "elsewhere")
+    (run.root / RESCORE).symlink_to(tmp_path / "elsewhere")
+    ((file, _),) = differences(read_run(run.root), None)
+    assert file == RESCORE
