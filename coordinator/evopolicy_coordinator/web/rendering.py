@@ -10,6 +10,7 @@ from typing import Any
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
+from evopolicy_coordinator.analysis.html import visible
 from evopolicy_coordinator.analysis.scoring.scores import title_of
 from evopolicy_coordinator.web.feeds import View
 
@@ -44,6 +45,7 @@ def _environment() -> Environment:
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
+        finalize=visible,
     )
     environment.filters |= {"number": number, "duration": duration, "short": short, "state": state_words}
     environment.filters["priority"] = lambda name: _PRIORITIES.get(name, name)

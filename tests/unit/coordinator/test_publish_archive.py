@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import stat
 import struct
+import tempfile
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from evopolicy_common.errors import ProtocolError
 from evopolicy_coordinator.publish.archive import Archive, Writer
@@ -152,6 +156,24 @@ def test_changed_bytes_are_noticed_when_they_are_read(tmp_path: Path) -> None:
     path.write_bytes(named("abc").replace(b"abc{}", b"abc[]"))
     with Archive(path) as archive, pytest.raises(ProtocolError, match="damaged"):
         archive.read("abc", 10)
+
+
+@given(
+    st.lists(st.tuples(st.integers(0, 10_000), st.binary(max_size=4)), min_size=1, max_size=4),
+    st.integers(0, 400),
+)
+def test_any_damage_is_read_as_it_was_or_refused(changes: list[tuple[int, bytes]], cut: int) -> None:
+    whole = named("manifest.json", "runs/0000/run.json")
+    data = bytearray(whole)
+    for at, new in changes:
+        data[at % len(data) : at % len(data) + len(new)] = new
+    with tempfile.NamedTemporaryFile() as file:
+        file.write(data[: len(data) - cut % 30 if cut > 300 else None])
+        file.flush()
+        with contextlib.suppress(ProtocolError), Archive(Path(file.name)) as archive:
+            for name in archive.names:
+                with contextlib.suppress(ProtocolError):
+                    assert archive.read(name, 100) == b"{}"
 
 
 def test_the_writer_makes_no_name_that_the_reader_refuses(tmp_path: Path) -> None:

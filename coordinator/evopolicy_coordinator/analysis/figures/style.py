@@ -17,6 +17,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
+from evopolicy_common.terminal import harmless
+
 INK = "#15181d"
 MUTED = "#5c6773"
 GRID = "#d5dae1"
@@ -102,7 +104,7 @@ def svg_text(figure: Figure, name: str) -> str:
     with matplotlib.rc_context({**RC, "svg.hashsalt": name}):
         _settle(figure)
         figure.savefig(out, format="svg", metadata={"Date": None, "Creator": None})
-    return out.getvalue()
+    return harmless(out.getvalue())  # XML has no control characters
 
 
 def png_bytes(figure: Figure) -> bytes:
@@ -131,6 +133,6 @@ def inline_svg(svg: str, name: str, alt: str) -> str:
     for colour, variable in _THEME.items():
         body = body.replace(colour, variable)
     body = _HEIGHT.sub(r"\1", _SIZE.sub(r"\1", body, count=1), count=1)
-    label = alt.replace("&", "&amp;").replace('"', "&quot;").replace("<", "&lt;")
+    label = harmless(alt).replace("&", "&amp;").replace('"', "&quot;").replace("<", "&lt;")
     body = body.replace("<svg", f'<svg role="img" aria-label="{label}"', 1)
     return body.replace("'DejaVu Sans'", "system-ui, 'DejaVu Sans'")

@@ -12,6 +12,7 @@ from jinja2 import DictLoader, Environment, StrictUndefined
 from markupsafe import Markup
 
 from evopolicy_coordinator.analysis.behaviour.trace import Trace, TraceRow, diff, sources
+from evopolicy_coordinator.analysis.html import visible
 from evopolicy_coordinator.analysis.html.small_timeline import small_timeline
 from evopolicy_coordinator.analysis.palette import Look
 from evopolicy_coordinator.analysis.reading.records import Run, Submit
@@ -67,7 +68,12 @@ def environment() -> Environment:
     names = [f"{name}.html.j2" for name in _TEMPLATES]
     loader = DictLoader({name: folder.joinpath(name).read_text(encoding="utf-8") for name in names})
     made = Environment(
-        loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+        loader=loader,
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        finalize=visible,
     )
     for name in ("report.css", "report.js"):
         made.globals[name.split(".")[1]] = Markup(folder.joinpath(name).read_text(encoding="utf-8"))

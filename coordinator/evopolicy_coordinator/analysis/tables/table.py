@@ -71,7 +71,7 @@ def to_csv(table: Table) -> str:
     formulas."""
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
-    writer.writerow([column.key for column in table.columns])
+    writer.writerow([csv_cell(column.key) for column in table.columns])  # may be names of agents
     for row in table.rows:
         values = [row.get(column.key) for column in table.columns]
         writer.writerow([csv_cell(value) for value in values])
