@@ -128,8 +128,10 @@ def test_runs_workers_and_sweeps_are_acted_on_from_the_page(tmp_path: Path) -> N
                 wait_until(lambda: done(folder) == 2, lambda: sweep.text)
 
                 # Its worker is killed in the midst of an episode, and one of other versions comes.
+                busy = "document.querySelector('#worker-rows td:nth-child(4)')?.textContent"
+                page.until(f"{busy} === '0/1'")
                 (folder / "go-2").touch()
-                page.until("document.querySelector('#worker-rows td:nth-child(4)')?.textContent === '1/1'")
+                page.until(f"{busy} === '1/1'")
                 os.kill(first.pid, signal.SIGKILL)
                 with process(log, *works, "--name", "w-other", PYTHONPATH=str(other.parent)) as second:
                     opened = "document.querySelector('#open-rows a')?.getAttribute('href')"
