@@ -11,9 +11,9 @@ from evopolicy_common.cli import end_on_sigterm, fail_on_our_errors, run_to_end
 from evopolicy_common.commands import App
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.terminal import say
+from evopolicy_common.wire.http import bound, serving
 from evopolicy_gateway.harbor.scores import make_app, tasks_in, token_of, write_task
 from evopolicy_gateway.http.listener import Listener, listener_of
-from evopolicy_gateway.http.server import bound, serving
 from evopolicy_gateway.workspace.agents_md import base_url
 
 app = App()

@@ -26,9 +26,10 @@ from evopolicy_common.errors import ConfigError, RefusedError
 from evopolicy_common.logs import structlog
 from evopolicy_common.records.blobs import BlobStore
 from evopolicy_common.wire import credentials, transport
+from evopolicy_common.wire.http import serving
 from evopolicy_common.wire.refusals import RUN_OVER
 from evopolicy_gateway.http.listener import AgentPlace, agent_place, ends_unseen
-from evopolicy_gateway.http.server import bind, serving
+from evopolicy_gateway.http.server import bind
 from evopolicy_gateway.http.service import make_app
 from evopolicy_gateway.run.coordinator_client import CoordinatorClient
 from evopolicy_gateway.run.layout import OpenedRun, RunFolder, saved

@@ -14,13 +14,13 @@ from __future__ import annotations
 import hashlib
 import hmac
 import ipaddress
+import re
 import secrets
 import socket
 from collections.abc import Iterable
 from http.cookies import CookieError, SimpleCookie
 from pathlib import Path
 from typing import Literal
-from urllib.parse import urlsplit
 
 import msgspec
 from starlette.datastructures import Headers, MutableHeaders
@@ -49,6 +49,8 @@ _HEADERS = {
 _OPEN = ("/login", "/static/", "/healthz")
 """Paths that need no token: they tell nothing."""
 _LOOPBACK_NAMES = ("localhost",)
+_HOST = re.compile(r"(?:\[(?P<six>[0-9A-Fa-f:.]+)\]|(?P<name>[A-Za-z0-9._-]+))(?::[0-9]{1,5})?")
+"""The `Host` header; a browser sends names of other alphabets in ASCII."""
 
 
 class Tokens(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -124,22 +126,24 @@ class Access:
 
     def is_own_host(self, host: str) -> bool:
         """Whether `Host` names this server: an address, which cannot be rebound, or one of its names."""
-        name = _name_of(host)
+        found = _HOST.fullmatch(host)
+        if found is None:
+            return False
         try:
-            ipaddress.ip_address(name.strip("[]"))
+            ipaddress.IPv6Address(found["six"]) if found["six"] else ipaddress.IPv4Address(found["name"])
         except ValueError:
-            return name in self._names
+            return not found["six"] and found["name"].lower().rstrip(".") in self._names
         return True
 
-    def objection(self, method: str, headers: Headers) -> tuple[int, str] | None:
+    def objection(self, scheme: str, method: str, headers: Headers) -> tuple[int, str] | None:
         """Why a request is refused before anything else is looked at; None for a good one."""
         host = headers.get("host", "")
         if not self.is_own_host(host):
             return 421, (
-                f"This server is not called {_name_of(host)[:100]!r}. Use its address, or start it with --name for that name."
+                f"This server is not called {host[:100]!r}. Use its address, or start it with --name for that name."
             )
         origin = headers.get("origin")
-        same = origin is not None and urlsplit(origin).netloc.lower() == host.lower()
+        same = origin is not None and origin.lower() == f"{scheme}://{host}".lower()
         if origin is not None and not same:
             return 403, "The request comes from another site's page."
         site = headers.get("sec-fetch-site", "none")
@@ -148,14 +152,6 @@ class Access:
         if method not in ("GET", "HEAD") and not same and headers.get("authorization") is None:
             return 403, "The request does not tell its origin."
         return None
-
-
-def _name_of(host: str) -> str:
-    """The name in a `Host` header, without its port."""
-    host = host.strip().lower()
-    if host.startswith("["):
-        return host.partition("]")[0] + "]"
-    return host.partition(":")[0].rstrip(".")
 
 
 class Guard:
@@ -183,7 +179,7 @@ class Guard:
 
     def _refusal(self, scope: Scope) -> Response | None:
         headers, path = Headers(scope=scope), str(scope["path"])
-        if (objection := self._access.objection(scope["method"], headers)) is not None:
+        if (objection := self._access.objection(scope["scheme"], scope["method"], headers)) is not None:
             return PlainTextResponse(objection[1] + "\n", objection[0])
         role = scope["role"] = self._access.role_of(headers)
         if role is not None or path in _OPEN or path.startswith("/static/"):

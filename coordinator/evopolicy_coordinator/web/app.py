@@ -8,15 +8,15 @@ import contextlib
 import hashlib
 import os
 import re
+import resource
 import socket
 import time
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qsl, urlencode
 
 import msgspec
-import uvicorn
 from prometheus_client import CollectorRegistry, Gauge, ProcessCollector, generate_latest
 from starlette.applications import Starlette
 from starlette.middleware.gzip import GZipMiddleware
@@ -29,6 +29,7 @@ from evopolicy_common.errors import ConfigError, EvopolicyError
 from evopolicy_common.logs import structlog
 from evopolicy_common.messages.status import StatusReply
 from evopolicy_common.wire.credentials import Credentials
+from evopolicy_common.wire.http import bound, serving
 from evopolicy_coordinator.server.monitoring.metrics import CONTENT_TYPE, StatusCollector
 from evopolicy_coordinator.web import acting, rendering
 from evopolicy_coordinator.web.access import Access, Guard
@@ -42,6 +43,7 @@ from evopolicy_coordinator.web.views.cluster import cluster_view
 from evopolicy_coordinator.web.views.run import episode_values, run_view, submit_values
 from evopolicy_coordinator.web.views.sweeps import sweeps_view
 
+_FORM_WAIT_S = 10.0
 _LOOK_S = 1.0
 """Minimum pause between two scans of the folders."""
 _SHARE = 20.0
@@ -455,12 +457,16 @@ def _words(request: Request) -> Words:
 
 
 async def _form(request: Request) -> dict[str, str]:
-    """The fields of a small form."""
+    """The fields of a small form; none for one that is too long or too late."""
     data = b""
-    async for chunk in request.stream():
-        data += chunk
-        if len(data) > 16_384:
-            return {}
+    try:
+        async with asyncio.timeout(_FORM_WAIT_S):
+            async for chunk in request.stream():
+                data += chunk
+                if len(data) > 16_384:
+                    return {}
+    except TimeoutError:
+        return {}
     return dict(parse_qsl(data.decode("utf-8", "replace")))
 
 
@@ -537,61 +543,21 @@ class Address(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def listen(address: Address) -> socket.socket:
-    """A listening socket. ConfigError where the machine refuses."""
-    family = socket.AF_INET6 if ":" in address.host else socket.AF_INET
-    sock = socket.socket(family, socket.SOCK_STREAM)
+    """A bound socket. ConfigError where the machine refuses."""
     try:
-        sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        sock.bind((address.host, address.port))
-        sock.listen(512)
+        return bound(address.host, address.port)
     except OSError as error:
-        sock.close()
         raise ConfigError(
             f"cannot listen on {address.host}:{address.port}: {error.strerror or error}; choose another with --http HOST:PORT"
         ) from error
-    return sock
 
 
 async def serve(site: Site, sock: socket.socket, address: Address, ready: Callable[[], None]) -> None:
     """Serves until the task is cancelled."""
-    config = uvicorn.Config(
-        site.app(),
-        lifespan="off",
-        access_log=False,
-        log_config=None,
-        log_level="warning",
-        server_header=False,
-        date_header=False,
-        timeout_graceful_shutdown=1,
-        timeout_keep_alive=20,
-        h11_max_incomplete_event_size=32 << 10,
-        ssl_certfile=None if address.certificate is None else str(address.certificate),
-        ssl_keyfile=None if address.private_key is None else str(address.private_key),
-        proxy_headers=False,
-    )
-    server = _Server(config, ready)
-    async with site.running():
-        task = asyncio.create_task(server.serve(sockets=[sock]))
-        try:
-            await asyncio.shield(task)
-        finally:
-            server.should_exit = True
-            with contextlib.suppress(asyncio.CancelledError, TimeoutError):
-                async with asyncio.timeout(5):
-                    await task
-
-
-class _Server(uvicorn.Server):
-    """Says when it serves, and leaves signals to the command."""
-
-    def __init__(self, config: uvicorn.Config, ready: Callable[[], None]) -> None:
-        super().__init__(config)
-        self._ready = ready
-
-    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        await super().startup(sockets)
-        self._ready()
-
-    @contextlib.contextmanager
-    def capture_signals(self) -> Iterator[None]:
-        yield
+    # A connection that never ends its TLS handshake holds a descriptor for a minute.
+    _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
+    tls = {"certificate": address.certificate, "private_key": address.private_key}
+    async with site.running(), serving(site.app(), sock, **tls) as task:
+        ready()
+        await asyncio.shield(task)

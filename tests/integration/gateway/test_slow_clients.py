@@ -12,8 +12,8 @@ from urllib.parse import SplitResult, urlsplit
 import pytest
 from gateway_double import Served, served
 
+from evopolicy_common.wire import http as server
 from evopolicy_gateway.http import service as http
-from evopolicy_gateway.http import timeouts
 
 SHORT_S = 0.5
 TIMEOUT_S = 60.0
@@ -61,7 +61,7 @@ async def drip(address: SplitResult, start: bytes, drop: bytes) -> bytes:
 def test_headers_that_do_not_come_are_not_waited_for(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, start: bytes, drop: bytes
 ) -> None:
-    monkeypatch.setattr(timeouts, "HEADERS_WAIT_S", SHORT_S)
+    monkeypatch.setattr(server, "HEADERS_WAIT_S", SHORT_S)
 
     async def script(s: Served) -> None:
         slow = [drip(urlsplit(s.urls.info), start, drop) for _ in range(20)]
@@ -75,7 +75,7 @@ def test_headers_that_do_not_come_are_not_waited_for(
 def test_a_second_request_on_a_connection_may_not_drip_either(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(timeouts, "HEADERS_WAIT_S", SHORT_S)
+    monkeypatch.setattr(server, "HEADERS_WAIT_S", SHORT_S)
 
     async def script(s: Served) -> None:
         address = urlsplit(s.urls.info)
@@ -91,7 +91,7 @@ def test_a_body_that_drips_is_refused_and_costs_nothing(
 ) -> None:
     monkeypatch.setattr(http, "BODY_WAIT_S", SHORT_S)
     monkeypatch.setattr(http, "LINGER", (1 << 20, SHORT_S))
-    monkeypatch.setattr(timeouts, "HEADERS_WAIT_S", SHORT_S)
+    monkeypatch.setattr(server, "HEADERS_WAIT_S", SHORT_S)
 
     async def script(s: Served) -> None:
         address = urlsplit(s.urls.submit)
@@ -107,7 +107,7 @@ def test_a_body_that_drips_is_refused_and_costs_nothing(
 def test_an_answer_that_nobody_reads_is_not_kept_for_ever(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(timeouts, "ANSWER_WAIT_S", SHORT_S)
+    monkeypatch.setattr(server, "ANSWER_WAIT_S", SHORT_S)
 
     async def script(s: Served) -> None:
         address = urlsplit(s.urls.task)

@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
+import datetime as dt
 import fcntl
 import os
+import resource
+from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 
+import httpx
 import msgspec
 import pytest
 from invented.web_site import (
@@ -23,7 +29,11 @@ from invented.web_site import (
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.status import WorkerStatus
 from evopolicy_common.records.suite_folder import INDEX, Entry, Index
+from evopolicy_common.wire import http as server
+from evopolicy_coordinator.pki import certs
+from evopolicy_coordinator.web import app
 from evopolicy_coordinator.web.access import POLICY, kept_tokens
+from evopolicy_coordinator.web.app import Address, listen, serve
 from evopolicy_coordinator.web.run_folders import key_of
 
 SCORE, RANDOM = "4242", "-4322"
@@ -102,14 +112,28 @@ def test_a_token_file_that_others_may_read_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "host", ["evil.example", "127.0.0.1.evil.example", "evil.example:8765", "localhost.evil.example", ""]
+    "host",
+    [
+        *("evil.example", "127.0.0.1.evil.example", "evil.example:8765", "localhost.evil.example", ""),
+        *("[::1].evil.example", "[::1]evil.example:80", "[::1", "::1]", "[localhost]", "[127.0.0.1]"),
+        *(
+            "localhost:x",
+            "localhost:",
+            "localhost:80:80",
+            "evil.example@localhost",
+            "localhost/evil",
+            "local host",
+        ),
+    ],
 )
 def test_a_name_that_was_rebound_to_this_server_is_refused(tmp_path: Path, host: str) -> None:
     with client(site_of(tmp_path)) as browser:
         assert browser.get("/", headers={"host": host}).status_code == 421
 
 
-@pytest.mark.parametrize("host", ["localhost:8765", "127.0.0.1:1", "[::1]:8765", "10.1.2.3"])
+@pytest.mark.parametrize(
+    "host", ["localhost:8765", "LOCALHOST.:8765", "127.0.0.1:1", "[::1]:8765", "[::1]", "10.1.2.3"]
+)
 def test_the_servers_own_addresses_are_not_refused(tmp_path: Path, host: str) -> None:
     with client(site_of(tmp_path)) as browser:
         assert browser.get("/healthz", headers={"host": host}).status_code == 200
@@ -121,6 +145,11 @@ def test_the_servers_own_addresses_are_not_refused(tmp_path: Path, host: str) ->
         {"origin": "https://evil.example"},
         {"origin": "null"},
         {"origin": "http://127.0.0.1:9999"},
+        {"origin": f"https://{HOST}"},
+        {"origin": f"//{HOST}"},
+        {"origin": f"{ORIGIN}/"},
+        {"origin": f"{ORIGIN}/evil"},
+        {"origin": f"http://evil.example@{HOST}"},
         {"sec-fetch-site": "cross-site"},
         {"sec-fetch-site": "same-site"},
         {},
@@ -142,6 +171,105 @@ def test_another_sites_page_cannot_load_our_files_or_events(tmp_path: Path) -> N
     with client(site_of(tmp_path)) as browser:
         for path in ("/", "/events/runs", "/static/web.js"):
             assert browser.get(path, headers=headers).status_code == 403
+
+
+# ---- connections ----
+
+
+@contextlib.asynccontextmanager
+async def served_view(folder: Path, **tls: Path) -> AsyncIterator[tuple[str, int]]:
+    address = Address(host="127.0.0.1", port=0, **tls)
+    with listen(address) as sock:
+        ready = asyncio.Event()
+        serving = asyncio.create_task(serve(site_of(folder), sock, address, ready.set))
+        await ready.wait()
+        try:
+            yield sock.getsockname()
+        finally:
+            serving.cancel()
+            await asyncio.gather(serving, return_exceptions=True)
+
+
+@contextlib.asynccontextmanager
+async def held_open(
+    host: str, port: int, start: bytes, connections: int
+) -> AsyncIterator[list[asyncio.StreamReader]]:
+    """A stranger's connections, on each of which it sends `start` and nothing more."""
+    opened = [await asyncio.open_connection(host, port) for _ in range(connections)]
+    for _, writer in opened:
+        writer.write(start)
+    try:
+        yield [reader for reader, _ in opened]
+    finally:
+        for _, writer in opened:
+            writer.close()
+
+
+HEAD = b"GET /healthz HTTP/1.1\r\nHost: local"
+POST = f"POST /login HTTP/1.1\r\nHost: {HOST}\r\nOrigin: {ORIGIN}\r\nContent-Length: 9\r\n\r\ntok".encode()
+
+
+@pytest.fixture
+def few_descriptors() -> Iterator[None]:
+    """A usual limit on open files. Both ends of each connection are in this process, so it is doubled."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (min(2048, hard), hard))
+    yield
+    resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+
+
+def test_unfinished_requests_keep_nobody_out_and_are_limited(tmp_path: Path, few_descriptors: None) -> None:
+    async def attack() -> None:
+        async with (
+            served_view(tmp_path) as (host, port),
+            held_open(host, port, HEAD, 1200) as readers,
+            httpx.AsyncClient(timeout=60) as browser,
+            asyncio.timeout(60),
+        ):
+            assert (await browser.get(f"http://{host}:{port}/healthz")).status_code == 200
+            for _ in range(1200 - server.MAX_CONNECTIONS):
+                # Cut off, long before their time is up: the oldest first.
+                with contextlib.suppress(ConnectionResetError):
+                    assert await readers.pop(0).read() == b""
+
+    asyncio.run(attack())
+
+
+def test_unfinished_handshakes_keep_nobody_out(tmp_path: Path, few_descriptors: None) -> None:
+    now = dt.datetime.now(dt.UTC)
+    authority = certs.make_authority("lab", now)
+    made = certs.issue(authority, "coordinator/lab", now, 1, hosts=["127.0.0.1"], serves=True)
+    certificate, key = tmp_path / "certificate.pem", tmp_path / "key.pem"
+    certificate.write_bytes(made.certificate)
+    key.write_bytes(made.private_key)
+
+    async def attack() -> None:
+        async with (
+            served_view(tmp_path, certificate=certificate, private_key=key) as (host, port),
+            held_open(host, port, b"", 1200),
+            httpx.AsyncClient(timeout=60, verify=False) as browser,
+        ):
+            assert (await browser.get(f"https://{host}:{port}/healthz")).status_code == 200
+
+    asyncio.run(attack())
+
+
+@pytest.mark.parametrize(("start", "answer"), [(HEAD, b""), (POST, b"HTTP/1.1 401")])
+def test_a_request_that_does_not_end_is_not_waited_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, start: bytes, answer: bytes
+) -> None:
+    monkeypatch.setattr(server, "HEADERS_WAIT_S", 0.2)
+    monkeypatch.setattr(app, "_FORM_WAIT_S", 0.2)
+
+    async def attack() -> bytes:
+        async with (
+            served_view(tmp_path) as (host, port),
+            held_open(host, port, start, 1) as readers,
+            asyncio.timeout(60),
+        ):
+            return await readers[0].read()
+
+    assert asyncio.run(attack())[: len(answer) or None] == answer
 
 
 # ---- reading and acting ----

@@ -22,11 +22,11 @@ from stages.cli_stage import settings
 from starlette.responses import PlainTextResponse
 
 from evopolicy_common.errors import ConfigError
+from evopolicy_common.wire import http as server
 from evopolicy_gateway.agent_supervisor import agent_process
 from evopolicy_gateway.agents.client import Client, ProtocolError
 from evopolicy_gateway.harnesses import base, command
 from evopolicy_gateway.harnesses.coding_agents import cli_agent, turn
-from evopolicy_gateway.http import server
 from evopolicy_gateway.http import service as http
 from evopolicy_gateway.jail import settings as jail_settings
 from evopolicy_gateway.operator.child_rpc import Child
