@@ -11,7 +11,7 @@
 # make bench-peers        the same episodes through Gymnasium's vectors, Ray and Dask, where they are installed
 # make bench-throughput   episodes per second through the coordinator
 # make bench-scale        CPU of coordinator, gateways and workers' supervisors an episode, with real trajectories
-# make bench-channels     what a policy can tell others on its machine, at once and afterwards
+# make bench-channels     what a policy can tell others on its machine, at once and afterwards; --gaps N: what time tells it of its split
 # make bench-report bench-coverage       a report over 1,024 runs
 # make bench-isolation    a sweep with hidden episodes kept from agents' machines, and without
 # make bench-web bench-web-live       the live view: 2,000 workers, 500 open runs, 200 browsers
@@ -111,6 +111,7 @@ bench-throughput: install
 bench-scale: install
 	@PYTHONPATH=tests/support $(BIN)/python tests/bench/scale_bench.py $(ARGS)
 
+# Whether a policy tells hidden episodes by the time between its calls: make bench-channels ARGS="--gaps 1000"
 bench-channels: install
 	@PYTHONPATH=tests/support $(BIN)/python tests/bench/channel_bench.py $(ARGS)
 

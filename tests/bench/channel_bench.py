@@ -3,19 +3,71 @@
 Prints bits a second that arrive in an agent's jail, and in another policy, by each way that is known; then, of episodes some
 of which did all that lasts, which share a jailed agent tells apart by each number it can read, `--wait` seconds after they
 ended (0.5 is guessing). On a machine that does other things less arrives.
+
+With `--gaps N` instead: whether a policy tells hidden from train episodes by the time between its calls, from N episodes of each
+kind. Another size: `--gaps 40 --gap-steps 50 --gap-envs gym/acrobot`.
 """
 
 from __future__ import annotations
 
 import argparse
 import os
+import random
 import tempfile
 from pathlib import Path
 
-from attacks import channels
+import numpy as np
+from attacks import channels, gaps
 from rich.console import Console
 from rich.table import Table
+from scipy.stats import ks_2samp
 from slots import Slots
+
+ACTIONS = {
+    "gym/acrobot": 1,
+    "gym/ant5": [0.0] * 8,
+    "gym/racing": [0.0, 0.05, 0.0],
+    "gymnasium/MiniGrid-FourRooms-v0": 0,
+    "gymnasium/ALE/Pong-v5": 0,
+}
+"""Environments for the gaps: flat observations, then symbols and pictures. Actions that end no episode early."""
+PER_POLICY = 4
+"""Episodes of each policy with policy scope "submit"."""
+
+
+def tell_gaps(slots: Slots, console: Console, chosen: argparse.Namespace) -> None:
+    """A table for each environment: what an episode's gaps say about its kind."""
+    rng = random.Random(chosen.seed)
+    for env in chosen.gap_envs:
+        for video, per_policy in ((False, 1), (True, 1), (False, PER_POLICY), (True, PER_POLICY)):
+            found = gaps.collect(
+                slots,
+                env,
+                ACTIONS[env],
+                n=chosen.gaps,
+                steps=chosen.gap_steps,
+                video=video,
+                per_policy=per_policy,
+                rng=rng,
+            )
+            hidden = found.hidden
+            share, p = gaps.by_chance(found, 200, np.random.default_rng(chosen.seed))
+            scope = "submit" if per_policy > 1 else "episode"
+            table = Table(
+                "gap (µs)",
+                "train",
+                "hidden",
+                "hidden is longer",
+                "KS p",
+                title=f"{env}, policy scope {scope}, {'with' if video else 'without'} video: {len(hidden)} episodes;"
+                f" guessed rightly {share:.3f}, p = {p:.3f}",
+            )
+            for name, values in zip(gaps.FEATURES, found.features.T, strict=True):
+                train, other = values[~hidden], values[hidden]
+                medians = (f"{np.median(train):.2f}", f"{np.median(other):.2f}")
+                test = ks_2samp(train, other).pvalue
+                table.add_row(name, *medians, f"{gaps.area(hidden, values):.3f}", f"{test:.2g}")
+            console.print(table)
 
 
 def main() -> None:
@@ -24,14 +76,22 @@ def main() -> None:
     )
     options.add_argument("--wait", type=float, default=60.0, help="seconds after an episode's end")
     options.add_argument("--episodes", type=int, default=10, help="of each wait")
+    options.add_argument(
+        "--gaps", type=int, default=0, help="episodes of each kind; only the gaps are measured"
+    )
+    options.add_argument("--gap-steps", type=int, default=100, help="of each of their episodes")
+    options.add_argument("--gap-envs", nargs="+", choices=ACTIONS, default=list(ACTIONS))
+    options.add_argument("--seed", type=int, default=0, help="of their order and cases")
     chosen = options.parse_args()
     console = Console()
     with tempfile.TemporaryDirectory(prefix="evopolicy-channels-") as name:
         folder = Path(name)
         (folder / "slots").mkdir()
         slots = Slots(folder / "slots")
-        reader = channels.JailedReader(folder)
         try:
+            if chosen.gaps:
+                return tell_gaps(slots, console, chosen)
+            reader = channels.JailedReader(folder)
             at_once = Table("the policy", "the other reads", "bits/s")
             for way in channels.WAYS:
                 for reading, rate in channels.live(slots, reader, way).items():

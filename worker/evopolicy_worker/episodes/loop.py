@@ -6,7 +6,11 @@ Rules:
   every row with such an action has `policy_failed`. An action outside the space is repaired, and its row marked.
 - When a recording is replayed, its actions replace the policy's, up to its last step. The episode then stops, even if
   the environment did not end it.
-- A video is made from the episode's actions after its end (see `video.py`); the episode itself never renders.
+- Between a policy's calls the same work is done in every split, since a policy can measure the time: each step goes to
+  both recorders, although hidden episodes keep only the actions. Pictures are compressed after the end as far as memory
+  allows (`rendered.HELD_BYTES`).
+- A video is made from the episode's actions after the job's last policy has ended (see `video.py`); the episode itself
+  never renders, and no policy waits for a video.
 - A policy's failure is a result, and so is the effect of its actions on the environment: if an environment breaks down
   on them, the episode is repeated once with random actions only. Other failures of environment or sandbox are raised.
 - A policy that was ended from outside is restarted together with its episode, and so is a hidden episode whose job was
@@ -22,7 +26,7 @@ import time
 from collections import OrderedDict
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -36,7 +40,7 @@ from evopolicy_common.errors import (
     WorkerError,
 )
 from evopolicy_common.messages.bounds import LARGEST
-from evopolicy_common.messages.environment import EnvironmentDescription
+from evopolicy_common.messages.environment import Case, EnvironmentDescription
 from evopolicy_common.messages.episode import (
     LARGEST_LIMITS,
     NO_POLICY,
@@ -100,7 +104,7 @@ class Player:
         failure: PolicyFailure | None = None,
     ) -> bytes:
         """Plays the job's episodes in order, and passes each outcome to `tell` as a framed `Finished`, except for the
-        last, which is returned. `files`: its bundle.
+        last, which is returned. Videos follow likewise, as `Filmed`. `files`: its bundle.
 
         Starts at index `first`. If `failure` is given, the policy has failed in that episode, which is played without
         it. Raises CancelledJobError; WorkerError, SandboxError or SlotDiedError for failures that are not the policy's.
@@ -111,9 +115,8 @@ class Player:
             raise WorkerError("a job with a bundle came without the bundle")
         policies = JobPolicies(self._policies, job, files, environment)
         before = unpack(job)
-        if not job.video:
-            self._videos.close()
         frame = b""
+        films: list[_Film] = []
         try:
             progress.episodes_done = first
             for k in range(first, len(job.episodes)):
@@ -127,7 +130,8 @@ class Player:
                     begun = Begun(failure=failure)
                 if is_kept(job):
                     progress.begins(k, begun)
-                failure, frame = self._play(k, job, spec, policies, progress, tell, begun)
+                failure, frame, film_of = self._play(k, job, spec, policies, progress, tell, begun)
+                films += film_of
                 progress.episodes_done += 1
                 if failure is not None and _verdict_of_submit(job, spec, failure):
                     others = (_unplayed(each.index, failure) for each in job.episodes[k + 1 :])
@@ -136,9 +140,24 @@ class Player:
                     frame = b"".join((frame, *map(messages.framed, finished)))
                     break
                 failure = None
-            return frame
         finally:
             policies.close(progress)
+        if not job.video:
+            self._videos.close()
+        for film in films:
+            if frame:
+                tell(frame)
+            frame = self._filmed(job.env, film, progress)
+        return frame
+
+    def _filmed(self, env: str, film: _Film, progress: Progress) -> bytes:
+        """A framed `Filmed`; nothing where there can be no video."""
+        k, case, actions, length = film
+        description = self._environment(env).description
+        mp4 = self._videos.record(description, case, actions, length, lambda: progress.cancelled)
+        if progress.cancelled:
+            raise CancelledJobError
+        return b"" if mp4 is None else messages.framed(messages.Filmed(place=k, video=_blob(mp4)))
 
     def _play(
         self,
@@ -149,17 +168,19 @@ class Player:
         progress: Progress,
         tell: Callable[[bytes], None],
         begun: Begun,
-    ) -> tuple[PolicyFailure | None, bytes]:
-        """The failure in one episode, which continues from `begun`, and its framed outcome."""
+    ) -> tuple[PolicyFailure | None, bytes, list[_Film]]:
+        """The failure in one episode, which continues from `begun`, its framed outcome, and the video to make."""
         n_ends = 0
         while True:
             environment = self._environment(job.env)
-            episode = _Episode(job, spec, environment, policies, progress, self._videos, tell, begun)
+            episode = _Episode(job, spec, environment, policies, progress, tell, begun)
             try:
-                outcome = episode.play(k)
+                outcome, log = episode.play(k)
                 kept = begun.packed() if is_kept(job) and len(job.episodes) > 1 else None
                 finished = messages.Finished(outcome=_brief(outcome, _share(job)), begun=kept)
-                return outcome.failure, messages.framed(finished)
+                films = log and job.video and (not job.video_episodes or k < job.video_episodes)
+                film = [_Film(k, spec.case, log, outcome.length)] if films else []
+                return outcome.failure, messages.framed(finished), film
             except EndedFromOutsideError as error:
                 # Where one policy plays several episodes it took with it what it had learned.
                 n_ends += 1
@@ -207,6 +228,16 @@ class Player:
         return environment
 
 
+class _Film(NamedTuple):
+    """A video to make."""
+
+    place: int
+    """The episode's index in the job."""
+    case: Case
+    actions: bytes
+    length: int
+
+
 class _Episode:
     """One episode from reset to its end."""
 
@@ -217,7 +248,6 @@ class _Episode:
         environment: Environment,
         policies: JobPolicies,
         progress: Progress,
-        videos: VideoRecorder,
         tell: Callable[[bytes], None],
         begun: Begun,
     ) -> None:
@@ -232,7 +262,6 @@ class _Episode:
         self._environment = environment
         self._policies = policies
         self._progress = progress
-        self._videos = videos
         self.acted = False
         """Whether an action of the policy's has reached the environment."""
 
@@ -241,30 +270,32 @@ class _Episode:
         """How the policy has failed."""
         return self._begun.failure
 
-    def play(self, k: int) -> EpisodeOutcome:
+    def play(self, k: int) -> tuple[EpisodeOutcome, bytes]:
+        """The outcome, without a video, and the log of actions if it was kept."""
         job, spec = self._job, self._spec
         start = time.monotonic()
+        full, actions = self._recorders()
         policy = self._begin(k) if job.bundle is not None and self.failure is None else None
         if self.failure is not None and _verdict_of_submit(job, spec, self.failure):
             ended = self._policies.release()
-            return msgspec.structs.replace(
+            unplayed = msgspec.structs.replace(
                 _unplayed(spec.index, self.failure),
                 stdout=ended.stdout,
                 stderr=ended.stderr,
                 policy_cpu_s=ended.cpu_s,
                 wall_s=time.monotonic() - start,
             )
-        recorder = (
-            Renderer(job.observations, self._environment.description.obs_storage)
-            if job.render and job.record == "full"
-            else Recorder(job.record, job.observations)
-        )
-        films = job.video and (not job.video_episodes or k < job.video_episodes)
-        played = Recorder("actions") if films else None
-        total, components, length, terminated, truncated, success = self._steps(policy, recorder, played)
+            return unplayed, b""
+        total, components, length, terminated, truncated, success = self._steps(policy, full, actions)
         wall_s = time.monotonic() - start
         ended = self._policies.release() if job.bundle is not None else Ended(b"", b"", 0.0)
-        return EpisodeOutcome(
+        # A policy of several episodes can measure the pause between them, in which feedback files are made.
+        pauses = job.policy_scope == "submit"
+        rows = full.finish() if full is not None and (pauses or job.record == "full") else b""
+        log = (
+            actions.finish() if actions is not None and (pauses or job.record != "full" or job.video) else b""
+        )
+        outcome = EpisodeOutcome(
             index=spec.index,
             episode_return=total,
             length=length,
@@ -273,23 +304,25 @@ class _Episode:
             failure=self.failure,
             reward_components=components,
             success=success,
-            trajectory=_blob(recorder.finish()),
-            video=None if played is None else self._video(played.finish(), length),
+            trajectory=_blob(rows if job.record == "full" else log),
             stdout=ended.stdout,
             stderr=ended.stderr,
             wall_s=wall_s,
             policy_cpu_s=ended.cpu_s,
         )
+        return outcome, log
 
-    def _video(self, actions: bytes, length: int) -> BlobRef | None:
-        """The episode's video; None where there can be none."""
-        progress = self._progress
-        mp4 = self._videos.record(
-            self._environment.description, self._spec.case, actions, length, lambda: progress.cancelled
-        )
-        if progress.cancelled:
-            raise CancelledJobError
-        return None if mp4 is None else _blob(mp4)
+    def _recorders(self) -> tuple[Recorder | None, Recorder | None]:
+        """One of everything, as feedback has it, and one of the actions, as hidden results and videos need them."""
+        job = self._job
+        full = actions = None
+        if job.record == "full" and not job.render:
+            full = Recorder("full", job.observations)
+        elif job.record == "full" or job.bundle is not None:
+            full = Renderer(job.observations, self._environment.description.obs_storage)
+        if job.record == "actions" or job.video or job.bundle is not None:
+            actions = Recorder("actions", job.observations)
+        return full, actions
 
     def _begin(self, k: int) -> PolicyProcess | None:
         """The policy, told of the new episode; None, with the failure noted, when it failed before its first act."""
@@ -308,26 +341,23 @@ class _Episode:
         self._begun.failure = msgspec.structs.replace(failure, step_index=step)
 
     def _steps(
-        self, policy: PolicyProcess | None, recorder: Recorder, played: Recorder | None
+        self, policy: PolicyProcess | None, full: Recorder | None, actions: Recorder | None
     ) -> tuple[float, dict[str, float], int, bool, bool, bool | None]:
         """Play to the end: return, components of the reward, length, terminated, truncated, whether the task was solved.
 
-        `played` is given the actions as they were played, for the video.
+        `full` is given the actions as the policy returned them, `actions` as they were played.
         """
         environment, progress = self._environment, self._progress
         codec = environment.action_codec
-        repair, step, append = codec.repair, environment.step, recorder.append
-        actions_only = self._job.record == "actions"
+        repair, step = codec.repair, environment.step
         recorded = _recorded_actions(self._spec)
         last = (self._job.max_steps or sys.maxsize) - 1
         rng = None if policy is not None or recorded is not None else random_actions(self._spec.policy_seed)
         failed = False
         names = environment.description.reward_components
         sums = dict.fromkeys(names, 0.0)
-        solves, ever = environment.description.success, environment.description.success_at == "any"
-        if not solves and actions_only:
-            # Only of hidden episodes: an agent's feedback stays as it was.
-            solves = environment.solved_by
+        solves = environment.description.success or environment.solved_by
+        ever = environment.description.success_at == "any"
         success: bool | None = None
         total, t = 0.0, 0
         taken = self._begun.taken
@@ -370,9 +400,10 @@ class _Episode:
                 info = {**info, "action_invalid": True}
             if failed:
                 info = {**info, "policy_failed": True}
-            append(obs, action if actions_only else returned, reward, terminated, truncated, info)
-            if played is not None:
-                played.append(None, action, reward, terminated, truncated, info)
+            if full is not None:
+                full.append(obs, returned, reward, terminated, truncated, info)
+            if actions is not None:
+                actions.append(None, action, reward, terminated, truncated, info)
             total += reward
             t += 1
             progress.steps += 1
@@ -381,6 +412,9 @@ class _Episode:
             if progress.cancelled:
                 raise CancelledJobError
             obs = next_obs
+        if self._job.record == "full" and not environment.description.success:
+            # An agent's feedback stays as it was.
+            success = None
         for name, value in (("reward", total), *sums.items()):
             if not abs(value) <= LARGEST:
                 raise BrokenEnvironmentError(

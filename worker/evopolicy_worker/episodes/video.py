@@ -110,7 +110,8 @@ def replay(environment: Environment, case: Case, actions: bytes) -> bytes:
         encoder.add(environment.render())
         # Repaired already, and once more for its type: the codec's arrays may come back as other views.
         step = environment.step(environment.action_codec.repair(row.action)[0])
-        if (step.reward, step.terminated, step.truncated) != (row.reward, row.terminated, row.truncated):
+        # A run's own limit of steps truncates an episode that the environment would continue.
+        if (step.reward, step.terminated) != (row.reward, row.terminated) or step.truncated > row.truncated:
             raise WorkerError(
                 f"{environment.description.env} departs from the recorded episode at step {row.t}"
             )

@@ -205,6 +205,10 @@ class Slot:
                             if reply.begun is not None:
                                 self._begun[len(outcomes)] = reply.begun
                             outcomes.append(reply.outcome)
+                        elif isinstance(reply, messages.Filmed):
+                            outcomes[reply.place] = msgspec.structs.replace(
+                                outcomes[reply.place], video=reply.video
+                            )
                         elif isinstance(reply, messages.Begun):
                             self._begun[reply.place] = reply.begun
                         else:

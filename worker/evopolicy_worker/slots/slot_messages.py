@@ -8,7 +8,7 @@ import msgspec
 
 from evopolicy_common.catalogue import Entry
 from evopolicy_common.messages.environment import EnvironmentDescription
-from evopolicy_common.messages.episode import EpisodeOutcome, Job, PolicyFailure, Tier
+from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome, Job, PolicyFailure, Tier
 from evopolicy_worker.environments.calls import Limits
 from evopolicy_worker.episodes.begun import PackedBegun
 
@@ -49,7 +49,7 @@ class Files(msgspec.Struct, frozen=True, kw_only=True):
 
 class Play(Message, frozen=True, kw_only=True, tag="play"):
     """Play this job. The replies are any number of Progress; for each episode Acting, when its policy's first action
-    is due, and Finished; Begun when an episode is stopped; and last Played or Fault."""
+    is due, and Finished; Begun when an episode is stopped; Filmed for each video; and last Played or Fault."""
 
     job: Job
     bundle: Files | None
@@ -92,6 +92,14 @@ class Finished(Message, frozen=True, kw_only=True, tag="finished"):
     """The policy's actions in it. Only in jobs of several episodes, which are returned as a whole."""
 
 
+class Filmed(Message, frozen=True, kw_only=True, tag="filmed"):
+    """The video of one of the job's finished episodes."""
+
+    place: int
+    """The episode's index in the job."""
+    video: BlobRef
+
+
 class Begun(Message, frozen=True, kw_only=True, tag="begun"):
     """The policy's actions so far in a stopped episode. Sent on Cancel, and before a Fault."""
 
@@ -121,7 +129,7 @@ class Fault(Message, frozen=True, kw_only=True, tag="fault"):
 
 
 Command = Start | Play | Describe | Cancel
-Reply = Ready | Progress | Acting | Finished | Begun | Played | Described | Fault
+Reply = Ready | Progress | Acting | Finished | Filmed | Begun | Played | Described | Fault
 
 encoder = msgspec.msgpack.Encoder()
 commands: msgspec.msgpack.Decoder[Command] = msgspec.msgpack.Decoder(Command)

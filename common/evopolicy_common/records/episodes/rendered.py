@@ -5,7 +5,8 @@ Rules that this module owns:
   `.npz` file.
 - Beside the files is the log of actions, rewards and flags, as a trajectory with record "actions". Audits take the
   actions from it, bit for bit as they were returned. The log contains nothing that the files do not.
-- Rows and pictures are compressed as they arrive.
+- Rows are compressed by blocks. Arrays outside the rows are held until the end, since a policy can measure the time
+  between its calls; beyond `HELD_BYTES`, each that arrives has the oldest ones compressed.
 - Received bytes are not trusted: sizes are checked against the limits before anything is unpacked, and the rows against
   the declared length and return.
 - Layout: `magic, {length, header}, {length, log}, {length, file}…`.
@@ -18,6 +19,7 @@ import operator
 import struct
 import threading
 import zipfile
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Final, Literal, NamedTuple, cast
 
@@ -43,6 +45,9 @@ MAX_OBSERVATIONS_BYTES = 1 << 30
 """Limit of `observations.npz`, bytes."""
 MIN_PICTURE_SIDE = 16
 """Least height and width of a picture; smaller arrays of bytes count as symbols."""
+
+HELD_BYTES = 32 << 20
+"""Limit of the arrays that wait for the end of their episode, bytes. 1,000 frames of CarRacing take 28 MB."""
 
 _LENGTH = struct.Struct("<I")
 _MAX_HEADER_BYTES = 4096
@@ -95,6 +100,8 @@ class Renderer(Recorder):
         # Observations are kept for a block, until they are rendered.
         self._full = True
         self._npz = None if storage == "inline" else NpzWriter()
+        self._held: deque[tuple[str, Any]] = deque()
+        self._held_bytes = 0
         self._compressor = zstandard.ZstdCompressor(level=1).compressobj()
         self._rows: list[bytes] = []
         self._rows_size = 0
@@ -103,6 +110,7 @@ class Renderer(Recorder):
     def finish(self) -> bytes:
         """The container's bytes. The recorder must not be used afterwards."""
         log = super().finish()
+        self._compress_held(0)
         files: list[tuple[File, bytes]] = []
         if not self._left_out:
             try:
@@ -131,9 +139,9 @@ class Renderer(Recorder):
 
     def _begin_block(self, obs: Any) -> None:
         super()._begin_block(obs)
-        # Arrays stored outside the rows are compressed at once: a block of pictures would be large.
+        # Not in the block: a block of pictures would be large.
         is_single = self._npz is not None and isinstance(obs, np.ndarray)
-        self._pictures = _Single(self._put_observations) if is_single else None
+        self._pictures = _Single(self._hold) if is_single else None
 
     def _flush(self) -> None:
         first = self._n_packed
@@ -148,7 +156,7 @@ class Renderer(Recorder):
         if self._npz is not None:
             if self._obs:
                 for name, leaf in columns.leaves(columns.unpack(columns.pack(self._obs)).values()):
-                    self._put_observations(name or SINGLE, leaf)
+                    self._hold(name or SINGLE, leaf)
             obs = None
         elif self._form == "lists":
             obs = as_lists(self._obs)
@@ -167,14 +175,23 @@ class Renderer(Recorder):
         except ProtocolError as error:
             self._left_out = str(error)
 
-    def _put_observations(self, name: str, rows: Any) -> None:
-        assert self._npz is not None
-        if self._left_out:
-            return
-        try:
-            self._npz.add(name, rows)
-        except (ProtocolError, ValueError) as error:
-            self._left_out = str(error)
+    def _hold(self, name: str, rows: Any) -> None:
+        self._held.append((name, rows))
+        self._held_bytes += getattr(rows, "nbytes", 0)
+        if self._held_bytes > HELD_BYTES:
+            self._compress_held(HELD_BYTES)
+
+    def _compress_held(self, most: int) -> None:
+        """Adds the oldest arrays to the file, until at most that many bytes are held."""
+        while self._held and (self._held_bytes > most or not most):
+            name, rows = self._held.popleft()
+            self._held_bytes -= getattr(rows, "nbytes", 0)
+            if self._npz is None or self._left_out:
+                continue
+            try:
+                self._npz.add(name, rows)
+            except (ProtocolError, ValueError) as error:
+                self._left_out = str(error)
 
 
 class _Rows(NamedTuple):

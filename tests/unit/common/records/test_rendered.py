@@ -99,6 +99,17 @@ def test_pictures_are_read_with_numpy_alone(shape: tuple[int, ...]) -> None:
     assert all(json.loads(line)["obs"] is None for line in files[ROWS].splitlines())
 
 
+@pytest.mark.parametrize("held", [0, 1000, 3000])
+def test_the_bytes_do_not_depend_on_how_many_pictures_wait(
+    held: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pictures = np.random.default_rng(0).integers(0, 256, (9, 20, 20)).astype(np.uint8)
+    rows = [(picture, 0, 1.0) for picture in pictures]
+    at_the_end = recorded(Renderer("arrays", "npz"), rows)
+    monkeypatch.setattr(rendered, "HELD_BYTES", held)
+    assert recorded(Renderer("arrays", "npz"), rows) == at_the_end
+
+
 def test_parts_of_an_observation_are_arrays_of_their_own_over_many_blocks(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -43,6 +43,11 @@ def test_only_as_many_of_a_jobs_episodes_as_asked_have_a_video(slots: Slots) -> 
     assert [outcome.video is not None for outcome in outcomes] == [True, False, False]
 
 
+def test_a_runs_own_limit_of_steps_leaves_the_video(slots: Slots) -> None:
+    outcome = slots.play(None, video=True, max_steps=7)
+    assert (outcome.truncated, outcome.length, n_frames(outcome)) == (True, 7, 7)
+
+
 def test_what_cannot_be_drawn_has_no_video_and_a_note(capfd: pytest.CaptureFixture[str]) -> None:
     description = environments.describe("toy/line")
     case = Case(seed=1)
