@@ -12,6 +12,7 @@ from __future__ import annotations
 import os
 import shutil
 import sys
+from collections.abc import Collection
 from pathlib import Path
 
 from evopolicy_gateway.agents.client import Client, ProtocolError, Refusal, exit_after
@@ -57,12 +58,23 @@ def stage(policy: Path, system: Path) -> None:
             shutil.rmtree(old)
         else:
             old.unlink()
-    metadata = METADATA if (policy / "_meta.json").exists() else frozenset()
+    _copy(policy, system, {"__pycache__", *(METADATA if (policy / "_meta.json").exists() else ())})
 
-    def ignored(folder: str, names: list[str]) -> set[str]:
-        return {"__pycache__"} | (metadata if Path(folder) == policy else frozenset())
 
-    shutil.copytree(policy, system, symlinks=True, dirs_exist_ok=True, ignore=ignored)
+def _copy(source: Path, target: Path, left_out: Collection[str]) -> None:
+    # Not by `shutil.copytree`: it fails on set-id bits of folders that users share, which the jail refuses.
+    target.mkdir(exist_ok=True)
+    for entry in source.iterdir():
+        place = target / entry.name
+        if entry.name in left_out:
+            continue
+        if entry.is_symlink():
+            place.symlink_to(os.readlink(entry))
+        elif entry.is_dir():
+            _copy(entry, place, ("__pycache__",))
+        else:
+            shutil.copyfile(entry, place)
+            place.chmod(entry.stat().st_mode & 0o777)
 
 
 def play(client: Client, folder: Path, workspace: Path) -> int:

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from evopolicy_common.errors import ConfigError
+from evopolicy_common.processes.left_files import keep_to_owner
 from evopolicy_common.processes.scratch import remove_tree
 from evopolicy_gateway.agent_supervisor.redaction import is_secret
 
@@ -93,6 +94,7 @@ def copy(paths: Sequence[str], private: Path) -> None:
                 shutil.copytree(source, target, symlinks=True, dirs_exist_ok=True)
         except (OSError, shutil.Error) as error:
             raise ConfigError(f"user_config: {path} cannot be copied: {error}") from error
+    keep_to_owner(begun)
     begun.rename(home)
 
 

@@ -90,7 +90,7 @@ class Way:
             self._serving = asyncio.create_task(self._serve(ended))
 
     def failed(self) -> None:
-        """Releases the descriptors of a program that could not be started."""
+        """Releases the descriptors of a program that could not be started, or has ended."""
         self._close_files()
         for sock in (self._supervisor, self._child):
             if sock is not None:
@@ -199,9 +199,9 @@ class Jail:
         """Prepares one start of a program."""
         return Way(self._view.arguments(), program, None if self._open_network else self._proxy())
 
-    def sealed(self, program: Sequence[str]) -> list[str]:
-        """The command of a program without network access, such as a CLI that prints its version."""
-        return [*self._view.arguments(), "--", *program]
+    def sealed(self, program: Sequence[str]) -> Way:
+        """One start of a program without network access, such as a CLI that prints its version."""
+        return Way(self._view.arguments(), program, None)
 
     def _proxy(self) -> JailProxy:
         return JailProxy(self._forwards, self._hosts)

@@ -6,6 +6,8 @@ Rules that this module owns:
   does AF_ALG; of netlink, only routes and socket listings are permitted. A ring (io_uring) would create sockets without
   `socket`.
 - Keyrings belong to a login, not to a namespace: none can be read or written.
+- No file gets a set-id bit, capabilities or an access control list: the program outlives the jail, and would run with
+  the operator's rights for whoever reaches it. The sticky bit is harmless.
 - No program may read the kernel's log, measure other processes' performance, or run programs in the kernel.
 """
 
@@ -14,9 +16,21 @@ from __future__ import annotations
 import errno
 import os
 import socket
+import stat
 
-from evopolicy_common.seccomp import ALLOWED, AUDIT_ARCH, JUMP_EQUAL, Instruction, one_of, program, refuse
-from evopolicy_common.seccomp.numbers import REFUSED, SOCKET
+from evopolicy_common.seccomp import (
+    ALLOWED,
+    AUDIT_ARCH,
+    JUMP_ANY_BIT,
+    JUMP_EQUAL,
+    LOAD,
+    Instruction,
+    argument,
+    one_of,
+    program,
+    refuse,
+)
+from evopolicy_common.seccomp.numbers import ATTRIBUTES, MODES, REFUSED, SOCKET
 
 _REFUSED = {
     # ENOSYS as from a kernel without these calls, which programs can handle.
@@ -25,6 +39,11 @@ _REFUSED = {
 }
 _FAMILIES = (socket.AF_UNIX, socket.AF_INET, socket.AF_INET6)
 _NETLINK = (0, 4)  # NETLINK_ROUTE, NETLINK_SOCK_DIAG
+_SET_ID = stat.S_ISUID | stat.S_ISGID
+_MODE_AT = {"chmod": 1, "fchmod": 1, "creat": 1, "mknod": 1, "open": 2}
+"""Argument with the mode, by call; in calls with a folder's descriptor it is one later."""
+_MAKES_A_FILE = os.O_CREAT | (os.O_TMPFILE & ~os.O_DIRECTORY)
+"""Flags of `open` with which its mode counts; without them it may be anything."""
 
 
 def filter_program() -> bytes | None:
@@ -36,7 +55,24 @@ def filter_program() -> bytes | None:
     for number, calls in _REFUSED.items():
         for call in calls:
             body += [(JUMP_EQUAL, 0, 1, REFUSED[machine][call]), refuse(number)]
+    # As on a file system without them, which programs that copy files expect.
+    for call_number in ATTRIBUTES[machine]:
+        body += [(JUMP_EQUAL, 0, 1, call_number), refuse(errno.ENOTSUP)]
+    for call, call_number in MODES[machine].items():
+        block = _without_set_id(call)
+        body += [(JUMP_EQUAL, 0, len(block), call_number), *block]
     netlink = one_of(2, _NETLINK, refuse(errno.EPROTONOSUPPORT))
     other_family = [(JUMP_EQUAL, 1, 0, int(socket.AF_NETLINK)), refuse(errno.EAFNOSUPPORT), *netlink]
     body += [(JUMP_EQUAL, 1, 0, SOCKET[machine]), ALLOWED, *one_of(0, map(int, _FAMILIES), *other_family)]
     return program(machine, refuse(errno.ENOSYS), body)
+
+
+def _without_set_id(call: str) -> list[Instruction]:
+    """Decides on a call that gives a file its mode."""
+    if call == "openat2":  # its mode is in memory, which a filter cannot read; programs fall back to `openat`
+        return [refuse(errno.ENOSYS)]
+    at = _MODE_AT.get(call) or _MODE_AT[call.partition("at")[0]] + 1
+    block: list[Instruction] = []
+    if call.startswith("open"):
+        block = [(LOAD, 0, 0, argument(at - 1)), (JUMP_ANY_BIT, 1, 0, _MAKES_A_FILE), ALLOWED]
+    return [*block, (LOAD, 0, 0, argument(at)), (JUMP_ANY_BIT, 0, 1, _SET_ID), refuse(errno.EPERM), ALLOWED]

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import os
 import sys
 import time
 import uuid
@@ -27,6 +28,7 @@ from evopolicy_common.errors import ConfigError, EvopolicyError
 from evopolicy_common.messages.gateway import CANCELLED
 from evopolicy_common.messages.operator import RunFinished
 from evopolicy_common.processes import child_process, host
+from evopolicy_common.processes.left_files import keep_to_owner
 from evopolicy_common.processes.notices import Waiting
 from evopolicy_common.processes.scratch import remove_tree
 from evopolicy_common.records.run_files import read_record
@@ -196,7 +198,6 @@ class RunLifecycle:
     async def _played(self, run: str, *, agents_side: bool) -> RunRecord:
         self.run = run
         self._operations.watched_by(run, (self._folder.lock, self._folder.supervisor_lock))
-        plan = self._plan
         self._stopwatch = Stopwatch(self._folder.times)
         try:
             if agents_side:
@@ -215,7 +216,16 @@ class RunLifecycle:
             else:
                 await self._give_up(run, str(error) if isinstance(error, EvopolicyError) else None)
             raise
-        return await record.write(self._folder, plan, finished, self._operations, self._stopwatch.times)
+        return await self._write(finished)
+
+    async def _write(self, finished: RunFinished, why: str | None = None) -> RunRecord:
+        refused = await asyncio.to_thread(keep_to_owner, self._folder.root)
+        if refused:
+            how = f"as root: chown -R {os.getuid()} {self._folder.root}; chmod -R a-s,o-w {self._folder.root}"
+            text = f"{refused} files and folders that the agent left belong to other users and keep their modes; {how}"
+            self._watch.note(self._name, text)
+        times = self._stopwatch.times
+        return await record.write(self._folder, self._plan, finished, self._operations, times, why)
 
     async def _agents_side(self) -> None:
         """Runs gateway and agent until the run is closed."""
@@ -475,5 +485,4 @@ class RunLifecycle:
                 await self._operations.cancel(run)
                 await self._tell_gone(run)
                 finished = await self._finish(run)
-                times = self._stopwatch.times
-                await record.write(self._folder, self._plan, finished, self._operations, times, why)
+                await self._write(finished, why)

@@ -163,11 +163,12 @@ class Plan(msgspec.Struct, frozen=True, kw_only=True):
             return None
 
     def claim(self) -> None:
-        """Creates the run's empty folder; only for the holder of its lock. Raises ConfigError as `check`."""
+        """Creates the run's empty folder, which no other user may enter; only for the holder of its lock. Raises
+        ConfigError as `check`."""
         self.check_held()
         if self.folder.root.exists():
             remove_tree(self.folder.root)
-        self.folder.root.mkdir(parents=True)
+        self.folder.root.mkdir(mode=0o700, parents=True)
 
 
 def _unusual(values: dict[str, Any], usual: dict[str, Any]) -> dict[str, Any]:

@@ -20,7 +20,7 @@ from evopolicy_common.errors import ConfigError, StorageError
 from evopolicy_common.messages.environment import Split
 from evopolicy_common.messages.gateway import CANCELLED
 from evopolicy_common.messages.operator import RunFinished, SubmitRecord
-from evopolicy_common.processes.scratch import give_back_rights, remove_tree
+from evopolicy_common.processes.scratch import remove_tree
 from evopolicy_common.records.aggregates import mean, std
 from evopolicy_common.records.blobs import BlobStore, write_atomically
 from evopolicy_common.records.policies import bundles, checkpoints
@@ -353,7 +353,6 @@ def _env_log(finished: RunFinished) -> bytes:
 
 def _put_in_place(system: Path, bundle: Bundle) -> None:
     """Replaces `system/` by the bundle, whatever it contains. Raises ConfigError when it cannot be removed."""
-    give_back_rights(system.parent)
     # Only a real folder is removed recursively; opening a pipe would block until its other end opens.
     if system.is_dir() and not system.is_symlink():
         remove_tree(system)

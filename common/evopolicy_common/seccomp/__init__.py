@@ -13,7 +13,7 @@ Instruction = tuple[int, int, int, int]
 """Opcode, number of instructions to skip when the condition holds and when it does not, and an operand."""
 
 LOAD, AND = 0x20, 0x54
-JUMP_EQUAL, JUMP_AT_LEAST = 0x15, 0x35
+JUMP_EQUAL, JUMP_AT_LEAST, JUMP_ANY_BIT = 0x15, 0x35, 0x45
 RETURN = 0x06
 KILL_PROCESS, ERRNO, ALLOW = 0x80000000, 0x00050000, 0x7FFF0000
 AUDIT_ARCH = {"x86_64": 0xC000003E, "aarch64": 0xC00000B7}

@@ -88,3 +88,12 @@ REACHING_OUT: dict[str, dict[str, int]] = {
 """Calls that affect other processes of the same user."""
 SOCKET = {"x86_64": 41, "aarch64": 198}
 SECCOMP = {"x86_64": 317, "aarch64": 277}
+MODES: dict[str, dict[str, int]] = {
+    "x86_64": _parsed(
+        "chmod=90 fchmod=91 fchmodat=268 fchmodat2=452 mknod=133 mknodat=259 creat=85 open=2 openat=257 openat2=437"
+    ),
+    "aarch64": _parsed("fchmod=52 fchmodat=53 fchmodat2=452 mknodat=33 openat=56 openat2=437"),
+}
+"""Calls that give a file its mode. Those for folders are missing: the kernel keeps no set-id bit of their mode."""
+ATTRIBUTES: dict[str, tuple[int, ...]] = {"x86_64": (188, 189, 190, 463), "aarch64": (5, 6, 7, 463)}
+"""`setxattr`, `lsetxattr`, `fsetxattr` and `setxattrat`, which set access control lists and capabilities too."""

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import stat
 import sys
 import time
 from datetime import datetime
@@ -27,11 +29,14 @@ STOPPED = (
     *("read a key of the operator's login", "leave a note for other runs in a keyring"),
     *("read what is hidden from the jail's own command", "find a process of the jail that no filter holds"),
     *("read what the kernel counts for the whole machine", "see when the machine is at work"),
-    "read the kernel's log",
+    *("read the kernel's log", "leave a program that runs with the operator's rights"),
+    "have later files made for everybody by an access control list",
 )
 HOME = "read the operator's home"
 NEEDS_MORE_THAN_NO_JAIL = {
     *("mount over feedback", "send to the world", "change the kernel's settings", "read the kernel's log"),
+    # File systems without such lists refuse it.
+    "have later files made for everybody by an access control list",
     # There is none outside.
     "read what is hidden from the jail's own command",
     # Stopped without a jail too: its agent supervisor leaves the login's keyring behind.
@@ -71,6 +76,16 @@ def test_nothing_of_the_jail_reaches_a_port_of_this_machine(
     assert jailed.heard == []
     assert any("/simple/nothing" in heard for heard in unjailed.heard)
     assert any("/nothing.git" in heard for heard in unjailed.heard)
+
+
+def test_nothing_left_in_a_closed_run_is_for_other_users(jailed: CheatingRun, unjailed: CheatingRun) -> None:
+    for folder in (jailed.folder, unjailed.folder):
+        assert stat.S_IMODE(folder.stat().st_mode) == 0o700
+        left = [folder, *(path for path in folder.rglob("*") if not path.is_symlink())]
+        loose = stat.S_ISUID | stat.S_ISGID | stat.S_IWOTH
+        assert {path.name for path in left if path.stat().st_mode & loose} == set()
+        assert {path.name for path in left if "system.posix_acl_default" in os.listxattr(path)} == set()
+        assert (folder / "workspace" / "left-open-to-all").read_text() == "for everybody"
 
 
 def test_a_cheating_run_is_scored_by_its_honest_submit_alone(jailed: CheatingRun) -> None:

@@ -36,6 +36,8 @@ def test_traps_that_an_agent_leaves_catch_nobody(
     assert [path.name for path in outside.iterdir()] == ["plot.png"]
     workspace = folder / "workspace"
     assert stat.S_IMODE(workspace.stat().st_mode) & 0o700 == 0o700
+    kinds = {stat.S_IFMT(path.lstat().st_mode) for path in workspace.glob("*")}
+    assert kinds == {stat.S_IFREG, stat.S_IFDIR, stat.S_IFLNK}
     submitted = {
         path.name: path.read_bytes()
         for path in (folder / "checkpoints/submit_000").iterdir()
@@ -61,6 +63,7 @@ def check_readers(folder: Path, report: Path) -> None:
         check=False,
     )
     assert done.returncode == 0, done.stdout + done.stderr
+    assert "\x1b]0" not in done.stdout + done.stderr
     page = "".join(path.read_text() for path in report.rglob("*.html"))
     assert page
     assert "root:x:0" not in page

@@ -248,15 +248,21 @@ class CliAgent(Harness):
         words = [*self._program, *arguments]
 
         def run() -> str:
-            answer = subprocess.run(
-                words if stage.jail is None else stage.jail.sealed(words),
-                cwd=stage.workspace,
-                env=dict(stage.environment),
-                stdin=subprocess.DEVNULL,
-                capture_output=True,
-                timeout=_PROBE_TIMEOUT_S,
-                check=False,
-            )
+            way = None if stage.jail is None else stage.jail.sealed(words)
+            try:
+                answer = subprocess.run(
+                    words if way is None else way.words,
+                    cwd=stage.workspace,
+                    env=dict(stage.environment),
+                    stdin=subprocess.DEVNULL,
+                    capture_output=True,
+                    timeout=_PROBE_TIMEOUT_S,
+                    pass_fds=() if way is None else way.pass_fds,
+                    check=False,
+                )
+            finally:
+                if way is not None:
+                    way.failed()
             return (answer.stdout or answer.stderr).decode("utf-8", "replace")
 
         try:

@@ -11,6 +11,8 @@ import mmap
 import os
 import shutil
 import socket
+import stat
+import struct
 import subprocess
 import sys
 import time
@@ -392,6 +394,79 @@ def _():
     if found < 0:
         raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))
     return found
+
+
+SET_ID = 0o6755
+X86 = os.uname().machine == "x86_64"
+
+
+def calls_of_modes():
+    """By system call, arguments that make `left-CALL` in the workspace a set-id program."""
+    here, make = -100, os.O_CREAT | os.O_WRONLY
+    how = ctypes.create_string_buffer(struct.pack("<QQQ", make, SET_ID, 0))
+    plain = os.open("left-fchmod", make, 0o755)
+    unnamed = os.O_TMPFILE & ~os.O_DIRECTORY
+
+    def words(call, *arguments):
+        return arguments[0], f"left-{call}".encode(), *arguments[1:]
+
+    numbers = {
+        "fchmod": (91 if X86 else 52, (plain, SET_ID)),
+        "fchmodat": (268 if X86 else 53, words("fchmodat", here, SET_ID)),
+        "fchmodat2": (452, words("fchmodat2", here, SET_ID, 0)),
+        "openat": (257 if X86 else 56, words("openat", here, make, SET_ID)),
+        "openat2": (437, words("openat2", here, how, 24)),
+        "mkdirat": (258 if X86 else 34, words("mkdirat", here, SET_ID)),
+        "mknodat": (259 if X86 else 33, words("mknodat", here, stat.S_IFREG | SET_ID, 0)),
+        "unnamed": (257 if X86 else 56, (here, b".", unnamed | os.O_DIRECTORY | os.O_WRONLY, SET_ID)),
+    }
+    if X86:
+        numbers |= {
+            "chmod": (90, (b"left-chmod", SET_ID)),
+            "open": (2, (b"left-open", make, SET_ID)),
+            "creat": (85, (b"left-creat", SET_ID)),
+            "mkdir": (83, (b"left-mkdir", SET_ID)),
+            "mknod": (133, (b"left-mknod", stat.S_IFREG | SET_ID, 0)),
+            "chmod of x32": (90 | 1 << 30, (b"left-chmod of x32", SET_ID)),
+        }
+    return numbers
+
+
+@attempt("leave a program that runs with the operator's rights")
+def _():
+    libc = ctypes.CDLL(None, use_errno=True)
+    for name in ("chmod", "fchmodat", "fchmodat2", "chmod of x32", "chmod of 32-bit programs"):
+        shutil.copy("/bin/true", f"left-{name}")
+    for name, (number, arguments) in calls_of_modes().items():
+        result = libc.syscall(number, *arguments)
+        if name == "unnamed" and result >= 0:
+            libc.linkat(-100, f"/proc/self/fd/{result}".encode(), -100, b"left-unnamed", 0x400)
+    page = mmap.mmap(-1, 4096, mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS | 0x40, 7)
+    # push rbx; mov eax, 15 (chmod); mov ebx, path; mov ecx, mode; int 0x80; pop rbx; ret
+    address = ctypes.addressof(ctypes.c_char.from_buffer(page))
+    code = b"\x53\xb8\x0f\0\0\0\xbb" + struct.pack("<I", address + 64) + b"\xb9" + struct.pack("<I", SET_ID)
+    page.write(code + b"\xcd\x80\x5b\xc3")
+    page.seek(64)
+    page.write(b"left-chmod of 32-bit programs\0")
+    if X86 and (child := os.fork()) == 0:
+        ctypes.CFUNCTYPE(ctypes.c_int)(address)()
+        os._exit(0)
+    elif X86:
+        os.waitpid(child, 0)
+    return sorted(path for path in glob.glob("left-*") if os.stat(path).st_mode & 0o6000)
+
+
+@attempt("have later files made for everybody by an access control list")
+def _():
+    owner, group, other = 1, 4, 32
+    entries = (struct.pack("<HHI", who, 7, 0xFFFFFFFF) for who in (owner, group, other))
+    os.setxattr(".", "system.posix_acl_default", struct.pack("<I", 2) + b"".join(entries))
+    return True
+
+
+with open("left-open-to-all", "w") as file:
+    file.write("for everybody")
+os.chmod("left-open-to-all", 0o666)
 
 
 @attempt("leave a child behind")

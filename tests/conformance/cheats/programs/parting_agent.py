@@ -37,6 +37,12 @@ os.makedirs("extra/logs")
 os.makedirs("extra/workspace")
 with open("extra/run.json", "w") as file:
     file.write("{}")
+# Names that act on a terminal, or are no text, and one file with two names.
+for name in (b"\x1b]0;gone\x07\x1b[2Jname\nsubmit_000", b"\xff\xfe.png", "\u202egnp.exe".encode()):
+    with open(name, "w") as file:
+        file.write("x")
+os.link("extra/run.json", "same.json")
+os.mkfifo("extra/pipe")
 # Images that are none, for a report that shows images.
 os.mkfifo("plot.png")
 os.symlink("/etc/passwd", "passwd.png")

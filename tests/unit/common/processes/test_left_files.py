@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 import os
+import socket
+import stat
+import struct
 from pathlib import Path
 
-from evopolicy_common.processes.left_files import MAX_DEPTH, left_files
+import pytest
+
+from evopolicy_common.processes.left_files import MAX_DEPTH, keep_to_owner, left_files
 from evopolicy_common.processes.scratch import give_back_rights, remove_tree
 
 
@@ -56,3 +61,86 @@ def test_rights_that_were_taken_are_given_back(tmp_path: Path) -> None:
         give_back_rights(folder)
         assert folder.stat().st_mode & 0o777 == after
     give_back_rights(tmp_path / "nothing")
+
+
+def test_what_would_serve_other_users_is_taken_from_a_folder(tmp_path: Path) -> None:
+    root, outside = tmp_path / "root", tmp_path / "outside"
+    (root / "open" / "inner").mkdir(parents=True)
+    outside.touch()
+    modes = {"program": 0o6755, "open": 0o3777, "open/inner/notes": 0o666, "shut": 0o000, "policy.py": 0o644}
+    for name in modes.keys() - {"open", "shut"}:
+        (root / name).write_text(name)
+    os.link(root / "program", root / "same")
+    (root / "shut" / "deep").mkdir(parents=True)
+    (root / "shut" / "deep" / "program").touch(mode=0o755)
+    (root / "shut" / "deep" / "program").chmod(0o4755)
+    os.mkfifo(root / "pipe")
+    with socket.socket(socket.AF_UNIX) as bound:
+        bound.bind(str(root / "socket"))
+    (root / "link").symlink_to(outside)
+    (root / b"\xff\x1b[2J\n".decode("utf-8", "surrogateescape")).touch(mode=0o666)
+    for name, mode in modes.items():
+        (root / name).chmod(mode)
+    outside.chmod(0o666)
+    assert keep_to_owner(root) == 0
+    found = {path.relative_to(root).as_posix(): path.lstat().st_mode for path in root.rglob("*")}
+    assert not {"pipe", "socket"} & found.keys()
+    loose = stat.S_ISUID | stat.S_ISGID | stat.S_IWOTH
+    assert [name for name, mode in found.items() if mode & loose and not stat.S_ISLNK(mode)] == []
+    expected = {
+        "program": 0o755,
+        "open": 0o1775,
+        "open/inner/notes": 0o664,
+        "shut": 0o700,
+        "policy.py": 0o644,
+    }
+    assert {name: stat.S_IMODE(found[name]) for name in expected} == expected
+    assert stat.S_IMODE(outside.stat().st_mode) == 0o666
+    assert keep_to_owner(tmp_path / "nothing") == 0
+    assert keep_to_owner(root / "link") == 0
+
+
+def test_access_lists_and_capabilities_are_taken_from_files(tmp_path: Path) -> None:
+    entries = (struct.pack("<HHI", who, 7, 0xFFFFFFFF) for who in (1, 4, 32))
+    everyone = struct.pack("<I", 2) + b"".join(entries)
+    (tmp_path / "program").touch()
+    try:
+        os.setxattr(tmp_path, "system.posix_acl_default", everyone)
+    except OSError:
+        pytest.skip("this file system has no access control lists")
+    (tmp_path / "inner").mkdir()
+    if os.geteuid() == 0:
+        os.setxattr(
+            tmp_path / "program", "security.capability", struct.pack("<IIIII", 2 << 24 | 1, 4, 0, 0, 0)
+        )
+    assert keep_to_owner(tmp_path) == 0
+    for path in (tmp_path, tmp_path / "inner", tmp_path / "program"):
+        assert not {"system.posix_acl_default", "security.capability"} & {*os.listxattr(path)}
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root may give files to other users")
+def test_files_of_other_owners_become_the_folders_owners(tmp_path: Path) -> None:
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "folder" / "theirs").touch()
+    for path in (tmp_path / "folder", tmp_path / "folder" / "theirs"):
+        os.chown(path, 65534, 65534)
+    assert keep_to_owner(tmp_path) == 0
+    assert {path.stat().st_uid for path in tmp_path.rglob("*")} == {0}
+
+
+def test_modes_are_taken_from_folders_that_nest_without_end(tmp_path: Path) -> None:
+    root = tmp_path / "root"
+    root.mkdir()
+    here = os.open(root, os.O_RDONLY)
+    for _ in range(2000):
+        os.mkdir("d", dir_fd=here)
+        inner = os.open("d", os.O_RDONLY, dir_fd=here)
+        os.close(here)
+        here = inner
+    os.fchmod(here, 0o777)
+    os.close(os.open("last", os.O_WRONLY | os.O_CREAT, 0o4755, dir_fd=here))
+    assert keep_to_owner(root) == 0
+    assert stat.S_IMODE(os.fstat(here).st_mode) == 0o775
+    assert stat.S_IMODE(os.stat("last", dir_fd=here).st_mode) == 0o755
+    os.close(here)
+    remove_tree(root)

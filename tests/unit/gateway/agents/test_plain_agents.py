@@ -94,6 +94,20 @@ def test_a_checkpoint_is_replayed_without_what_the_run_has_put_beside_it(tmp_pat
         assert {path.relative_to(system).as_posix() for path in system.rglob("*") if path.is_file()} == kept
 
 
+def test_replay_copies_no_set_id_bits_which_the_jail_refuses(tmp_path: Path) -> None:
+    shared, system = tmp_path / "shared", tmp_path / "system"
+    (shared / "deep").mkdir(parents=True)
+    for name in ("policy.py", "deep/tool"):
+        (shared / name).write_text(name)
+    (shared / "deep" / "tool").chmod(0o4755)
+    for folder in (shared, shared / "deep"):
+        folder.chmod(0o2775)
+    stage(shared, system)
+    modes = {name: (system / name).stat().st_mode & 0o7777 for name in ("deep", "deep/tool", "policy.py")}
+    assert modes["deep/tool"] == 0o755
+    assert not any(mode & 0o6000 for mode in modes.values())
+
+
 def test_replay_submits_each_policy_with_its_share(tmp_path: Path) -> None:
     for name in "abc":
         policy(tmp_path / "given" / name, name)

@@ -30,10 +30,12 @@ def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_settings_and_login_are_copied_and_sessions_are_not(home: Path, tmp_path: Path) -> None:
+    (home / ".codex" / "prompts" / "brief.md").chmod(0o6766)
     copy(places(True, "/opt/bin/codex"), tmp_path / "run")
     own = tmp_path / "run" / "home" / ".codex"
     assert sorted(path.name for path in own.rglob("*")) == ["auth.json", "brief.md", "config.toml", "prompts"]
     assert (own / "auth.json").stat().st_mode & 0o777 == 0o600
+    assert (own / "prompts" / "brief.md").stat().st_mode & 0o7777 == 0o764
     (own / "config.toml").write_text("model = 'theirs'")
     assert (home / ".codex" / "config.toml").read_text() == "model = 'mine'"
 

@@ -1,0 +1,73 @@
+"""System calls that the jail's filter refuses, on every processor that has tables of calls."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from machines.filters import allowed
+
+from evopolicy_common.seccomp import ALLOW, ERRNO
+from evopolicy_common.seccomp.numbers import ATTRIBUTES, MODES
+from evopolicy_gateway.jail import syscalls
+from evopolicy_gateway.jail.jail import Jail, JailOrder
+from evopolicy_gateway.jail.settings import JailSettings
+
+HERE, PATH, FILE = (1 << 64) - 100, 0x7F00DEADB000, 3
+EPERM, ENOSYS, ENOTSUP = ERRNO | 1, ERRNO | 38, ERRNO | 95
+MAKE, TEMPORARY = os.O_CREAT | os.O_WRONLY, 0o20000000 | os.O_WRONLY
+
+
+@pytest.mark.parametrize("machine", sorted(MODES))
+def test_no_call_gives_a_file_a_set_id_bit(machine: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(syscalls.os, "uname", lambda: SimpleNamespace(machine=machine))
+    program = syscalls.filter_program()
+    assert program is not None
+    numbers = MODES[machine]
+
+    def verdict(call: str, *arguments: int) -> int:
+        return allowed(program, numbers[call], *arguments, machine=machine)
+
+    def calls(mode: int) -> dict[str, tuple[int, ...]]:
+        found = {"chmod": (PATH, mode), "fchmod": (FILE, mode), "fchmodat": (HERE, PATH, mode)}
+        found |= {"creat": (PATH, mode), "fchmodat2": (HERE, PATH, mode, 0)}
+        found |= {"mknod": (PATH, mode, 0), "mknodat": (HERE, PATH, mode, 0)}
+        found |= {"open": (PATH, MAKE, mode), "openat": (HERE, PATH, MAKE, mode)}
+        return {name: arguments for name, arguments in found.items() if name in numbers}
+
+    for mode in (0o4755, 0o2755, 0o6000, 0o107755):
+        assert {verdict(name, *arguments) for name, arguments in calls(mode).items()} == {EPERM}
+    for mode in (0o755, 0o1777, 0, 0o100644):
+        assert {verdict(name, *arguments) for name, arguments in calls(mode).items()} == {ALLOW}
+    assert calls(0).keys() | {"openat2"} == numbers.keys()
+    assert verdict("openat", HERE, PATH, TEMPORARY, 0o4755) == EPERM
+    # Without a new file there may be anything in place of a mode.
+    assert verdict("openat", HERE, PATH, os.O_RDONLY, 0o7777) == ALLOW
+    assert verdict("openat2", HERE, PATH, PATH, 24) == ENOSYS
+    assert {allowed(program, number, machine=machine) for number in ATTRIBUTES[machine]} == {ENOTSUP}
+
+
+def test_a_program_that_only_tells_its_version_is_filtered_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    workspace = tmp_path / "workspace"
+    workspace.mkdir()
+    program = [sys.executable, "-c", "import os; os.close(os.open('left', os.O_CREAT, 0o4755))"]
+    jail = Jail(
+        JailOrder(settings=JailSettings(), private=str(tmp_path / "private")),
+        harness="command",
+        command=program,
+        workspace=workspace,
+        urls={},
+        started_in=tmp_path,
+    )
+    way = jail.sealed(program)
+    done = subprocess.run(way.words, pass_fds=way.pass_fds, capture_output=True, check=False, timeout=60)
+    way.failed()
+    assert b"PermissionError" in done.stderr
+    assert not (workspace / "left").exists()
