@@ -31,6 +31,7 @@ _SYSTEM = (
     "integration/deploy/test_kubernetes.py",
     "integration/deploy/test_slurm.py",
     "integration/gateway/command_line/test_cancelled_run.py",
+    "integration/gateway/command_line/test_finished_runs.py",
     "integration/gateway/test_elastic_workers.py",
     "integration/gateway/agents/test_llm_agent_runs.py",
     "integration/gateway/test_hostile_home.py",

@@ -19,6 +19,7 @@ import sys
 import time
 import uuid
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -199,6 +200,9 @@ class RunLifecycle:
         self.run = run
         self._operations.watched_by(run, (self._folder.lock, self._folder.supervisor_lock))
         self._stopwatch = Stopwatch(self._folder.times)
+        if not agents_side:
+            self._closed.set()
+        finished: RunFinished | None = None
         try:
             if agents_side:
                 await self._agents_side()
@@ -206,17 +210,22 @@ class RunLifecycle:
                 await self._tell_gone(run)
             self._on_agent_gone()
             finished = await self._finish(run)
+            return await self._write(finished)
         except BaseException as error:
             if self._survivors:
                 self._tell_survivors()
                 how = f"when they are gone, go on with --resume, or say: evopolicy runs agent-gone {run}"
                 self._watch.note(self._name, how)
+            elif finished is not None or (self._closed.is_set() and isinstance(error, Exception)):
+                how = f"--resume --exp-id {self._plan.settings.exp_id}, or the suite's command again,"
+                self._watch.note(
+                    self._name, f"its agent has ended: {how} completes the run without starting it"
+                )
             elif self._stays_open and isinstance(error, asyncio.CancelledError):
                 await self._tell_gone(run)
             else:
                 await self._give_up(run, str(error) if isinstance(error, EvopolicyError) else None)
             raise
-        return await self._write(finished)
 
     async def _write(self, finished: RunFinished, why: str | None = None) -> RunRecord:
         refused = await asyncio.to_thread(keep_to_owner, self._folder.root)
@@ -224,8 +233,8 @@ class RunLifecycle:
             how = f"as root: chown -R {os.getuid()} {self._folder.root}; chmod -R a-s,o-w {self._folder.root}"
             text = f"{refused} files and folders that the agent left belong to other users and keep their modes; {how}"
             self._watch.note(self._name, text)
-        times = self._stopwatch.times
-        return await record.write(self._folder, self._plan, finished, self._operations, times, why)
+        times, note = self._stopwatch.times, partial(self._watch.note, self._name)
+        return await record.write(self._folder, self._plan, finished, self._operations, times, note, why)
 
     async def _agents_side(self) -> None:
         """Runs gateway and agent until the run is closed."""

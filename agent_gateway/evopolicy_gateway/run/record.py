@@ -2,13 +2,18 @@
 
 These are `checkpoints/`, `replays/`, `logs/env.log`, the selected policy in `workspace/system/`, and `run.json` last.
 They hold hidden scores, so `write` is called only when the agent and all its children are gone.
+
+The run's result is fixed by then, and no file costs it: one that a bug keeps from being written is left out, with a note.
+A full disk, a lost connection, or a folder of another user ends `write`; `--resume` then writes all files without the agent.
 """
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import os
-from collections.abc import Mapping, Sequence
+import traceback
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, cast, get_args
@@ -16,10 +21,11 @@ from typing import Any, cast, get_args
 import msgspec
 
 from evopolicy_common import catalogue
-from evopolicy_common.errors import ConfigError, StorageError
+from evopolicy_common.errors import ConfigError, StorageError, TransportError
 from evopolicy_common.messages.environment import Split
 from evopolicy_common.messages.gateway import CANCELLED
 from evopolicy_common.messages.operator import RunFinished, SubmitRecord
+from evopolicy_common.processes.preflight import foreseen
 from evopolicy_common.processes.scratch import remove_tree
 from evopolicy_common.records.aggregates import mean, std
 from evopolicy_common.records.blobs import BlobStore, write_atomically
@@ -53,6 +59,39 @@ from evopolicy_gateway.run.transitions import Transitions, count_transitions
 from evopolicy_gateway.submits.journal import Accepted, AnyEntry, Journal, Rejected, Requested
 from evopolicy_gateway.submits.names import submit_id
 
+_RESUMABLE = (OSError, StorageError, TransportError, ConfigError)
+"""Errors with a remedy, after which `--resume` writes everything."""
+
+
+class _Parts:
+    """The parts of a run's directory that were left out."""
+
+    def __init__(self, log: Path) -> None:
+        self._log = log
+        self.left_out: list[str] = []
+
+    @contextlib.contextmanager
+    def part(self, name: str) -> Iterator[None]:
+        """Notes that `name` is left out when a bug ends the `with`."""
+        try:
+            yield
+        except _RESUMABLE:
+            raise
+        except Exception as error:
+            self.left_out.append(f"{name} is left out: {why_failed(error, self._log)}")
+
+
+def why_failed(error: Exception, log: Path) -> str:
+    """Why a run or a part of it failed, in one line; writes a bug's traceback to the run's log."""
+    why = foreseen(error)
+    if why is None:
+        why = f"{type(error).__name__}: {error}; the traceback is in {log}"
+        with contextlib.suppress(OSError):
+            log.parent.mkdir(parents=True, exist_ok=True)
+            with log.open("a", errors="backslashreplace") as file:
+                traceback.print_exception(error, file=file)
+    return why
+
 
 async def write(
     folder: RunFolder,
@@ -60,35 +99,49 @@ async def write(
     finished: RunFinished,
     operations: Operations,
     times: Times,
+    note: Callable[[str], None],
     error: str | None = None,
 ) -> RunRecord:
     """Writes all files and removes the gateway's folder. Raises StorageError when the disk refuses.
 
-    `error`: why this command gave the run up, unless the operator cancelled it.
+    `note` receives each part that was left out. `error`: why this command gave the run up, unless the operator cancelled it.
     """
+    parts = _Parts(folder.harness_log)
     selected: Bundle | None = None
-    code: dict[int, CodeMetrics] = {}
+    code: dict[int, CodeMetrics | None] = {}
     folder.checkpoints.mkdir(exist_ok=True)
-    entries = await asyncio.to_thread(_journal, folder)
-    kept = _kept(entries)
+    entries: list[AnyEntry] = []
+    with parts.part("the gateway's journal"):
+        entries = await asyncio.to_thread(_journal, folder)
     for submit in finished.submits:
-        bundle: Bundle | None
-        if submit.bundle is not None:
-            bundle = await _bundle(folder, submit.bundle, operations)
-        else:
-            bundle = await asyncio.to_thread(_own_bundle, folder, kept.get(submit.submit_index))
-        code[submit.submit_index] = await asyncio.to_thread(
-            _write_checkpoint, folder, finished, submit, bundle
-        )
-        if submit.submit_index == finished.best_submit_index:
-            selected = bundle
+        code[submit.submit_index] = None
+        with parts.part(f"checkpoint {submit_id(submit.submit_index, finished.episode_budget)}"):
+            bundle: Bundle | None
+            if submit.bundle is not None:
+                bundle = await _bundle(folder, submit.bundle, operations)
+            else:
+                bundle = await asyncio.to_thread(_own_bundle, folder, _kept(entries).get(submit.submit_index))
+            if submit.submit_index == finished.best_submit_index:
+                selected = bundle
+            code[submit.submit_index] = await asyncio.to_thread(
+                _write_checkpoint, folder, finished, submit, bundle, parts
+            )
     if selected is not None:
-        await asyncio.to_thread(_put_in_place, folder.system, checkpoints.without_metadata(selected.files))
+        files = checkpoints.without_metadata(selected.files)
+        with parts.part("the selected policy in workspace/system"):
+            await asyncio.to_thread(_put_in_place, folder.system, files)
     if error is not None and finished.status == "cancelled":
         finished = msgspec.structs.replace(finished, status="error", error=error)
-    recorded = await replays.fetch(folder.root, finished, operations)
+    recorded: tuple[Replay, ...] = ()
+    with parts.part("the recordings of held-out episodes"):
+        recorded = await replays.fetch(folder.root, finished, operations)
     rejected = [entry for entry in entries if isinstance(entry, Rejected)]
-    return await asyncio.to_thread(_write_record, folder, plan, finished, times, recorded, code, rejected)
+    done = await asyncio.to_thread(
+        _write_record, folder, plan, finished, times, recorded, code, rejected, parts
+    )
+    for text in parts.left_out:
+        note(text)
+    return done
 
 
 def run_record(
@@ -98,7 +151,7 @@ def run_record(
     rejected: Sequence[Rejected],
     times: Times,
     recorded: tuple[Replay, ...] = (),
-    code: Mapping[int, CodeMetrics] | None = None,
+    code: Mapping[int, CodeMetrics | None] | None = None,
     artifacts: Artifacts | None = None,
     transitions: Transitions | None = None,
 ) -> RunRecord:
@@ -194,7 +247,7 @@ def _agent(plan: Plan, facts: dict[str, Any]) -> Agent:
 
 
 def _outcome(
-    finished: RunFinished, code: Mapping[int, CodeMetrics], transitions: Transitions | None
+    finished: RunFinished, code: Mapping[int, CodeMetrics | None], transitions: Transitions | None
 ) -> Outcome:
     heldout, reference = finished.heldout_returns, finished.random_heldout_returns
     completed = finished.status == "completed"
@@ -207,7 +260,7 @@ def _outcome(
         "code_metrics_by_submit": {str(index): metrics for index, metrics in code.items()},
         "code_metrics_trend": {
             "submits": list(code),
-            **{name: [getattr(metrics, name) for metrics in code.values()] for name in TREND},
+            **{name: [getattr(metrics, name, None) for metrics in code.values()] for name in TREND},
         },
         "policy_failures": dict(finished.policy_failures),
         "infrastructure_retries": finished.infrastructure_retries,
@@ -296,9 +349,13 @@ def _kept(entries: Sequence[AnyEntry]) -> dict[int, str]:
 
 
 def _write_checkpoint(
-    folder: RunFolder, finished: RunFinished, submit: SubmitRecord, bundle: Bundle | None
-) -> CodeMetrics:
+    folder: RunFolder, finished: RunFinished, submit: SubmitRecord, bundle: Bundle | None, parts: _Parts
+) -> CodeMetrics | None:
     """Writes `checkpoints/submit_NNN/`: the submitted policy, read-only, and its numbers."""
+    name = submit_id(submit.submit_index, finished.episode_budget)
+    metrics = None
+    with parts.part(f"metrics.json of {name}"):
+        metrics = checkpoints.measured(bundle)
     requested = len(submit.env_instances)
     charged = 0 if submit.status == CANCELLED else requested
     meta = CheckpointMeta(
@@ -311,9 +368,8 @@ def _write_checkpoint(
         mean_return=submit.mean_return,
         val_mean=submit.val_mean,
     )
-    return checkpoints.write(
-        folder.checkpoints / submit_id(submit.submit_index, finished.episode_budget), meta, bundle
-    )
+    checkpoints.write(folder.checkpoints / name, meta, bundle, metrics)
+    return metrics
 
 
 def _env_log(finished: RunFinished) -> bytes:
@@ -372,20 +428,27 @@ def _write_record(
     finished: RunFinished,
     times: Times,
     recorded: tuple[Replay, ...],
-    code: Mapping[int, CodeMetrics],
+    code: Mapping[int, CodeMetrics | None],
     rejected: Sequence[Rejected],
+    parts: _Parts,
 ) -> RunRecord:
     staged = None
     if folder.staged.exists():
         staged = saved(folder.staged, Staged)
         # The agent's log exists even when the agent printed nothing.
         folder.agent_log.touch()
-    write_atomically(folder.env_log, _env_log(finished))
+    with parts.part("logs/env.log"):
+        write_atomically(folder.env_log, _env_log(finished))
+    transitions = None
     # At the level `scores` the feedback has no rows to count.
-    transitions = None if plan.settings.feedback == "scores" else count_transitions(folder.feedback)
+    if plan.settings.feedback != "scores":
+        with parts.part("the number of steps"):
+            transitions = count_transitions(folder.feedback)
     done = run_record(
         plan, finished, staged, rejected, times, recorded, code, folder.artifacts(), transitions
     )
     write_atomically(folder.run_json, encode_run_record(done))
-    remove_tree(folder.state)
+    # A next command removes what is left.
+    with contextlib.suppress(OSError):
+        remove_tree(folder.state)
     return done

@@ -23,12 +23,12 @@ from typing import Any
 
 import msgspec
 
-from evopolicy_common.errors import EvopolicyError
+from evopolicy_common.errors import EvopolicyError, StorageError
 from evopolicy_common.messages.operator import ClaimState
 from evopolicy_common.processes.local_cluster import unless_failed
 from evopolicy_common.processes.scratch import remove_tree
 from evopolicy_common.records.run_files import read_record
-from evopolicy_common.records.suite_folder import FINISHED, PAUSED, Entry, Index
+from evopolicy_common.records.suite_folder import FINISHED, INDEX, PAUSED, Entry, Index
 from evopolicy_common.wire.credentials import Credentials
 from evopolicy_gateway import harnesses
 from evopolicy_gateway.harnesses.coding_agents import session
@@ -73,6 +73,8 @@ class ClaimedSweep(Sweep):
         self._ending: set[str] = set()
         """Cancelled runs that have not ended yet."""
         self._unsaved = False
+        self._unwritable = ""
+        """Why the disk refused the index the last time."""
         self._paused = False
         view.on_doing = self._on_doing
 
@@ -84,8 +86,7 @@ class ClaimedSweep(Sweep):
         finally:
             renewing.cancel()
             await asyncio.gather(renewing, return_exceptions=True)
-            with contextlib.suppress(EvopolicyError):
-                self._save()
+            self._save()
 
     def _startable(self) -> list[Decision]:
         """As in `Sweep`; empty while the sweep is paused."""
@@ -193,9 +194,7 @@ class ClaimedSweep(Sweep):
         while True:
             await asyncio.sleep(min(sweep.LOOK_S, every_s))
             if self._unsaved:
-                # Claims are renewed even when the disk refuses.
-                with contextlib.suppress(EvopolicyError):
-                    self._save()
+                self._save()
             for name, task in list(self._active.items()):
                 run = self._decided[name].run
                 known, at = renewed.get(name, ("", 0.0))
@@ -283,8 +282,15 @@ class ClaimedSweep(Sweep):
         self._save()
 
     def _save(self) -> None:
-        suite_index.save(self._root, self._index)
-        self._unsaved = False
+        """Runs and claims go on when the disk refuses: the next start reads the index anew from each `run.json`."""
+        try:
+            suite_index.save(self._root, self._index)
+        except (StorageError, OSError) as error:
+            if self._unwritable != str(error):
+                self._view.say(f"{INDEX} is not up to date, and is written again later: {error}")
+            self._unsaved, self._unwritable = True, str(error)
+        else:
+            self._unsaved, self._unwritable = False, ""
 
 
 async def look(run: Plan, index: Index, operations: Operations) -> Found:

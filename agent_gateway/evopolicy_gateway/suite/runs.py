@@ -57,7 +57,7 @@ class _Runs(Sweep):
         )
 
     def _why(self, run: Plan, error: Exception) -> str:
-        if isinstance(error, ConfigError):
+        if isinstance(error, ConfigError) and run.name not in self._scored:
             self._results.wrong.add(run.name)
             return str(error)
         why = super()._why(run, error)

@@ -8,16 +8,12 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
-import traceback
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from functools import partial
-from pathlib import Path
 
 import msgspec
 
-from evopolicy_common.processes.preflight import foreseen
 from evopolicy_common.records.run_record import RunRecord
 from evopolicy_common.records.suite_folder import Entry, Index
 from evopolicy_common.wire.credentials import Credentials
@@ -25,6 +21,7 @@ from evopolicy_gateway.operator.operations import Operations
 from evopolicy_gateway.operator.watch import Watch
 from evopolicy_gateway.run.lifecycle import RunLifecycle
 from evopolicy_gateway.run.plan import Plan
+from evopolicy_gateway.run.record import why_failed
 from evopolicy_gateway.suite.decisions import Decision, side_by_side
 from evopolicy_gateway.suite.suite_file import Parallel
 from evopolicy_gateway.suite.suite_index import directory_of
@@ -32,6 +29,10 @@ from evopolicy_gateway.suite.suite_index import directory_of
 LOOK_S = 1.0
 MAX_SCORED = 256
 """Limit of agent-less runs followed at once, in addition to those with a place: each polls the coordinator."""
+
+
+FINISH_AGAIN_S = (1.0, 5.0, 30.0)
+"""Pauses before a run whose agent is gone is finished again after an error: on the last one, it is left to `--resume`."""
 
 
 class Sweep(ABC):
@@ -175,13 +176,20 @@ class Sweep(ABC):
     async def _play(self, decision: Decision) -> None:
         begun = self._begun(decision)
         self._put(begun)
-        try:
-            done = await self._record(decision, begun)
-        except Exception as error:
-            tokens, why = self._index.runs[begun.name].tokens, self._why(decision.run, error)
-            done = msgspec.structs.replace(begun, state="error", error=why, tokens=tokens)
-        finally:
-            self._plays.pop(begun.name, None)
+        pauses = list(FINISH_AGAIN_S)
+        done: Entry | None = None
+        while done is None:
+            try:
+                done = await self._record(decision, begun)
+            except Exception as error:
+                tokens, why = self._index.runs[begun.name].tokens, self._why(decision.run, error)
+                if begun.name in self._scored and pauses:
+                    decision = msgspec.structs.replace(decision, kind="finish")
+                    await asyncio.sleep(pauses.pop(0))
+                else:
+                    done = msgspec.structs.replace(begun, state="error", error=why, tokens=tokens)
+            finally:
+                self._plays.pop(begun.name, None)
         self._put(done)
 
     async def _played(self, decision: Decision, plan: Plan) -> RunRecord:
@@ -195,15 +203,3 @@ class Sweep(ABC):
         )
         self._plays[plan.name] = play
         return await (play.go_on() if decision.kind in ("resume", "finish") else play.play())
-
-
-def why_failed(error: Exception, log: Path) -> str:
-    """Why a run failed, in one line; writes a bug's traceback to the run's log. The command's other runs continue."""
-    why = foreseen(error)
-    if why is None:
-        why = f"{type(error).__name__}: {error}; the traceback is in {log}"
-        with contextlib.suppress(OSError):
-            log.parent.mkdir(parents=True, exist_ok=True)
-            with log.open("a") as file:
-                traceback.print_exception(error, file=file)
-    return why

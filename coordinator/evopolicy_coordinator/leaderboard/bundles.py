@@ -200,7 +200,8 @@ def _unpack(archive: Archive, run: PublishedRun, place: Path) -> None:
             mean_return=submit.mean_return,
             val_mean=submit.val_mean,
         )
-        checkpoints.write(place / "checkpoints" / f"submit_{submit.submit_index:03d}", meta, bundle)
+        folder = place / "checkpoints" / f"submit_{submit.submit_index:03d}"
+        checkpoints.write(folder, meta, bundle, checkpoints.measured(bundle))
 
 
 def _curves(archive: Archive, run: PublishedRun) -> tuple[Curve, ...]:

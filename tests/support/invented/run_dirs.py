@@ -213,7 +213,8 @@ def _write_submit(
         mean_return=summary.mean_return,
         val_mean=version.val,
     )
-    checkpoints.write(checkpoint, meta, pack([BundleFile(name, False, data) for name, data in files.items()]))
+    bundle = pack([BundleFile(name, False, data) for name, data in files.items()])
+    checkpoints.write(checkpoint, meta, bundle, checkpoints.measured(bundle))
 
 
 def _write_replays(folder: Path, replays: Mapping[str, bytes], best: int) -> tuple[Replay, ...]:

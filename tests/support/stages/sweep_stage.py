@@ -148,7 +148,11 @@ class Stage:
                 await stage.score(self.name)
                 return run_record(self.plan, finished(self.plan), None, [], Times())
 
-            go_on = play
+            async def go_on(self) -> RunRecord:
+                if self.name not in stage.attempts:
+                    return await self.play()
+                await stage.score(self.name)
+                return run_record(self.plan, finished(self.plan), None, [], Times())
 
         monkeypatch.setattr(sweep, "RunLifecycle", Play)
 

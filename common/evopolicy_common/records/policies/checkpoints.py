@@ -90,8 +90,16 @@ _meta = msgspec.json.Decoder(CheckpointMeta)
 _old_metrics = msgspec.json.Decoder(_OldMetrics)
 
 
-def write(folder: Path, meta: CheckpointMeta, bundle: Bundle | None) -> CodeMetrics:
-    """Creates `folder` anew and returns its metrics. `meta` describes the submit; its fields on files are set here."""
+def measured(bundle: Bundle | None) -> CodeMetrics:
+    """The metrics of a submitted policy; None: `system/` could not be bundled."""
+    return code_metrics({} if bundle is None else {file.path: file.data for file in bundle.files})
+
+
+def write(folder: Path, meta: CheckpointMeta, bundle: Bundle | None, metrics: CodeMetrics | None) -> None:
+    """Creates `folder` anew. `meta` describes the submit; its fields on files are set here.
+
+    `metrics`: of the bundle; None leaves out `metrics.json` and `import_scan`.
+    """
     if folder.exists():
         shutil.rmtree(folder)
     files = () if bundle is None else bundle.files
@@ -99,20 +107,21 @@ def write(folder: Path, meta: CheckpointMeta, bundle: Bundle | None) -> CodeMetr
     for path in folder.rglob("*"):
         if path.is_file():
             path.chmod(path.stat().st_mode & 0o555)
-    metrics = code_metrics({file.path: file.data for file in files})
     meta = msgspec.structs.replace(
         meta,
         snapshot_size_bytes=sum(len(file.data) for file in files),
         snapshot_files=tuple(file.path for file in files),
-        import_scan=ImportScan(
+        import_scan=None
+        if metrics is None
+        else ImportScan(
             imports=metrics.imports, denied=tuple(name for name in metrics.imports if name in SIMULATORS)
         ),
         bundle="" if bundle is None else bundle.digest,
         shadowed_files=tuple(file for file in files if file.path in METADATA),
     )
     for name, value in ((META, meta), (METRICS, metrics)):
-        write_atomically(folder / name, msgspec.json.format(msgspec.json.encode(value), indent=2) + b"\n")
-    return metrics
+        if value is not None:
+            write_atomically(folder / name, msgspec.json.format(msgspec.json.encode(value), indent=2) + b"\n")
 
 
 def without_metadata(files: tuple[BundleFile, ...]) -> Bundle:

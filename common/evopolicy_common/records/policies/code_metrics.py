@@ -7,8 +7,10 @@ source in one policy, and where the parser's memory would grow with the square o
 from __future__ import annotations
 
 import ast
+import gc
 import hashlib
 import re
+import threading
 import warnings
 from collections.abc import Mapping
 from pathlib import PurePosixPath
@@ -23,6 +25,10 @@ _UNCOUNTED_FOLDERS = frozenset({"__pycache__", ".pytest_cache", ".mypy_cache", "
 
 # CPython's parser copies every prefix of `a.a.a…`: gigabytes for an import of fifty thousand parts.
 _ENDLESS_NAME = re.compile(rb"\b(?:\w++[ \t\f\r\n\\]*+\.[ \t\f\r\n\\]*+){100}")
+
+_PARSING = threading.Lock()
+"""Python 3.11 counts the depth of the tree that it builds once for all threads. A collection of garbage may let another
+thread run and parse in between, and both fail with SystemError: no parse is interrupted by a collection."""
 
 
 class CodeMetrics(msgspec.Struct, frozen=True, kw_only=True):
@@ -113,12 +119,17 @@ def parse(source: bytes | str) -> ast.Module | None:
     data = source if isinstance(source, bytes) else source.encode()
     if _ENDLESS_NAME.search(data) is not None:
         return None
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+    with _PARSING, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        collects = gc.isenabled()
+        gc.disable()
+        try:
             return ast.parse(source)
-    except (SyntaxError, ValueError, RecursionError, MemoryError):
-        return None
+        except (SyntaxError, ValueError, RecursionError, MemoryError):
+            return None
+        finally:
+            if collects:
+                gc.enable()
 
 
 def _counts(path: PurePosixPath) -> bool:

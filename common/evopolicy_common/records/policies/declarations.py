@@ -5,6 +5,8 @@ from __future__ import annotations
 import ast
 from collections.abc import Mapping
 
+from evopolicy_common.records.policies.code_metrics import parse
+
 _MAX_BYTES = 1 << 20
 
 
@@ -16,12 +18,9 @@ def declares_deterministic(files: Mapping[str, bytes]) -> bool:
     source = files.get("policy.py", b"")
     if len(source) > _MAX_BYTES:
         return False
-    try:
-        module = ast.parse(source)
-    except (SyntaxError, ValueError, RecursionError, MemoryError):
-        return False
+    module = parse(source)
     found = False
-    for node in module.body:
+    for node in () if module is None else module.body:
         if isinstance(node, ast.ClassDef) and node.name == "Policy":
             found = any(_declares(inner) for inner in node.body)
     return found

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import ast
+import gc
 import json
+import sys
+import threading
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -11,8 +16,9 @@ import pytest
 from evopolicy_common.errors import BundleError, ProtocolError
 from evopolicy_common.records.policies import bundles, checkpoints
 from evopolicy_common.records.policies.bundles import MAX_FILES, BundleFile, pack
-from evopolicy_common.records.policies.checkpoints import CheckpointMeta
-from evopolicy_common.records.policies.code_metrics import MAX_PARSED_BYTES, code_metrics
+from evopolicy_common.records.policies.checkpoints import CheckpointMeta, measured
+from evopolicy_common.records.policies.code_metrics import MAX_PARSED_BYTES, code_metrics, parse
+from evopolicy_common.records.policies.declarations import declares_deterministic
 
 META = CheckpointMeta(
     submit_index=2,
@@ -38,7 +44,7 @@ def test_a_bundle_comes_back_from_its_checkpoint_with_names_that_metadata_have_t
         ]
     )
     folder = tmp_path / "submit_002"
-    checkpoints.write(folder, META, bundle)
+    checkpoints.write(folder, META, bundle, measured(bundle))
     assert checkpoints.bundle_of(folder) == bundle
     assert checkpoints.policy_folder(folder) == folder
     meta = checkpoints.read_meta(folder, 8)
@@ -59,12 +65,13 @@ def test_a_bundle_comes_back_from_its_checkpoint_with_names_that_metadata_have_t
 
 def test_a_bundle_of_as_many_files_as_there_may_be_comes_back(tmp_path: Path) -> None:
     bundle = pack([BundleFile(f"f{number}", False, b"") for number in range(MAX_FILES)])
-    checkpoints.write(tmp_path / "c", META, bundle)
+    checkpoints.write(tmp_path / "c", META, bundle, measured(bundle))
     assert checkpoints.bundle_of(tmp_path / "c").digest == bundle.digest
 
 
 def test_a_submit_without_a_bundle_has_a_checkpoint_of_metadata_alone(tmp_path: Path) -> None:
-    metrics = checkpoints.write(tmp_path / "c", META, None)
+    metrics = measured(None)
+    checkpoints.write(tmp_path / "c", META, None, metrics)
     assert {path.name for path in (tmp_path / "c").iterdir()} == checkpoints.METADATA
     assert (metrics.files, metrics.cyclomatic_max) == (0, 0)
 
@@ -83,7 +90,7 @@ def test_a_checkpoint_of_an_earlier_version_is_read(tmp_path: Path) -> None:
 
 def test_damaged_metadata_are_reported(tmp_path: Path) -> None:
     assert checkpoints.read_meta(tmp_path, 8) is None
-    checkpoints.write(tmp_path / "c", META, None)
+    checkpoints.write(tmp_path / "c", META, None, measured(None))
     (tmp_path / "c" / "_meta.json").write_text("{}")
     with pytest.raises(ProtocolError, match=r"_meta\.json is not a checkpoint's"):
         checkpoints.read_meta(tmp_path / "c", 8)
@@ -152,3 +159,55 @@ def test_hostile_sources_are_measured_in_bounded_time() -> None:
     assert time.process_time() - started < 60.0
     assert set(found.parse_errors) >= {"dots.py", "nested.py", "null.py", "large.py"}
     assert found.functions == 99
+
+
+@pytest.fixture
+def restless() -> Iterator[None]:
+    """Garbage is collected all the time, each collection runs Python code, and threads take turns at every chance."""
+    threshold, interval = gc.get_threshold(), sys.getswitchinterval()
+
+    def collected(*_: object) -> None:
+        sum(range(20))
+
+    gc.callbacks.append(collected)
+    gc.set_threshold(50)
+    sys.setswitchinterval(1e-6)
+    yield
+    sys.setswitchinterval(interval)
+    gc.set_threshold(*threshold)
+    gc.callbacks.remove(collected)
+
+
+@pytest.mark.usefixtures("restless")
+def test_code_is_parsed_beside_other_threads_that_parse() -> None:
+    """Python 3.11 ends `ast.parse` with SystemError when another thread parses meanwhile; tracebacks parse too."""
+    source = b"\n".join(b"def f%d(a, b): return [x * (a + 1) for x in b if x > a]" % n for n in range(60))
+    source += b"\nclass Policy:\n    deterministic = True\n"
+    done = threading.Event()
+    failed: list[BaseException] = []
+
+    def others() -> None:
+        while not done.is_set():
+            try:
+                ast.parse(source)
+            except SystemError:
+                pass
+
+    def ours() -> None:
+        try:
+            for _ in range(100):
+                assert parse(source) is not None
+                assert declares_deterministic({"policy.py": source})
+        except BaseException as error:
+            failed.append(error)
+
+    beside = threading.Thread(target=others)
+    threads = [threading.Thread(target=ours) for _ in range(2)]
+    for thread in (beside, *threads):
+        thread.start()
+    for thread in threads:
+        thread.join()
+    done.set()
+    beside.join()
+    assert failed == []
+    assert gc.isenabled()

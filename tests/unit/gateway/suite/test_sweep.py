@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 from stages.sweep_stage import CODEX, EVOLVE, HEAD, TIMEOUT_S, TOKENS, Stage, until
 
-from evopolicy_common.records.suite_folder import PAUSED, Entry
+from evopolicy_common.errors import StorageError
+from evopolicy_common.records.suite_folder import PAUSED, Entry, Index
 from evopolicy_gateway.suite import suite_index, sweep
 
 
@@ -221,3 +222,43 @@ def test_a_paused_sweep_begins_nothing_and_goes_on_later(
     assert sorted(stage.begun) == sorted(index.runs)
     assert len(index.runs) == 2
     assert sum("paused" in line for line in stage.events) == 1
+
+
+def test_a_run_whose_agent_is_gone_is_finished_again_after_an_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stage = Stage(tmp_path, HEAD + CODEX.format("a") + CODEX.format("b"), monkeypatch)
+    monkeypatch.setattr(sweep, "FINISH_AGAIN_S", (0.0, 0.0))
+    failures = {"a/toy/line/0": 2, "b/toy/line/0": 3}
+    agents: list[str] = []
+
+    async def act(name: str) -> None:
+        agents.append(name)
+
+    async def score(name: str) -> None:
+        if failures[name]:
+            failures[name] -= 1
+            raise SystemError("AST constructor recursion depth mismatch")
+
+    stage.act, stage.score = act, score
+    index = stage.play()
+    assert (index.runs["a/toy/line/0"].state, index.runs["b/toy/line/0"].state) == ("completed", "error")
+    assert sorted(agents) == ["a/toy/line/0", "b/toy/line/0"]
+
+
+def test_runs_go_on_while_the_disk_refuses_the_index(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    stage = Stage(tmp_path, HEAD + EVOLVE.format("a") + EVOLVE.format("b"), monkeypatch)
+    save = suite_index.save
+    refused: list[None] = []
+
+    def full(root: Path, index: Index) -> None:
+        if len(refused) < 3:
+            refused.append(None)
+            raise StorageError("No space left on device")
+        save(root, index)
+
+    monkeypatch.setattr(suite_index, "save", full)
+    index = stage.play()
+    assert len(refused) == 3
+    assert {entry.state for entry in index.runs.values()} == {"completed"}
+    assert len([line for line in stage.events if "suite.json is not up to date" in line]) == 1
