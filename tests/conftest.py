@@ -24,6 +24,7 @@ _SYSTEM = (
     "conformance/protocol/test_run_artifacts.py",
     "faults",
     "integration/coordinator/test_foreign_environments_on_a_cluster.py",
+    "integration/coordinator/test_published_fields.py",
     "integration/coordinator/test_published_policies.py",
     "integration/coordinator/test_published_results.py",
     "integration/coordinator/test_rescore_command.py",

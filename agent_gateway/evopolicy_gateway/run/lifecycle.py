@@ -287,6 +287,7 @@ class RunLifecycle:
                 self._watch.note(self._name, f"stderr: {line}")
             self._watch.note(self._name, f"full log: {self._folder.agent_log}")
         about = {"turns": ended.turns, "retries": ended.retries, "detail": ended.detail, **ended.facts}
+        about["record"] = record.told_at_close(self._folder, self._plan, about)
         self._order = CloseRun(reason=reason, agent=about)
         if self._gateway is not None:
             await self._gateway.tell(self._order)

@@ -29,11 +29,13 @@ from evopolicy_common.processes.preflight import foreseen
 from evopolicy_common.processes.scratch import remove_tree
 from evopolicy_common.records.aggregates import mean, std
 from evopolicy_common.records.blobs import BlobStore, write_atomically
+from evopolicy_common.records.journal import GATEWAY_SIDE
 from evopolicy_common.records.policies import bundles, checkpoints
 from evopolicy_common.records.policies.bundles import Bundle
 from evopolicy_common.records.policies.checkpoints import CheckpointMeta
 from evopolicy_common.records.policies.code_metrics import TREND, CodeMetrics
 from evopolicy_common.records.run_record import (
+    PUBLISHED_SETTINGS,
     Agent,
     Artifacts,
     ExperimentDimensions,
@@ -222,6 +224,20 @@ def run_record(
         audit=finished.audit,
         committed=finished.committed,
     )
+
+
+def told_at_close(folder: RunFolder, plan: Plan, facts: dict[str, Any]) -> dict[str, Any]:
+    """The `GATEWAY_SIDE` of `run.json`, which the coordinator commits to when the run ends."""
+    agent = msgspec.to_builtins(_agent(plan, facts))
+    settings = {name: value for name, value in agent["settings"].items() if name in PUBLISHED_SETTINGS}
+    told = {f"agent.{name}": value for name, value in agent.items()}
+    told |= {"jail": plan.jail.recorded, "agent.settings": settings}
+    if folder.staged.exists():
+        staged = saved(folder.staged, Staged)
+        told["versions.agents_md_hash"] = sha256_text(staged.agents_md_file_hash)
+        told["versions.rules_hash"] = sha256_text(staged.agents_md_hash)
+        told["versions.initial_policy_hash"] = sha256_text(staged.initial_policy_hash)
+    return {name: told[name] for name in GATEWAY_SIDE if name in told}
 
 
 def _agent(plan: Plan, facts: dict[str, Any]) -> Agent:

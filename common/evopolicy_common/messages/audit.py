@@ -50,6 +50,16 @@ class AuditRecord(msgspec.Struct, frozen=True, kw_only=True):
     findings: Many[AuditFinding] = ()
     """The first disagreements."""
 
+    def counts(self) -> AuditRecord:
+        """The part that is published: no names of workers."""
+        return AuditRecord(
+            share=self.share,
+            sampled=self.sampled,
+            audited=self.audited,
+            agreed=self.agreed,
+            disputed=self.disputed,
+        )
+
     @property
     def in_question(self) -> bool:
         """Whether the run's numbers may be forged: a result is disputed, or a forger played some of its episodes."""

@@ -16,11 +16,12 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable
+from typing import Any
 
 import msgspec
 
 from evopolicy_common.errors import DECODE_ERRORS, ProtocolError
-from evopolicy_common.messages.bounds import Int, Many, Named, Number, Word
+from evopolicy_common.messages.bounds import Int, Many, Named, Number, Plain, Word
 from evopolicy_common.messages.environment import Case
 from evopolicy_common.messages.gateway import SubmitStatus
 from evopolicy_common.messages.operator import RunFinished
@@ -124,6 +125,24 @@ class Result(msgspec.Struct, frozen=True, kw_only=True):
     submits: Many[SubmitResult]
     heldout_successes: Many[bool] = ()
     """Empty where the environment reports none, and in documents of earlier versions."""
+    record: Plain = {}
+    """Further fields of `run.json` as they are published, by path. Empty in documents of earlier versions."""
+
+
+GATEWAY_SIDE = (
+    "jail",
+    "agent.harness",
+    "agent.cli_version",
+    "agent.model_string",
+    "agent.retries",
+    "agent.turns",
+    "agent.tokens",
+    "agent.settings",
+    "versions.agents_md_hash",
+    "versions.rules_hash",
+    "versions.initial_policy_hash",
+)
+"""Fields of `run.json` that a gateway's command knows, and sends as `record` when it closes the run."""
 
 
 def result_of(finished: RunFinished) -> Result:
@@ -152,7 +171,35 @@ def result_of(finished: RunFinished) -> Result:
             )
             for submit in finished.submits
         ),
+        record=_record(finished),
     )
+
+
+def _record(finished: RunFinished) -> dict[str, Any]:
+    sent = finished.agent.get("record")
+    found = {name: sent[name] for name in GATEWAY_SIDE if name in sent} if isinstance(sent, dict) else {}
+    audit, fingerprint = finished.audit, finished.fingerprint
+    hashes = {name: f"sha256:{digest}" for name, digest in finished.split_hashes.items()}
+    for name, split in (("train", "train"), ("valid", "validation"), ("heldout", "heldout")):
+        found[f"versions.data_{name}_hash"] = hashes.get(f"{name}.json", hashes.get(split, ""))
+    if finished.random_heldout_returns:
+        found["outcome.random_reference.seeded_by"] = "case" if finished.reference_by_case else "run"
+    return found | {
+        "env_title": finished.env_title,
+        "env_family": finished.env_family,
+        "hidden_isolation": finished.hidden_isolation,
+        "outcome.closed_reason": finished.closed_reason,
+        **{
+            f"timing.{name}_s": round(float(finished.wall_s.get(name, 0.0)), 3)
+            for name in ("queue", "rollout", "finalise")
+        },
+        "versions.env": finished.env_version,
+        "versions.env_deterministic": finished.deterministic,
+        "versions.fingerprint": {} if fingerprint is None else fingerprint.flat(),
+        "versions.fingerprint_overrides": ["left out" for _ in finished.fingerprint_overrides],
+        "versions.installations": list(finished.installations),
+        "audit": None if audit is None else msgspec.to_builtins(audit.counts()),
+    }
 
 
 def document(content: Entry | Opening | Result) -> bytes:

@@ -48,6 +48,10 @@ class Tokens(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     """Cost in US dollars; None without prices."""
 
 
+PUBLISHED_SETTINGS = frozenset({"wall_limit_s", "silence_limit_s", "effort"})
+"""Those of an agent's settings that are published: numbers and words of the project's own options."""
+
+
 class AgentInput(msgspec.Struct, frozen=True, kw_only=True):
     """A skill or MCP server that the operator gave to the agent, read-only."""
 

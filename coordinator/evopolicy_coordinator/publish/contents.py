@@ -110,6 +110,13 @@ class Group(msgspec.Struct, frozen=True, kw_only=True):
     def name(self) -> str:
         return group_name(self.split, self.submit_index)
 
+    @property
+    def part(self) -> str:
+        """The part of the run that it belongs to, in words."""
+        return (
+            "random" if self.submit_index == RANDOM else "held-out" if self.split == "heldout" else self.split
+        )
+
 
 class Removed(msgspec.Struct, frozen=True, kw_only=True):
     """A removed part."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, Literal, NamedTuple, Protocol, TypeVar
 
 import msgspec
@@ -36,6 +36,7 @@ KINDS = {
     "completeness": "every run that was opened for the entries is here",
     "order": "the journal could not be begun anew",
     "policies": "the actions came from the policies",
+    "claims": "every field follows from another, or was fixed when the run was opened or ended",
     "replay": "the environments give the recorded rewards for the recorded actions",
 }
 """The checks, in the order of the output."""
@@ -72,6 +73,8 @@ class PublishedRun(msgspec.Struct, frozen=True, kw_only=True):
     groups: tuple[Group, ...]
     opening_bytes: bytes
     result_bytes: bytes
+    as_written: dict[str, Any]
+    """The content of `run.json`."""
 
     def cases(self, split: Split) -> tuple[Any, ...]:
         """The cases of a split."""
@@ -92,10 +95,22 @@ class Checked(msgspec.Struct, kw_only=True):
     """Every run that was opened for the published entries."""
     removed: tuple[Removed, ...] = ()
     runs: list[PublishedRun] = []
+    claims: dict[str, list[str]] = {}
+    """Fields that nobody can check, by file (`fields`)."""
+    recorded: dict[str, dict[str, tuple[int, int]]] = {}
+    """By run and part (`contents.PARTS`): the episodes that have a recording, and all."""
 
     @property
     def failed(self) -> bool:
         return any(each.state == "failed" for each in self.findings)
+
+    def unrecorded(self, run: str) -> list[str]:
+        """The parts of a run with episodes that have no recording, such as `0 of 6 held-out`."""
+        return [f"{n} of {of} {part}" for part, (n, of) in self.recorded.get(run, {}).items() if n < of]
+
+    def claim(self, file: str, fields: Iterable[str]) -> None:
+        if found := list(fields):
+            self.claims.setdefault(file, []).extend(found)
 
     def add(self, kind: str, state: Literal["ok", "failed", "open"], text: str, run: str = "") -> None:
         self.findings.append(Finding(kind=kind, state=state, text=text, run=run))

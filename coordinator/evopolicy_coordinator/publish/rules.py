@@ -14,13 +14,14 @@ from collections.abc import Sequence
 
 from evopolicy_common.errors import ProtocolError
 from evopolicy_common.records import journal
+from evopolicy_common.records.canary import CANARY
 from evopolicy_common.records.journal import Ended, Opened
 from evopolicy_common.records.summary import utc_text
 from evopolicy_coordinator.pki.identity import HEAD, signed_by
-from evopolicy_coordinator.publish import contents
+from evopolicy_coordinator.publish import contents, fields
 from evopolicy_coordinator.publish.contents import Countersignature, Manifest, Removed, Signature
 from evopolicy_coordinator.publish.findings import Checked, Files, History, decoded
-from evopolicy_coordinator.publish.run_rules import check_run, read_run
+from evopolicy_coordinator.publish.run_rules import UPDATE, check_run, read_run, refuse_unknown
 
 
 def check(files: Files, identity: str = "", heads: Sequence[str | Countersignature] = ()) -> Checked:
@@ -32,6 +33,7 @@ def check(files: Files, identity: str = "", heads: Sequence[str | Countersignatu
     manifest = _manifest(files, identity, checked)
     if manifest is None:
         return checked
+    _names(files, manifest, checked)
     damaged = _digests(files, manifest, checked)
     entries = _journal(files, manifest, checked)
     _order(entries, heads, checked)
@@ -52,8 +54,12 @@ def check(files: Files, identity: str = "", heads: Sequence[str | Countersignatu
         seen.add(run.opening.run)
         checked.runs.append(run)
         check_run(files, run, entries, damaged, checked)
+    if any(name.startswith("runs/") and "/actions/" in name for name in files.names):
+        text = "only --replay compares the recorded actions, single rewards and ends with the environment"
+        checked.add("claims", "open", text)
     checked.listing = contents.listing(entries.entries, seen)
     _completeness(checked)
+    _claims(checked)
     return checked
 
 
@@ -61,7 +67,10 @@ def _manifest(files: Files, identity: str, checked: Checked) -> Manifest | None:
     try:
         data = files.read(contents.MANIFEST, contents.MAX_DOCUMENT_BYTES)
         manifest = decoded(contents.MANIFEST, data, Manifest)
-        signature = decoded(contents.SIGNATURE, files.read(contents.SIGNATURE, 4096), Signature)
+        by = files.read(contents.SIGNATURE, 4096)
+        signature = decoded(contents.SIGNATURE, by, Signature)
+        if contents.document(signature) != by:
+            raise ProtocolError(f"{contents.SIGNATURE} is not written as the software writes it")
     except ProtocolError as error:
         checked.add("format", "failed", str(error))
         return None
@@ -71,13 +80,14 @@ def _manifest(files: Files, identity: str, checked: Checked) -> Manifest | None:
             "format", "failed", f"{found}; this program reads {contents.FORMAT!r} version {contents.VERSION}"
         )
         return None
-    if data != contents.document(manifest):
+    if data != contents.document(manifest) or manifest.canary != CANARY:
         checked.add(
             "format",
             "failed",
-            "the manifest is not written as the software writes it: a field is added or doubled",
+            "the manifest is not written as the software writes it: a field is added or doubled, or another canary",
         )
         return None
+    checked.claim(contents.MANIFEST, ["software"])
     checked.add("format", "ok", f"version {manifest.version}, made by evopolicy {manifest.software}")
     if not signed_by(signature.key, signature.signature, contents.digest(data)):
         checked.add("signature", "failed", f"not a signature of this manifest by {signature.key[:64]}")
@@ -96,6 +106,15 @@ def _manifest(files: Files, identity: str, checked: Checked) -> Manifest | None:
     return manifest
 
 
+def _names(files: Files, manifest: Manifest, checked: Checked) -> None:
+    """Files that publication does not write, and those of the manifest that it leaves to a run's digests."""
+    odd = sorted(name for name in files.names if fields.file_kind(name) is None)
+    top = (contents.JOURNAL, contents.REMOVED)
+    odd += [name for name in manifest.files if name not in top and not name.endswith(f"/{contents.DIGESTS}")]
+    for name in odd:
+        checked.add("format", "failed", f"{name[:120]} is no file of published results: {UPDATE}")
+
+
 def _digests(files: Files, manifest: Manifest, checked: Checked) -> set[str]:
     """The names of files that are not what was signed."""
     wanted = dict(manifest.files)
@@ -104,6 +123,7 @@ def _digests(files: Files, manifest: Manifest, checked: Checked) -> set[str]:
         try:
             data = files.read(name, contents.MAX_DOCUMENT_BYTES)
             inner = decoded(name, data, dict[str, str])
+            fields.parsed(name, data)
         except ProtocolError as error:
             bad.append(str(error))
             continue
@@ -134,6 +154,8 @@ def _journal(files: Files, manifest: Manifest, checked: Checked) -> History:
     try:
         lines = contents.journal_entries(files.read(contents.JOURNAL, contents.MAX_RECORDING_BYTES))
         entries = [journal.read_entry(line) for line in lines]
+        for line in lines:
+            fields.parsed(contents.JOURNAL, line)
     except ProtocolError as error:
         checked.add("journal", "failed", f"{contents.JOURNAL}: {error}")
         return History([], [])
@@ -213,8 +235,17 @@ def _removed(files: Files, checked: Checked) -> None:
     try:
         data = files.read(contents.REMOVED, contents.MAX_DOCUMENT_BYTES)
         checked.removed = decoded(contents.REMOVED, data, tuple[Removed, ...])
+        refuse_unknown(contents.REMOVED, fields.parsed(contents.REMOVED, data), {}, checked)
     except ProtocolError as error:
         checked.add("format", "failed", str(error))
+
+
+def _claims(checked: Checked) -> None:
+    for file, found in checked.claims.items():
+        kind = fields.file_kind(file) or file
+        run = next((run.opening.run for run in checked.runs if file.startswith(f"{run.folder}/")), "")
+        text = f"nobody can check, in {kind.removeprefix('runs/*/')}: {', '.join(found)}"
+        checked.add("claims", "open", text, run)
 
 
 def _completeness(checked: Checked) -> None:

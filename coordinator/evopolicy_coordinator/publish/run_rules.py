@@ -3,16 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import zip_longest
 from typing import Any, TypeVar
 
+import msgspec
+
+from evopolicy_common import catalogue
 from evopolicy_common.errors import BundleError, ProtocolError
 from evopolicy_common.records import journal
 from evopolicy_common.records.aggregates import mean
 from evopolicy_common.records.episodes.trajectory import Trajectory, decode
 from evopolicy_common.records.journal import Ended, Opened, Opening, Result, Revealed
 from evopolicy_common.records.policies import bundles
-from evopolicy_common.records.run_record import decode_run_record, inputs_digest
-from evopolicy_coordinator.publish import contents
+from evopolicy_common.records.policies.bundles import Bundle
+from evopolicy_common.records.policies.code_metrics import TREND, code_metrics
+from evopolicy_common.records.run_record import PROTOCOL_VERSION, decode_run_record, inputs_digest
+from evopolicy_common.records.summary import utc_text
+from evopolicy_coordinator.publish import contents, fields
 from evopolicy_coordinator.publish.contents import Group
 from evopolicy_coordinator.publish.findings import (
     KINDS,
@@ -29,27 +36,59 @@ from evopolicy_coordinator.verify.numbers import outcome_pairs
 
 T = TypeVar("T")
 
+_SHOWN = 8
+"""Unknown fields of a file that become findings."""
+_BY_SUBMIT = "code_metrics_by_submit"
+_PARSED = (
+    "classes",
+    "functions",
+    "imports",
+    "import_count",
+    "cyclomatic_total",
+    "cyclomatic_max",
+    "parse_errors",
+)
+"""Metrics of code that rest on Python's parser."""
+UPDATE = "it was added, or a later version of evopolicy wrote it (then update)"
+
+
+def refuse_unknown(name: str, value: Any, committed: dict[str, Any], checked: Checked, run: str = "") -> None:
+    """Refuses fields that the table of `fields` does not name, and notes those that are claims."""
+    unknown, claims = fields.unknown_and_claims(name, value, committed)
+    for field in unknown[:_SHOWN]:
+        checked.add(
+            "format", "failed", f"{name}: {field[:120]} is no field of published results: {UPDATE}", run
+        )
+    checked.claim(name, claims)
+
 
 def read_run(files: Files, folder: str, checked: Checked) -> PublishedRun | None:
-    def read(name: str) -> bytes:
-        return files.read(f"{folder}/{name}", contents.MAX_DOCUMENT_BYTES)
-
+    data, content = {}, {}
     try:
-        opening, result = read(contents.OPENING), read(contents.RESULT)
-        salt = read(contents.SALT).decode("ascii", "replace")
-        return PublishedRun(
+        for name in (contents.OPENING, contents.RESULT, contents.EPISODES, contents.RUN, contents.SALT):
+            data[name] = files.read(f"{folder}/{name}", contents.MAX_DOCUMENT_BYTES)
+            if name != contents.SALT:
+                content[name] = fields.parsed(f"{folder}/{name}", data[name])
+        salt = data[contents.SALT].decode("ascii", "replace")
+        run = PublishedRun(
             folder=folder,
-            record=decode_run_record(read(contents.RUN)),
-            opening=decoded(f"{folder}/{contents.OPENING}", opening, Opening),
+            record=decode_run_record(data[contents.RUN]),
+            opening=decoded(f"{folder}/{contents.OPENING}", data[contents.OPENING], Opening),
             salt=bytes.fromhex(salt),
-            result=decoded(f"{folder}/{contents.RESULT}", result, Result),
-            groups=decoded(f"{folder}/{contents.EPISODES}", read(contents.EPISODES), tuple[Group, ...]),
-            opening_bytes=opening,
-            result_bytes=result,
+            result=decoded(f"{folder}/{contents.RESULT}", data[contents.RESULT], Result),
+            groups=decoded(f"{folder}/{contents.EPISODES}", data[contents.EPISODES], tuple[Group, ...]),
+            opening_bytes=data[contents.OPENING],
+            result_bytes=data[contents.RESULT],
+            as_written=content[contents.RUN],
         )
+        if salt != run.salt.hex():
+            raise ProtocolError("its salt is not written as the software writes it")
     except (ProtocolError, ValueError) as error:
         checked.add("format", "failed", f"{folder}: {error}", folder)
         return None
+    for name in (contents.EPISODES, contents.RUN):
+        refuse_unknown(f"{folder}/{name}", content[name], run.result.record, checked, run.opening.run)
+    return run
 
 
 def check_run(files: Files, run: PublishedRun, history: History, damaged: set[str], checked: Checked) -> None:
@@ -58,7 +97,7 @@ def check_run(files: Files, run: PublishedRun, history: History, damaged: set[st
         ("commitment", _commitment(run, history)),
         ("disclosure", _disclosure(run, history)),
         ("result", _result(run, history)),
-        ("record", _record(run)),
+        ("record", _record(run, history)),
         ("budget", _budget(run)),
         ("selection", _selection(run)),
         ("scores", _scores(run)),
@@ -135,12 +174,14 @@ def _result(run: PublishedRun, history: History) -> Iterator[Fault]:
         yield Fault("record", "run.json tells another end of the run than the journal has")
 
 
-def _record(run: PublishedRun) -> Iterator[Fault]:
+def _record(run: PublishedRun, history: History) -> Iterator[Fault]:
     """`run.json`, compared with the committed documents."""
     record, opening, result = run.record, run.opening, run.result
     settings, dimensions = opening.settings, record.experiment_dimensions
-    staged = dimensions.n_train > 0
+    # A run that ended before it had a workspace tells no counts.
+    staged = dimensions.n_train > 0 or bool(result.submits)
     pairs: list[tuple[str, Any, Any]] = [
+        ("protocol_version", record.protocol_version, PROTOCOL_VERSION),
         ("run", record.run, opening.run),
         ("env", record.env, settings.env),
         ("model", record.model, settings.model),
@@ -171,14 +212,32 @@ def _record(run: PublishedRun) -> Iterator[Fault]:
     ):
         pairs.append((name, here, f"sha256:{fixed}" if fixed else ""))
     pairs.append(("agent.inputs", inputs_digest(record.agent.inputs), settings.inputs))
-    if staged:
-        pairs.append(("n_train", dimensions.n_train, len(opening.train)))
-        pairs.append(
-            ("min_episodes_per_submit", dimensions.min_episodes_per_submit, opening.min_episodes_per_submit)
-        )
-        pairs.append(
-            ("max_episodes_per_submit", dimensions.max_episodes_per_submit, opening.max_episodes_per_submit)
-        )
+    for name, told in (
+        ("n_train", len(opening.train)),
+        ("min_episodes_per_submit", opening.min_episodes_per_submit),
+        ("max_episodes_per_submit", opening.max_episodes_per_submit),
+    ):
+        pairs.append((name, getattr(dimensions, name), told if staged else 0))
+    suite = catalogue.suite_of(settings.env) if catalogue.is_shipped(settings.env) else catalogue.OTHER
+    for name, n, usual in (
+        ("n_validation", len(opening.validation), suite.n_validation),
+        ("n_heldout", len(opening.heldout), suite.n_heldout),
+    ):
+        # Where files determine the cases, `run.json` may tell the suite's number.
+        if getattr(dimensions, name) != usual or getattr(settings, name) is not None:
+            pairs.append((name, getattr(dimensions, name), n))
+    for path, fixed in result.record.items():
+        here = fields.value_at(run.as_written, path)
+        if not _alike(here, fixed):
+            pairs.append((path, here, fixed))
+    if not result.random_heldout_returns:
+        pairs.append(("outcome.random_reference", record.outcome.random_reference, None))
+    began, over = _entry(history, Opened, opening.run), _entry(history, Ended, opening.run)
+    if began is not None and over is not None:
+        start, end = began[1].at, over[1].at
+        pairs.append(("timing.start_time", record.timing.start_time, utc_text(start)))
+        pairs.append(("timing.end_time", record.timing.end_time, utc_text(end)))
+        pairs.append(("timing.wall_time_seconds", record.timing.wall_time_seconds, round(end - start, 3)))
     for split in SPLITS:
         ours = f"sha256:{cases_hash(run.cases(split))}"
         pairs.append((f"the hash of the {FILE_STEMS[split]} cases", record.versions.cases_hash(split), ours))
@@ -236,6 +295,9 @@ def _scores(run: PublishedRun) -> Iterator[Fault]:
     result, opening = run.result, run.opening
     if len({group.name for group in run.groups}) != len(run.groups):
         yield Fault("scores", "a list of episodes occurs twice")
+    wanted_names = [contents.group_name(split, index) for split, index, _ in contents.wanted_groups(result)]
+    if odd := [group.name for group in run.groups if group.name not in wanted_names]:
+        yield Fault("scores", f"the result has no episodes of {odd[0]}")
     groups = {(group.split, group.submit_index): group for group in run.groups}
     submits = {submit.submit_index: submit for submit in result.submits}
     for split, index, n in contents.wanted_groups(result):
@@ -260,6 +322,13 @@ def _scores(run: PublishedRun) -> Iterator[Fault]:
             told = submit.mean_return if split == "train" else submit.val_mean
             if returns and mean(returns) != told:
                 yield Fault("scores", f"the returns of {name} have the mean {mean(returns)!r}, not {told!r}")
+    for split in ("validation", "heldout"):
+        best = groups.get((split, -2 if result.best_submit_index is None else result.best_submit_index))
+        failed = 0 if best is None else sum(episode.failure != "" for episode in best.episodes)
+        if best is not None and failed != result.policy_failures.get(split, 0):
+            yield Fault(
+                "scores", f"{best.name} has {failed} failures of the policy, which the result does not tell"
+            )
     if result.status == "completed":
         n_heldout = len(result.heldout_returns)
         if n_heldout != len(opening.heldout) or result.final_score != mean(result.heldout_returns):
@@ -267,34 +336,45 @@ def _scores(run: PublishedRun) -> Iterator[Fault]:
 
 
 def _recordings(files: Files, run: PublishedRun, damaged: set[str], checked: Checked) -> None:
-    name, played, missing, fine = run.opening.run, 0, 0, True
-    for group in run.groups:
-        path = f"{run.folder}/actions/{group.name}"
-        if path not in files.names or path in damaged:
-            missing += len(group.episodes)
-            continue
-        try:
-            recordings = contents.unpack_recordings(files.read(path, contents.MAX_RECORDING_BYTES))
-        except ProtocolError as error:
-            checked.add("recordings", "failed", f"{group.name}: {error}", name)
-            fine = False
-            continue
-        if len(recordings) != len(group.episodes):
-            checked.add("recordings", "failed", f"{group.name}: {len(recordings)} recordings", name)
-            fine = False
-            continue
-        for episode, data in zip(group.episodes, recordings, strict=True):
+    name, fine = run.opening.run, True
+    recorded: dict[str, tuple[int, int]] = {}
+    lists = f"{run.folder}/actions/"
+    odd = {each for each in files.names if each.startswith(lists)} - {
+        lists + each.name for each in run.groups
+    }
+    for path in sorted(odd):
+        checked.add("recordings", "failed", f"{path} is of no list of episodes", name)
+        fine = False
+    for number, group in enumerate(run.groups):
+        path, there = f"{lists}{group.name}", 0
+        # The result has the returns of held-out episodes.
+        claimed = ["length"] if group.split == "heldout" else ["length", "episode_return"]
+        recordings: list[bytes | None] = []
+        if path in files.names and path not in damaged:
+            try:
+                recordings = contents.unpack_recordings(files.read(path, contents.MAX_RECORDING_BYTES))
+                if len(recordings) != len(group.episodes):
+                    raise ProtocolError(f"{len(recordings)} recordings")
+            except ProtocolError as error:
+                checked.add("recordings", "failed", f"{group.name}: {error}", name)
+                fine, recordings = False, []
+        for position, (episode, data) in enumerate(zip_longest(group.episodes, recordings)):
             if data is None:
-                missing += 1
+                place = f"{number}.episodes.{position}"
+                checked.claim(f"{run.folder}/{contents.EPISODES}", (f"{place}.{field}" for field in claimed))
                 continue
-            played += 1
+            there += 1
             if fault := recording_fault(episode, data):
                 checked.add("recordings", "failed", f"{group.name}, episode {episode.index}: {fault}", name)
                 fine = False
-    if missing:
-        checked.add("recordings", "open", f"{missing} episodes have no recording here", name)
+        before = recorded.get(group.part, (0, 0))
+        recorded[group.part] = before[0] + there, before[1] + len(group.episodes)
+    checked.recorded[name] = recorded
+    if missing := checked.unrecorded(name):
+        text = f"only {', '.join(missing)} episodes have a recording: the other returns rest on the publisher's word"
+        checked.add("recordings", "open", text, name)
     elif fine:
-        checked.add("recordings", "ok", f"{played} episodes", name)
+        checked.add("recordings", "ok", f"{sum(n for n, _ in recorded.values())} episodes", name)
 
 
 def recording_fault(episode: contents.Episode, data: bytes) -> str | None:
@@ -330,15 +410,20 @@ def return_of(recording: Trajectory) -> float:
 
 def _checkpoints(files: Files, run: PublishedRun, damaged: set[str], checked: Checked) -> None:
     name, withheld, there, fine = run.opening.run, 0, 0, True
-    for submit in run.result.submits:
-        if submit.bundle is None:
-            continue
-        path = f"{run.folder}/{contents.checkpoint_path(submit.submit_index)}"
+    places = {contents.checkpoint_path(each.submit_index): each for each in run.result.submits if each.bundle}
+    policies: dict[int, Bundle] = {}
+    for path in sorted(files.names):
+        if path.startswith(f"{run.folder}/checkpoints/") and path[len(run.folder) + 1 :] not in places:
+            checked.add("checkpoints", "failed", f"{path} is the policy of no submit", name)
+            fine = False
+    for place, submit in places.items():
+        path = f"{run.folder}/{place}"
         if path not in files.names or path in damaged:
             withheld += 1
             continue
         try:
-            bundles.load(files.read(path, contents.MAX_DOCUMENT_BYTES * 2), submit.bundle)
+            data = files.read(path, contents.MAX_DOCUMENT_BYTES * 2)
+            policies[submit.submit_index] = bundles.load(data, submit.bundle or "")
             there += 1
         except (BundleError, ProtocolError) as error:
             text = f"submit {submit.submit_index}: another policy than the one that was submitted: {error}"
@@ -348,6 +433,47 @@ def _checkpoints(files: Files, run: PublishedRun, damaged: set[str], checked: Ch
         checked.add("checkpoints", "open", f"{withheld} policies were withheld", name)
     elif fine:
         checked.add("checkpoints", "ok", f"{there} policies", name)
+    for fault in _metrics(run, policies, checked):
+        checked.add(fault.kind, "failed", fault.text, name)
+
+
+def _metrics(run: PublishedRun, policies: dict[int, Bundle], checked: Checked) -> Iterator[Fault]:
+    """The metrics of code in `run.json`, compared with the policies."""
+    told = run.record.outcome.auxiliary
+    by_submit = told.get(_BY_SUBMIT, {})
+    best = run.record.outcome.best_submit_index
+    try:
+        trend = {name: [each[name] for each in by_submit.values()] for name in TREND}
+        pairs: list[tuple[str, Any, Any]] = [
+            (_BY_SUBMIT, list(by_submit), [str(submit.submit_index) for submit in run.result.submits]),
+            ("code_metrics_best", told.get("code_metrics_best"), by_submit.get(str(best))),
+            ("code_metrics_trend", told.get("code_metrics_trend"), {"submits": list(map(int, by_submit)), **trend}),
+        ]  # fmt: skip
+        for index, here in by_submit.items():
+            where = f"outcome.auxiliary.{_BY_SUBMIT}.{index}"
+            if (policy := policies.get(int(index))) is None:
+                checked.claim(f"{run.folder}/{contents.RUN}", [f"{where}.**"])
+                continue
+            own = msgspec.to_builtins(code_metrics({file.path: file.data for file in policy.files}))
+            # Versions of Python differ in what they can parse.
+            parsed = () if own["parse_errors"] == tuple(here["parse_errors"]) else _PARSED
+            checked.claim(f"{run.folder}/{contents.RUN}", [f"{where}.{name}" for name in parsed])
+            pairs += [(where, here.get(name), value) for name, value in own.items() if name not in parsed]
+            pairs.append((where, sorted(here), sorted(own)))
+    except (AttributeError, KeyError, TypeError, ValueError):
+        yield Fault("record", "run.json tells metrics of code in another form than the software")
+        return
+    # Runs of early versions have none.
+    for name, here, fixed in (
+        pairs if told.keys() & {_BY_SUBMIT, "code_metrics_best", "code_metrics_trend"} else ()
+    ):
+        if not _alike(here, fixed):
+            yield Fault("record", f"run.json tells {name} {_short(here)}; the policies give {_short(fixed)}")
+
+
+def _alike(here: Any, fixed: Any) -> bool:
+    """Whether two values are the same JSON."""
+    return msgspec.json.encode(here, order="sorted") == msgspec.json.encode(fixed, order="sorted")
 
 
 def _short(value: Any) -> str:

@@ -12,12 +12,9 @@ from collections.abc import Iterable, Iterator, Mapping
 
 import msgspec
 
-from evopolicy_common.messages.audit import AuditRecord
-from evopolicy_common.records.run_record import Artifacts, RunRecord
+from evopolicy_common.records.run_record import PUBLISHED_SETTINGS, Artifacts, RunRecord
 from evopolicy_coordinator.publish.contents import Removed
 
-KEPT_SETTINGS = frozenset({"wall_limit_s", "silence_limit_s", "effort"})
-"""Of an agent's settings: numbers and words of the project's own options."""
 _MIN_NEEDLE = 4
 _SYSTEM_PATHS = (
     "/usr",
@@ -58,7 +55,7 @@ class Needle(msgspec.Struct, frozen=True):
 def record(full: RunRecord) -> tuple[RunRecord, list[Removed]]:
     """The part of a `run.json` that is published, and what was left out."""
     removed = []
-    settings = {name: each for name, each in full.agent.settings.items() if name in KEPT_SETTINGS}
+    settings = {name: each for name, each in full.agent.settings.items() if name in PUBLISHED_SETTINGS}
     for name in sorted(full.agent.settings.keys() - settings.keys()):
         removed.append(Removed(what=f"agent.settings.{name}", why="may name paths and commands of a machine"))
     dropped = {
@@ -91,15 +88,7 @@ def record(full: RunRecord) -> tuple[RunRecord, list[Removed]]:
             full.versions,
             fingerprint_overrides=tuple("left out" for _ in full.versions.fingerprint_overrides),
         ),
-        audit=None
-        if audit is None
-        else AuditRecord(
-            share=audit.share,
-            sampled=audit.sampled,
-            audited=audit.audited,
-            agreed=audit.agreed,
-            disputed=audit.disputed,
-        ),
+        audit=None if audit is None else audit.counts(),
     )
     return kept, removed
 

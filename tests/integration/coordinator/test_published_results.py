@@ -19,158 +19,20 @@ from typing import Any
 import msgspec
 import pytest
 from commands import evopolicy
-from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
-from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
+from publications import ENV, Forger, Held, Results, spelt
 
-from evopolicy_common.errors import ProtocolError
 from evopolicy_common.records import journal
 from evopolicy_common.records.episodes.trajectory import Recorder, decode
 from evopolicy_common.records.policies import bundles
 from evopolicy_common.records.policies.bundles import BundleFile
 from evopolicy_coordinator.publish import contents, rules, run_rules
 from evopolicy_coordinator.publish import replay as replays
-from evopolicy_coordinator.publish.archive import Archive, Writer
 from evopolicy_coordinator.publish.findings import KINDS, Finding
-
-ENV = "toy/line"
-AGENT = """
-import json, os, urllib.request
-def submit(scale, ids):
-    with open("system/policy.py", "w") as file:
-        file.write(f'''
-class Policy:
-    def __init__(self, obs_space, action_space, env_meta):
-        pass
-    def reset(self, episode_index):
-        pass
-    def act(self, obs):
-        return {scale}
-''')
-    request = urllib.request.Request(
-        os.environ["EVOPOLICYGYM_SUBMIT_URL"], data=json.dumps({"env_instances": ids}).encode()
-    )
-    urllib.request.urlopen(request).read()
-submit(1, [0, 1])
-submit(0, [2, 0, 1])
-"""
-
-
-class Results:
-    """A state folder with two runs of one entry, and files of published results."""
-
-    def __init__(self, root: Path) -> None:
-        self.root = root
-        (root / "agent.py").write_text(AGENT)
-        for exp_id in ("first", "second"):
-            done = evopolicy(
-                root,
-                *(
-                    "local",
-                    "--env",
-                    ENV,
-                    "--budget",
-                    "5",
-                    "--validation",
-                    "2",
-                    "--heldout",
-                    "3",
-                    "--state",
-                    "st",
-                ),
-                *(
-                    "--agent",
-                    f"command:{sys.executable} {root / 'agent.py'}",
-                    "--entry",
-                    "mine",
-                    "--exp-id",
-                    exp_id,
-                ),
-            )
-            assert done.returncode == 0, done.stdout + done.stderr
-        self.summary = self.publish("all.evp", "runs")
-        self.files = self.read("all.evp")
-
-    def publish(self, out: str, *runs: str) -> dict[str, Any]:
-        done = evopolicy(self.root, "publish", *runs, "--out", out, "--local", "--state", "st", "--json")
-        assert done.returncode == 0, done.stdout + done.stderr
-        document: dict[str, Any] = json.loads(done.stdout)
-        return document
-
-    def read(self, name: str) -> dict[str, bytes]:
-        with Archive(self.root / name) as archive:
-            return {each: archive.read(each, 1 << 30) for each in archive.names}
-
-    def run_folder(self, exp_id: str) -> str:
-        return str(next(self.root.glob(f"runs/*/*/{exp_id}")).relative_to(self.root))
 
 
 @pytest.fixture(scope="module")
 def results(tmp_path_factory: pytest.TempPathFactory) -> Results:
     return Results(tmp_path_factory.mktemp("published"))
-
-
-class Held:
-    """Files in memory."""
-
-    def __init__(self, files: dict[str, bytes]) -> None:
-        self.files = files
-
-    @property
-    def names(self) -> frozenset[str]:
-        return frozenset(self.files)
-
-    def read(self, name: str, most: int) -> bytes:
-        if name not in self.files:
-            raise ProtocolError(f"{name} is missing")
-        return self.files[name]
-
-
-class Forger:
-    """Changes published files."""
-
-    def __init__(self, files: dict[str, bytes]) -> None:
-        self.files = dict(files)
-
-    def json(self, name: str, change: Callable[[Any], Any]) -> None:
-        """Changes a document in place, or into what `change` returns."""
-        document = json.loads(self.files[name])
-        new = change(document)
-        self.files[name] = json.dumps(document if new is None else new).encode()
-
-    def text(self, name: str, before: bytes, after: bytes) -> None:
-        assert before in self.files[name]
-        self.files[name] = self.files[name].replace(before, after, 1)
-
-    def entries(self, change: Callable[[list[bytes]], list[bytes]]) -> None:
-        """Changes the journal, and what `run.json` tells of it, as its owner could who begins another."""
-        lines = change(contents.journal_entries(self.files[contents.JOURNAL]))
-        self.files[contents.JOURNAL] = contents.journal_lines(lines)
-
-    def sign(self) -> None:
-        """Makes digests, head and signature anew."""
-        folders = sorted({name[:9] for name in self.files if name.startswith("runs/")})
-        manifest = json.loads(self.files[contents.MANIFEST])
-        manifest["files"] = {}
-        for folder in folders:
-            own = {
-                name.removeprefix(f"{folder}/"): contents.digest(data)
-                for name, data in self.files.items()
-                if name.startswith(f"{folder}/") and not name.endswith(contents.DIGESTS)
-            }
-            self.files[f"{folder}/{contents.DIGESTS}"] = contents.document(own)
-            manifest["files"][f"{folder}/{contents.DIGESTS}"] = contents.digest(contents.document(own))
-        for name in (contents.JOURNAL, contents.REMOVED):
-            manifest["files"][name] = contents.digest(self.files[name])
-        lines = contents.journal_entries(self.files[contents.JOURNAL])
-        manifest["journal_entries"], manifest["journal_head"] = len(lines), journal.heads(lines)[-1]
-        self.files[contents.MANIFEST] = contents.document(msgspec.convert(manifest, contents.Manifest))
-        key = Ed25519PrivateKey.from_private_bytes(b"f" * 32)
-        digest = contents.digest(self.files[contents.MANIFEST])
-        signature = contents.Signature(
-            key=key.public_key().public_bytes(Encoding.Raw, PublicFormat.Raw).hex(),
-            signature=key.sign(b"evopolicy manifest 1\0" + bytes.fromhex(digest)).hex(),
-        )
-        self.files[contents.SIGNATURE] = contents.document(signature)
 
 
 RUN, RESULT, OPENING, EPISODES, SALT = (
@@ -236,7 +98,7 @@ def better_result(forger: Forger) -> None:
             part = part[step]
         part[path[-1]] = [0.0, 0.0, 0.0]
         (document if name == RESULT else document["outcome"])["final_score"] = 0.0
-        forger.files[name] = json.dumps(document).encode()
+        forger.put(name, document)
 
 
 Edit = Callable[[Forger], None]
@@ -288,7 +150,7 @@ SIGNED_ANEW: dict[str, tuple[Edit, str, str]] = {
     "a number that is none": (lambda f: f.text(EPISODES, b'"episode_return":', b'"episode_return":NaN,"x":'), "format", "damaged"),
     "a number without end": (lambda f: f.text(EPISODES, b'"episode_return":', b'"episode_return":1e999,"x":'), "format", "damaged"),
     "a length beyond all numbers": (lambda f: f.text(EPISODES, b'"length":', b'"length":' + b"9" * 400 + b',"x":'), "format", "damaged"),
-    "text that is no UTF-8": (lambda f: f.text(RUN, b'"model": "', b'"model": "\xff\xfe'), "format", "not a run record"),
+    "text that is no UTF-8": (lambda f: f.text(RUN, b'"model": "', b'"model": "\xff\xfe'), "format", "is damaged"),
     "a document nested without end": (lambda f: f.files.__setitem__(OPENING, b"[" * 100_000), "format", "damaged"),
     "a record of a later version": (lambda f: f.json(RUN, put("record_version", value=99)), "format", "update evopolicy"),
     "a document of another kind": (lambda f: f.files.__setitem__(RESULT, b"[]"), "format", "damaged"),
@@ -320,7 +182,7 @@ def named(findings: list[Finding], kind: str, text: str) -> bool:
 def test_untouched_results_hold(results: Results) -> None:
     checked = rules.check(Held(results.files), results.summary["signer"])
     assert [each for each in checked.findings if each.state == "failed"] == []
-    assert {each.kind for each in checked.findings if each.state == "open"} == {"order", "policies"}
+    assert {each.kind for each in checked.findings if each.state == "open"} == {"claims", "order", "policies"}
     assert {each.kind for each in checked.findings} == KINDS.keys() - {"replay", "signals", "logs"}
     assert [each.state for each in checked.listing] == ["published", "published"]
 
@@ -482,7 +344,7 @@ def test_rewards_that_the_environment_does_not_give_are_found_by_replay_alone(re
         pytest.fail("the second policy is the better one")
     result["heldout_returns"][0] = value
     result["final_score"] = math.fsum(result["heldout_returns"]) / 3
-    forger.files[RESULT] = json.dumps(result).encode()
+    forger.put(RESULT, result)
     forger.json(EPISODES, put(4, "episodes", 0, "episode_return", value=value))
 
     def altered(record: Any) -> None:
@@ -504,7 +366,7 @@ def test_rewards_that_the_environment_does_not_give_are_found_by_replay_alone(re
         for each in kept:
             if each["kind"] == "ended":
                 each["result"] = contents.digest(forger.files[RESULT])
-        return [json.dumps(each).encode() for each in kept]
+        return [spelt(contents.JOURNAL, each) for each in kept]
 
     forger.json(RUN, altered)
     forger.entries(rewritten)
@@ -513,11 +375,7 @@ def test_rewards_that_the_environment_does_not_give_are_found_by_replay_alone(re
     forger.json(RUN, lambda record: record["committed"].update(places))
     forger.sign()
     assert found(forger.files) == []
-    path = results.root / "forged.evp"
-    writer = Writer(path)
-    for name, data in forger.files.items():
-        writer.add(name, data)
-    writer.close()
+    forger.write(results.root / "forged.evp")
     done = evopolicy(results.root, "check", "forged.evp", "--replay", "all")
     assert done.returncode == 1, done.stdout + done.stderr
     assert "FAILED replay: heldout-001, episode 0" in done.stdout
@@ -556,7 +414,7 @@ def test_wrong_usage_ends_with_2(results: Results) -> None:
 def test_a_hundred_thousand_entries_are_checked_in_seconds(results: Results) -> None:
     forger = Forger(results.files)
     last = json.loads(contents.journal_entries(results.files[contents.JOURNAL])[-1])
-    more = [json.dumps({**last, "epoch": str(number)}).encode() for number in range(100_000)]
+    more = [spelt(contents.JOURNAL, {**last, "epoch": str(number)}) for number in range(100_000)]
     forger.entries(lambda lines: [*lines, *more])
     forger.sign()
     began = time.process_time()

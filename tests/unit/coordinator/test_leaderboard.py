@@ -77,7 +77,7 @@ def test_an_unpacked_run_names_no_files_of_this_machine(tmp_path: Path) -> None:
     nothing: Any = SimpleNamespace(budget=0, submits=(), names=frozenset())
     run = PublishedRun(
         folder="runs/0000", record=hostile, opening=nothing, salt=b"", result=nothing, groups=(), opening_bytes=b"",
-        result_bytes=b"",
+        result_bytes=b"", as_written={},
     )  # fmt: skip
     _unpack(nothing, run, tmp_path / "there")
     assert decode_run_record((tmp_path / "there" / "run.json").read_bytes()).artifacts == Artifacts()

@@ -1,0 +1,286 @@
+"""Each field of each published file, changed and signed again by its own publisher: refused, contradicted, or listed as a claim."""
+
+from __future__ import annotations
+
+import copy
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+from publications import Forger, Held, Results, spelt
+
+from evopolicy_common.records import journal
+from evopolicy_common.records.episodes.trajectory import Recorder, decode
+from evopolicy_common.records.run_record import RunRecord
+from evopolicy_coordinator.publish import contents, fields, rules
+from evopolicy_coordinator.publish.findings import Checked
+
+FILES = {
+    "manifest.json": contents.MANIFEST,
+    "signature.json": contents.SIGNATURE,
+    "removed.json": contents.REMOVED,
+    **{
+        name: f"runs/0000/{name}"
+        for name in (contents.RUN, contents.OPENING, contents.RESULT, contents.EPISODES, contents.DIGESTS)
+    },
+}
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> Results:
+    return Results(tmp_path_factory.mktemp("fields"))
+
+
+def changed(leaf: Any) -> Any:
+    if isinstance(leaf, bool):
+        return not leaf
+    if isinstance(leaf, int | float):
+        return leaf + 1
+    return "x" if leaf is None else leaf[:-1] + ("0" if leaf.endswith("1") else "1")
+
+
+def with_leaf(content: Any, path: tuple[str, ...]) -> Any:
+    content = copy.deepcopy(content)
+    part = content
+    for step in path[:-1]:
+        part = part[int(step) if isinstance(part, list) else step]
+    last = int(path[-1]) if isinstance(part, list) else path[-1]
+    part[last] = changed(part[last])
+    return content
+
+
+def checked(results: Results, forger: Forger) -> Checked:
+    """As a reader who knows the signer's key and noted the journal's head at the end."""
+    head = results.summary["journal_head"]
+    return rules.check(Held(forger.files), results.summary["signer"], heads=[head])
+
+
+def claimed(found: Checked, file: str, path: tuple[str, ...]) -> bool:
+    """Whether the output lists the field as a claim."""
+    kind = (fields.file_kind(file) or "").removeprefix("runs/*/")
+    listed: list[str] = []
+    for each in found.findings:
+        begin = f"nobody can check, in {kind}: "
+        if each.kind == "claims" and each.text.startswith(begin):
+            listed += each.text.removeprefix(begin).split(", ")
+    # `a.*.b` for any element, `a.**` for everything below.
+    return any(
+        len(steps := pattern.split(".")) <= len(path)
+        and all(a in ("*", "**", b) for a, b in zip(steps, path, strict=False))
+        and (len(steps) == len(path) or steps[-1] == "**")
+        for pattern in listed
+    )
+
+
+def signed(results: Results, forger: Forger, file: str) -> Checked:
+    """A forger cannot make digests anew that contradict the files: the manifest's own fields are signed as they are."""
+    if file in (contents.MANIFEST, contents.SIGNATURE):
+        if file == contents.MANIFEST:
+            forger.sign_manifest(results.root / "st")
+    elif file.endswith(contents.DIGESTS):
+        manifest = json.loads(forger.files[contents.MANIFEST])
+        manifest["files"][file] = contents.digest(forger.files[file])
+        forger.put(contents.MANIFEST, manifest)
+        forger.sign_manifest(results.root / "st")
+    else:
+        forger.sign(results.root / "st")
+    return checked(results, forger)
+
+
+@pytest.mark.parametrize("kind", FILES)
+def test_each_changed_field_is_refused_contradicted_or_listed_as_a_claim(results: Results, kind: str) -> None:
+    file = FILES[kind]
+    content = json.loads(results.files[file])
+    through, n = [], 0
+    for path, _ in fields.leaves(content):
+        if kind == contents.OPENING and path[0] == "train" and int(path[1]) > 2:
+            continue  # hundreds of cases that are alike
+        forger = Forger(results.files)
+        forger.put(file, with_leaf(content, path))
+        found = signed(results, forger, file)
+        n += 1
+        if not found.failed and not claimed(found, file, path):
+            through.append(".".join(path))
+    assert n > 1
+    assert through == []
+
+
+@pytest.mark.parametrize("kind", FILES)
+def test_a_key_that_occurs_twice_is_refused(results: Results, kind: str) -> None:
+    file = FILES[kind]
+    for path in ((), ("agent",)) if kind == contents.RUN else ((),):
+        content = json.loads(results.files[file])
+        key = next(iter(fields.value_at(content, ".".join(path)) if path else _first(content)))
+        data = results.files[file].replace(f'"{key}":'.encode(), f'"{key}":null,"{key}":'.encode(), 1)
+        assert data != results.files[file]
+        forger = Forger(results.files)
+        forger.files[file] = data
+        assert signed(results, forger, file).failed
+
+
+def _first(content: Any) -> dict[str, Any]:
+    return content if isinstance(content, dict) else content[0]
+
+
+def test_every_json_object_refuses_an_added_field(results: Results) -> None:
+    for file in FILES.values():
+        content = json.loads(results.files[file])
+        for path in _objects(content):
+            new = copy.deepcopy(content)
+            part = new
+            for step in path:
+                part = part[step]
+            part["added"] = 1
+            forger = Forger(results.files)
+            forger.put(file, new)
+            assert signed(results, forger, file).failed, (file, path)
+
+
+def _objects(content: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+    if isinstance(content, dict):
+        yield path
+    items = content.items() if isinstance(content, dict) else enumerate(content[:3])
+    for key, inner in items:
+        if isinstance(inner, dict | list):
+            yield from _objects(inner, (*path, key))
+
+
+def test_a_changed_journal_contradicts_the_noted_head(results: Results) -> None:
+    lines = contents.journal_entries(results.files[contents.JOURNAL])
+    for number, line in enumerate(lines):
+        content = json.loads(line)
+        for path, _ in fields.leaves(content):
+            forger = Forger(results.files)
+            new = spelt(contents.JOURNAL, with_leaf(content, path))
+            forger.entries(lambda old, n=number, new=new: [*old[:n], new, *old[n + 1 :]])  # type: ignore[misc]
+            forger.sign(results.root / "st")
+            assert checked(results, forger).failed, (number, path)
+
+
+def test_changed_policies_salts_and_rewards_are_found(results: Results) -> None:
+    for name in ("checkpoints/000", contents.SALT, "actions/train-000"):
+        forger = Forger(results.files)
+        data = forger.files[f"runs/0000/{name}"]
+        forger.files[f"runs/0000/{name}"] = data[:-9] + bytes([data[-9] ^ 1]) + data[-8:]
+        forger.sign(results.root / "st")
+        assert checked(results, forger).failed, name
+
+
+def test_changed_actions_are_listed_as_what_replay_alone_compares(results: Results) -> None:
+    forger = Forger(results.files)
+    name = "runs/0000/actions/heldout-001"
+    recordings = contents.unpack_recordings(forger.files[name])
+    assert recordings[0] is not None
+    recorder = Recorder("actions")
+    for row in decode(recordings[0]).rows():
+        recorder.append(None, row.action + 1, row.reward, row.terminated, row.truncated, {})
+    forger.files[name] = contents.pack_recordings([recorder.finish(), *recordings[1:]])
+    forger.sign(results.root / "st")
+    found = checked(results, forger)
+    assert not found.failed
+    assert any(each.kind == "claims" and "only --replay" in each.text for each in found.findings)
+
+
+def test_files_of_no_kind_are_refused(results: Results) -> None:
+    for name in ("notes", "runs/0000/notes", "runs/0000/actions/train-777", "runs/0000/checkpoints/777"):
+        forger = Forger(results.files)
+        forger.files[name] = b"x"
+        forger.sign(results.root / "st")
+        if "/" not in name:
+            manifest = json.loads(forger.files[contents.MANIFEST])
+            manifest["files"][name] = contents.digest(b"x")
+            forger.put(contents.MANIFEST, manifest)
+            forger.sign_manifest(results.root / "st")
+        assert checked(results, forger).failed, name
+
+
+def test_a_digest_of_a_runs_file_in_the_manifest_is_refused(results: Results) -> None:
+    forger = Forger(results.files)
+    manifest = json.loads(forger.files[contents.MANIFEST])
+    manifest["files"]["runs/0000/run.json"] = "00" * 32
+    forger.put(contents.MANIFEST, manifest)
+    forger.sign_manifest(results.root / "st")
+    assert checked(results, forger).failed
+
+
+def test_the_table_of_fields_names_every_field_of_a_run_record() -> None:
+    schema = msgspec.json.schema(RunRecord)
+
+    def paths(part: dict[str, Any], path: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
+        if "$ref" in part:
+            part = schema["$defs"][part["$ref"].rpartition("/")[2]]
+        if "anyOf" in part:
+            for each in part["anyOf"]:
+                if each.get("type") != "null":
+                    yield from paths(each, path)
+        elif "properties" in part:
+            for name, inner in part["properties"].items():
+                yield from paths(inner, (*path, name))
+        elif part.get("type") == "array":
+            yield from paths(part["items"], (*path, "*"))
+        elif part.get("type") == "object":
+            inner = part.get("additionalProperties")
+            yield from paths(inner, (*path, "*")) if isinstance(inner, dict) else iter(((*path, "*"),))
+        else:
+            yield path
+
+    known = fields.FIELDS[f"runs/*/{contents.RUN}"]
+    listed = {field for text in known.values() for field in text.split()}
+    missing = [
+        ".".join(path)
+        for path in paths(schema, ())
+        if not any(
+            ".".join(path) == field or (field.endswith("*") and ".".join(path).startswith(field.rstrip("*")))
+            for field in listed
+        )
+        and path[:2] not in (("agent", "settings"), ("outcome", "auxiliary"))
+    ]
+    assert missing == []
+
+
+def older(results: Results) -> Forger:
+    """The same file as an earlier version would have written it: its result holds no fields of `run.json`."""
+    forger = Forger(results.files)
+    moved: dict[str, str] = {}
+    for run in ("runs/0000", "runs/0001"):
+        result = json.loads(forger.files[f"{run}/{contents.RESULT}"])
+        del result["record"]
+        forger.put(f"{run}/{contents.RESULT}", result)
+        moved[result["run"]] = contents.digest(forger.files[f"{run}/{contents.RESULT}"])
+
+    def entries(lines: list[bytes]) -> list[bytes]:
+        found = [json.loads(line) for line in lines]
+        for each in found:
+            if each["kind"] == "ended":
+                each["result"] = moved[each["run"]]
+        return [spelt(contents.JOURNAL, each) for each in found]
+
+    forger.entries(entries)
+    heads = journal.heads(contents.journal_entries(forger.files[contents.JOURNAL]))
+    for run in ("runs/0000", "runs/0001"):
+        record = json.loads(forger.files[f"{run}/{contents.RUN}"])
+        place = record["committed"]
+        place["opened_head"], place["ended_head"] = heads[place["opened"]], heads[place["ended"]]
+        forger.put(f"{run}/{contents.RUN}", record)
+    forger.sign(results.root / "st")
+    return forger
+
+
+def test_results_of_earlier_versions_hold_and_list_more_claims(results: Results) -> None:
+    forger = older(results)
+    found = rules.check(Held(forger.files), results.summary["signer"])
+    assert [each for each in found.findings if each.state == "failed"] == []
+    for field in ("versions.fingerprint.cpu", "agent.model_string", "hidden_isolation", "jail"):
+        assert claimed(found, "runs/0000/run.json", tuple(field.split("."))), field
+    now = rules.check(Held(results.files), results.summary["signer"])
+    assert not claimed(now, "runs/0000/run.json", ("versions", "fingerprint", "cpu"))
+
+
+def test_the_page_on_publication_lists_the_claims_of_the_table() -> None:
+    page = (Path(__file__).parents[3] / "docs/how-to/publish.md").read_text()
+    for file, by_cover in fields.FIELDS.items():
+        for field in by_cover.get("claim", "").split():
+            assert f"`{field.removeprefix('*.').replace('.*', '')}`" in page, (file, field)

@@ -1,0 +1,179 @@
+"""Published results of two runs that were really played, and a forger who changes them and signs them again."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import msgspec
+from commands import evopolicy
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
+
+from evopolicy_common.errors import ProtocolError
+from evopolicy_common.records import journal
+from evopolicy_coordinator.pki import identity
+from evopolicy_coordinator.publish import contents
+from evopolicy_coordinator.publish.archive import Archive, Writer
+
+ENV = "toy/line"
+AGENT = """
+import json, os, urllib.request
+def submit(scale, ids):
+    with open("system/policy.py", "w") as file:
+        file.write(f'''
+class Policy:
+    def __init__(self, obs_space, action_space, env_meta):
+        pass
+    def reset(self, episode_index):
+        pass
+    def act(self, obs):
+        return {scale}
+''')
+    request = urllib.request.Request(
+        os.environ["EVOPOLICYGYM_SUBMIT_URL"], data=json.dumps({"env_instances": ids}).encode()
+    )
+    urllib.request.urlopen(request).read()
+submit(1, [0, 1])
+submit(0, [2, 0, 1])
+"""
+
+
+class Results:
+    """A state folder with two runs of one entry, and files of published results."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        (root / "agent.py").write_text(AGENT)
+        for exp_id in ("first", "second"):
+            done = evopolicy(
+                root,
+                *(
+                    "local",
+                    "--env",
+                    ENV,
+                    "--budget",
+                    "5",
+                    "--validation",
+                    "2",
+                    "--heldout",
+                    "3",
+                    "--state",
+                    "st",
+                ),
+                *(
+                    "--agent",
+                    f"command:{sys.executable} {root / 'agent.py'}",
+                    "--entry",
+                    "mine",
+                    "--exp-id",
+                    exp_id,
+                ),
+            )
+            assert done.returncode == 0, done.stdout + done.stderr
+        self.summary = self.publish("all.evp", "runs")
+        self.files = self.read("all.evp")
+
+    def publish(self, out: str, *runs: str) -> dict[str, Any]:
+        done = evopolicy(self.root, "publish", *runs, "--out", out, "--local", "--state", "st", "--json")
+        assert done.returncode == 0, done.stdout + done.stderr
+        document: dict[str, Any] = json.loads(done.stdout)
+        return document
+
+    def read(self, name: str) -> dict[str, bytes]:
+        with Archive(self.root / name) as archive:
+            return {each: archive.read(each, 1 << 30) for each in archive.names}
+
+    def run_folder(self, exp_id: str) -> str:
+        return str(next(self.root.glob(f"runs/*/*/{exp_id}")).relative_to(self.root))
+
+
+class Held:
+    """Files in memory."""
+
+    def __init__(self, files: dict[str, bytes]) -> None:
+        self.files = files
+
+    @property
+    def names(self) -> frozenset[str]:
+        return frozenset(self.files)
+
+    def read(self, name: str, most: int) -> bytes:
+        if name not in self.files:
+            raise ProtocolError(f"{name} is missing")
+        return self.files[name]
+
+
+class Forger:
+    """Changes published files."""
+
+    def __init__(self, files: dict[str, bytes]) -> None:
+        self.files = dict(files)
+
+    def json(self, name: str, change: Callable[[Any], Any]) -> None:
+        """Changes a document in place, or into what `change` returns."""
+        document = json.loads(self.files[name])
+        new = change(document)
+        self.put(name, document if new is None else new)
+
+    def put(self, name: str, content: Any) -> None:
+        """Writes a document as the software does."""
+        self.files[name] = spelt(name, content)
+
+    def text(self, name: str, before: bytes, after: bytes) -> None:
+        assert before in self.files[name]
+        self.files[name] = self.files[name].replace(before, after, 1)
+
+    def entries(self, change: Callable[[list[bytes]], list[bytes]]) -> None:
+        """Changes the journal, and what `run.json` tells of it, as its owner could who begins another."""
+        lines = change(contents.journal_entries(self.files[contents.JOURNAL]))
+        self.files[contents.JOURNAL] = contents.journal_lines(lines)
+
+    def sign(self, state: Path | None = None) -> None:
+        """Makes digests, head and signature anew, with the key of the coordinator in `state`, or a key of the forger's."""
+        folders = sorted({name[:9] for name in self.files if name.startswith("runs/")})
+        manifest = json.loads(self.files[contents.MANIFEST])
+        manifest["files"] = {}
+        for folder in folders:
+            own = {
+                name.removeprefix(f"{folder}/"): contents.digest(data)
+                for name, data in self.files.items()
+                if name.startswith(f"{folder}/") and not name.endswith(contents.DIGESTS)
+            }
+            self.files[f"{folder}/{contents.DIGESTS}"] = contents.document(own)
+            manifest["files"][f"{folder}/{contents.DIGESTS}"] = contents.digest(contents.document(own))
+        for name in (contents.JOURNAL, contents.REMOVED):
+            manifest["files"][name] = contents.digest(self.files[name])
+        lines = contents.journal_entries(self.files[contents.JOURNAL])
+        manifest["journal_entries"], manifest["journal_head"] = len(lines), journal.heads(lines)[-1]
+        self.files[contents.MANIFEST] = contents.document(msgspec.convert(manifest, contents.Manifest))
+        self.sign_manifest(state)
+
+    def sign_manifest(self, state: Path | None = None) -> None:
+        """Makes the signature anew, of the manifest as it is."""
+        digest = contents.digest(self.files[contents.MANIFEST])
+        if state is None:
+            private = Ed25519PrivateKey.from_private_bytes(b"f" * 32)
+            key = private.public_key().public_bytes(Encoding.Raw, PublicFormat.Raw).hex()
+            signature = private.sign(b"evopolicy manifest 1\0" + bytes.fromhex(digest)).hex()
+        else:
+            key, signature = identity.sign(state, digest)
+        self.put(contents.SIGNATURE, {"key": key, "signature": signature})
+
+    def write(self, path: Path) -> None:
+        """The files as an archive."""
+        writer = Writer(path)
+        for name, data in self.files.items():
+            writer.add(name, data)
+        writer.close()
+
+
+def spelt(name: str, content: Any) -> bytes:
+    """JSON in the one spelling that published files have."""
+    if name.endswith(contents.RUN):
+        return msgspec.json.format(msgspec.json.encode(content), indent=2) + b"\n"
+    data = msgspec.json.encode(content, order="sorted")
+    return data if name.endswith((contents.OPENING, contents.RESULT, contents.JOURNAL)) else data + b"\n"
