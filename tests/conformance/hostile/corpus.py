@@ -97,7 +97,7 @@ PROBES = (
         stays_shut=frozenset(
             {
                 *("an io_uring", "a key", "a new network namespace", "what of a file is in memory"),
-                *("being looked into by others", "a process in new namespaces"),
+                *("being looked into by others", "a process in new namespaces", "watches of file systems"),
             }
         ),
     ),

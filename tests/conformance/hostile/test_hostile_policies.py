@@ -420,9 +420,15 @@ def test_a_bundle_of_thousands_of_files_is_played(slots: Slots) -> None:
     "decoy", ["policy/__init__.py", f"policy{EXTENSION_SUFFIXES[0]}", f"policy{EXTENSION_SUFFIXES[-1]}"]
 )
 def test_policy_py_is_played_whatever_else_has_its_name(slots: Slots, decoy: str) -> None:
-    files: dict[str, str | bytes] = {"policy.py": HONEST, decoy: "print('a decoy is played')"}
+    helper = "import policy\nprint(policy.__file__[-9:], policy.MINE)"
+    source = f"MINE = 1\nimport helper\n{HONEST}"
+    files: dict[str, str | bytes] = {
+        "policy.py": source,
+        "helper.py": helper,
+        decoy: "print('a decoy is played')",
+    }
     outcome = slots.play(files)
-    assert (outcome.failure, outcome.stdout) == (None, b"")
+    assert (outcome.failure, outcome.stdout) == (None, b"policy.py 1\n")
     # Python itself prefers the decoy.
     folder = str(slots.bundle(files))
     usual = [(ExtensionFileLoader, EXTENSION_SUFFIXES), (SourceFileLoader, SOURCE_SUFFIXES)]
