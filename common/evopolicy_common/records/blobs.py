@@ -21,6 +21,9 @@ from evopolicy_common.errors import StorageError
 MAX_UNFINISHED = 16
 """Most unfinished uploads of one sender; beyond it the sender's oldest is dropped."""
 
+FileState = tuple[int, int]
+"""Inode and time of the last change of a blob's file: an upload of the same bytes changes them."""
+
 _DIGEST = re.compile(r"[0-9a-f]{64}")
 
 
@@ -111,10 +114,10 @@ class BlobStore:
             raise StorageError(f"blob {digest} is not in {self._root}") from error
 
     def put(self, data: bytes, *, durable: bool = True) -> str:
-        """Stores `data` and returns its digest."""
+        """Stores `data` and returns its digest. A blob that is stored counts as stored now."""
         digest = digest_of(data)
-        path = self.path(digest)
-        if not path.is_file():
+        if not self._touched(digest):
+            path = self.path(digest)
             self._make_parent(path)
             write_atomically(path, data, durable=durable)
         return digest
@@ -147,20 +150,18 @@ class BlobStore:
         size: int,
         offset: int,
         data: bytes,
-        on_whole: Callable[[], None] | None = None,
+        on_whole: Callable[[FileState | None], None] | None = None,
     ) -> int:
         """Appends one chunk of a blob that `sender` uploads and returns the number of bytes received so far.
 
         A chunk that does not continue them changes nothing; the returned offset is where to continue. The last chunk
         checks the digest and stores the blob; StorageError when the digest does not match.
-        `on_whole` is called once the sender has sent the whole blob; with it, a copy stored before is ignored.
+        `on_whole` is called once the sender has sent the whole blob, with the state of its file, or None if the blob was
+        stored before; with it, a copy stored before is ignored.
         """
-        if on_whole is None and self.has(digest):
-            # Refresh its age: garbage collection spares young blobs.
-            with contextlib.suppress(OSError):
-                os.utime(self.path(digest))
+        if on_whole is None and self._touched(digest):
             return size
-        part = self._parts / f"{digest_of(sender.encode())[:16]}-{digest}"
+        part = self._parts / f"{_folded(sender)}-{digest}"
         try:
             have = part.stat().st_size if part.exists() else 0
             if offset == 0 and have:
@@ -179,31 +180,43 @@ class BlobStore:
         except OSError as error:
             raise StorageError(f"cannot write blob {digest}: {error.strerror or error}") from error
         if have == size:
+            is_new = not self.has(digest)
             self._finish(part, digest)
             if on_whole is not None:
-                on_whole()
+                on_whole(_state(self.path(digest).stat()) if is_new else None)
         return have
 
-    def drop_unfinished(self) -> None:
-        """Deletes unfinished uploads; their senders start again."""
-        for part in self._parts.iterdir():
+    def drop_unfinished(self, sender: str | None = None) -> None:
+        """Deletes unfinished uploads, of all senders or of one; their senders start again."""
+        for part in self._parts.glob("*" if sender is None else f"{_folded(sender)}-*"):
             part.unlink(missing_ok=True)
 
-    def delete(self, digest: str) -> int:
-        """Deletes the blob and returns the bytes freed; 0 when it was not stored."""
+    def delete(self, digest: str, unless_changed: FileState | None = None) -> int:
+        """Deletes the blob and returns the bytes freed; 0 when it was not stored, or was uploaded again since its file
+        was in the state `unless_changed`."""
         path = self.path(digest)
         try:
-            size = path.stat().st_size
+            found = path.stat()
+            if unless_changed not in (None, _state(found)):
+                return 0
             path.unlink()
         except FileNotFoundError:
             return 0
-        return size
+        return found.st_size
 
     def digests(self) -> Iterator[str]:
         """The digests of all blobs, in no particular order."""
         for folder in self._root.iterdir():
             if len(folder.name) == 2:
                 yield from (path.name for path in folder.iterdir() if is_digest(path.name))
+
+    def _touched(self, digest: str) -> bool:
+        """Whether the blob is stored; then it is as if stored now, since young blobs are not collected."""
+        if not self.has(digest):
+            return False
+        with contextlib.suppress(OSError):
+            os.utime(self.path(digest))
+        return True
 
     def _make_room(self, part: Path) -> None:
         """Drops a sender's oldest unfinished uploads when it has too many."""
@@ -231,3 +244,11 @@ class BlobStore:
                 fsync_directory(self._root)
             except OSError as error:
                 raise StorageError(f"cannot write {path.parent}: {error.strerror or error}") from error
+
+
+def _folded(sender: str) -> str:
+    return digest_of(sender.encode())[:16]
+
+
+def _state(found: os.stat_result) -> FileState:
+    return found.st_ino, found.st_mtime_ns

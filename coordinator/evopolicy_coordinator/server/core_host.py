@@ -87,6 +87,11 @@ class CoreHost:
         """Age of the transaction in flight, seconds; 0.0 when there is none."""
         return 0.0 if self._outbox is None else self._outbox.writing_s
 
+    @property
+    def idle(self) -> bool:
+        """Whether all that the core has decided is durable."""
+        return self._outbox is not None and self._outbox.idle
+
     # Start and end.
 
     async def start(self) -> None:

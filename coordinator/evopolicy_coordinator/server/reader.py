@@ -35,7 +35,7 @@ from evopolicy_common.messages.operator import (
 from evopolicy_common.messages.status import DiskUse
 from evopolicy_common.messages.worker import BlobAck, BlobChunk, BlobGet, BlobPut, Message, Refused
 from evopolicy_common.records import journal
-from evopolicy_common.records.blobs import BlobStore, digest_of, is_digest
+from evopolicy_common.records.blobs import BlobStore, FileState, digest_of, is_digest
 from evopolicy_common.wire import codec
 from evopolicy_common.wire.refusals import Refusal
 from evopolicy_common.wire.transport import IncomingQuery
@@ -102,6 +102,13 @@ class ServiceReader:
         self._lane(message.digest).submit(
             self._answer, lambda: self._put(sender, run, message, max_bytes, submitted), answer
         )
+
+    def drop_uploads(self, over: Callable[[str], bool]) -> None:
+        """Deletes the uploads of runs that are over, except those that a stored submit names or others have stored."""
+        for run, stored in self._uploads.forget(over).items():
+            self._lanes[0].submit(self._blobs.drop_unfinished, f"gw/{run}")
+            for digest, state in stored.items():
+                self._lane(digest).submit(self._drop, run, digest, state)
 
     def get(self, run: str | None, message: BlobGet, answer: Answer) -> None:
         """Sends one chunk of a blob; with `run`, only if this run's train feedback names the blob."""
@@ -184,6 +191,13 @@ class ServiceReader:
         except Exception:
             log.exception("cannot answer")
             answer(None)
+
+    def _drop(self, run: str, digest: str, stored: FileState) -> None:
+        try:
+            if digest not in self._reader.bundles(run):
+                self._blobs.delete(digest, stored)
+        except StorageError as error:
+            log.error("an upload stays until `evopolicy-coordinator gc`", run=run, error=str(error))
 
     def _audit(self, effect: AuditEffect, tell: Callable[[AuditEvent], None]) -> None:
         # Needs numpy, which a coordinator without audits never imports.

@@ -257,7 +257,9 @@ class RequestParser:
 
     def _check_stored(self, ref: BlobRef) -> None:
         if not is_digest(ref.digest) or not self._blobs.has(ref.digest):
-            raise RefusedError(Refusal.MISSING_BLOB, f"blob {ref.digest[:64]!r} is not stored here")
+            raise RefusedError(
+                Refusal.MISSING_BLOB, f"blob {ref.digest[:64]!r} is not stored here; upload it first"
+            )
         size = self._blobs.size(ref.digest)
         if size != ref.size:
             raise RefusedError(
@@ -542,10 +544,7 @@ class RequestParser:
                 f"{len(m.replays)} recordings for {n} cases; one for each is needed, and no bundle beside them",
             )
         for ref in m.replays:
-            if not (is_digest(ref.digest) and self._blobs.has(ref.digest)):
-                raise RefusedError(
-                    Refusal.MISSING_BLOB, f"blob {ref.digest[:64]!r} is not stored here; upload it first"
-                )
+            self._check_stored(ref)
         place = m.as_in
         if place is None:
             return

@@ -64,6 +64,7 @@ log: structlog.stdlib.BoundLogger = structlog.get_logger()
 MAX_BUNDLE_BYTES = bundles.MAX_BYTES + bundles.MAX_FILES * (bundles.MAX_PATH_BYTES + 32)
 _FORGET_S = 120.0
 """Longer than any long poll: the core answers those within `CoreSettings.max_wait_s`."""
+_SWEEP_S = _FORGET_S / 4
 _STALLS_LOGGED = 5
 
 
@@ -443,11 +444,17 @@ class Service:
         return tell
 
     def _sweep(self) -> None:
-        """Periodically drops queries without a waiter: queries of lost workers are never answered."""
-        self._sweeper = self._loop.call_later(_FORGET_S / 4, self._sweep)
+        """Periodically drops queries without a waiter (queries of lost workers are never answered), and uploads of runs
+        that are over."""
+        self._sweeper = self._loop.call_later(_SWEEP_S, self._sweep)
         self._pending.let_go(_FORGET_S)
         self._tell_stalls()
         self._spawn(self._look_at_disk())
+        core = self.host.core
+        # Once all is durable, the store names every bundle that a submit of a closed run ever will.
+        if core is not None and self.host.idle:
+            runs = core.state.runs
+            self._reader.drop_uploads(lambda run: run not in runs or runs[run].state.phase != "open")
 
     async def _look_at_disk(self) -> None:
         """Updates the figures of the disk, on a thread: a network disk may hang."""

@@ -6,18 +6,20 @@ every byte during this coordinator's lifetime, and the gateway is not told which
 upload is requested and sent again.
 
 A gateway submits each bundle right after its upload. The number and size of the uploads that no submit names are
-limited, as nobody is charged for them: otherwise an agent with its gateway's capability could fill the disk.
-`evopolicy-coordinator gc` deletes what remains of them.
+limited, as nobody is charged for them: otherwise an agent with its gateway's capability could fill the disk. They are
+deleted after their run was closed, unless someone else has stored the same bytes, before or since. A coordinator that
+is restarted leaves them to `evopolicy-coordinator gc`.
 """
 
 from __future__ import annotations
 
 import threading
 from collections import OrderedDict
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 
 from evopolicy_common.errors import RefusedError
+from evopolicy_common.records.blobs import FileState
 from evopolicy_common.wire.refusals import Refusal
 
 MAX_RUNS = 10_000
@@ -35,6 +37,8 @@ class _OfRun:
     sent: OrderedDict[str, None] = field(default_factory=OrderedDict)
     unclaimed: dict[str, int] = field(default_factory=dict)
     """Digest to announced size, from the first chunk on."""
+    stored: dict[str, FileState] = field(default_factory=dict)
+    """Of the blobs in `sent` that nobody had stored before."""
 
 
 class Uploads:
@@ -64,14 +68,21 @@ class Uploads:
                 )
             unclaimed[digest] = size
 
-    def note(self, run: str, digest: str) -> None:
-        """Records that the run's gateway has sent the whole blob."""
+    def note(self, run: str, digest: str, stored: FileState | None = None) -> None:
+        """Records that the run's gateway has sent the whole blob. `stored`: its file, if nobody had stored it before."""
         with self._lock:
-            sent = self._of(run).sent
-            sent[digest] = None
-            sent.move_to_end(digest)
-            while len(sent) > MAX_OF_A_RUN:
-                sent.popitem(last=False)
+            found = self._of(run)
+            found.sent[digest] = None
+            found.sent.move_to_end(digest)
+            if stored is not None:
+                found.stored[digest] = stored
+            while len(found.sent) > MAX_OF_A_RUN:
+                found.stored.pop(found.sent.popitem(last=False)[0], None)
+
+    def forget(self, over: Callable[[str], bool]) -> dict[str, dict[str, FileState]]:
+        """Forgets the runs that are over. Returns the files that their uploads made, by run and digest."""
+        with self._lock:
+            return {run: self._runs.pop(run).stored for run in list(self._runs) if over(run)}
 
     def has_sent(self, run: str, digest: str) -> bool:
         with self._lock:

@@ -291,6 +291,13 @@ class Reader:
         """The submit's current row; None when it is missing."""
         return self._one(SubmitRow, "WHERE run = ? AND submit_index = ?", (run, submit_index))
 
+    def bundles(self, run: str) -> frozenset[str | None]:
+        """The bundles that the run's submits name."""
+        return _guard(
+            self._path,
+            lambda: frozenset(row.bundle for row in rows(self._db, SubmitRow, "WHERE run = ?", (run,))),
+        )
+
     def finished(self, run: str) -> RunFinished | None:
         """The result of a run; None while it is not finished."""
         row = self._one(FinishedRow, "WHERE run = ?", (run,))

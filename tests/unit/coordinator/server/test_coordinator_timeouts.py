@@ -22,6 +22,7 @@ def test_a_query_that_nobody_waits_for_any_more_is_let_go(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(service, "_FORGET_S", SOON_S)
+    monkeypatch.setattr(service, "_SWEEP_S", SOON_S / 4)
 
     async def scenario(world: World) -> None:
         created = await world.create()

@@ -259,6 +259,19 @@ def test_results_must_hold_or_have_stored_the_blobs_they_name(
     assert refused(parser, key, report_results(video=BlobRef(digest="../x", size=1))).status == "missing_blob"
 
 
+def test_recordings_to_replay_are_stored_with_the_size_that_is_announced(
+    parser: RequestParser, blobs: BlobStore
+) -> None:
+    data = b"trajectory"
+    named = blob(data, inline=False)
+    asked = evaluate(cases=(0,), replays=(named,), bundle=None)
+    assert refused(parser, OPS, asked).status == "missing_blob"
+    blobs.put(data)
+    assert event(parser, OPS, asked).row.replays == (named,)
+    small = BlobRef(digest=named.digest, size=1)
+    assert refused(parser, OPS, evaluate(cases=(0,), replays=(small,), bundle=None)).status == "bad_blob"
+
+
 def test_a_blob_that_is_too_large_for_outcomes_or_begun_actions_is_never_read(
     parser: RequestParser, blobs: BlobStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -11,6 +11,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 import structlog
 from rigs.service_world import Requested, World, play, register
@@ -20,6 +21,7 @@ from evopolicy_common.errors import DamagedStoreError, PartFailedError
 from evopolicy_common.messages import gateway, operator, worker
 from evopolicy_common.messages.run_settings import RunSettings
 from evopolicy_common.messages.status import StatusRequest
+from evopolicy_common.records.blobs import digest_of
 from evopolicy_common.wire import keys
 from evopolicy_coordinator.core.machine import Core
 from evopolicy_coordinator.core.settings import CoreSettings
@@ -483,5 +485,70 @@ def test_an_answer_that_cannot_be_made_holds_up_no_other(
         asked = world.submit(created, "key")
         world.ask(world.state(created), asked)
         assert isinstance(await asked.message(), gateway.SubmitAccepted)
+
+    play(tmp_path, scenario)
+
+
+def test_uploads_that_no_submit_named_are_deleted_once_their_run_is_over(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(service, "_SWEEP_S", 0.05)
+
+    async def scenario(world: World) -> None:
+        one, other = await world.create("one"), await world.create("other")
+
+        async def put(created: operator.RunCreated, data: bytes, part: slice = slice(None)) -> None:
+            size, sent = len(data), data[part]
+            message = worker.BlobPut(
+                sender=created.run,
+                token=created.capability,
+                digest=digest_of(data),
+                size=size,
+                offset=0,
+                data=sent,
+            )
+            asked = Requested(keys.gateway_key("c", created.run, "blob"), message)
+            world.ask(asked)
+            assert (await asked.message()).have == len(sent)
+
+        kept_before = b"stored before by someone else"
+        world.blobs.put(kept_before)
+        for data in (
+            *(b"left behind", b"named", b"in both runs", b"brought again", b"stored again"),
+            kept_before,
+        ):
+            await put(one, data)
+        await put(other, b"in both runs")
+        await put(other, b"left behind in an open run")
+        await put(one, b"unfinished", slice(0, 4))
+        # As by an operator or a worker that refers to it from then on.
+        world.blobs.append_chunk("ops/operator", digest_of(b"brought again"), 13, 0, b"brought again")
+        world.blobs.put(b"stored again")
+        named = msgspec.structs.replace(
+            gateway.Submit(run=one.run, token=one.capability, key="k", env_instances=(0, 1), bundle=None),
+            bundle=digest_of(b"named"),
+        )
+        submitted = Requested(keys.gateway_key("c", one.run, "submit"), named)
+        world.ask(submitted)
+        assert isinstance(await submitted.message(), gateway.SubmitAccepted)
+        cancelled = Requested(
+            keys.operator_key("c", "cancel"), operator.CancelRun(token="operate", run=one.run)
+        )
+        world.ask(cancelled)
+        await cancelled.message()
+        async with asyncio.timeout(20):
+            while world.blobs.has(digest_of(b"left behind")) or list((tmp_path / "blobs/parts").iterdir()):
+                await asyncio.sleep(0.02)
+        in_use = (
+            b"named",
+            b"in both runs",
+            b"brought again",
+            b"stored again",
+            kept_before,
+            b"left behind in an open run",
+        )
+        assert all(world.blobs.read(digest_of(data)) == data for data in in_use)
+        assert world.uploads.has_sent(other.run, digest_of(b"in both runs"))
+        assert not world.uploads.has_sent(one.run, digest_of(b"named"))
 
     play(tmp_path, scenario)
