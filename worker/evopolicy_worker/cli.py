@@ -40,7 +40,7 @@ from evopolicy_worker.sandbox import SANDBOXED, available_tiers, why_not
 from evopolicy_worker.sandbox.doctor import best_tier, examine
 from evopolicy_worker.slots.cores import Cores
 from evopolicy_worker.slots.slot import Slot
-from evopolicy_worker.supervisor import MAX_PREPARED, Describe, Options, Supervisor
+from evopolicy_worker.supervisor import MAX_PREPARED, Describe, Options, Probe, Supervisor, tell_missing
 
 app = App(add_completion=True)
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
@@ -169,6 +169,8 @@ def work(
             tiers: tuple[Tier, ...] = (*needed, "none") if unsandboxed else needed
         else:
             tiers = available_tiers(unsandboxed=unsandboxed, wanted=needed or SANDBOXED)
+        missing = {tier: why_not(tier) or "" for tier in needed or SANDBOXED if tier not in (*tiers, "none")}
+        tell_missing(missing)
         if not tiers:
             raise MachineError(
                 "no sandbox works on this machine: `evopolicy-worker doctor` names the cause and the remedy; --unsandboxed plays"
@@ -176,7 +178,7 @@ def work(
             )
         for tier in needed:
             if tier not in tiers:
-                raise _refused(tier, why_not(tier), unsandboxed=unsandboxed)
+                raise _refused(tier, missing.get(tier), unsandboxed=unsandboxed)
         with scratch_folder("worker") as scratch:
             try:
                 asyncio.run(
@@ -186,6 +188,7 @@ def work(
                         wanted,
                         slots,
                         tiers,
+                        missing,
                         scratch,
                         tuple(allow_package or ()),
                         grace,
@@ -270,6 +273,7 @@ async def _run(
     env_ids: list[str],
     slots: int | None,
     tiers: tuple[Tier, ...],
+    missing: dict[Tier, str],
     scratch: Path,
     allowed_packages: tuple[str, ...],
     grace_s: float,
@@ -306,6 +310,13 @@ async def _run(
         finally:
             await slot.close()
 
+    async def probe(tier: Tier) -> None:
+        slot = Slot(None, tier, scratch / "slot-probe", packages, limits=limits)
+        try:
+            await slot.start()
+        finally:
+            await slot.close()
+
     try:
         known, now, later = descriptions.sorted_out(env_ids, cache)
         known += await descriptions.describe_all(now, first, cache, or_none=bool(known or later))
@@ -316,6 +327,7 @@ async def _run(
             name=name or default_name(found),
             slots=len(taken),
             tiers=tiers,
+            missing_tiers=missing,
             environments=importing(sorted(known, key=lambda each: env_ids.index(each.env))),
             undescribed=tuple(later),
             fingerprint=own,
@@ -329,7 +341,7 @@ async def _run(
             log.warning("this worker gets no hidden episodes", why=host.NO_BOOT_ID)
         log.info("waiting for the coordinator", endpoints=found.endpoints)
         with contextlib.suppress(asyncio.CancelledError):
-            await _serve(found, options, make_slot, describe)
+            await _serve(found, options, make_slot, describe, probe)
     finally:
         for slot in kept:
             await slot.close()
@@ -341,6 +353,7 @@ async def _serve(
     options: Options,
     make_slot: Callable[[int, Tier], Slot],
     describe: Describe,
+    probe: Probe,
 ) -> None:
     loop = asyncio.get_running_loop()
     main = asyncio.current_task()
@@ -358,7 +371,7 @@ async def _serve(
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, stop)
     async with transport.connect(found, timeout_s=None) as link:
-        supervisor = Supervisor(link, options, make_slot, describe)
+        supervisor = Supervisor(link, options, make_slot, describe, probe)
         await supervisor.run()
         log.info("stopped", jobs_done=supervisor.jobs_done)
 

@@ -18,9 +18,9 @@ import asyncio
 import contextlib
 import time
 from collections import OrderedDict
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, get_args
 
 import msgspec
 
@@ -68,6 +68,10 @@ CANCEL_TIMEOUT_S = 2.0
 """How long the worker waits, when it exits, for slots to stop their cancelled jobs."""
 WITHDRAW_TIMEOUT_S = 1.0
 SILENCE_LOOK_S = 0.5
+PROBE_PAUSE_S, LONGEST_PROBE_PAUSE_S = 30.0, 600.0
+"""Before a tier that does not work is tried again; the pause doubles each time."""
+MAX_WHY = 500
+"""Characters of the reason why a tier does not work."""
 MAX_PREPARED = 4
 """A worker that offers at most this many environments has its slots import all their simulators before work arrives."""
 
@@ -91,6 +95,8 @@ class SlotLike(Protocol):
     async def close(self) -> None: ...
 
 
+Probe = Callable[[Tier], Awaitable[None]]
+"""Starts a sandbox of a tier and ends it. Raises EvopolicyError or OSError when it does not start."""
 Describe = Callable[[Sequence[str]], Awaitable[tuple[EnvironmentDescription, ...]]]
 """Describes environments, without those that cannot be; see `descriptions.describe_all`."""
 
@@ -108,6 +114,8 @@ class Options(msgspec.Struct, frozen=True, kw_only=True):
     host: str
     boot_id: str = ""
     """Boot id of this kernel. Empty: unknown; this worker gets no hidden episodes."""
+    missing_tiers: dict[Tier, str] = {}
+    """Sandbox tiers that should work here and do not, with the reasons; tried again from time to time."""
     machine_id: str = ""
     scratch: Path
     grace_s: float = 10.0
@@ -123,9 +131,12 @@ class Supervisor:
         options: Options,
         make_slot: Callable[[int, Tier], SlotLike],
         describe: Describe | None = None,
+        probe: Probe | None = None,
     ) -> None:
-        """`describe`: needed where `options.undescribed` has any."""
+        """`describe`: needed where `options.undescribed` has any. `probe`: where `options.missing_tiers` has any."""
         self._link = link
+        self._tiers, self._missing_tiers = set(options.tiers), dict(options.missing_tiers)
+        self._probe = probe
         self._options = options
         self._make_slot = make_slot
         self._describe = describe
@@ -181,6 +192,7 @@ class Supervisor:
         report_results = asyncio.create_task(self._outbox.run())
         report_results.add_done_callback(self._report_ended)
         working = asyncio.create_task(self._work_and_report())
+        probing = asyncio.create_task(self._probe_again())
         try:
             await asyncio.wait([working, self._failed], return_when=asyncio.FIRST_COMPLETED)
             if self._failed.done():
@@ -188,7 +200,12 @@ class Supervisor:
             await working
         finally:
             self._heartbeat.stop()
-            tasks = [working, report_results, *([self._describing] if self._describing is not None else [])]
+            tasks = [
+                working,
+                report_results,
+                probing,
+                *([self._describing] if self._describing is not None else []),
+            ]
             for task in tasks:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
@@ -245,7 +262,8 @@ class Supervisor:
                 token=self._link.credentials.token,
                 protocol=codec.WIRE_VERSION,
                 slots=options.slots,
-                tiers=options.tiers,
+                tiers=tuple(tier for tier in get_args(Tier) if tier in self._tiers),
+                missing_tiers={tier: why[:MAX_WHY] for tier, why in self._missing_tiers.items()},
                 environments=tuple(self._described.values()),
                 undescribed=tuple(self._undescribed),
                 fingerprint=options.fingerprint,
@@ -298,6 +316,27 @@ class Supervisor:
             del self._undescribed[env_id]
         with contextlib.suppress(RefusedError):  # the lease loop meets the same refusal
             await self._register()
+
+    async def _probe_again(self) -> None:
+        """Tries the tiers that do not work until all do, and registers with each that does, or has another reason."""
+        pause_s = PROBE_PAUSE_S
+        while self._missing_tiers and self._probe is not None:
+            await asyncio.sleep(pause_s)
+            pause_s = min(2 * pause_s, LONGEST_PROBE_PAUSE_S)
+            before = dict(self._missing_tiers)
+            for tier in before:
+                try:
+                    await self._probe(tier)
+                except (EvopolicyError, OSError) as error:
+                    self._missing_tiers[tier] = str(error)
+                else:
+                    del self._missing_tiers[tier]
+                    self._tiers.add(tier)
+                    log.info("sandbox tier works now", tier=tier)
+            if self._missing_tiers != before:
+                tell_missing(self._missing_tiers)
+                with contextlib.suppress(RefusedError):  # the lease loop meets the same refusal
+                    await self._register()
 
     def _cancel(self, lease_id: str) -> None:
         """Returns the waiting job, or stops the running one, of a lease that this worker no longer holds."""
@@ -572,6 +611,12 @@ class Supervisor:
             await self._ask.once("lease", request, Leases)
         await asyncio.wait({lease}, timeout=WITHDRAW_TIMEOUT_S)
         lease.cancel()
+
+
+def tell_missing(tiers: Mapping[Tier, str]) -> None:
+    """Logs the sandbox tiers that do not work, with the reasons."""
+    for tier, why in tiers.items():
+        log.warning("sandbox tier does not work; it is tried again", tier=tier, why=why)
 
 
 def _held(lease: Lease, *, running: bool, episodes_done: int = 0, steps: int = 0) -> HeldLease:

@@ -47,6 +47,8 @@ class WorkerStatus(msgspec.Struct, frozen=True, kw_only=True):
     """Episode jobs that it plays now, by run or evaluation."""
     installation: Word = ""
     """Its Python installation, as in `versions.installations` of `run.json`."""
+    missing_tiers: Named[Text] = {}
+    """Sandbox tiers that should work there and do not, with the reasons."""
 
 
 class RetriedJobs(msgspec.Struct, frozen=True, kw_only=True):

@@ -100,6 +100,8 @@ class Register(Message, frozen=True, kw_only=True, tag="register"):
     """Ids of shipped environments that it offers, too, and describes once a reply to a heartbeat asks for them."""
     installation: Word = ""
     """The worker's Python installation (`installs.own`); empty from workers of earlier versions."""
+    missing_tiers: Named[Text] = {}
+    """Sandbox tiers that should work there and do not, with the reasons."""
 
 
 class Registered(Message, frozen=True, kw_only=True, tag="registered"):

@@ -22,8 +22,8 @@ from evopolicy_common.cli import Connect, CredentialsFile, fail_on_our_errors
 from evopolicy_common.commands import App
 from evopolicy_common.console import table, terminal
 from evopolicy_common.errors import ConfigError
-from evopolicy_common.messages.status import StatusReply
-from evopolicy_common.terminal import say, say_json
+from evopolicy_common.messages.status import StatusReply, WorkerStatus
+from evopolicy_common.terminal import say, say_json, say_lines
 from evopolicy_common.wire import credentials, transport
 from evopolicy_common.wire.operator_client import OperatorClient
 
@@ -116,14 +116,27 @@ def list_workers(connect: Connect = None, file: CredentialsFile = None, as_json:
         "state",
         "slots",
         "running",
+        "tiers",
         "environments",
         right=("slots", "running"),
         whole=("worker",),
     )
     for worker in reply.workers:
         counts = (str(worker.slots), str(worker.running))
-        shown.add_row(worker.worker, worker.host, worker.state, *counts, _names(worker.environments))
+        shown.add_row(
+            worker.worker, worker.host, worker.state, *counts, _tiers(worker), _names(worker.environments)
+        )
     terminal().print(shown if reply.workers else "no worker is connected")
+    say_lines(line for worker in reply.workers for line in _missing_tiers(worker))
+
+
+def _tiers(worker: WorkerStatus) -> str:
+    return ", ".join([" ".join(worker.tiers), *(f"no {tier}" for tier in worker.missing_tiers)])
+
+
+def _missing_tiers(worker: WorkerStatus) -> Iterator[str]:
+    for tier, why in worker.missing_tiers.items():
+        yield f"{worker.worker} has no sandbox tier {tier}: {why}"
 
 
 def _names(env_ids: Sequence[str]) -> str:
@@ -271,7 +284,7 @@ def _workers(reply: StatusReply) -> Table:
             str(worker.running),
             str(worker.held),
             str(len(worker.environments)),
-            " ".join(worker.tiers),
+            _tiers(worker),
             worker.fingerprint,
             f"{_age(worker.last_seen_s)} ago",
         )
@@ -335,6 +348,7 @@ def _remarks(reply: StatusReply) -> Iterator[str]:
     for worker in reply.workers:
         for run_id, why in worker.refused.items():
             yield f"{worker.worker} gets no work of {run_id}: {why}"
+        yield from _missing_tiers(worker)
         if worker.hidden_bar:
             yield f"{worker.worker} plays no hidden episodes now: {worker.hidden_bar}"
     yield from reply.stalls

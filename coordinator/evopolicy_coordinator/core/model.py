@@ -575,6 +575,8 @@ class Worker:
     """Its processor's features."""
     installation: str = ""
     """Its Python installation; empty for workers of earlier versions."""
+    missing_tiers: dict[str, str] = field(default_factory=dict)
+    """Sandbox tiers that should work there and do not, with the reasons."""
     state: Literal["active", "paused", "draining", "lost", "quarantined"] = "active"
     leases: dict[str, Lease] = field(default_factory=dict)
     """By id, oldest first; also given-up ones until the worker no longer names them."""

@@ -135,6 +135,7 @@ def _worker(state: State, worker: Worker, now: float, refused: dict[str, str]) -
         hidden_bar=conflicts.conflict_of_worker(state, worker),
         playing=_playing(live),
         installation=worker.installation,
+        missing_tiers=worker.missing_tiers,
     )
 
 

@@ -19,10 +19,20 @@ from evopolicy_coordinator.core.isolation.conflicts import NO_BOOT_ID
 from evopolicy_coordinator.core.reasons import Code, Reason
 
 
-def _workers(env: str, tier: str, same_versions: bool, away: tuple[str, ...], connected: bool) -> str:
+def _workers(
+    env: str,
+    tier: str,
+    same_versions: bool,
+    away: tuple[str, ...],
+    connected: bool,
+    lacking: tuple[tuple[str, str], ...],
+) -> str:
     wanted = f"a worker that offers {env} with sandbox tier {tier}"
     if same_versions:
         wanted += ", of the versions that the run started with"
+    if lacking:
+        reasons = "; ".join(f"{worker}: {why}" for worker, why in lacking)
+        wanted += f" (the tier does not work on {reasons})"
     # Agents must learn nothing of audits.
     states = sorted("out of service" if state == "quarantined" else state for state in away)
     if states:
@@ -30,7 +40,7 @@ def _workers(env: str, tier: str, same_versions: bool, away: tuple[str, ...], co
     if not connected:
         # A worker that is still starting lacks nothing that has to be installed.
         return f"{wanted}; no worker is connected yet"
-    advice = installs.advice(env)
+    advice = "" if lacking else installs.advice(env)
     return f"{wanted} ({advice} on a machine)" if advice else wanted
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hmac
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, get_args
 
 import msgspec
 
@@ -12,7 +12,7 @@ from evopolicy_common import catalogue
 from evopolicy_common.errors import RefusedError
 from evopolicy_common.messages import worker
 from evopolicy_common.messages.environment import Case
-from evopolicy_common.messages.episode import LARGEST_LIMIT, LARGEST_LIMITS, BlobRef, ResourceLimits
+from evopolicy_common.messages.episode import LARGEST_LIMIT, LARGEST_LIMITS, BlobRef, ResourceLimits, Tier
 from evopolicy_common.processes.packages import POLICY
 from evopolicy_common.records.blobs import digest_of
 from evopolicy_common.wire import codec, keys
@@ -33,6 +33,7 @@ MAX_ENVIRONMENTS = 10_000
 """Of one worker. The status for operators lists them."""
 _MAX_WAIT_S = 60.0
 _MAX_NAME = 200
+_MAX_WHY = 1000
 
 
 def finite_wait(seconds: float) -> float:
@@ -142,6 +143,13 @@ def check_registration(message: worker.Register) -> None:
     if n > MAX_ENVIRONMENTS or not all(map(catalogue.valid_id, message.undescribed)):
         raise RefusedError(
             Refusal.BAD_MESSAGE, f"{n:,} environments; {MAX_ENVIRONMENTS:,} with valid ids are the limit"
+        )
+    tiers = message.missing_tiers
+    if not tiers.keys() <= set(get_args(Tier)) or any(len(why) > _MAX_WHY for why in tiers.values()):
+        raise RefusedError(
+            Refusal.BAD_MESSAGE,
+            f"missing tiers {str(list(tiers))[:64]}: tiers are {', '.join(get_args(Tier))}, a reason has at most"
+            f" {_MAX_WHY} characters",
         )
     check_place(message.boot_id, message.machine_id, message.host, message.installation)
 

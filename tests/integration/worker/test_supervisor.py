@@ -27,6 +27,7 @@ from coordinator_harness import (
     play,
     run,
 )
+from typer.testing import CliRunner
 
 from evopolicy_common.errors import PartFailedError, SandboxError, SlotDiedError, WorkerError
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome, Job, Tier
@@ -34,9 +35,10 @@ from evopolicy_common.records.blobs import digest_of
 from evopolicy_common.wire import codec
 from evopolicy_common.wire.requests import Requester
 from evopolicy_common.wire.transport import connect
+from evopolicy_coordinator.cli.status import status_app, workers_app
 from evopolicy_worker import outbox, supervisor
 from evopolicy_worker.episodes.begun import HandedBack
-from evopolicy_worker.supervisor import Options, Supervisor
+from evopolicy_worker.supervisor import Options, Probe, Supervisor
 
 pytestmark = pytest.mark.slow
 
@@ -121,12 +123,16 @@ async def supervising(
     grace_s: float = 5.0,
     dress: Callable[[EpisodeOutcome], EpisodeOutcome] = large,
     kind: type[ScriptedSlot] = ScriptedSlot,
+    tiers: tuple[Tier, ...] = ("bwrap",),
+    missing: dict[Tier, str] | None = None,
+    probe: Probe | None = None,
 ) -> AsyncIterator[Supervisor]:
     """A supervisor that works in the background and is drained at the end."""
     options = Options(
         name=name,
         slots=slots,
-        tiers=("bwrap",),
+        tiers=tiers,
+        missing_tiers=missing or {},
         environments=(LINE,),
         fingerprint=FINGERPRINT,
         host="test",
@@ -139,7 +145,7 @@ async def supervising(
         return kind(script, dress)
 
     async with connect(coordinator.credentials("worker")) as link:
-        found = Supervisor(link, options, make_slot)
+        found = Supervisor(link, options, make_slot, probe=probe)
         task = asyncio.create_task(found.run())
         try:
             yield found
@@ -170,6 +176,49 @@ def test_a_whole_run_goes_through_the_supervisor(coordinator: Coordinator, tmp_p
             # 16 train, 2 × 3 validation, 4 held-out, 4 random; the second submit may have stopped validation that was
             # played by the time it heard of it.
             assert 30 <= worker.jobs_done <= 33
+
+    run(scenario)
+
+
+def test_a_tier_that_failed_once_is_told_and_tried_again(
+    coordinator: Coordinator, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(supervisor, "PROBE_PAUSE_S", 0.05)
+    works, probed = asyncio.Event(), asyncio.Event()
+
+    async def probe(tier: Tier) -> None:
+        probed.set()
+        if not works.is_set():
+            raise SandboxError(f"{tier}: still no namespaces")
+
+    async def scenario() -> None:
+        missing: dict[Tier, str] = {"bwrap": "no namespaces"}
+        async with (
+            supervising(coordinator, tmp_path, tiers=("landlock",), missing=missing, probe=probe),
+            operator_of(coordinator) as operator,
+        ):
+            played = asyncio.create_task(whole_run(coordinator, "waits"))
+            async with asyncio.timeout(30):
+                await probed.wait()
+                while True:
+                    status = await operator.status()
+                    waits = [run.waits_for for run in status.runs if "tier bwrap" in run.waits_for]
+                    if waits and status.workers[0].missing_tiers == {"bwrap": "bwrap: still no namespaces"}:
+                        break
+                    await asyncio.sleep(0.05)
+            assert status.workers[0].tiers == ("landlock",)
+            file = coordinator.ready["credentials"]["operator"]
+            for app, *arguments in ((status_app,), (workers_app, "list")):
+                arguments += ["--credentials", file]
+                shown = await asyncio.to_thread(CliRunner().invoke, app, arguments)
+                assert "w-1 has no sandbox tier bwrap: bwrap: still no namespaces" in shown.stdout.replace(
+                    "\n", " "
+                )
+            assert "does not work on w-1: bwrap: still no namespaces" in waits[0]
+            works.set()
+            assert (await played)["status"] == "completed"
+            (worker,) = (await operator.status()).workers
+            assert (worker.tiers, worker.missing_tiers) == (("bwrap", "landlock"), {})
 
     run(scenario)
 

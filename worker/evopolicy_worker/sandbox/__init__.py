@@ -21,18 +21,13 @@ SANDBOXED: tuple[Tier, ...] = ("bwrap", "landlock")
 """Tiers that confine policies, strongest first."""
 
 
-def available_tiers(
-    allowed_packages: tuple[str, ...] = ("numpy",),
-    *,
-    unsandboxed: bool = False,
-    wanted: Collection[str] = SANDBOXED,
-) -> tuple[Tier, ...]:
+def available_tiers(*, unsandboxed: bool = False, wanted: Collection[str] = SANDBOXED) -> tuple[Tier, ...]:
     """Tiers that this machine offers, strongest first; `none` only with `unsandboxed`.
 
     `wanted`: the sandboxed tiers to test; each takes about a second. A job names its tier, and nothing falls back to
     another.
     """
-    found = [tier for tier in SANDBOXED if tier in wanted and why_not(tier, allowed_packages) is None]
+    found = [tier for tier in SANDBOXED if tier in wanted and why_not(tier) is None]
     return (*found, "none") if unsandboxed else tuple(found)
 
 

@@ -73,6 +73,7 @@ def register(state: State, event: WorkerRegistered, kernel: Kernel, step: Step) 
         machine=event.machine,
         cpu=message.fingerprint.cpu,
         installation=message.installation,
+        missing_tiers=dict(message.missing_tiers),
         state="lost",
         undescribed=frozenset(message.undescribed),
         undescribed_size=sum(map(len, message.undescribed)),

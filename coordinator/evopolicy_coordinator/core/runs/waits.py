@@ -7,6 +7,8 @@ from evopolicy_coordinator.core.model import Flow, JobGroup
 from evopolicy_coordinator.core.reasons import Reason, because
 from evopolicy_coordinator.core.state import State
 
+_LACKING_SHOWN = 3
+
 
 def waits_for(state: State, group: JobGroup) -> Reason | None:
     """Returns the reason why an open group waits; None when one of its jobs is leased."""
@@ -42,6 +44,13 @@ def waits_for_workers(state: State, flow: Flow) -> Reason | None:
     if any(worker.state == "active" for worker in later):
         return because("description", env=flow.env)
     away = {worker.state for worker in (*same, *later) if worker.state != "active"}
+    lacking = [
+        (worker.name, worker.missing_tiers[flow.tier])
+        for worker in state.workers.values()
+        if worker.state != "lost"
+        and flow.tier in worker.missing_tiers
+        and (flow.env in worker.profile.classes or flow.env in worker.undescribed)
+    ]
     return because(
         "workers",
         env=flow.env,
@@ -49,4 +58,5 @@ def waits_for_workers(state: State, flow: Flow) -> Reason | None:
         same_versions=len(same) < len(able),
         away=tuple(sorted(away)),
         connected=any(worker.state != "lost" for worker in state.workers.values()),
+        lacking=tuple(lacking[:_LACKING_SHOWN]),
     )

@@ -127,6 +127,14 @@ def _cluster_notices(cluster: Cluster, status: StatusReply) -> list[dict[str, An
         ),
     )
     tell(
+        "Workers without a sandbox tier",
+        (
+            f"{worker.worker}: {tier}: {why}"
+            for worker in status.workers
+            for tier, why in worker.missing_tiers.items()
+        ),
+    )
+    tell(
         "Workers that play no hidden episodes now",
         (f"{worker.worker}: {worker.hidden_bar}" for worker in status.workers if worker.hidden_bar),
     )

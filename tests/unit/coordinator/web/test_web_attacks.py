@@ -326,7 +326,7 @@ def test_what_agents_wrote_is_text_on_every_page(tmp_path: Path) -> None:
     (episode / "error.txt").write_text(MARKUP)
     worker = WorkerStatus(
         worker=MARKUP, host=MARKUP, slots=1, state="active", tiers=("bwrap",), environments=(MARKUP,), fingerprint=MARKUP,
-        versions={MARKUP: MARKUP}, held=0, running=0, last_seen_s=0.0, refused={MARKUP: MARKUP}, hidden_bar=MARKUP, playing={MARKUP: 1},
+        versions={MARKUP: MARKUP}, held=0, running=0, last_seen_s=0.0, refused={MARKUP: MARKUP}, hidden_bar=MARKUP, missing_tiers={MARKUP: MARKUP}, playing={MARKUP: 1},
     )  # fmt: skip
     reply = status(
         open_status("r-open", entry=MARKUP, waits_for=MARKUP, exp_id=MARKUP),
