@@ -51,6 +51,8 @@ class LabRun(msgspec.Struct, frozen=True, kw_only=True):
     """The coordinator's id."""
     episodes: tuple[Curve, ...]
     """Held-out episodes of the selected checkpoint."""
+    unrecorded: bool = False
+    """Some of its episodes have no recording, so that no replay can contradict their returns."""
 
 
 class LabBundle(msgspec.Struct, kw_only=True):
@@ -59,6 +61,8 @@ class LabBundle(msgspec.Struct, kw_only=True):
     file: str
     """Its name without folders."""
     sha256: str
+    number: int = 0
+    """Position among the files of the site."""
     lab: str = ""
     """Name that the site's owner gives the signer; empty for none."""
     checked: Checked = msgspec.field(default_factory=Checked)
@@ -68,6 +72,11 @@ class LabBundle(msgspec.Struct, kw_only=True):
     refused: str = ""
     """Why no run of it is shown; empty when they are."""
     processors: list[str] = []
+
+    @property
+    def page(self) -> str:
+        """Its page, relative to the site's folder."""
+        return f"bundles/{self.number:03d}.html"
 
     @property
     def signer(self) -> str:
@@ -97,7 +106,7 @@ def read_bundles(
     found: list[LabBundle] = []
     seen: dict[str, str] = {}
     for number, path in enumerate(files):
-        bundle = LabBundle(file=path.name, sha256=_sha256(path))
+        bundle = LabBundle(file=path.name, sha256=_sha256(path), number=number)
         found.append(bundle)
         try:
             with Archive(path) as archive:
@@ -154,7 +163,12 @@ def _read(
     for loaded_run in loaded.runs:
         source = by_folder[loaded_run.path]
         bundle.runs.append(
-            LabRun(run=loaded_run, published=source.opening.run, episodes=_curves(archive, source))
+            LabRun(
+                run=loaded_run,
+                published=source.opening.run,
+                episodes=_curves(archive, source),
+                unrecorded=bool(checked.unrecorded(source.opening.run)),
+            )
         )
     if not bundle.runs:
         bundle.refused = "none of its runs has a score"

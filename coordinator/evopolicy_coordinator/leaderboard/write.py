@@ -67,9 +67,8 @@ def write_site(
 
 def _write_pages(bundles: Sequence[LabBundle], out: Path, title: str, tell: Tell) -> None:
     found = boards(bundles)
-    pages = {id(bundle): f"bundles/{number:03d}.html" for number, bundle in enumerate(bundles)}
     for bundle in bundles:
-        _write(out / pages[id(bundle)], _bundle_page(bundle))
+        _write(out / bundle.page, _bundle_page(bundle))
     sections: list[dict[str, Any]] = []
     entries: set[str] = set()
     reference: str | None = None
@@ -81,13 +80,13 @@ def _write_pages(bundles: Sequence[LabBundle], out: Path, title: str, tell: Tell
         write_report(study, out / folder, title=f"{title}, board {number}")
         entries |= set(study.entries)
         reference = reference or study.reference
-        sections.append(_board(board, study, number, folder, pages))
+        sections.append(_board(board, study, number, folder))
         for bundle in board.bundles:
             for each in bundle.runs:
                 page = f"episodes/{slug(each.run)}-{number}.html"
                 _write(out / page, _episodes(each, bundle, f"../{folder}/traces/{slug(each.run)}.html"))
-                run_rows.append(_run_row(each, bundle, folder, page, pages[id(bundle)]))
-    sections.append(_files(bundles, pages))
+                run_rows.append(_run_row(each, bundle, folder, page, bundle.page))
+    sections.append(_files(bundles))
     if run_rows:
         columns = ("Entry", "Environment", "Repeat", "Held-out mean", "Run", "Episodes", "File", "Signed by")
         caption = (
@@ -98,9 +97,7 @@ def _write_pages(bundles: Sequence[LabBundle], out: Path, title: str, tell: Tell
         sections.append(section("runs", "Runs", tables=[table]))
     refused = [bundle for bundle in bundles if bundle.refused]
     if refused:
-        rows: list[list[Cell]] = [
-            [Link(each.file, pages[id(each)]), each.label, each.refused] for each in refused
-        ]
+        rows: list[list[Cell]] = [[Link(each.file, each.page), each.label, each.refused] for each in refused]
         table = plain_view(
             "refused", "Not shown", "No run of these files is in a board.", ("File", "Signed by", "Why"), rows
         )
@@ -158,7 +155,7 @@ def _write(path: Path, text: str) -> None:
     path.write_text(text, encoding="utf-8", errors="replace")
 
 
-def _board(board: Board, study: Study, number: int, folder: str, pages: dict[int, str]) -> dict[str, Any]:
+def _board(board: Board, study: Study, number: int, folder: str) -> dict[str, Any]:
     views = []
     for table in tables_of(study):
         kind = table.name.partition("_")[0]
@@ -169,7 +166,11 @@ def _board(board: Board, study: Study, number: int, folder: str, pages: dict[int
     suites = ", ".join(suite_title(suite.name) for suite in study.suites)
     name = "Leaderboard" if number == 1 else f"Board {number}"
     reasons_title = ""
-    if board.mixed:
+    if board.unrecorded:
+        reasons_title = (
+            "These runs stand apart: their scores rest on the publisher's word, or their runs differ in"
+        )
+    elif board.mixed:
         reasons_title = "The runs of this file are no fair comparison; they differ in"
     elif board.apart:
         reasons_title = "These files stand apart: beside the first board their runs differ in"
@@ -187,7 +188,7 @@ def _board(board: Board, study: Study, number: int, folder: str, pages: dict[int
         tables=views,
         links=[
             ("The whole report of these runs", f"{folder}/index.html"),
-            *((f"{bundle.file}, signed by {bundle.label}", pages[id(bundle)]) for bundle in board.bundles),
+            *((f"{bundle.file}, signed by {bundle.label}", bundle.page) for bundle in board.bundles),
         ],
     )
 
@@ -206,14 +207,14 @@ def _run_row(each: LabRun, bundle: LabBundle, folder: str, episodes: str, page: 
     ]
 
 
-def _files(bundles: Sequence[LabBundle], pages: dict[int, str]) -> dict[str, Any]:
+def _files(bundles: Sequence[LabBundle]) -> dict[str, Any]:
     kinds = [kind for kind in KINDS if any(bundle.state_of(kind) for bundle in bundles)]
     rows: list[list[Cell]] = []
     for bundle in bundles:
         left = [each for each in bundle.checked.listing if each.state != "published"]
         rows.append(
             [
-                Link(bundle.file, pages[id(bundle)]),
+                Link(bundle.file, bundle.page),
                 bundle.label,
                 len(bundle.checked.runs),
                 len(left),

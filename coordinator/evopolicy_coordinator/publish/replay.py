@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
 
 from evopolicy_common import catalogue
 from evopolicy_common.errors import EvopolicyError, ProtocolError
@@ -28,6 +29,7 @@ from evopolicy_common.processes.local_cluster import local_cluster
 from evopolicy_common.processes.scratch import scratch_folder
 from evopolicy_common.records.blobs import digest_of
 from evopolicy_common.records.episodes.rendered import decode
+from evopolicy_common.records.episodes.trajectory import Trajectory
 from evopolicy_common.wire import credentials, transport
 from evopolicy_common.wire.operator_client import DESCRIPTION_S, OperatorClient
 from evopolicy_coordinator.publish import contents
@@ -36,6 +38,9 @@ from evopolicy_coordinator.publish.findings import Checked, Files, PublishedRun
 from evopolicy_coordinator.publish.run_rules import recording_of
 from evopolicy_coordinator.splits import FILE_STEMS, SPLITS, SplitFile, cases_hash, folder_name
 from evopolicy_coordinator.verify import compare
+
+LAST_PLACES = 4
+"""Units in the last place by which a reward may differ on a processor with other features."""
 
 Tell = Callable[[int, int], None]
 """Receives the number of episodes played, and the total."""
@@ -118,23 +123,32 @@ async def _play_run(
     if why_not:
         checked.add("replay", "open", f"not played: {why_not}", name)
         return played
-    before, faults = played, []
+    covered = {group.part: 0 for group in run.groups}
+    alike = True
     for part in parts:
-        n, found = await _play(ask, files, part)
-        faults += found
+        n, faults = await _play(ask, files, part)
+        covered[part.group.part] += n
         played += n
         tell(played)
-    for fault in faults:
-        if other_cpu:
-            text = f"{fault}; this machine's processor has other features than the run's, which can change numbers"
-            checked.add("replay", "open", text, name)
-        else:
-            checked.add("replay", "failed", fault, name)
-    if played == before:
-        checked.add("replay", "open", "no episode was played: none that was drawn has a recording here", name)
-    elif not faults:
-        text = f"{played - before} episodes, bit for bit (drawn by seed {seed})"
-        checked.add("replay", "ok", text, name)
+        for fault, rounding in faults:
+            alike = False
+            if other_cpu and rounding:
+                text = f"{fault}, {LAST_PLACES} units in the last place at most: this machine's processor has other features than the run's"
+                checked.add("replay", "open", text, name)
+            elif other_cpu:
+                text = f"{fault}; other features of the processor do not explain this"
+                checked.add("replay", "failed", text, name)
+            else:
+                checked.add("replay", "failed", fault, name)
+    # A replay shows nothing of episodes without a recording, however many it drew.
+    missing = checked.unrecorded(name)
+    if alike:
+        of = {part: n for part, (_, n) in checked.recorded.get(name, {}).items()}
+        text = ", ".join(f"{n} of {of.get(part, n)} {part}" for part, n in covered.items())
+        text += f" episodes, bit for bit (drawn by seed {seed})"
+        if missing:
+            text += f"; only {', '.join(missing)} episodes have a recording"
+        checked.add("replay", "open" if missing else "ok", text, name)
     return played
 
 
@@ -227,8 +241,8 @@ async def _offers(ask: OperatorClient, env: str) -> bool:
     return any(each.description.env == env for each in offered)
 
 
-async def _play(ask: OperatorClient, files: Files, part: Chosen) -> tuple[int, list[str]]:
-    """How many of these episodes were played, and what differed."""
+async def _play(ask: OperatorClient, files: Files, part: Chosen) -> tuple[int, list[tuple[str, bool]]]:
+    """How many of these episodes were played, and what differed, each with whether it may be a matter of rounding."""
     run, group = part.run, part.group
     path = f"{run.folder}/actions/{group.name}"
     if path not in files.names:
@@ -264,7 +278,7 @@ async def _play(ask: OperatorClient, files: Files, part: Chosen) -> tuple[int, l
         replays=tuple(refs),
         step_limit=run.opening.settings.step_limit,
     )
-    faults: list[str] = []
+    faults: list[tuple[str, bool]] = []
     seen: set[int] = set()
     async with contextlib.aclosing(ask.evaluate(message)) as outcomes:
         async for outcome, _, _ in outcomes:
@@ -273,15 +287,32 @@ async def _play(ask: OperatorClient, files: Files, part: Chosen) -> tuple[int, l
             index, data = stored[outcome.index]
             seen.add(index)
             episode = group.episodes[index]
-            again = decode(await ask.fetch(outcome.trajectory))
-            fault = compare.first_difference(recording_of(data), again)
+            recorded, again = recording_of(data), decode(await ask.fetch(outcome.trajectory))
+            fault = compare.first_difference(recorded, again)
             if fault is None and not compare.same(episode.episode_return, outcome.episode_return):
                 fault = f"return {episode.episode_return!r} is told, {outcome.episode_return!r} came"
             if fault is not None:
-                faults.append(f"{group.name}, episode {index}: {fault}")
+                faults.append((f"{group.name}, episode {index}: {fault}", rounded(recorded, again)))
     missing = [index for index, _ in stored if index not in seen]
-    faults += [f"{group.name}, episode {index}: not played to its end" for index in missing]
+    faults += [(f"{group.name}, episode {index}: not played to its end", False) for index in missing]
     return len(stored), faults
+
+
+def rounded(recorded: Trajectory, again: Trajectory) -> bool:
+    """Whether two episodes of the same actions first differ in a reward, by `LAST_PLACES` units in the last place at most, and in
+    nothing else at that step. Later steps are not compared: an environment can enlarge such a difference."""
+    for t in range(min(recorded.n, again.n)):
+        ours, theirs = float(recorded.rewards[t]), float(again.rewards[t])
+        if (recorded.terminated[t], recorded.truncated[t]) != (again.terminated[t], again.truncated[t]):
+            return False
+        if not compare.same(ours, theirs):
+            pair = np.array([ours, theirs])
+            with np.errstate(over="ignore"):
+                single = pair.astype(np.float32)
+            # Many environments compute in single precision.
+            unit = np.spacing(np.abs(single if np.array_equal(single, pair) else pair).max())
+            return abs(ours - theirs) <= LAST_PLACES * float(unit)
+    return False
 
 
 def share_of(text: str) -> float:

@@ -12,7 +12,6 @@ import msgspec
 import pytest
 from publications import Forger, Held, Results, spelt
 
-from evopolicy_common.records import journal
 from evopolicy_common.records.episodes.trajectory import Recorder, decode
 from evopolicy_common.records.run_record import RunRecord
 from evopolicy_coordinator.publish import contents, fields, rules
@@ -244,27 +243,9 @@ def test_the_table_of_fields_names_every_field_of_a_run_record() -> None:
 def older(results: Results) -> Forger:
     """The same file as an earlier version would have written it: its result holds no fields of `run.json`."""
     forger = Forger(results.files)
-    moved: dict[str, str] = {}
     for run in ("runs/0000", "runs/0001"):
-        result = json.loads(forger.files[f"{run}/{contents.RESULT}"])
-        del result["record"]
-        forger.put(f"{run}/{contents.RESULT}", result)
-        moved[result["run"]] = contents.digest(forger.files[f"{run}/{contents.RESULT}"])
-
-    def entries(lines: list[bytes]) -> list[bytes]:
-        found = [json.loads(line) for line in lines]
-        for each in found:
-            if each["kind"] == "ended":
-                each["result"] = moved[each["run"]]
-        return [spelt(contents.JOURNAL, each) for each in found]
-
-    forger.entries(entries)
-    heads = journal.heads(contents.journal_entries(forger.files[contents.JOURNAL]))
-    for run in ("runs/0000", "runs/0001"):
-        record = json.loads(forger.files[f"{run}/{contents.RUN}"])
-        place = record["committed"]
-        place["opened_head"], place["ended_head"] = heads[place["opened"]], heads[place["ended"]]
-        forger.put(f"{run}/{contents.RUN}", record)
+        forger.begin_anew(lambda result: result.pop("record") and None, run)
+    forger.place()
     forger.sign(results.root / "st")
     return forger
 

@@ -53,14 +53,20 @@ def put(*path: str | int, value: Any) -> Callable[[Any], None]:
     return change
 
 
-def rerecorded(forger: Forger, group: str = "heldout-001", reward: float = 100.0) -> None:
-    """Another reward in a recording."""
+def rerecorded(
+    forger: Forger,
+    group: str = "heldout-001",
+    reward: float = 100.0,
+    change: Callable[[float], float] | None = None,
+) -> None:
+    """Other rewards in a recording: `reward`, or what `change` makes of them."""
     name = f"runs/0000/actions/{group}"
     recordings = contents.unpack_recordings(forger.files[name])
     assert recordings[0] is not None
     recorder = Recorder("actions")
     for row in decode(recordings[0]).rows():
-        recorder.append(None, row.action, reward, row.terminated, row.truncated, {})
+        new = reward if change is None else change(row.reward)
+        recorder.append(None, row.action, new, row.terminated, row.truncated, {})
     forger.files[name] = contents.pack_recordings([recorder.finish(), *recordings[1:]])
 
 
@@ -331,6 +337,73 @@ def test_the_command_checks_and_replays(results: Results) -> None:
     assert (plain.returncode, document["ok"], document["signer"]) == (0, True, identity)
 
 
+def raised(change: Callable[[list[float]], list[float]]) -> Callable[[dict[str, Any]], None]:
+    """Other held-out returns in a result."""
+
+    def new(result: dict[str, Any]) -> None:
+        result["heldout_returns"] = change(result["heldout_returns"])
+        result["final_score"] = math.fsum(result["heldout_returns"]) / len(result["heldout_returns"])
+
+    return new
+
+
+def invented(results: Results, *groups: str) -> str:
+    """A file with held-out returns that nobody got, without recordings that would tell; its journal agrees."""
+    forger = Forger(results.files)
+    forger.begin_anew(raised(lambda old: [each + 100.0 for each in old]))
+    for group in groups:
+        forger.files.pop(f"runs/0000/actions/{group}")
+    forger.place()
+    forger.sign(results.root / "st")
+    forger.write(results.root / f"invented-{len(groups)}.evp")
+    return f"invented-{len(groups)}.evp"
+
+
+@pytest.mark.parametrize("share", ["all", "1%"])
+def test_a_replay_is_never_ok_for_a_run_whose_held_out_episodes_have_no_recording(
+    results: Results, share: str
+) -> None:
+    done = evopolicy(results.root, "check", invented(results, "heldout-001"), "--replay", share)
+    assert done.returncode == 3, done.stdout + done.stderr
+    assert "open   recordings: only 0 of 3 held-out episodes have a recording" in done.stdout
+    assert "1 of 2 runs have episodes without a recording" in done.stdout
+    if share == "all":
+        assert "5 of 5 train, 4 of 4 validation, 0 of 3 held-out, 3 of 3 random episodes" in done.stdout
+
+
+def test_a_removed_recording_of_one_episode_leaves_the_replay_open(results: Results) -> None:
+    forger = Forger(results.files)
+    name = "runs/0000/actions/heldout-001"
+    forger.files[name] = contents.pack_recordings([None, *contents.unpack_recordings(forger.files[name])[1:]])
+    forger.sign()
+    checked = rules.check(Held(forger.files))
+    assert not checked.failed
+    assert checked.unrecorded(checked.runs[0].opening.run) == ["2 of 3 held-out"]
+
+
+def test_an_edited_processor_excuses_differences_of_last_places_alone(results: Results) -> None:
+    """In results of earlier versions nothing covers the fingerprint, so that its owner can edit it."""
+    edits: tuple[tuple[Callable[[float], float], int, str], ...] = (
+        (lambda reward: math.nextafter(reward, 9.0), 3, "units in the last place at most"),
+        (lambda reward: reward + 1e-9, 1, "other features of the processor do not explain this"),
+    )
+    for change, code, text in edits:
+        forger = Forger(results.files)
+        rerecorded(forger, change=change)
+        recording = contents.unpack_recordings(forger.files["runs/0000/actions/heldout-001"])[0]
+        assert recording is not None
+        value = run_rules.return_of(decode(recording))
+        forger.begin_anew(lambda result: result.pop("record") and None)
+        forger.begin_anew(raised(lambda old, value=value: [value, *old[1:]]))  # type: ignore[misc]
+        forger.json(RUN, put("versions", "fingerprint", "cpu", value="another"))
+        forger.place()
+        forger.sign()
+        forger.write(results.root / "processor.evp")
+        done = evopolicy(results.root, "check", "processor.evp", "--replay", "all")
+        (results.root / "processor.evp").unlink()
+        assert (done.returncode, text in done.stdout) == (code, True), done.stdout + done.stderr
+
+
 def test_rewards_that_the_environment_does_not_give_are_found_by_replay_alone(results: Results) -> None:
     """A forger who begins a journal anew with rewards of his own: only the environment contradicts him."""
     forger = Forger(results.files)
@@ -338,41 +411,13 @@ def test_rewards_that_the_environment_does_not_give_are_found_by_replay_alone(re
     rerecorded(forger, reward=1.0)
     recording = contents.unpack_recordings(forger.files["runs/0000/actions/heldout-001"])[0]
     assert recording is not None
-    value = run_rules.return_of(decode(recording))
-    result = json.loads(forger.files[RESULT])
-    if result["best_submit_index"] != 1:
+    if json.loads(forger.files[RESULT])["best_submit_index"] != 1:
         pytest.fail("the second policy is the better one")
-    result["heldout_returns"][0] = value
-    result["final_score"] = math.fsum(result["heldout_returns"]) / 3
-    forger.put(RESULT, result)
-    forger.json(EPISODES, put(4, "episodes", 0, "episode_return", value=value))
-
-    def altered(record: Any) -> None:
-        returns = result["heldout_returns"]
-        mean = result["final_score"]
-        std = math.sqrt(math.fsum((each - mean) * (each - mean) for each in returns) / 3)
-        outcome = record["outcome"]
-        outcome |= {
-            "heldout_returns": returns,
-            "final_score": mean,
-            "heldout_mean_return": mean,
-            "heldout_std_return": std,
-        }
-
-    def rewritten(lines: list[bytes]) -> list[bytes]:
-        run = result["run"]
-        kept = [json.loads(line) for line in lines]
-        kept = [each for each in kept if each.get("run") == run or each["kind"] == "revealed"]
-        for each in kept:
-            if each["kind"] == "ended":
-                each["result"] = contents.digest(forger.files[RESULT])
-        return [spelt(contents.JOURNAL, each) for each in kept]
-
-    forger.json(RUN, altered)
-    forger.entries(rewritten)
-    heads = journal.heads(contents.journal_entries(forger.files[contents.JOURNAL]))
-    places = {"opened": 0, "opened_head": heads[0], "ended": 1, "ended_head": heads[1]}
-    forger.json(RUN, lambda record: record["committed"].update(places))
+    value = run_rules.return_of(decode(recording))
+    forger.begin_anew(raised(lambda old: [value, *old[1:]]))
+    run = json.loads(forger.files[RUN])["run"]
+    forger.entries(lambda lines: [each for each in lines if run.encode() in each or b"revealed" in each])
+    forger.place()
     forger.sign()
     assert found(forger.files) == []
     forger.write(results.root / "forged.evp")

@@ -87,7 +87,7 @@ def test_an_earlier_site_stays_until_the_new_one_is_whole(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = tmp_path / "site"
-    first, second = (LabBundle(file=name, sha256="", refused="torn") for name in ("x.evp", "y.evp"))
+    first, second = (LabBundle(file=f"{n}.evp", sha256="", number=n, refused="torn") for n in (0, 1))
     index = write.write_site([first], out, title="First")
     with monkeypatch.context() as patched:
         patched.setattr(write, "front_page", lambda **_: 1 / 0)

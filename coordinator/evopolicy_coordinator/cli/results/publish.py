@@ -1,7 +1,7 @@
 """`evopolicy publish`, `evopolicy check`: results that others can check, and the check.
 
 Exit codes of `check`: 0 nothing contradicts, 1 something does, 2 wrong usage or no file of published results, 3 a replay that
-was asked for could not be done.
+was asked for could not be done, or not of all parts of a run.
 """
 
 from __future__ import annotations
@@ -146,7 +146,7 @@ def check(
 
     Checks signature, digests, commitments, journal, selection and scores; with --replay also the recorded episodes. Executes nothing
     of the file, except policies in the sandbox with --policies. Exit codes: 0 no contradiction, 1 a contradiction, 2 wrong usage or
-    no such file, 3 a replay was not possible.
+    no such file, 3 a replay was not possible, or some episodes have no recording.
     """
     if identity is not None and not re.fullmatch(r"[0-9a-fA-F]{64}", identity):
         fail(
@@ -188,8 +188,9 @@ def check(
         say_json(result)
     else:
         _print(checked)
-    replayed = share is None or not any(
-        each.kind == "replay" and each.state == "open" for each in checked.findings
+    replayed = share is None or not (
+        any(each.kind == "replay" and each.state == "open" for each in checked.findings)
+        or any(map(checked.unrecorded, checked.recorded))
     )
     raise typer.Exit(FAILED if checked.failed else 0 if replayed else NOT_REPLAYED)
 
@@ -264,6 +265,9 @@ def _print(checked: Checked) -> None:
         if checked.failed
         else "nothing in this file contradicts itself"
     )
+    without = sum(bool(checked.unrecorded(run)) for run in checked.recorded)
+    if without:
+        shown += f"; {without} of {len(checked.recorded)} runs have episodes without a recording, which no replay can confirm"
     known = any(each.kind == "identity" and each.state == "ok" for each in checked.findings)
     say(f"verdict: {shown}; " + ("the signer is the one that you named" if known else "self-signed"))
 
