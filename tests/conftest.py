@@ -27,6 +27,7 @@ _SYSTEM = (
     "integration/coordinator/test_published_fields.py",
     "integration/coordinator/test_published_policies.py",
     "integration/coordinator/test_published_results.py",
+    "integration/coordinator/test_published_sweeps.py",
     "integration/coordinator/test_rescore_command.py",
     "integration/coordinator/test_verify_command.py",
     "integration/deploy/test_kubernetes.py",

@@ -18,7 +18,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from evopolicy_common.errors import BundleError, ConfigError, EvopolicyError, ProtocolError
+from evopolicy_common.errors import BundleError, ConfigError, EvopolicyError, ProtocolError, RefusedError
 from evopolicy_common.messages.environment import Split
 from evopolicy_common.messages.episode import EpisodeOutcome
 from evopolicy_common.records import journal
@@ -27,7 +27,7 @@ from evopolicy_common.records.episodes.rendered import decode
 from evopolicy_common.records.episodes.trajectory import Recorder, Trajectory
 from evopolicy_common.records.journal import Result, SubmitResult
 from evopolicy_common.records.policies.checkpoints import bundle_of
-from evopolicy_common.records.run_files import read_record, read_regular
+from evopolicy_common.records.run_files import read_record, read_regular, run_folders
 from evopolicy_common.records.run_record import RunRecord, encode_run_record
 from evopolicy_common.wire.operator_client import TIMEOUT_S, OperatorClient
 from evopolicy_common.wire.transport import Link
@@ -62,29 +62,46 @@ class Published(msgspec.Struct, frozen=True, kw_only=True):
     removed: tuple[Removed, ...]
     left_out: tuple[Listed, ...]
     """Runs of the same entries that are not in the file."""
+    folders_left_out: tuple[Removed, ...]
+    """Run directories that are not in the file, with the reason."""
+    completeness: str
 
 
-def find_runs(paths: Sequence[Path]) -> list[tuple[Path, RunRecord]]:
-    """The finished runs in and below these folders, in the order of the coordinator's names. ConfigError for none."""
+class _GoneError(EvopolicyError):
+    """The coordinator no longer has a run's episodes."""
+
+
+def find_runs(paths: Sequence[Path]) -> tuple[list[tuple[Path, RunRecord]], list[Removed]]:
+    """The finished runs in and below these folders, in the order of the coordinator's names, and the folders that are left out.
+    ConfigError where no run is left."""
     found: dict[str, tuple[Path, RunRecord]] = {}
-    for root in paths:
-        files = [root / "run.json"] if (root / "run.json").is_file() else sorted(root.rglob("run.json"))
-        if not files:
-            raise ConfigError(f"{root} holds no finished run: there is no run.json in it or below")
-        for path in files:
-            try:
-                record = read_record(path.parent)
-            except OSError as error:
-                raise ConfigError(f"{path} cannot be read: {error.strerror}") from error
-            except ProtocolError as error:
-                raise ConfigError(f"{path}: {error}") from error
+    folders, without = run_folders(paths)
+    left = [(path, "no run directory in it or below") for path in without]
+    for folder in folders:
+        try:
+            record = read_record(folder)
+        except FileNotFoundError:
+            left.append((folder, "the run did not finish: it has no run.json"))
+        except OSError as error:
+            left.append((folder, f"run.json cannot be read: {error.strerror}"))
+        except ProtocolError as error:
+            left.append((folder, str(error)))
+        else:
             if record.committed is None:
-                raise ConfigError(
-                    f"{path.parent}: the coordinator kept no journal when the run was opened; it has no commitment and cannot"
-                    " be published"
+                left.append(
+                    (folder, "it has no commitment: its coordinator kept no journal when it opened the run")
                 )
-            found[record.run] = (path.parent, record)
-    return [found[run] for run in sorted(found)]
+            elif record.run in found:
+                left.append((folder, f"it repeats the run in {found[record.run][0]}"))
+            else:
+                found[record.run] = folder, record
+    attempts = [each for path in paths for each in path.rglob(".attempts") if each.is_dir()]
+    left += [(each, "another attempt replaced it") for each in run_folders(attempts)[0]]
+    removed = [Removed(what=str(folder), why=why) for folder, why in left]
+    if not found:
+        listed = "; ".join(f"{each.what}: {each.why}" for each in removed[:8])
+        raise ConfigError(f"no finished run to publish: {listed}")
+    return [found[run] for run in sorted(found)], removed
 
 
 class Publisher:
@@ -100,10 +117,19 @@ class Publisher:
         self._needles = needles
         self._removed: list[Removed] = [_OTHER_LOGS if with_logs else _LOGS, *_NEVER]
 
-    async def publish(self, runs: Sequence[tuple[Path, RunRecord]], out: Path) -> Published:
-        """Writes `out` atomically. Raises RefusedError when the coordinator refuses."""
-        ids = tuple(record.run for _, record in runs)
-        await self._ask.disclose(ids)
+    async def publish(
+        self, runs: Sequence[tuple[Path, RunRecord]], out: Path, left: Sequence[Removed] = ()
+    ) -> Published:
+        """Writes `out` atomically. Raises ConfigError when the coordinator refuses. `left`: folders that are left out."""
+        left = list(left)
+        ids: list[str] = []
+        try:
+            await self._ask.disclose(tuple(record.run for _, record in runs))
+        except RefusedError as error:
+            named = [str(folder) for folder, record in runs if record.run in str(error)]
+            named = named or [each.what for each in left if "did not finish" in each.why]
+            where = f" ({', '.join(named[:8])})" if named else ""
+            raise ConfigError(f"{error}{where}") from error
         entries = await self._ask.journal()
         files: dict[str, str] = {}
         partial = out.with_name(f".{out.name}.partial")
@@ -111,14 +137,23 @@ class Publisher:
         try:
             for number, (folder, record) in enumerate(runs):
                 self._tell(f"{number + 1} of {len(runs)}: {record.agent.entry} on {record.env}")
-                place = contents.run_folder(number)
+                place = contents.run_folder(len(ids))
                 inner: dict[str, str] = {}
-                async for name, data in self._run_files(folder, record, place):
-                    writer.add(f"{place}/{name}", data)
-                    inner[name] = contents.digest(data)
+                before = len(self._removed)
+                try:
+                    async for name, data in self._run_files(folder, record, place):
+                        writer.add(f"{place}/{name}", data)
+                        inner[name] = contents.digest(data)
+                except _GoneError as error:  # before the first file
+                    del self._removed[before:]
+                    left.append(Removed(what=str(folder), why=str(error)))
+                    continue
                 digests = contents.document(inner)
                 writer.add(f"{place}/{contents.DIGESTS}", digests)
                 files[f"{place}/{contents.DIGESTS}"] = contents.digest(digests)
+                ids.append(record.run)
+            if not ids:
+                raise ConfigError(f"no run to publish: {left[-1].what}: {left[-1].why}")
             lines = contents.journal_lines(entries)
             for name, data in (
                 (contents.JOURNAL, lines),
@@ -151,11 +186,13 @@ class Publisher:
         return Published(
             path=str(out),
             bytes=out.stat().st_size,
-            runs=len(runs),
+            runs=len(ids),
             signer=signed.key,
             journal_head=heads[-1],
             removed=tuple(self._removed),
             left_out=tuple(each for each in listed if each.state != "published"),
+            folders_left_out=tuple(left),
+            completeness=contents.completeness(listed),
         )
 
     async def _run_files(
@@ -197,8 +234,8 @@ class Publisher:
             outcomes[outcome.index] = outcome
         name = contents.group_name(split, index)
         if not outcomes or (n >= 0 and len(outcomes) < n):
-            raise ConfigError(
-                f"run {run}: the coordinator no longer has the episodes of {name}; `evopolicy gc` removed them"
+            raise _GoneError(
+                f"the coordinator no longer has the episodes of {name}: `evopolicy gc` removed them"
             )
         episodes = []
         recordings: list[bytes | None] = []

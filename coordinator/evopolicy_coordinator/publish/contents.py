@@ -18,7 +18,7 @@ Digests are SHA-256 (hex). JSON is as `document` makes it: the same content give
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import msgspec
 
@@ -238,3 +238,12 @@ def listing(entries: Iterable[journal.Entry], published: Iterable[str]) -> tuple
             )
         )
     return tuple(found)
+
+
+def completeness(listed: Sequence[Listed]) -> str:
+    """How many of the runs that were opened are left out, in words."""
+    left = [each.state for each in listed if each.state != "published"]
+    if not left:
+        return f"all {len(listed)} runs that the journal has of these entries are here"
+    states = ", ".join(f"{left.count(state)} {state}" for state in sorted(set(left)))
+    return f"{len(left)} of {len(listed)} runs of these entries are left out ({states}): these runs were selected"

@@ -104,6 +104,17 @@ class Checked(msgspec.Struct, kw_only=True):
     def failed(self) -> bool:
         return any(each.state == "failed" for each in self.findings)
 
+    covered: dict[str, int] = {}
+    """By part, the episodes that a replay played."""
+
+    def coverage(self) -> str:
+        """The episodes that a replay played of all, by part, such as `2 of 5 train, 0 of 3 held-out`."""
+        total: dict[str, int] = {}
+        for parts in self.recorded.values():
+            for part, (_, of) in parts.items():
+                total[part] = total.get(part, 0) + of
+        return ", ".join(f"{self.covered.get(part, 0)} of {of} {part}" for part, of in total.items())
+
     def unrecorded(self, run: str) -> list[str]:
         """The parts of a run with episodes that have no recording, such as `0 of 6 held-out`."""
         return [f"{n} of {of} {part}" for part, (n, of) in self.recorded.get(run, {}).items() if n < of]

@@ -123,11 +123,10 @@ async def _play_run(
     if why_not:
         checked.add("replay", "open", f"not played: {why_not}", name)
         return played
-    covered = {group.part: 0 for group in run.groups}
-    alike = True
+    before, alike = played, True
     for part in parts:
         n, faults = await _play(ask, files, part)
-        covered[part.group.part] += n
+        checked.covered[part.group.part] = checked.covered.get(part.group.part, 0) + n
         played += n
         tell(played)
         for fault, rounding in faults:
@@ -143,9 +142,7 @@ async def _play_run(
     # A replay shows nothing of episodes without a recording, however many it drew.
     missing = checked.unrecorded(name)
     if alike:
-        of = {part: n for part, (_, n) in checked.recorded.get(name, {}).items()}
-        text = ", ".join(f"{n} of {of.get(part, n)} {part}" for part, n in covered.items())
-        text += f" episodes, bit for bit (drawn by seed {seed})"
+        text = f"{played - before} episodes, bit for bit (drawn by seed {seed})"
         if missing:
             text += f"; only {', '.join(missing)} episodes have a recording"
         checked.add("replay", "open" if missing else "ok", text, name)

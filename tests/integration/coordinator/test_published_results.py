@@ -368,7 +368,10 @@ def test_a_replay_is_never_ok_for_a_run_whose_held_out_episodes_have_no_recordin
     assert "open   recordings: only 0 of 3 held-out episodes have a recording" in done.stdout
     assert "1 of 2 runs have episodes without a recording" in done.stdout
     if share == "all":
-        assert "5 of 5 train, 4 of 4 validation, 0 of 3 held-out, 3 of 3 random episodes" in done.stdout
+        assert (
+            "covered 10 of 10 train, 8 of 8 validation, 3 of 6 held-out, 6 of 6 random episodes"
+            in done.stdout
+        )
 
 
 def test_a_removed_recording_of_one_episode_leaves_the_replay_open(results: Results) -> None:

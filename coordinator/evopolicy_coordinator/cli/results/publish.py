@@ -71,13 +71,13 @@ def publish(
 
     async def work() -> Published:
         end_on_sigterm()
-        found = find_runs(runs)
+        found, left = find_runs(runs)
         async with where.link("publish") as (link, _):
             needles = needles_of_this_machine(link, *runs, *([state] if state else []))
             publisher = Publisher(
                 link, lambda text: say(one_line(text), err=True), needles, with_logs=with_logs
             )
-            return await publisher.publish(found, out)
+            return await publisher.publish(found, out, left)
 
     with fail_on_our_errors():
         done = asyncio.run(work())
@@ -86,6 +86,11 @@ def publish(
         return
     say(f"{done.path}: {done.runs} runs, {done.bytes:,} bytes, signed by {done.signer}")
     say(f"journal head: {done.journal_head}")
+    for each in done.folders_left_out[:_SHOWN]:
+        say(one_line(f"left out: {each.what}: {each.why}"))
+    if len(done.folders_left_out) > _SHOWN:
+        say(f"… and {len(done.folders_left_out) - _SHOWN} more (--json tells all)")
+    say(f"completeness: {done.completeness}; {len(done.folders_left_out)} folders were left out")
     _say_listing("left out, of the same entries:", done.left_out)
     say(f"{len(done.removed)} things were removed; removed.json in the file lists them")
     say(f"next: evopolicy check {done.path} --identity {done.signer}")
@@ -182,6 +187,8 @@ def check(
             "ok": not checked.failed,
             "signer": checked.signer,
             "findings": checked.findings,
+            "claims": checked.claims,
+            "covered": checked.covered,
             "listing": checked.listing,
             "removed": checked.removed,
         }
@@ -257,6 +264,8 @@ def _print(checked: Checked) -> None:
         if all(each.state == "ok" for each in of_kind):
             n = len({each.run for each in of_kind if each.run})
             say(one_line(f"{marks['ok']} {kind}: " + (f"{meaning} ({n} runs)" if n else of_kind[0].text)))
+    if checked.covered:
+        say(f"the replay covered {checked.coverage()} episodes")
     _say_listing(
         "left out, of the same entries:", [each for each in checked.listing if each.state != "published"]
     )
