@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from evopolicy_coordinator.core import loading, machine
-from evopolicy_coordinator.core.agents import permits, precedence
+from evopolicy_coordinator.core.agents import permits, precedence, requests
 from evopolicy_coordinator.core.families import Families
 from evopolicy_coordinator.core.isolation import conflicts, occupancies
 from evopolicy_coordinator.core.leasing import expiry, fleet, groups, leases, queue
@@ -236,8 +236,8 @@ BUGS = (
         "take a lease on its way for one that was let go of",
         occupancies,
         "surely",
-        "occupancy is None or settled == 0",
-        "True",
+        "if settled == 0:",
+        "if True:",
     ),
     Bug("forget what a silent worker may still play", occupancies, "left", "if sure:", "if True:"),
     Bug(
@@ -285,5 +285,54 @@ BUGS = (
         "job.begun_attempt = result.attempt",
     ),
     Bug("forget at a restart what was handed back", loading, "load", "loading.begun.update(", "dict("),
+    Bug(
+        "end others' permits when a gateway names another kernel of their machine",
+        requests,
+        "requested",
+        "kernel = permits.place(run, message.boot_id)",
+        "kernel = permits.place(run, message.boot_id);"
+        " [permits._end(state, there, row, step, '') for each in list(state.permits)"
+        " for there, row in permits.held(state, each)"
+        " if row.host == message.host and row.boot_id != message.boot_id]",
+    ),
+    Bug(
+        "end permits when a worker names another kernel of their machine",
+        membership,
+        "registered",
+        "occupancies.joined(state, worker, step)",
+        "occupancies.joined(state, worker, step);"
+        " permits = __import__('evopolicy_coordinator.core.agents.permits', fromlist=['held']);"
+        " [permits._end(state, there, row, step, '') for each in list(state.permits)"
+        " for there, row in permits.held(state, each)"
+        " if row.host == worker.host and row.boot_id != message.boot_id]",
+    ),
+    Bug(
+        "let a worker free the kernel of another of its name",
+        occupancies,
+        "surely",
+        "(occupancy.kernel, occupancy.machine) != (worker.kernel, worker.machine)",
+        "False",
+    ),
+    Bug(
+        "let an agent keep others waiting for ever",
+        precedence,
+        "_hidden",
+        "_end_overdue(state, reversal, step)",
+        "pass",
+    ),
+    Bug(
+        "cancel a run that keeps others waiting at once",
+        precedence,
+        "_end_overdue",
+        ">= state.settings.agent_wait_s",
+        ">= 0.0",
+    ),
+    Bug(
+        "believe in kernels on which nobody works",
+        precedence,
+        "_hidden",
+        "_at_work(state, kernel)",
+        "True",
+    ),
     Bug("draw episodes anew at a restart", audits, "sample", "run.row.audit_share", "0.5"),
 )

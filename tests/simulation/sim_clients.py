@@ -62,8 +62,11 @@ class SimOperator(Asker):
         assert isinstance(message, operator.RunCreated), message
         if not self.started:
             self.started = True
-            self.simulation.gateways.append(SimGateway(self.simulation, self.plan))
+            self.start_gateway()
         self._wait()
+
+    def start_gateway(self) -> None:
+        self.simulation.gateways.append(SimGateway(self.simulation, self.plan))
 
     def _wait(self) -> None:
         self.ask(operator.WaitRun, {"run": self.plan.name, "wait_s": 10.0}, self._waited, 10.0)
@@ -161,7 +164,7 @@ class SimGateway(Asker):
         fields = {
             "run": self.plan.name,
             "boot_id": self.boot_id if known else "",
-            "machine_id": self.machine.name if known else "",
+            "host": self.machine.name,
             "wait_s": 5.0,
         }
         self.ask(gateway.RequestPermit, fields, self._permitted, 5.0)

@@ -43,6 +43,8 @@ class PlannedRun:
     """When an operator cancels it, seconds after the start; None for never."""
     kin: str = ""
     """Runs with equal `kin` have the same hidden cases; empty: cases of its own."""
+    hostile: bool = False
+    """Its gateway lies; it may end in any way, but it ends."""
 
     def related(self, other: PlannedRun) -> bool:
         """Whether they share a hidden case."""

@@ -12,6 +12,7 @@ from sim_coordinator import SimCoordinator
 from sim_faults import HARMLESS, RATES, Faults, draw
 from sim_oracle import PlannedRun, PlannedSubmit
 from sim_store import Disk
+from sim_strangers import HostileOperator, HostileWorker
 from sim_truth import Machine, Truth
 from sim_worker import SimWorker
 from sim_world import World
@@ -27,6 +28,8 @@ HORIZON_S = 1500.0
 """Simulated seconds after which an unfinished run counts as stuck."""
 AUDIT_WAIT_S = 60.0
 HIDDEN_WAIT_S = 20.0
+AGENT_WAIT_S = 300.0
+"""Longer than any honest agent lives; in a crowd, which has no hostile gateway, much longer."""
 PERMIT_S = 400.0
 """Longest time that an agent waits for its permit without faults, seconds."""
 ENVS = ("toy/line", "toy/maze")
@@ -79,7 +82,13 @@ class Simulation:
             self.plans = [
                 replace(_plan(f"r{index}", size, chance), env=env, cancel_at=None) for index in range(6)
             ]
-        if self.near and (self.crowd or self.places.random() < 0.7):
+        self.hostile = seed % 8 == 1
+        """A sibling of all runs has a hostile gateway, and a hostile worker joins; in some crowds, the worker alone."""
+        if self.hostile:
+            self.harmless = False
+            cuckoo = replace(self.plans[0], name="cuckoo", submits=(), cancel_at=None, hostile=True)
+            self.plans.append(cuckoo)
+        if self.near and (self.crowd or self.hostile or self.places.random() < 0.7):
             self.plans = [replace(plan, kin=f"kin-{seed}") for plan in self.plans]
         self.thinks_s = 12.0 if self.crowd else 0.0
         """Shortest time that agents are alive between submits."""
@@ -95,6 +104,8 @@ class Simulation:
         }
         # In a crowd one slot plays six runs.
         self._horizon_s = HORIZON_S * max(2.0 if self.crowd else 1.0, size.episodes / Size.episodes)
+        if self.hostile:
+            self._horizon_s += AGENT_WAIT_S
         self.lengths = chance.choice((0.05, 0.4, 2.0, 4.0))
         self.checkers = Checkers(self)
         self.workers: dict[str, SimWorker] = {}
@@ -108,7 +119,10 @@ class Simulation:
         """The worker that reports false replays as an auditor; players are honest, so all runs get
         their expected results."""
         settings = CoreSettings(
-            audit_share=self.audit_share, audit_wait_s=AUDIT_WAIT_S, hidden_wait_s=HIDDEN_WAIT_S
+            audit_share=self.audit_share,
+            audit_wait_s=AUDIT_WAIT_S,
+            hidden_wait_s=HIDDEN_WAIT_S,
+            agent_wait_s=AGENT_WAIT_S * (10.0 if self.crowd else 1.0),
         )
         self.coordinator = SimCoordinator(self.world, self.disk, self.checkers, settings)
         for index in range(1 if self.crowd else chance.randint(1, size.workers)):
@@ -124,9 +138,13 @@ class Simulation:
             )
         opened_s = 30.0 if self.absent else 0.0
         self.operators = [
-            SimOperator(self, plan, opened_s + chance.random() * 3.0 + (20.0 * index if self.crowd else 0.0))
+            (HostileOperator if plan.hostile else SimOperator)(
+                self, plan, opened_s + chance.random() * 3.0 + (20.0 * index if self.crowd else 0.0)
+            )
             for index, plan in enumerate(self.plans)
         ]
+        if self.hostile or seed % 32 == 19:
+            HostileWorker(self)
         self._plan_faults()
 
     # ---- machines ----
@@ -249,7 +267,7 @@ class Simulation:
 
     def run(self) -> None:
         """Play the seed to its end. Raises the errors of the checkers and the core."""
-        finished = self.world.run(self.world.now + self._horizon_s, self._all_done)
+        finished = self.world.run(self.world.now + self._horizon_s, self.over)
         if not finished:
             missing = {plan.name for plan in self.plans} - self.checkers.finished_runs
             core = self.coordinator.core
@@ -260,12 +278,14 @@ class Simulation:
         self.checkers.ended(self.coordinator.core)
         if (
             self.faults == Faults()
+            and not self.hostile
             and not self.truth.agents
             and max(self.truth.waited_s, default=0.0) > PERMIT_S
         ):
             raise ViolationError(f"an agent waits {max(self.truth.waited_s):.0f} s for its permit")
 
-    def _all_done(self) -> bool:
+    def over(self) -> bool:
+        """Whether all runs have ended."""
         return len(self.checkers.finished_runs) == len(self.plans) and all(
             each.closed for each in self.gateways
         )

@@ -17,6 +17,7 @@ from sim_oracle import failure_of, return_of
 from evopolicy_common.messages import worker as wire
 from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome, EpisodeSpec, Job, PolicyFailure
+from evopolicy_common.wire.refusals import Refusal
 
 if TYPE_CHECKING:
     from sim_scenario import Simulation
@@ -159,26 +160,22 @@ class SimWorker(Asker):
         self._introduce(first=True)
 
     def _introduce(self, *, first: bool = False) -> None:
-        descriptions = tuple(
-            EnvironmentDescription(
-                env=env, env_version="1", obs_space={}, action_space={}, max_episode_steps=9, task_text=""
-            )
-            for env in self.envs
-        )
-        print_of = wire.Fingerprint(code_version=self.version, python="3", packages={}, cpu="")
         session = f"{self.name}-{self.world.chance.randrange(1 << 30)}"
         fields = {
             "worker": self.name,
             "session": session,
             "slots": self.slots,
-            "tiers": ("bwrap",),
-            "environments": descriptions,
-            "fingerprint": print_of,
+            **describe(self.envs, self.version),
             "boot_id": self.boot_id if self.tells_kernel else "",
-            "machine_id": self.machine.name if self.tells_kernel else "",
+            "host": self.machine.name,
+            # Otherwise credentials alone would keep auditors apart.
+            "machine": self.machine.name if self.simulation.near else "",
         }
 
         def registered(message: Any) -> None:
+            if isinstance(message, wire.Refused) and message.status == Refusal.NAME_TAKEN:
+                self.later(3.0, lambda: self._introduce(first=first))  # it tries again
+                return
             if isinstance(message, wire.Refused):
                 self.life += 1  # quarantined: the worker ends
                 return
@@ -275,8 +272,12 @@ class SimWorker(Asker):
         }
 
         def answered(message: Any) -> None:
-            self.polling = False
             self.outstanding.discard(serial)
+            current = fields["session"] == self.session
+            if current:
+                self.polling = False
+            if isinstance(message, wire.Refused) and not current:
+                return
             if self._lost_session(message):
                 return
             for lease_id in message.cancelled:
@@ -284,7 +285,8 @@ class SimWorker(Asker):
             for lease in message.leases:
                 self.queue[lease.lease_id] = lease
             self._start()
-            self._poll()
+            if current:
+                self._poll()
 
         self.ask(wire.LeaseRequest, fields, answered, POLL_S)
 
@@ -354,6 +356,18 @@ class SimWorker(Asker):
             self._put(lease, "done", episodes)
         self._start()
         self._poll()
+
+
+def describe(envs: tuple[str, ...], version: str) -> dict[str, Any]:
+    """The part of a registration that tells what a worker can play."""
+    descriptions = tuple(
+        EnvironmentDescription(
+            env=env, env_version="1", obs_space={}, action_space={}, max_episode_steps=9, task_text=""
+        )
+        for env in envs
+    )
+    fingerprint = wire.Fingerprint(code_version=version, python="3", packages={}, cpu="")
+    return {"tiers": ("bwrap",), "environments": descriptions, "fingerprint": fingerprint}
 
 
 def begun_of(lease: wire.Lease) -> BlobRef | None:

@@ -36,6 +36,12 @@ NOTICED_BY = {
     "play train episodes beside hidden ones": 12,
     "forget the hidden jobs that train jobs wait behind": 25,
     "never preempt": 8,
+    "end others' permits when a gateway names another kernel of their machine": 9,
+    "end permits when a worker names another kernel of their machine": 19,
+    "let a worker free the kernel of another of its name": 19,
+    "let an agent keep others waiting for ever": 25,
+    "believe in kernels on which nobody works": 25,
+    "cancel a run that keeps others waiting at once": 9,
 }
 """Seeds to try first for bugs that few seeds detect. After a change of the core other seeds may: then all are tried."""
 

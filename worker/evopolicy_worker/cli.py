@@ -333,7 +333,6 @@ async def _run(
             fingerprint=own,
             host=socket.gethostname(),
             boot_id=host.boot_id(),
-            machine_id=host.machine_id(),
             scratch=scratch,
             grace_s=grace_s,
         )

@@ -116,7 +116,6 @@ class Options(msgspec.Struct, frozen=True, kw_only=True):
     """Boot id of this kernel. Empty: unknown; this worker gets no hidden episodes."""
     missing_tiers: dict[Tier, str] = {}
     """Sandbox tiers that should work here and do not, with the reasons; tried again from time to time."""
-    machine_id: str = ""
     scratch: Path
     grace_s: float = 10.0
     """How long running episodes may continue after SIGTERM."""
@@ -269,7 +268,6 @@ class Supervisor:
                 fingerprint=options.fingerprint,
                 host=options.host,
                 boot_id=options.boot_id,
-                machine_id=options.machine_id,
                 installation=installs.own(),
             )
             reply = await self._ask.until_answered("register", message, Registered)

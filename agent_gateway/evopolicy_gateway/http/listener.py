@@ -45,7 +45,6 @@ class AgentPlace(msgspec.Struct, frozen=True, kw_only=True):
 
     boot_id: str = ""
     """Empty: unknown, which counts as every kernel."""
-    machine_id: str = ""
     host: str = ""
 
 
@@ -109,7 +108,7 @@ def place_of(named: str) -> AgentPlace:
 def agent_place(folder: RunFolder) -> AgentPlace:
     """The place of an open run's agent: the gateway's kernel, unless the agent is started elsewhere."""
     if not folder.listener.exists():
-        return AgentPlace(boot_id=host.boot_id(), machine_id=host.machine_id(), host=platform.node())
+        return AgentPlace(boot_id=host.boot_id(), host=platform.node())
     named = _agent_host(folder)
     return AgentPlace(boot_id="" if named == ELSEWHERE else named)
 

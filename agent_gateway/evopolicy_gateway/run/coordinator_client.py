@@ -94,7 +94,6 @@ class CoordinatorClient:
                 run=self._run,
                 token=self._token,
                 boot_id=place.boot_id,
-                machine_id=place.machine_id,
                 host=place.host,
                 wait_s=wait_s,
             )

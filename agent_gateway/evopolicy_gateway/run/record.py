@@ -269,7 +269,7 @@ def _outcome(
     completed = finished.status == "completed"
     error = finished.error
     if finished.status == "cancelled" and error is None:
-        error = "cancelled by the operator"
+        error = "cancelled by the operator, or because other runs waited for its agent (the coordinator's log: run_cancelled)"
     best = finished.best_submit_index if completed else None
     auxiliary: dict[str, Any] = {
         "code_metrics_best": None if best is None else code.get(best),

@@ -61,15 +61,13 @@ class OpenRun(Message, frozen=True, kw_only=True, tag="open_run"):
 class RequestPermit(Message, frozen=True, kw_only=True, tag="request_permit"):
     """Requests a permit for the run's agent to be alive on a kernel: a long poll, safe to send again.
 
-    The permit lasts until the run is closed or cancelled, or its machine has another boot id.
+    The permit lasts until the run is closed or cancelled, or an operator vouches that the agent has ended.
     """
 
     run: Word
     token: Word
     boot_id: Word
     """Boot id of the agent's kernel (`host.boot_id`); empty: unknown, which counts as every kernel."""
-    machine_id: Word = ""
-    """Id of that machine (`host.machine_id`), stable over reboots; empty: unknown."""
     host: Word = ""
     """Name of that machine, for people."""
     wait_s: Number = 0.0

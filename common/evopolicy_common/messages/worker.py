@@ -94,8 +94,6 @@ class Register(Message, frozen=True, kw_only=True, tag="register"):
     host: Word = ""
     boot_id: Word = ""
     """Boot id of the worker's kernel (`host.boot_id`); without it a worker plays no hidden episodes."""
-    machine_id: Word = ""
-    """Id of the worker's machine (`host.machine_id`)."""
     undescribed: Many[Word] = ()
     """Ids of shipped environments that it offers, too, and describes once a reply to a heartbeat asks for them."""
     installation: Word = ""

@@ -5,13 +5,11 @@ Namespaces and containers share their kernel's counters, so the unit is the kern
 
 from __future__ import annotations
 
-import hashlib
 import platform
 import subprocess
 from pathlib import Path
 
 _BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
-_MACHINE_ID = Path("/etc/machine-id")
 
 NO_BOOT_ID = f"the kernel does not tell its boot id: mount /proc so that {_BOOT_ID} can be read"
 """Why a worker plays no hidden episodes, and why an agent counts as being on every kernel."""
@@ -29,15 +27,3 @@ def boot_id() -> str:
         ["sysctl", "-n", "kern.bootsessionuuid"], capture_output=True, text=True, check=False
     )
     return done.stdout.strip().lower() if done.returncode == 0 else ""
-
-
-def machine_id() -> str:
-    """16 hex digits, stable over reboots; empty if the machine has no id of its own.
-
-    The host name is part of it, since machines cloned from one image may share `/etc/machine-id`.
-    """
-    try:
-        installed = _MACHINE_ID.read_text(encoding="ascii").strip()
-    except (OSError, UnicodeDecodeError):
-        return ""
-    return hashlib.sha256(f"{installed} {platform.node()}".encode()).hexdigest()[:16] if installed else ""

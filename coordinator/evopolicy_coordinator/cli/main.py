@@ -106,6 +106,15 @@ def serve(
             " they are played.",
         ),
     ] = CoreSettings().hidden_wait_s,
+    agent_wait: Annotated[
+        float,
+        typer.Option(
+            min=0.0,
+            metavar="SECONDS",
+            help="Cancel a run that is still open this long after its agent's start, if hidden episodes of closed runs wait for"
+            " the agent. Choose more than the longest wall limit of your agents.",
+        ),
+    ] = CoreSettings().agent_wait_s,
     metrics: Annotated[
         str | None,
         typer.Option(
@@ -155,7 +164,10 @@ def serve(
             unjailed=unjailed_agents,
             trust_workers=trust_workers,
             core=CoreSettings(
-                audit_share=audit, hidden_isolation=hidden_isolation, hidden_wait_s=hidden_wait
+                audit_share=audit,
+                hidden_isolation=hidden_isolation,
+                hidden_wait_s=hidden_wait,
+                agent_wait_s=agent_wait,
             ),
             metrics=metrics,
         )

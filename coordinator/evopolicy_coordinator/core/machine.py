@@ -195,6 +195,7 @@ NEWS: dict[tuple[type, str], tuple[Rule, ...]] = {
     (step.EpisodesDone, "audit"): (audits.replayed,),
     (step.SubmitEnded, ""): (finalisation.submit_ended,),
     (step.AuditsMoved, ""): (finalisation.audits_moved,),
+    (step.AgentOverdue, ""): (finalisation.agent_overdue,),
     (step.FlowPinned, "run"): (runs.pinned,),
     (step.FlowPinned, "evaluation"): (evaluations.pinned,),
     (step.JobRetried, ""): (runs.retried,),

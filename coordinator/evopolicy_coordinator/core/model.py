@@ -486,7 +486,8 @@ class Occupancy:
     id: str
     worker: str
     kernel: Kernel
-    machine_id: str
+    machine: str
+    """As `Worker.machine`, of its worker."""
     family: Family | None
     """None: not known, so related to all."""
     hidden: bool
@@ -566,7 +567,6 @@ class Worker:
     profile: Profile
     last_seen: float
     kernel: Kernel
-    machine_id: str = ""
     first_serial: int | None = None
     """Number of the session's first poll."""
     machine: str = ""
@@ -633,8 +633,6 @@ class Run:
     """The submit in flight."""
     hidden_failures: dict[str, int] = field(default_factory=dict)
     """Group id to number of hidden episodes in which the policy failed, of finished groups."""
-    places: set[tuple[str, str]] = field(default_factory=set)
-    """Machine id and boot id of each place for which its gateway has requested a permit from this core."""
     hidden_returns: dict[str, tuple[float, ...]] = field(default_factory=dict)
     """Held-out and random group id to returns, of finished groups."""
     hidden_successes: dict[str, tuple[bool, ...]] = field(default_factory=dict)

@@ -10,7 +10,6 @@ Code = Literal[
     "no_unfinished_run",
     "unknown_evaluation",
     "run_cancelled",
-    "cancelled_by_operator",
     "run_finished",
     "run_closed",
     "run_takes_no_more",

@@ -246,7 +246,6 @@ class PermitRow(msgspec.Struct, frozen=True, kw_only=True, tag="permit"):
     run: str
     boot_id: str
     """Of the kernel; empty: it may be any."""
-    machine_id: str = ""
     host: str = ""
     """Its host name, for people."""
     granted_at: float = 0.0
@@ -258,7 +257,8 @@ class KernelRow(msgspec.Struct, frozen=True, kw_only=True, tag="kernel"):
 
     worker: str
     boot_id: str
-    machine_id: str
+    machine: str = ""
+    """As `Worker.machine`; missing in rows of earlier versions."""
 
 
 class JournalRow(msgspec.Struct, frozen=True, kw_only=True, tag="journal"):

@@ -55,6 +55,9 @@ class CoreSettings(msgspec.Struct, frozen=True, kw_only=True):
     """Which agents and train jobs keep hidden jobs from a kernel: of runs that share a hidden case, all, or none."""
     hidden_wait_s: float = 60.0
     """After hidden jobs of closed runs were barred from all kernels for this long, one kernel is reserved for them."""
+    agent_wait_s: float = 7 * 86_400.0
+    """An agent that keeps hidden jobs of closed runs from a reserved kernel is stopped, and its run cancelled, this long
+    after its permit was granted. Must be longer than any agent's wall limit."""
     silent_bar_s: float = 60.0
     """After this time, a silent worker has surely stopped its hidden jobs. Well above `lease_ttl_s`, the time after
     which the worker stops them itself."""

@@ -141,7 +141,5 @@ class State:
         """By run and boot id."""
         self.known_kernels: dict[str, KernelRow] = {}
         """By worker: as stored."""
-        self.boots: dict[str, dict[str, None]] = {}
-        """By machine: the boot ids under which any of its processes is known."""
         self.grantable = False
         """Whether a requested permit may have become possible in this step."""

@@ -111,7 +111,25 @@ class AuditsMoved:
     kind: ClassVar[str] = ""
 
 
-News = ResultsPersisted | EpisodesDone | JobRetried | ResultsDiffered | FlowPinned | SubmitEnded | AuditsMoved
+@dataclass(slots=True, eq=False)
+class AgentOverdue:
+    """A run's agent has kept hidden jobs of closed runs from their kernels for too long."""
+
+    run: Run
+
+    kind: ClassVar[str] = ""
+
+
+News = (
+    ResultsPersisted
+    | EpisodesDone
+    | JobRetried
+    | ResultsDiffered
+    | FlowPinned
+    | SubmitEnded
+    | AuditsMoved
+    | AgentOverdue
+)
 
 
 # ---- steps ----

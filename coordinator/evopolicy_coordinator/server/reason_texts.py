@@ -48,7 +48,7 @@ def _agent_alive(run: str, place: str) -> str:
     where = f"on {place}" if place else "on any machine"
     return (
         f"the agent of {run} to end, which may be alive {where}; if it is not, resume that run, or run"
-        f" `evopolicy runs agent-gone {run}`"
+        f" `evopolicy runs agent-gone {run}`; to end it, run `evopolicy runs cancel {run}`"
     )
 
 
@@ -66,7 +66,6 @@ TEXTS: Mapping[Code, str | Callable[..., str]] = {
     "no_unfinished_run": "no unfinished run {run!r}",
     "unknown_evaluation": "unknown evaluation {evaluation!r}",
     "run_cancelled": "run {run!r} was cancelled",
-    "cancelled_by_operator": "run {run!r} was cancelled by the operator",
     "run_finished": "run {run!r} is finished",
     "run_closed": "run {run!r} is closed",
     "run_takes_no_more": "run {run!r} is closed and takes no more submits",

@@ -151,7 +151,7 @@ def check_registration(message: worker.Register) -> None:
             f"missing tiers {str(list(tiers))[:64]}: tiers are {', '.join(get_args(Tier))}, a reason has at most"
             f" {_MAX_WHY} characters",
         )
-    check_place(message.boot_id, message.machine_id, message.host, message.installation)
+    check_place(message.boot_id, message.host, message.installation)
 
 
 def check_packages(message: worker.Register, allowed: tuple[str, ...]) -> None:
@@ -168,11 +168,10 @@ def check_packages(message: worker.Register, allowed: tuple[str, ...]) -> None:
         )
 
 
-def check_place(boot_id: str, machine_id: str, host: str, installation: str = "") -> None:
-    """Checks the lengths of a boot id, a machine id, a host name and an installation's name."""
+def check_place(boot_id: str, host: str, installation: str = "") -> None:
+    """Checks the lengths of a boot id, a host name and an installation's name."""
     places = {
         "boot id": boot_id,
-        "machine id": machine_id,
         "host name": host,
         "installation": installation,
     }

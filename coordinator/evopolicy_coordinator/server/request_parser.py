@@ -278,7 +278,7 @@ class RequestParser:
         return m
 
     def _checked_permit(self, m: gateway.RequestPermit) -> gateway.RequestPermit:
-        check_place(m.boot_id, m.machine_id, m.host)
+        check_place(m.boot_id, m.host)
         return m
 
     def _checked_submit(self, m: gateway.Submit) -> gateway.Submit:

@@ -255,7 +255,7 @@ class Rig:
                 environments=more.get("described", tuple(describe(env) for env in envs)),
                 fingerprint=fingerprint(version, more.get("packages")),
                 boot_id=more.get("boot_id", f"kernel-of-{worker}"),
-                machine_id=more.get("machine_id", ""),
+                machine=more.get("machine", ""),
                 undescribed=more.get("undescribed", ()),
                 installation=more.get("installation", ""),
             )

@@ -22,7 +22,7 @@ def over(state: State, name: str) -> tuple[Refusal, Reason]:
     """Returns why a run that is not open refuses requests."""
     last = state.finished.get(name)
     if last is not None and last.cancelled:
-        return Refusal.RUN_CANCELLED, because("cancelled_by_operator", run=name)
+        return Refusal.RUN_CANCELLED, because("run_cancelled", run=name)
     if last is not None:
         return Refusal.RUN_FINISHED, because("run_finished", run=name)
     if name in state.runs:

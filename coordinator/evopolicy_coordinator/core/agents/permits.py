@@ -1,8 +1,9 @@
 """Permits: an agent's right to be alive on a kernel.
 
 Rules that this module owns:
-- A permit ends when its run is closed, `CANCELLED_S` after its run is cancelled, by an operator's command, or with a
-  new boot id of its machine; never by silence.
+- A permit ends when its run's gateway closes the run, `CANCELLED_S` after its run is cancelled, or by an operator's
+  command; never by silence, and never by a report of another run's gateway or of a worker.
+- A permit on a kernel that no worker names, such as that of a machine before its restart, bars nothing.
 - A requested permit stops related hidden jobs, without blame, unless the kernel is reserved for them (`precedence`). It
   is granted once their workers have released them.
 """
@@ -16,7 +17,7 @@ import msgspec
 from evopolicy_common.messages import gateway
 from evopolicy_common.messages.run_settings import ELSEWHERE
 from evopolicy_common.wire.refusals import Refusal
-from evopolicy_coordinator.core.isolation import conflicts, kernels, occupancies
+from evopolicy_coordinator.core.isolation import conflicts, kernels
 from evopolicy_coordinator.core.isolation.kernels import all_related, put, related, take
 from evopolicy_coordinator.core.leasing import leases
 from evopolicy_coordinator.core.model import Ask, Family, Kernel, Run
@@ -38,6 +39,13 @@ def place(run: Run, boot_id: str) -> str | None:
 def held(state: State, run: str) -> list[tuple[Kernel, PermitRow]]:
     """A run's permits."""
     return [(kernel, row) for kernel, (row, _) in state.permits.get(run, {}).items()]
+
+
+def places(state: State, run: str) -> set[str]:
+    """Boot ids of the kernels on which a run has or requests a permit."""
+    return {kernel.boot_id for kernel, _ in held(state, run)} | {
+        boot_id for name, boot_id in state.asks if name == run
+    }
 
 
 # ---- requests ----
@@ -163,23 +171,6 @@ def agent_ended(state: State, run: str, step: Step) -> None:
     end(state, run, step, "its run was cancelled")
 
 
-def booted(state: State, machine_id: str, boot_id: str, step: Step) -> None:
-    """Record a machine's present boot id: all processes under another one have ended."""
-    if not machine_id or not boot_id:
-        return
-    before, state.boots[machine_id] = state.boots.get(machine_id, {}), {boot_id: None}
-    for old in before:
-        kernel = state.kernels.get(old)
-        if kernel is None or old == boot_id:
-            continue
-        for row in all_related(kernel.permits, None):
-            if row.machine_id == machine_id:
-                _end(state, kernel, row, step, "its machine was started anew")
-        for occupancy in (*all_related(kernel.hidden, None), *all_related(kernel.train, None)):
-            if occupancy.machine_id == machine_id and occupancy.lease is None:
-                occupancies.forget(state, occupancy, step)
-
-
 def cancelled(state: State, run: str, step: Step, at: float | None = None) -> None:
     """Set the deadline after which the permits of a cancelled run end; its agent is being ended."""
     if held(state, run):
@@ -201,7 +192,6 @@ def load(
         family = state.families.join(run.settings.env, (*run.validation, *run.heldout))
         restore(state, row, family)
         state.families.leave(family)
-        state.boots.setdefault(row.machine_id, {})[row.boot_id] = None
         stored = states.get(row.run)
         if stored is not None and stored.phase == "finished":
             at = step.now if stored.closed_at is None else min(stored.closed_at, step.now)

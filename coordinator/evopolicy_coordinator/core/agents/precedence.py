@@ -4,6 +4,9 @@ Rules that this module owns:
 - Agents have precedence at first. When hidden jobs of closed runs, or of an operator, were kept from all kernels that
   could play them for `CoreSettings.hidden_wait_s` in total, one kernel is reserved for them until none of them is left:
   the one with the fewest related agents, then train jobs. Hidden jobs of open runs never cause this.
+- No agent is stopped for hidden jobs, except one whose permit keeps them from a reserved kernel and was granted
+  `CoreSettings.agent_wait_s` ago: its run is cancelled. A run that never ends could otherwise keep others from their
+  scores for ever.
 - A reserved kernel grants no related permit. Once no related permit is left, no related train job is leased there, and
   hidden jobs go before others.
 - A submit is held while none of its episodes runs because hidden jobs occupy all its kernels. That time counts against
@@ -27,7 +30,7 @@ from evopolicy_coordinator.core.model import (
 )
 from evopolicy_coordinator.core.records import train_group
 from evopolicy_coordinator.core.state import State
-from evopolicy_coordinator.core.step import Step
+from evopolicy_coordinator.core.step import AgentOverdue, Step
 
 LOOK_S = 1.0
 """Interval between checks of waiting hidden jobs, and of train jobs that hidden ones may keep waiting."""
@@ -79,13 +82,29 @@ def _hidden(
     if reversal is not None:
         if reversal.kernel not in there:
             release_kernel(state, reversal, step, "its workers are gone")
+        elif not played:
+            _end_overdue(state, reversal, step)
         return
     known = [kernel for kernel in there if kernel.boot_id != EVERYWHERE]
-    if played or not known or not all(conflicts.hidden_conflict(state, family, kernel) for kernel in known):
+    barred = [kernel for kernel in known if conflicts.hidden_conflict(state, family, kernel)]
+    if played or not barred or any(kernel not in barred and _at_work(state, kernel) for kernel in known):
         return
     kept_s = lane.kept_s[family] = lane.kept_s.get(family, 0.0) + passed_s
     if kept_s >= state.settings.hidden_wait_s:
-        _reserve_kernel(state, lane, family, known, step)
+        _reserve_kernel(state, lane, family, barred, step)
+
+
+def _at_work(state: State, kernel: Kernel) -> bool:
+    """Whether any worker on a kernel plays or asks for jobs. Others may have made the kernel up."""
+    return any(state.workers[name].poll or state.workers[name].n_live for name in kernel.workers)
+
+
+def _end_overdue(state: State, reversal: Reversal, step: Step) -> None:
+    """Report the runs whose agents have kept hidden jobs from a reserved kernel for too long."""
+    for kernel in (reversal.kernel, state.everywhere):
+        for row in all_related(kernel.permits, reversal.family):
+            if row.run in state.runs and step.now - row.granted_at >= state.settings.agent_wait_s:
+                step.tell(AgentOverdue(state.runs[row.run]))
 
 
 def _played(state: State, lane: Lane, family: Family) -> bool:
@@ -100,11 +119,11 @@ def _played(state: State, lane: Lane, family: Family) -> bool:
     )
 
 
-def _reserve_kernel(state: State, lane: Lane, family: Family, known: list[Kernel], step: Step) -> None:
+def _reserve_kernel(state: State, lane: Lane, family: Family, barred: list[Kernel], step: Step) -> None:
     def in_the_way(kernel: Kernel) -> tuple[int, int]:
         return len(all_related(kernel.permits, family)), len(all_related(kernel.train, family))
 
-    kernel = min(known, key=in_the_way)
+    kernel = min(barred, key=in_the_way)
     reversal = lane.reversals[family] = Reversal(kernel, lane, family)
     family.users += 1
     kernel.reversals.setdefault(family, {})[str(lane.key)] = reversal

@@ -20,7 +20,7 @@ from . import permits
 ASK_AGAIN_S = 10.0
 """A declined permit request is kept for this long, until the gateway repeats it."""
 MAX_PLACES = 16
-"""Kernels that a run's gateway may name: enough for an agent that moves, and for machines that start anew. With more, a
+"""Kernels on which a run's agent may be: enough for an agent that moves, and for machines that restart. With more, a
 hostile gateway could keep hidden jobs from every kernel, and add rows without end."""
 
 
@@ -31,23 +31,15 @@ def requested(state: State, event: events.Requested[gateway.RequestPermit], step
     if run is None or run.state.phase != "open":
         step.refuse(event.request, *over(state, message.run))
         return
-    place = message.machine_id, message.boot_id
-    if place not in run.places and len(run.places) >= MAX_PLACES:
-        step.refuse(event.request, Refusal.BAD_REQUEST, because("too_many_places", run=run.id, n=MAX_PLACES))
-        return
-    run.places.add(place)
-    permits.booted(state, message.machine_id, message.boot_id, step)
     kernel = permits.place(run, message.boot_id)
     if kernel is None:
         step.reply(event.request, gateway.Permit(granted=True))
         return
-    same = kernel == message.boot_id
-    row = PermitRow(
-        run=run.id,
-        boot_id=kernel,
-        machine_id=message.machine_id if same else "",
-        host=message.host if same else "",
-    )
+    places = permits.places(state, run.id)
+    if kernel not in places and len(places) >= MAX_PLACES:
+        step.refuse(event.request, Refusal.BAD_REQUEST, because("too_many_places", run=run.id, n=MAX_PLACES))
+        return
+    row = PermitRow(run=run.id, boot_id=kernel, host=message.host if kernel == message.boot_id else "")
     waits_for = permits.ask(state, run, row, step)
     if waits_for is None:
         step.reply(event.request, gateway.Permit(granted=True))
@@ -93,8 +85,6 @@ def agent_gone(state: State, event: events.Requested[operator.AgentGone], step: 
         step.refuse(event.request, Refusal.UNKNOWN_RUN, because("unknown_run", run=message.run))
         return
     permits.end(state, message.run, step, "by an operator's word", boot_id=message.boot_id)
-    if message.run in state.runs:
-        state.runs[message.run].places.clear()
     step.reply(event.request, operator.Done())
 
 

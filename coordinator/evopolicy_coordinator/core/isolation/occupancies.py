@@ -4,6 +4,8 @@ Rules that this module owns:
 - A lease occupies its kernel until its worker has released it: by reporting a result, or by a heartbeat that does not
   name it and was sent after the lease had arrived or was lost. If the worker fell silent, the occupancy stays for
   `CoreSettings.silent_bar_s`; within that time the worker has stopped the lease by itself.
+- A heartbeat releases nothing on another kernel, and nothing that a worker of another machine was leased under the
+  same name.
 - After a start each known worker counts as playing anything.
 """
 
@@ -33,7 +35,7 @@ def leased(state: State, lease: Lease, worker: Worker, serial: int, step: Step) 
         lease.id,
         worker.name,
         worker.kernel,
-        worker.machine_id,
+        worker.machine,
         group.flow.family,
         group.hidden,
         lease,
@@ -109,7 +111,11 @@ def heard(state: State, worker: Worker, named: set[str], settled: int, step: Ste
 def surely(worker: Worker, occupancy: Occupancy | None, settled: int) -> bool:
     """Whether a heartbeat that does not name a lease proves that its worker does not hold it and never will. All polls
     of the worker up to number `settled` are finished; 0: it does not number its polls."""
-    if occupancy is None or settled == 0:
+    if occupancy is None:
+        return True
+    if (occupancy.kernel, occupancy.machine) != (worker.kernel, worker.machine):
+        return False
+    if settled == 0:
         return True
     serial = occupancy.serial
     if serial == 0:
@@ -136,7 +142,7 @@ def unknown(state: State, worker: Worker, item: HeldLease, step: Step) -> None:
         family = None if run is None else run.flow.family
     _linger(
         state,
-        Occupancy(item.lease_id, worker.name, worker.kernel, worker.machine_id, family, not train, None),
+        Occupancy(item.lease_id, worker.name, worker.kernel, worker.machine, family, not train, None),
         step,
     )
 
@@ -165,18 +171,10 @@ def expire(state: State, name: str, step: Step) -> None:
 def joined(state: State, worker: Worker, step: Step) -> None:
     """Enter a newly registered worker on its kernel."""
     worker.kernel.workers[worker.name] = None
-    row = KernelRow(worker=worker.name, boot_id=worker.kernel.boot_id, machine_id=worker.machine_id)
+    row = KernelRow(worker=worker.name, boot_id=worker.kernel.boot_id, machine=worker.machine)
     if state.known_kernels.get(worker.name) != row:
         state.known_kernels[worker.name] = row
         step.persist(row)
-
-
-def replaced(state: State, worker: Worker, step: Step) -> None:
-    """Remove the occupancies of a worker's predecessor on an earlier kernel of the same machine: they
-    ended with that process."""
-    for occupancy in list(state.lingering.get(worker.name, {}).values()):
-        if occupancy.kernel is not worker.kernel and occupancy.machine_id == worker.machine_id != "":
-            forget(state, occupancy, step)
 
 
 def forgotten(state: State, worker: Worker) -> None:
@@ -192,9 +190,8 @@ def load(state: State, known_kernels: Iterable[KernelRow], step: Step) -> None:
     for known in known_kernels:
         state.known_kernels[known.worker] = known
         kernel = kernels.kernel(state, known.boot_id)
-        state.boots.setdefault(known.machine_id, {})[known.boot_id] = None
         for hidden in (True, False):
             if hidden and not known.boot_id:
                 continue
             name = f"{known.worker} before, {'hidden' if hidden else 'train'}"
-            _linger(state, Occupancy(name, known.worker, kernel, known.machine_id, None, hidden, None), step)
+            _linger(state, Occupancy(name, known.worker, kernel, known.machine, None, hidden, None), step)

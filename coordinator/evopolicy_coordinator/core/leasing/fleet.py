@@ -69,7 +69,6 @@ def register(state: State, event: WorkerRegistered, kernel: Kernel, step: Step) 
         profile=profile,
         last_seen=step.now,
         kernel=kernel,
-        machine_id=message.machine_id,
         machine=event.machine,
         cpu=message.fingerprint.cpu,
         installation=message.installation,

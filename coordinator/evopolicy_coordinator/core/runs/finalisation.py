@@ -30,7 +30,7 @@ from evopolicy_coordinator.core.records import (
     validation_group,
 )
 from evopolicy_coordinator.core.state import State
-from evopolicy_coordinator.core.step import AuditsMoved, EpisodesDone, Step, SubmitEnded
+from evopolicy_coordinator.core.step import AgentOverdue, AuditsMoved, EpisodesDone, Step, SubmitEnded
 
 from . import audit_end, evaluations, finished, journal, result_polls, runs, templates
 
@@ -142,6 +142,24 @@ def cancel(state: State, event: events.Requested[operator.CancelRun], step: Step
         else:
             step.refuse(event.request, Refusal.UNKNOWN_RUN, because("unknown_run", run=message.run))
         return
+    _cancel(state, run, step)
+    step.reply(event.request, operator.Done())
+
+
+def agent_overdue(state: State, news: AgentOverdue, step: Step) -> None:
+    """Cancel a run whose agent keeps hidden jobs of others waiting: its gateway ends the agent, as at any
+    cancellation."""
+    if news.run.id in state.runs:
+        step.log(
+            "warning",
+            "run_cancelled",
+            run=news.run.id,
+            why="its agent kept hidden cases waiting for too long",
+        )
+        _cancel(state, news.run, step)
+
+
+def _cancel(state: State, run: Run, step: Step) -> None:
     if run.open is not None:
         index, run.open = run.open, None
         run.ledger.refund(index)
@@ -154,7 +172,6 @@ def cancel(state: State, event: events.Requested[operator.CancelRun], step: Step
         permits.cancelled(state, run.id, step)
     permits.drop_asks(state, run.id, Refusal.RUN_CANCELLED, because("run_cancelled", run=run.id), step)
     _finish(state, run, None, step, cancelled=True, unplayed=True)
-    step.reply(event.request, operator.Done())
 
 
 def _finish(

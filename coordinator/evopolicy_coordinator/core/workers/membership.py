@@ -18,7 +18,6 @@ from evopolicy_common.messages import operator
 from evopolicy_common.messages import worker as wire
 from evopolicy_common.wire.refusals import Refusal
 from evopolicy_coordinator.core import events
-from evopolicy_coordinator.core.agents import permits
 from evopolicy_coordinator.core.isolation import conflicts, kernels, occupancies
 from evopolicy_coordinator.core.leasing import fleet, leases, pins
 from evopolicy_coordinator.core.model import Profile, Worker
@@ -51,8 +50,6 @@ def registered(state: State, event: events.WorkerRegistered, step: Step) -> None
     state.timers.disarm(("forget", message.worker))
     worker = fleet.register(state, event, kernels.kernel(state, message.boot_id), step)
     occupancies.joined(state, worker, step)
-    permits.booted(state, worker.machine_id, worker.kernel.boot_id, step)
-    occupancies.replaced(state, worker, step)
     if old is not None and old.kernel is not worker.kernel:
         occupancies.forgotten(state, old)
     reply = wire.Registered(

@@ -27,17 +27,4 @@ def test_boot_id_is_the_same_in_namespaces_of_their_own() -> None:
 
 def test_kernel_without_an_id_has_an_empty_one(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(host, "_BOOT_ID", tmp_path / "none")
-    monkeypatch.setattr(host, "_MACHINE_ID", tmp_path / "none")
     assert host.boot_id() == ""
-    assert host.machine_id() == ""
-
-
-def test_clones_of_one_image_differ_by_their_names(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    image = tmp_path / "machine-id"
-    image.write_text("0123456789abcdef0123456789abcdef\n")
-    monkeypatch.setattr(host, "_MACHINE_ID", image)
-    ids = set()
-    for name in ("first", "second"):
-        monkeypatch.setattr(host.platform, "node", lambda name=name: name)
-        ids.add(host.machine_id())
-    assert len(ids) == 2

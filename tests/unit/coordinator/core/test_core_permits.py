@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
+import msgspec
 import pytest
 from rigs.asking import asked
-from rigs.core_rig import Rig, result, split_of
+from rigs.core_rig import Rig, describe, fingerprint, result, split_of
 
 from evopolicy_common.messages import gateway, operator
 from evopolicy_common.messages import worker as wire
@@ -32,10 +33,6 @@ def gone(rig: Rig, run: str = "r1", boot_id: str = "") -> Any:
     return rig.tell(asked(operator.AgentGone, request=rig.request(), run=run, boot_id=boot_id))
 
 
-def reboot(rig: Rig, name: str = "w1", boot_id: str = "another", machine_id: str = "m") -> str:
-    return rig.register(name, boot_id=boot_id, machine_id=machine_id)
-
-
 def splits(leases: list[wire.Lease]) -> set[str]:
     return {split_of(lease.job) for lease in leases}
 
@@ -45,9 +42,9 @@ def test_a_permit_is_durable_and_asked_for_again_at_no_cost() -> None:
     rig.register()
     rig.create(agent=None)
     for _ in range(2):
-        assert rig.permit("r1", HERE, machine_id="m", host="lab") == gateway.Permit(granted=True)
+        assert rig.permit("r1", HERE, host="lab") == gateway.Permit(granted=True)
     row = rig.row(PermitRow, "r1", HERE)
-    assert (row.host, row.machine_id, row.ended_at) == ("lab", "m", None)
+    assert (row.host, row.ended_at) == ("lab", None)
     rig.load()
     assert rig.status().runs[0].agent_host == "lab"
 
@@ -316,29 +313,79 @@ def test_an_operators_word_ends_a_permit_and_silence_does_not() -> None:
     assert gone(rig, "nobody").status == Refusal.UNKNOWN_RUN
 
 
-@pytest.mark.parametrize("by", ["worker", "gateway"])
-def test_another_boot_id_of_its_machine_ends_a_permit(by: str) -> None:
+def earlier_version(rig: Rig, message: type[wire.Message], **fields: Any) -> Any:
+    """A request with `machine_id`, a field of earlier versions, from which they concluded that a machine was restarted."""
+    given = asked(message, request=rig.request(), **fields)
+    sent = {**msgspec.to_builtins(given.message), "machine_id": "m"}
+    return rig.tell(msgspec.structs.replace(given, message=msgspec.convert(sent, message)))
+
+
+@pytest.mark.parametrize("by", ["its own gateway", "another gateway", "another worker", "its own worker"])
+def test_no_report_of_another_boot_id_ends_a_permit(by: str) -> None:
     rig = Rig()
-    rig.register()
-    rig.create("r1", agent=None)
-    rig.permit("r1", HERE, machine_id="m")
-    if by == "worker":
-        reboot(rig)
+    session = rig.register(slots=8)
+    scored(rig, session)
+    for run in ("r1", "r2"):
+        rig.create(run, agent=None)
+    earlier_version(rig, gateway.RequestPermit, run="r1", boot_id=HERE, host="lab")
+    if "gateway" in by:
+        run = "r1" if by == "its own gateway" else "r2"
+        assert earlier_version(rig, gateway.RequestPermit, run=run, boot_id="fake", host="lab").granted
     else:
-        rig.create("r2", agent=None)
-        rig.permit("r2", "another", machine_id="m")
-    assert rig.row(PermitRow, "r1", HERE).ended_at == rig.now
-
-
-@pytest.mark.parametrize(
-    ("boot_id", "machine_id"), [("another", "other"), ("another", ""), ("", "m"), (HERE, "m")]
-)
-def test_nothing_else_of_a_worker_ends_a_permit(boot_id: str, machine_id: str) -> None:
-    rig = Rig()
-    rig.create("r1", agent=None)
-    rig.permit("r1", HERE, machine_id="m")
-    reboot(rig, boot_id=boot_id, machine_id=machine_id)
+        name = "w1" if by == "its own worker" else "w2"
+        described = {"tiers": ("bwrap",), "environments": (describe(),), "fingerprint": fingerprint()}
+        earlier_version(
+            rig, wire.Register, worker=name, session=f"{name}-x", slots=8, boot_id="fake", **described
+        )
+        session = rig.register("w3", slots=8, boot_id=HERE)
     assert rig.row(PermitRow, "r1", HERE).ended_at is None
+    assert "validation" not in splits(rig.poll(session, 8))
+
+
+def test_a_permit_on_a_kernel_that_no_worker_names_bars_nothing() -> None:
+    rig = Rig()
+    session = rig.register(slots=8)
+    scored(rig, session)
+    rig.create("r1", agent=HERE)
+    assert splits(rig.poll(session, 8)) == {"random"}
+    session = rig.register(slots=8, boot_id="another")  # the machine was restarted
+    assert splits(rig.poll(session, 8)) == {"validation"}
+
+
+@pytest.mark.parametrize("restart", [False, True])
+@pytest.mark.parametrize("there", [HERE, "another"])
+def test_a_stranger_under_a_lost_workers_name_frees_no_kernel(there: str, restart: bool) -> None:
+    rig = Rig()
+    session = rig.register(slots=8, machine="m1")
+    scored(rig, session)
+    leases = rig.poll(session, 8)
+    assert "validation" in splits(leases)
+    if restart:
+        rig.load()
+    else:
+        rig.pass_time(20.0)
+    stranger = rig.register(slots=8, machine="m2", boot_id=there)
+    rig.beat(stranger)
+    rig.create("r1", agent=None)
+    assert not rig.permit("r1", HERE).granted
+    rig.pass_time(rig.settings.silent_bar_s)
+    assert rig.permit("r1", HERE).granted
+
+
+def test_a_worker_on_another_kernel_speaks_for_no_earlier_one() -> None:
+    rig = Rig()
+    session = rig.register(slots=8)
+    scored(rig, session)
+    assert "validation" in splits(rig.poll(session, 8))
+    session = rig.register(slots=8, boot_id="another")
+    rig.create("r1", agent=None)
+    for _ in range(10):
+        rig.pass_time(2.0)
+        rig.beat(session)
+    assert not rig.permit("r1", HERE).granted
+    assert rig.permit("r1", "elsewhere").granted
+    rig.pass_time(rig.settings.silent_bar_s)
+    assert rig.permit("r1", HERE).granted
 
 
 def test_a_takeover_by_another_host_keeps_the_first_permit() -> None:
@@ -459,12 +506,14 @@ def test_a_gateway_may_name_only_so_many_kernels() -> None:
     rig = Rig()
     rig.register()
     rig.create(agent=None)
-    answers = [rig.permit("r1", f"kernel-{n}", machine_id=f"m{n}") for n in range(20)]
+    answers = [rig.permit("r1", f"kernel-{n}") for n in range(20)]
     granted = [isinstance(each, gateway.Permit) for each in answers]
     assert granted == [True] * 16 + [False] * 4
     assert answers[-1].status == "bad_request"
     assert "agent-gone" in answers[-1].message
+    rig.load()
+    assert rig.permit("r1", "kernel-16").status == "bad_request"
     # Where it was it may be, and the operator can let it go on.
-    assert rig.permit("r1", "kernel-3", machine_id="m3").granted
+    assert rig.permit("r1", "kernel-3").granted
     gone(rig)
     assert rig.permit("r1", "kernel-16").granted

@@ -181,6 +181,62 @@ def test_the_time_for_which_a_submit_is_held_does_not_count_against_its_limit() 
     assert rig.core.state.runs["r1"].submits[0].status == "rollout_timeout"
 
 
+@pytest.mark.parametrize("where", ["", HERE])
+@pytest.mark.parametrize("restart", [False, True])
+def test_a_run_that_keeps_others_waiting_for_too_long_is_cancelled(where: str, restart: bool) -> None:
+    rig = Rig(agent_wait_s=600.0)
+    session = rig.register(slots=8)
+    rig.create("r1", agent=where)
+    rig.create("r2", agent="remote")
+    rig.create("r3", agent=HERE, hidden_from=9000)  # shares no hidden case
+    keep_alive(rig, session, 700.0)
+    assert "r1" in rig.core.state.runs, "it keeps nobody waiting"
+    closed(rig, session, "r0")
+    if restart:
+        rig.load()
+        session = rig.register(slots=8)
+    rig.play(session, *rig.poll(session, 8))
+    keep_alive(rig, session, WAIT_S - 8.0)
+    assert "r1" in rig.core.state.runs
+    keep_alive(rig, session, 12.0)
+    assert rig.finished("r1").status == "cancelled"
+    assert {"r2", "r3"} <= rig.core.state.runs.keys()
+    assert rig.permit("r1", where).status == "run_cancelled"
+    assert "validation" not in splits(rig.poll(session, 8))  # its agent has its time to end
+    keep_alive(rig, session, 30.0)
+    assert "validation" in splits(rig.poll(session, 8))
+
+
+def test_an_agent_that_keeps_others_waiting_is_named_until_its_time_is_up() -> None:
+    rig = Rig(agent_wait_s=600.0)
+    session = rig.register(slots=8)
+    closed(rig, session, "r0")
+    rig.create("r1", agent="")
+    rig.play(session, *rig.poll(session, 8))
+    keep_alive(rig, session, 590.0)
+    (stall,) = rig.status().stalls
+    assert "agent of r1" in stall
+    assert "runs agent-gone r1" in stall
+    assert "runs cancel r1" in stall
+    keep_alive(rig, session, 20.0)
+    assert "r1" not in rig.core.state.runs
+
+
+def test_a_worker_that_asks_for_no_work_keeps_no_kernel_from_being_turned_over() -> None:
+    rig = Rig()
+    session = rig.register(slots=8)
+    closed(rig, session, "r0")
+    rig.create("r1", agent=HERE)
+    rig.play(session, *rig.poll(session, 8))
+    idle = rig.register("w2", boot_id="made-up")
+    for _ in range(40):
+        rig.pass_time(2.0)
+        rig.beat(session)
+        rig.beat(idle)
+    turned = [name for name, kernel in rig.core.state.kernels.items() if kernel.reversals]
+    assert turned == [HERE]
+
+
 def test_early_validation_never_keeps_an_agent_away() -> None:
     rig = Rig()
     session = rig.register(slots=8)

@@ -19,6 +19,7 @@ from evopolicy_coordinator.core.records import (
     EvaluationRow,
     JournalRow,
     KernelRow,
+    PermitRow,
     WorkerRow,
     head_of,
 )
@@ -148,13 +149,28 @@ def test_row_is_replaced_under_its_key(store: Store) -> None:
 
 def test_workers_that_have_ended_are_forgotten_on_their_own_kernel_alone(store: Store) -> None:
     store.write(
-        [
-            KernelRow(worker=name, boot_id=boot_id, machine_id="m")
-            for name, boot_id in (("here", "k1"), ("there", "k2"))
-        ]
+        [KernelRow(worker=name, boot_id=boot_id) for name, boot_id in (("here", "k1"), ("there", "k2"))]
     )
     store.forget_kernels("k1")
     assert [row.worker for row in store.load().kernels] == ["there"]
+
+
+def test_permits_and_kernels_that_an_earlier_version_wrote_are_read(store: Store, path: Path) -> None:
+    permit = {
+        "type": "permit",
+        "run": "r",
+        "boot_id": "k",
+        "machine_id": "m",
+        "host": "lab",
+        "granted_at": 5.0,
+    }
+    kernel = {"type": "kernel", "worker": "w", "boot_id": "k", "machine_id": "m"}
+    with contextlib.closing(sqlite3.connect(path)) as db, db:
+        db.execute("INSERT INTO permits VALUES ('r', 'k', 0, ?)", (msgspec.msgpack.encode(permit),))
+        db.execute("INSERT INTO kernels VALUES ('w', ?)", (msgspec.msgpack.encode(kernel),))
+    snapshot = store.load()
+    assert snapshot.permits == (PermitRow(run="r", boot_id="k", host="lab", granted_at=5.0),)
+    assert snapshot.kernels == (KernelRow(worker="w", boot_id="k"),)
 
 
 def test_write_that_fails_leaves_nothing_behind(store: Store) -> None:
