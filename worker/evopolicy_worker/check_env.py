@@ -57,6 +57,8 @@ class InASlot(msgspec.Struct, frozen=True, kw_only=True):
     """Memory of all of the slot's processes after it, MiB; shared memory counts for each."""
     fault: str = ""
     """Why an episode could not be played."""
+    notes: str = ""
+    """As `EnvironmentDescription.notes`."""
 
 
 class Checked(msgspec.Struct, frozen=True):
@@ -163,7 +165,11 @@ async def in_a_slot(env_id: str, definitions: tuple[Entry, ...]) -> InASlot:
                 timed.append((outcome.length, outcome.wall_s))
             (n, spent), (more, longer) = timed
             each = (longer - spent) / (more - n) if more > n else 0.0
-            return InASlot(microseconds=round(1e6 * max(each, 0.0), 1), memory_mb=slot.memory_bytes() >> 20)
+            return InASlot(
+                microseconds=round(1e6 * max(each, 0.0), 1),
+                memory_mb=slot.memory_bytes() >> 20,
+                notes=description.notes(),
+            )
         except EvopolicyError as error:
             return InASlot(fault=f"in a slot: {error}"[:300])
         finally:
@@ -265,6 +271,8 @@ def command(
         for each in wanted:
             shown.add_row(*known[each].cells())
         terminal().print(shown)
+        for each in filter(None, (known[each].slot.notes for each in wanted)):
+            say(f"note: {each}", err=True)
         raise typer.Exit(any(known[each].verdict != "ok" for each in wanted))
 
 

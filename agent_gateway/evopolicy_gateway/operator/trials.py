@@ -23,7 +23,7 @@ from evopolicy_common.records.aggregates import mean, std
 from evopolicy_common.records.episodes import rendered
 from evopolicy_common.records.policies import bundles
 from evopolicy_common.records.policies.checkpoints import bundle_of
-from evopolicy_common.terminal import one_line, say_json
+from evopolicy_common.terminal import one_line, say, say_json
 from evopolicy_gateway.operator.cluster import Cluster, connected
 from evopolicy_gateway.operator.operations import Operations
 from evopolicy_gateway.submits.formatting import cut_text
@@ -89,6 +89,7 @@ async def try_policy(trial: Trial, where: Cluster, *, as_json: bool) -> int:
     check_writable(trial.out, "--out")
     console = terminal(stderr=as_json)
     results: list[TrialResult] = []
+    notes: set[str] = set()
 
     async def work(operations: Operations) -> None:
         await operations.upload(bundle.digest, bundle.packed)
@@ -111,10 +112,15 @@ async def try_policy(trial: Trial, where: Cluster, *, as_json: bool) -> int:
             for outcome, case in zip(outcomes, trial.cases, strict=True)
         ]
         results.append(_result(trial.env, episodes, where, folder))
+        if not catalogue.is_shipped(trial.env):
+            offered = (each.description for each in (await operations.environments())[0])
+            notes.update(each.notes() for each in offered if each.env == trial.env)
 
     async with connected(where, [trial.env], {trial.tier}) as (operations, _, failed):
         await unless_failed(asyncio.create_task(work(operations)), failed)
     _print(results, as_json, console)
+    for note in filter(None, notes):
+        say(f"note: {note}", err=True)
     return int(any(episode.failure for episode in results[0].episodes))
 
 

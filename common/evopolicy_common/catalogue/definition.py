@@ -29,6 +29,7 @@ USUAL_STEP_BYTES = 1000
 MAX_STEPS = 1 << 22
 MAX_TASK_CHARACTERS = 64 << 10
 MAX_FILE_BYTES = 1 << 20
+MAX_DATA = 32
 _ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*([/:][A-Za-z0-9][A-Za-z0-9_.-]*){0,3}")
 _MAX_ID = 120
 _MAX_REWARD_TEXT = 1000
@@ -85,6 +86,11 @@ class Entry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     """Whether only the last step's value counts, or a true value at any step."""
     deterministic: bool = True
     """False when even a fresh environment does not repeat an episode from its seed and actions."""
+    data: tuple[str, ...] = ()
+    """Files and folders that the environment reads besides its modules, relative to its file's folder; read from a file,
+    absolute."""
+    info_strings: tuple[str, ...] = ()
+    """Keys of info whose texts feedback has; an environment's other texts are left out."""
 
     @property
     def label(self) -> str:
@@ -165,6 +171,7 @@ def _entry(path: Path, table: dict[str, Any]) -> Entry:
         entry = msgspec.convert(fields, Entry)
     except msgspec.ValidationError as error:
         raise ConfigError(f"{where}: {error}") from error
+    entry = msgspec.structs.replace(entry, data=_data(where, path, entry.data))
     for wrong, why in _faults(entry):
         if wrong:
             raise ConfigError(f"{where}: {why}")
@@ -193,10 +200,36 @@ def _task(where: str, path: Path, fields: dict[str, Any], task_file: object) -> 
         raise ConfigError(f"{what} is not UTF-8: {error}; save it as UTF-8") from error
 
 
+def _data(where: str, path: Path, names: tuple[str, ...]) -> tuple[str, ...]:
+    """Absolute paths of the declared data."""
+    if len(names) > MAX_DATA:
+        raise ConfigError(
+            f"{where}: data has {len(names)} names; {MAX_DATA} are the limit: name their folder"
+        )
+    folder = path.parent.resolve()
+    found: list[str] = []
+    for name in names:
+        place = folder / name
+        real = place.resolve() if "\0" not in name else folder
+        if (
+            real == folder
+            or not real.is_relative_to(folder)
+            or any(part.startswith(".") for part in Path(name).parts)
+        ):
+            raise ConfigError(
+                f"{where}: data {name[:80]!r}: name files and folders in the environment file's folder, relative to it and"
+                " without a dot at the beginning"
+            )
+        if not real.exists():
+            raise ConfigError(f"{where}: data {name[:80]!r}: there is no {place}")
+        found.append(str(path.parent.absolute() / name))
+    return tuple(found)
+
+
 def _faults(entry: Entry) -> list[tuple[bool, str]]:
     """Possible faults of a foreign definition: whether each is present, and its error text."""
     unknown = sorted(entry.reward_weights.keys() - set(entry.reward_vector))
-    names = (entry.success, *entry.reward_components, *entry.reward_vector)
+    names = (entry.success, *entry.reward_components, *entry.reward_vector, *entry.info_strings)
     long_name = next((name for name in names if len(name) > _MAX_ID or not name.isprintable()), "")
     long_text = next((text for text in entry.reward_components.values() if len(text) > _MAX_REWARD_TEXT), "")
     return [
@@ -222,8 +255,8 @@ def _faults(entry: Entry) -> list[tuple[bool, str]]:
         ),
         (
             bool(long_name),
-            f"key of info {long_name[:80]!r}: one line of {_MAX_ID} characters at most, in success, reward_components and"
-            " reward_vector",
+            f"key of info {long_name[:80]!r}: one line of {_MAX_ID} characters at most, in success, reward_components,"
+            " reward_vector and info_strings",
         ),
         (
             bool(long_text),

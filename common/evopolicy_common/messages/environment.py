@@ -74,6 +74,17 @@ class EnvironmentDescription(msgspec.Struct, frozen=True, kw_only=True):
     """Name to exact version of the distributions that decide this environment's numbers."""
     step_us: Number = 0.0
     """Mean time of a few random steps where it was described, microseconds; 0: not measured."""
+    info_left_out: Many[Text] = ()
+    """Keys of info that had text in these steps, which feedback leaves out."""
+
+    def notes(self) -> str:
+        """What its author should know, with the remedy; empty if there is nothing."""
+        if not self.info_left_out:
+            return ""
+        return (
+            f"{self.env}: feedback leaves out the texts of info under {', '.join(map(repr, self.info_left_out))}; to pass them"
+            " on, name their keys in info_strings of an environment file"
+        )
 
     def digest(self) -> str:
         """SHA-256 of the definition, 64 hex digits: of all fields except the adapter, versions, the time of a
@@ -94,4 +105,4 @@ def _default(field: msgspec.structs.FieldInfo) -> object:
     return field.default if factory is msgspec.NODEFAULT else factory()
 
 
-_NOT_DEFINED = frozenset({"env_version", "obs_storage", "adapter", "packages", "step_us"})
+_NOT_DEFINED = frozenset({"env_version", "obs_storage", "adapter", "packages", "step_us", "info_left_out"})

@@ -42,6 +42,28 @@ def test_a_file_defines_an_environment_with_all_that_is_stated_of_it(tmp_path: P
     assert catalogue.entry("acme/glider") == entry
 
 
+def test_declared_data_lies_in_the_files_folder_and_is_no_hidden_file(tmp_path: Path) -> None:
+    home, file = tmp_path / "home", tmp_path / "home" / "glider.toml"
+    (home / "maps").mkdir(parents=True)
+    (tmp_path / "token").touch()
+    (home / ".env").touch()
+    (home / "out").symlink_to(tmp_path / "token")
+
+    def data(*names: str) -> tuple[str, ...]:
+        listed = ", ".join(map(repr, names))
+        file.write_text(f'id = "acme/x"\ngymnasium_id = "a:B-v0"\ndata = [{listed}]')
+        return read_file(file)[0].data
+
+    assert data("maps") == (str(home / "maps"),)
+    for wrong in ("../token", "/etc/passwd", ".env", "out", ".", "maps/.git"):
+        with pytest.raises(ConfigError, match="in the environment file's folder"):
+            data(wrong)
+    with pytest.raises(ConfigError, match="there is no"):
+        data("levels")
+    with pytest.raises(ConfigError, match="32 are the limit"):
+        data(*["maps"] * 33)
+
+
 def test_a_file_may_define_several(tmp_path: Path) -> None:
     rows = [f'[[environment]]\nid = "acme/{k}"\ngymnasium_id = "acme_envs:Glider-v0"\n' for k in range(3)]
     (tmp_path / "many.toml").write_text("".join(rows))

@@ -7,6 +7,7 @@ The thread that plays sets `current`, which takes a few dozen nanoseconds a step
 from __future__ import annotations
 
 import os
+import re
 import resource
 import sys
 from typing import Literal
@@ -112,13 +113,27 @@ def note(text: str) -> None:
     print(f"{NOTE}{text}", file=sys.stderr, flush=True)
 
 
+own_folders: list[str] = []
+"""The operator's folders on this process's module search path, of which only modules and declared data are shown."""
+
+
 def described(error: BaseException) -> str:
-    """Type and text of an exception of third-party code, in one line."""
+    """Type and text of an exception of third-party code, in one line, with the remedy for a file that is not shown."""
     try:
         text = str(error)
     except Exception:
         text = "its text cannot be made"
-    return one_line(f"{type(error).__name__}: {text}")
+    return one_line(f"{type(error).__name__}: {text}{_not_shown(error, text)}")
+
+
+def _not_shown(error: BaseException, text: str) -> str:
+    for folder in own_folders if isinstance(error, OSError | ValueError) else ():
+        found = re.search(rf"{re.escape(folder)}/([^'\"\n]+)", text)
+        if found is not None and not os.path.exists(found[0]):
+            return f"; {found[1]} is not shown to the environment: if it exists, declare it in data of its environment file"
+    if isinstance(error, ModuleNotFoundError) and own_folders:
+        return f"; if {error.name} is a folder on PYTHONPATH, it needs an __init__.py to be shown"
+    return ""
 
 
 def raised(error: BaseException, text: str, limits: Limits) -> str:

@@ -21,7 +21,7 @@ from evopolicy_common.messages.environment import Case, EnvironmentDescription
 from evopolicy_worker.environments import settings
 from evopolicy_worker.environments.adapters import versions
 from evopolicy_worker.environments.base import Environment
-from evopolicy_worker.environments.families.foreign import ForeignFamily
+from evopolicy_worker.environments.families import foreign
 from evopolicy_worker.environments.gymnasium_adapter import GymnasiumEnvironment, GymnasiumFamily, quiet
 
 _TIMED_STEPS, _TIMED_S = 16, 0.25
@@ -33,6 +33,11 @@ _defined: dict[str, Entry] = {}
 def define(definitions: Iterable[Entry]) -> None:
     """Makes environments that do not ship known to this process."""
     _defined.update((each.id, each) for each in definitions)
+
+
+def defined() -> tuple[Entry, ...]:
+    """The definitions that `define` got in this process."""
+    return tuple(_defined.values())
 
 
 def definition(env_id: str) -> list[str]:
@@ -78,6 +83,15 @@ def describe(env_id: str) -> EnvironmentDescription:
     if not catalogue.is_shipped(env_id) and isinstance(environment, GymnasiumEnvironment):
         environment.try_out()
     description = measured(environment)
+    left_out, found = tuple(foreign.left_out.get(env_id, ())), _entry(env_id)
+    if found.success in left_out:
+        raise WorkerError(
+            f"environment {env_id}, info[{found.success!r}]: it is a text; success is true or false"
+        )
+    told = {"info_strings": list(found.info_strings)} if found.info_strings else {}
+    description = msgspec.structs.replace(
+        description, definition=description.definition | told, info_left_out=left_out
+    )
     # Not after an exception: it belongs to the call that is running, which its message names.
     environment.close()
     return description
@@ -172,7 +186,7 @@ def _entry(env_id: str) -> Entry:
 def family_of(found: Entry) -> GymnasiumFamily:
     """The family that makes an environment which does not belong to the toys. Imports its module, no simulator."""
     if found.adapter == "foreign":
-        return ForeignFamily(found.gymnasium_id or "")
+        return foreign.ForeignFamily(found)
     return cast(
         GymnasiumFamily,
         importlib.import_module(f"evopolicy_worker.environments.families.{found.adapter}").FAMILY,

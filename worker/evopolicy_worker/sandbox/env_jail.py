@@ -3,6 +3,7 @@
 Rules:
 - No credentials, no network, and no environment variables but those listed here. Installed code is read-only; only the
   slot's scratch folder is writable. Only the supervisor has a session with the coordinator.
+- Of the operator's other folders on the module search path: their modules and declared data (`user_code`).
 - Tier bwrap: its own namespaces, in which the machine's processes, sockets and other files do not exist. Tier landlock:
   Landlock and a filter of system calls instead. Tier none: only the environment variables are restricted.
 - The process starts the policies' sandbox inside its jail, then seals itself, and only then imports a simulator.
@@ -19,18 +20,20 @@ import platform
 import struct
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import cache
 from pathlib import Path
 
 import evopolicy_common
 import evopolicy_worker
+from evopolicy_common.catalogue import Entry
 from evopolicy_common.errors import SandboxError
 from evopolicy_common.messages.episode import Tier
+from evopolicy_common.processes.scratch import remove_tree
 from evopolicy_common.seccomp.numbers import SECCOMP
-from evopolicy_worker.environments import process_environment
+from evopolicy_worker.environments import calls, defined, process_environment
 from evopolicy_worker.environments.settings import BROWSER
-from evopolicy_worker.sandbox import jail, seccomp
+from evopolicy_worker.sandbox import jail, seccomp, user_code
 from evopolicy_worker.sandbox.inside import zygote as inside
 
 _SYSTEM = ("/usr", "/bin", "/sbin", "/lib", "/lib32", "/lib64")
@@ -62,8 +65,9 @@ _PASSED_ON_PREFIXES = (
 )
 _LATER_PATH = "EVOPOLICY_SIMULATORS_PATH"
 """Passes the operator's PYTHONPATH into the jail, where `seal` applies it: its modules could shadow standard ones."""
-_PATHS = ("LD_LIBRARY_PATH", "PYTHONPATH", _LATER_PATH)
-"""Variables whose folders are visible in the jail."""
+_INSTALLATIONS = ("site-packages", "dist-packages")
+_own_folders: dict[str, str] = {}
+"""Folders on the module search path of which only modules are shown, and what the process has in their place."""
 
 
 def variables(scratch: Path) -> dict[str, str]:
@@ -73,11 +77,11 @@ def variables(scratch: Path) -> dict[str, str]:
         for name, value in os.environ.items()
         if name in _PASSED_ON or name.startswith(_PASSED_ON_PREFIXES)
     }
-    path = [entry for entry in os.environ.get("PYTHONPATH", "").split(os.pathsep) if entry]
+    path = [os.path.abspath(entry) for entry in _folders("PYTHONPATH")]
     ours = [entry for entry in path if os.path.realpath(entry) in _our_folders()]
     own = {
         **({"PYTHONPATH": os.pathsep.join(ours)} if ours else {}),
-        _LATER_PATH: os.pathsep.join(entry for entry in path if not _holds_home(os.path.realpath(entry))),
+        _LATER_PATH: os.pathsep.join(path),
         "PATH": "/usr/bin:/bin",
         "HOME": f"{scratch}/home",
         "TMPDIR": f"{scratch}/tmp",
@@ -86,13 +90,18 @@ def variables(scratch: Path) -> dict[str, str]:
     return {**passed_on, **own, **process_environment()}
 
 
-def command(tier: Tier, scratch: Path, *, draws: bool = False) -> tuple[str, ...]:
+def command(
+    tier: Tier, scratch: Path, *, draws: bool = False, definitions: Sequence[Entry] = ()
+) -> tuple[str, ...]:
     """The command line that starts an environment process in that tier.
 
-    `draws`: whether this machine's graphics devices are visible. Raises SandboxError when bubblewrap is not installed.
+    `draws`: whether this machine's graphics devices are visible. `definitions`: environments that do not ship. Raises SandboxError when bubblewrap is not installed.
     """
     python = (sys.executable, "-P", "-m", "evopolicy_worker.episodes.env_process")
-    return (*_UNHEEDING, *_bubblewrap(scratch, draws), *python) if tier == "bwrap" else python
+    if tier != "bwrap":
+        return python
+    declared = user_code.declared(definitions, _folders("PYTHONPATH"))
+    return (*_UNHEEDING, *_bubblewrap(scratch, draws, declared), *python)
 
 
 def graphics_devices() -> tuple[str, ...]:
@@ -113,10 +122,27 @@ def enclose(tier: Tier, scratch: Path, *, draws: bool) -> None:
     for name in ("home", "tmp"):
         (scratch / name).mkdir(exist_ok=True)
     os.chdir(scratch / "home")
+    later = _folders(_LATER_PATH)
+    _own_folders.update((each, each) for each in (*sys.path, *later) if not _is_installed(each))
     if tier == "landlock":
+        declared = user_code.declared(defined(), later)
+        for n, folder in enumerate(_own_folders):
+            # Beside the scratch folder, in which this process may write.
+            place = Path(f"{scratch}-modules", str(n))
+            _own_folders[folder] = str(place)
+            remove_tree(place)
+            below = (each for each in declared if _below(each, folder))
+            user_code.mirror(folder, {*user_code.modules(folder), *below}, place)
         drawn_with = graphics_devices() if draws else ()
         devices = [path for path in drawn_with if path.startswith("/dev/")]
-        shown = [*_code(), *_etc(), *_SYSTEM, "/proc", *(path for path in drawn_with if path not in devices)]
+        shown = [
+            *_code(declared),
+            f"{scratch}-modules",
+            *_etc(),
+            *_SYSTEM,
+            "/proc",
+            *(path for path in drawn_with if path not in devices),
+        ]
         with _explained("be closed in by Landlock"):
             inside.check(inside.libc.prctl(38, 1, 0, 0, 0), "no_new_privs")
             inside.landlock({"read": shown, "write": [*_DEVICES, *devices]}, str(scratch))
@@ -131,8 +157,11 @@ def seal(tier: Tier, scratch: Path, user: int | None, *, draws: bool) -> None:
     """
     if tier != "none":
         _seal(tier, scratch, user, graphics_devices() if draws else ())
-    path = os.environ["PYTHONPATH"] = os.environ.get(_LATER_PATH, "")
-    sys.path[:0] = [entry for entry in path.split(os.pathsep) if entry]
+    later = _folders(_LATER_PATH)
+    sys.path[:] = [_own_folders.get(entry, entry) for entry in (*later, *sys.path)]
+    os.environ["PYTHONPATH"] = os.pathsep.join(_own_folders.get(entry, entry) for entry in later)
+    if tier != "none":
+        calls.own_folders += _own_folders.values()
 
 
 def _seal(tier: Tier, scratch: Path, user: int | None, drawn_with: tuple[str, ...]) -> None:
@@ -190,7 +219,7 @@ def _explained(what: str) -> Iterator[None]:
 # The file system of the process.
 
 
-def _bubblewrap(scratch: Path, draws: bool) -> list[str]:
+def _bubblewrap(scratch: Path, draws: bool, declared: Sequence[str]) -> list[str]:
     arguments = [jail.bubblewrap(), "--die-with-parent", "--new-session", "--hostname", "slot"]
     arguments += ["--unshare-pid", "--unshare-net", "--unshare-ipc", "--unshare-uts", "--unshare-cgroup-try"]
     if os.geteuid() == 0:
@@ -211,7 +240,7 @@ def _bubblewrap(scratch: Path, draws: bool) -> list[str]:
     for path in _DEVICES:
         if os.path.exists(path):
             arguments += ["--dev-bind", path, path]
-    read = (*_etc(), *_code())
+    read = (*_etc(), *_code(declared))
     drawn_with = graphics_devices() if draws else ()
     for path in jail.parents([*read, *drawn_with, *_DEVICES, str(scratch)]):
         arguments += ["--perms", "0755", "--dir", path]
@@ -226,18 +255,41 @@ def _etc() -> list[str]:
     return [path for name in _ETC if os.path.exists(path := f"/etc/{name}")]
 
 
-def _code() -> list[str]:
-    """Python, its installed packages, and the folders in the operator's path variables. Folders inside other ones are
-    left out."""
-    named = [entry for name in _PATHS for entry in os.environ.get(name, "").split(os.pathsep) if entry]
+def _code(declared: Sequence[str]) -> list[str]:
+    """Python, its installed packages, the folders of libraries, the modules in the operator's other folders, and what is
+    declared. Paths inside other ones are left out."""
+    path = [*_python_path(), *_folders("PYTHONPATH"), *_folders(_LATER_PATH)]
+    named = _folders("LD_LIBRARY_PATH")
     named += [os.path.dirname(os.path.realpath(path)) for path in (os.environ.get(BROWSER, ""),) if path]
-    listed = [path for path in (*_python_path(), *named) if not _holds_home(os.path.realpath(path))]
-    wanted = [sys.prefix, sys.exec_prefix, sys.base_prefix, *_our_folders(), *listed]
+    named += filter(_is_installed, path)
+    listed = [entry for entry in named if not _holds_home(os.path.realpath(entry))]
+    wanted = [*_installation(), *listed]
+    places = {*map(os.path.abspath, wanted), *map(os.path.realpath, wanted)}
+    own = [entry for entry in path if not _is_installed(entry)]
+    for folder in {*map(os.path.abspath, own), *map(os.path.realpath, own)}:
+        places |= {*user_code.modules(folder)}
     found: list[str] = []
-    for path in sorted({*map(os.path.abspath, wanted), *map(os.path.realpath, wanted)}):
-        if os.path.exists(path) and not any(_below(path, other) for other in ("/usr", *found)):
-            found.append(path)
+    for place in sorted({*places, *declared}):
+        if os.path.exists(place) and not any(_below(place, other) for other in ("/usr", *found)):
+            found.append(place)
     return found
+
+
+def _folders(variable: str) -> list[str]:
+    return [entry for entry in os.environ.get(variable, "").split(os.pathsep) if entry]
+
+
+def _installation() -> list[str]:
+    return [sys.prefix, sys.exec_prefix, sys.base_prefix, *_our_folders()]
+
+
+def _is_installed(path: str) -> bool:
+    """Whether a place on the module search path is Python's, ours, or a folder of installed packages, and no folder of the
+    operator's, which may hold anything."""
+    real = os.path.realpath(path)
+    if os.path.basename(real) in _INSTALLATIONS or not os.path.isdir(real):
+        return True
+    return any(_below(real, os.path.realpath(folder)) for folder in ("/usr", *_installation()))
 
 
 def _holds_home(path: str) -> bool:

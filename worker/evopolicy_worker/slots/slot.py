@@ -120,7 +120,12 @@ class Slot:
         for name in ("home", "tmp"):  # must not pass files from the previous process to this one
             remove_tree(self._scratch / name)
         self._process = await asyncio.create_subprocess_exec(
-            *env_jail.command(self._start.tier, self._scratch, draws=self._start.draws),
+            *env_jail.command(
+                self._start.tier,
+                self._scratch,
+                draws=self._start.draws,
+                definitions=self._start.definitions,
+            ),
             stdin=asyncio.subprocess.PIPE,
             stdout=asyncio.subprocess.PIPE,
             stderr=asyncio.subprocess.PIPE,

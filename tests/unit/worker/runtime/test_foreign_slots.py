@@ -89,7 +89,8 @@ def test_pages_with_options_of_ones_own_have_browser_and_fonts_in_their_fingerpr
     versions = {"chromium": "1.2", "fonts": "f"}
     monkeypatch.setattr(Page, "identity", lambda self: versions)
     name = "evopolicy_worker.environments.browser.registered:evopolicy/MiniWoB-v0"
-    packages = ForeignFamily(name).packages(Entry(id="my/page", gymnasium_id=name))
+    entry = Entry(id="my/page", gymnasium_id=name)
+    packages = ForeignFamily(entry).packages(entry)
     assert versions.items() <= packages.items()
 
 

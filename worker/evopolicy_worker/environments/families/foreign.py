@@ -1,15 +1,18 @@
 """Environments that do not ship: any that Gymnasium can create from an environment file or from `module:Id`.
 
-Nothing about them is trusted: each episode gets a fresh environment, and their source is part of their fingerprint.
+Nothing about them is trusted: each episode gets a fresh environment, and their source is part of their fingerprint. Texts
+in `info` may tell of the machine, so only those that the definition declares are passed on.
 """
 
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Mapping
 from functools import cache
 from importlib.metadata import packages_distributions, version
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 from evopolicy_common.catalogue import Entry
 from evopolicy_worker.environments.adapters import versions
@@ -20,8 +23,12 @@ _OF_GYMNASIUM = ("mujoco", "box2d", "pygame-ce", "ale-py")
 """Distributions of Gymnasium's own environments, besides Gymnasium."""
 _SOURCES = (".py", ".pyx", ".so", ".xml", ".json", ".toml", ".yaml", ".csv", ".npz", ".npy")
 _MAX_FILES = 5000
+_MAX_NAMED, _MAX_NAME = 16, 100
 _PAGES = "evopolicy_worker.environments.browser.registered"
 """Registers pages with options of one's own."""
+
+left_out: dict[str, dict[str, None]] = {}
+"""By id, the keys of `info` whose texts were left out in this process, the first `_MAX_NAMED`."""
 
 
 class ForeignFamily(GymnasiumFamily):
@@ -30,8 +37,11 @@ class ForeignFamily(GymnasiumFamily):
     remembers = True
     measures = True
 
-    def __init__(self, gymnasium_id: str) -> None:
-        self._module = gymnasium_id.partition(":")[0] if ":" in gymnasium_id else ""
+    def __init__(self, entry: Entry) -> None:
+        name = entry.gymnasium_id or ""
+        self._module = name.partition(":")[0] if ":" in name else ""
+        self._told = frozenset(entry.info_strings)
+        self._left_out = left_out.setdefault(entry.id, {})
 
     def installed(self) -> bool:
         return super().installed() and (not self._module or _package(self._module) is not None)
@@ -42,11 +52,21 @@ class ForeignFamily(GymnasiumFamily):
     def rebuilds(self, entry: Entry) -> bool:
         return True
 
+    def info(self, info: Mapping[str, Any]) -> dict[str, Any]:
+        plain = super().info(info)
+        if self._module == _PAGES:  # its texts are ours
+            return plain
+        for key in [key for key, value in plain.items() if isinstance(value, str) and key not in self._told]:
+            del plain[key]
+            if len(self._left_out) < _MAX_NAMED:
+                self._left_out[key[:_MAX_NAME]] = None
+        return plain
+
     def packages(self, entry: Entry) -> dict[str, str]:
         common = super().packages(entry)
         if not self._module:
             return common | versions(_OF_GYMNASIUM)
-        own = _own(self._module.partition(".")[0])
+        own = _own(self._module.partition(".")[0], entry.data)
         return common | own | (miniwob.FAMILY.packages(entry) if self._module == _PAGES else {})
 
     def version(self, entry: Entry) -> str:
@@ -67,17 +87,18 @@ def _package(module: str) -> Path | None:
 
 
 @cache
-def _own(top: str) -> dict[str, str]:
-    """The package's version, where it is a distribution's, and a digest of its files: code that is edited in place has no
-    other version."""
+def _own(top: str, data: tuple[str, ...] = ()) -> dict[str, str]:
+    """The package's version, where it is a distribution's, and a digest of its files and its data: code that is edited in
+    place has no other version."""
     place = _package(top)
     named = packages_distributions().get(top, [])
     digest = hashlib.sha256()
-    if place is not None:
+    for each in (*([] if place is None else [place]), *map(Path, data)):
+        suffixes = _SOURCES if each == place else ("",)
         files = (
-            sorted(each for each in place.rglob("*") if each.suffix in _SOURCES)
-            if place.is_dir()
-            else [place]
+            sorted(path for path in each.rglob("*") if path.is_file() and path.name.endswith(suffixes))
+            if each.is_dir()
+            else [each]
         )
         for path in files[:_MAX_FILES]:
             digest.update(path.name.encode() + b"\0" + path.read_bytes() + b"\0")

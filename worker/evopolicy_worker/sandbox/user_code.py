@@ -1,0 +1,127 @@
+"""Files of the operator's folders that an environment's process sees: modules, and the data that definitions declare.
+
+A folder on the module search path may hold anything besides: run directories with hidden returns, state folders, keys.
+Shown are its modules, packages, and metadata of installed packages, without names that begin with a dot, key files, run
+directories and state folders, also inside packages and declared folders. Links to folders are not followed.
+"""
+
+from __future__ import annotations
+
+import importlib.machinery
+import os
+from collections.abc import Iterable, Sequence
+from importlib.util import find_spec
+from pathlib import Path
+
+from evopolicy_common.catalogue import Entry
+from evopolicy_common.errors import SandboxError
+
+_MODULES = tuple(importlib.machinery.all_suffixes())
+_INSTALLED = (".dist-info", ".egg-info", ".libs")
+_KEYS = (".pem", ".key", ".p12", ".pfx")
+_OURS = frozenset(("run.json", "suite.json", ".gateway", "identity.json", "coordinator.sqlite"))
+"""Files that mark run directories, folders of suites, and state folders."""
+_MOST = 1000
+_INIT = tuple(f"__init__{suffix}" for suffix in _MODULES)
+
+
+def modules(folder: str) -> list[str]:
+    """Paths of what is shown of a folder on the module search path, which need not exist."""
+    found: list[str] = []
+    for entry in _entries(folder):
+        if entry.is_file() and entry.name.endswith(_MODULES):
+            found.append(entry.path)
+        elif entry.is_dir() and (
+            entry.name.endswith(_INSTALLED) or any(os.path.exists(f"{entry.path}/{name}") for name in _INIT)
+        ):
+            found += content(entry.path)
+    return found
+
+
+def content(path: str) -> list[str]:
+    """What is shown of a file, or of a folder: the folder itself if it has nothing that is hidden. Raises SandboxError
+    where that are too many files."""
+    if not os.path.isdir(path):
+        return [path]
+    found, whole = _content(path)
+    if len(found) > _MOST and not whole:
+        raise SandboxError(
+            f"{path} has {len(found):,} files and folders to show one by one, and {_MOST:,} are the limit: move hidden files,"
+            " keys, links and run directories out of it"
+        )
+    return [path] if whole else found
+
+
+def declared(definitions: Iterable[Entry], folders: Sequence[str]) -> list[str]:
+    """What is shown for these definitions in addition: their data, and their modules, wherever those are installed.
+
+    `folders`: those that are searched for modules before this process's own.
+    """
+    found: dict[str, None] = {}
+    for entry in definitions:
+        names = (entry.gymnasium_id or "", *(wrapper.wrapper for wrapper in entry.wrappers))
+        places = [_place(name.partition(":")[0].partition(".")[0], folders) for name in names if ":" in name]
+        for path in (*entry.data, *map(os.path.realpath, entry.data), *filter(None, places)):
+            found |= dict.fromkeys(content(path))
+    return list(found)
+
+
+def mirror(folder: str, shown: Iterable[str], place: Path) -> None:
+    """Makes the folder `place`, in which links to the shown files of `folder` have their relative paths. Landlock can show a
+    file in a folder, but not that the folder has it, and a module is found by listing its folder."""
+    for path in shown:
+        for base, _, names in (
+            os.walk(path) if os.path.isdir(path) else [(os.path.dirname(path), [], [os.path.basename(path)])]
+        ):
+            own = place / os.path.relpath(base, folder)
+            own.mkdir(parents=True, exist_ok=True)
+            for name in names:
+                (own / name).symlink_to(f"{base}/{name}")
+
+
+def _place(top: str, folders: Sequence[str]) -> str:
+    """Path of a module, found without importing it; of an installation by reference too. Empty if there is none."""
+    try:
+        spec = importlib.machinery.PathFinder.find_spec(top, folders) or find_spec(top)
+    except (ImportError, ValueError):
+        return ""
+    if spec is None:
+        return ""
+    places = list(spec.submodule_search_locations or ())
+    found = places[0] if places else spec.origin or ""
+    return found if os.path.isabs(found) else ""
+
+
+def _entries(folder: str) -> list[os.DirEntry[str]]:
+    """The entries of a folder that may be shown; none of a run directory or state folder, or of one that cannot be read."""
+    try:
+        with os.scandir(folder) as listed:
+            found = sorted(listed, key=lambda entry: entry.name)
+    except OSError:
+        return []
+    return [entry for entry in found if not entry.name.startswith(".") and not entry.name.endswith(_KEYS)]
+
+
+def _is_ours(folder: str) -> bool:
+    return any(os.path.lexists(f"{folder}/{name}") for name in _OURS)
+
+
+def _content(folder: str) -> tuple[list[str], bool]:
+    """What is shown of a folder, and whether that is all of it."""
+    if _is_ours(folder):
+        return [], False
+    found: list[str] = []
+    entries = _entries(folder)
+    whole = len(entries) == len(os.listdir(folder))
+    for entry in entries:
+        if entry.is_dir(follow_symlinks=False):
+            inner, entirely = _content(entry.path)
+            found += [entry.path] if entirely else inner
+            whole = whole and entirely
+        elif entry.is_file():
+            found.append(entry.path)
+            # A link is shown with what it names, which a folder as a whole would not have.
+            whole = whole and not entry.is_symlink()
+        else:
+            whole = False
+    return found, whole
