@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -12,23 +13,33 @@ from evopolicy._runs import Runs
 from evopolicy_common.terminal import csv_cell
 
 
-def _tables(runs: Runs) -> Iterator[tuple[str, Records[Any]]]:
-    yield "runs", runs.summaries()
-    yield "submits", runs.submits()
-    yield "episodes", runs.episodes()
+def names(runs: Runs) -> dict[str, str]:
+    """The name of each run below the folder that all have in common, by its path: files for others hold no path of this machine."""
+    folders = [run.folder for run in runs]
+    common = os.path.commonpath([(folder, *folder.parents)[:4][-1] for folder in folders]) if folders else ""
+    return {str(folder): os.path.relpath(folder, common) for folder in folders}
+
+
+def _tables(runs: Runs) -> Iterator[tuple[str, Records[Any], list[dict[str, Any]]]]:
+    """A table's name, its records, and their rows."""
+    known = names(runs)
+    for name, records in (
+        ("runs", runs.summaries()),
+        ("submits", runs.submits()),
+        ("episodes", runs.episodes()),
+    ):
+        yield name, records, [row | {"run": known[row["run"]]} for row in records.to_dicts()]
 
 
 def write_csv(runs: Runs, out: Path) -> list[Path]:
     """Writes `runs.csv`, `submits.csv` and `episodes.csv`: UTF-8, a header, empty cells for missing values."""
     written = []
-    for name, records in _tables(runs):
+    for name, records, rows in _tables(runs):
         path = out / f"{name}.csv"
         with path.open("w", encoding="utf-8", newline="") as file:
             writer = csv.writer(file)
             writer.writerow(records.columns)
-            writer.writerows(
-                [csv_cell(getattr(one, column)) for column in records.columns] for one in records
-            )
+            writer.writerows(map(csv_cell, row.values()) for row in rows)
         written.append(path)
     return written
 
@@ -45,14 +56,12 @@ def write_parquet(runs: Runs, out: Path) -> list[Path]:
         "bool": pyarrow.bool_(),
     }
     written = []
-    for name, records in _tables(runs):
+    for name, records, rows in _tables(runs):
         fields = [
             pyarrow.field(column, types[str(text).partition(" ")[0]], nullable="None" in str(text))
             for column, text in records.types.items()
         ]
         path = out / f"{name}.parquet"
-        parquet.write_table(
-            pyarrow.Table.from_pylist(records.to_dicts(), schema=pyarrow.schema(fields)), path
-        )
+        parquet.write_table(pyarrow.Table.from_pylist(rows, schema=pyarrow.schema(fields)), path)
         written.append(path)
     return written

@@ -13,6 +13,7 @@ from __future__ import annotations
 import hashlib
 import math
 import os
+import socket
 import time
 from collections.abc import Iterator
 from datetime import datetime
@@ -255,6 +256,11 @@ class TensorBoard:
         folder = self._folder(curve)
         if curve.id not in self._writers:
             self._writers[curve.id] = SummaryWriter(str(folder))
+            # tensorboardX puts the host's name at the end of the file's.
+            host = f".{socket.gethostname()}"
+            for path in folder.glob("events.out.tfevents.*"):
+                if path.name.endswith(host):
+                    path.rename(path.with_name(path.name.removesuffix(host)))
         writer = self._writers[curve.id]
         for point in points:
             for name, value in point.metrics.items():
@@ -278,6 +284,8 @@ class MLflow:
     """Runs of an MLflow experiment named `evopolicy`, or by MLFLOW_EXPERIMENT_NAME."""
 
     def __init__(self, out: str) -> None:
+        # Without it, a local database names a folder of this machine as the place of artifacts, of which there are none.
+        os.environ.setdefault("_MLFLOW_SERVER_ARTIFACT_ROOT", "mlflow-artifacts:/")
         from mlflow import MlflowClient
 
         self._client = MlflowClient(tracking_uri=out)
@@ -307,7 +315,7 @@ class MLflow:
             run = self._client.create_run(
                 self._experiment,
                 run_name=curve.name,
-                tags={"evopolicy.id": curve.id, "evopolicy.folder": str(curve.folder)},
+                tags={"evopolicy.id": curve.id},
             )
             self._runs[curve.id] = run
         params = [Param(name, value) for name, value in curve.settings().items()] if finished else []
@@ -359,7 +367,17 @@ class WeightsAndBiases:
                 dir=str(self._out),
                 resume="allow",
                 reinit="create_new",
-                settings=wandb.Settings(console="off", silent=True, disable_git=True, x_disable_stats=True),
+                settings=wandb.Settings(
+                    console="off",
+                    silent=True,
+                    disable_git=True,
+                    x_disable_stats=True,
+                    x_disable_meta=True,
+                    x_disable_machine_info=True,
+                    host="evopolicy",
+                    program="evopolicy",
+                    x_executable="evopolicy",
+                ),
             )
             self._open[curve.id].define_metric("*", step_metric="budget/spent")
         run = self._open[curve.id]

@@ -17,6 +17,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from evopolicy._exports.tables import names
 from evopolicy._runs import Run, Runs
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.records.episodes.npz import MAX_BYTES, read_arrays
@@ -37,6 +38,7 @@ def write_minari(runs: Runs, out: Path) -> list[Path]:
     import minari
     from minari.serialization import deserialize_space
 
+    known_as = names(runs)
     groups: dict[str, list[Run]] = {}
     for run in runs:
         known = run.summary
@@ -48,7 +50,7 @@ def write_minari(runs: Runs, out: Path) -> list[Path]:
         buffers: list[Any] = []
         about: list[dict[str, Any]] = []
         for run in members:
-            for buffer, metadata in _episodes(run):
+            for buffer, metadata in _episodes(run, known_as[str(run.folder)]):
                 buffers.append(buffer)
                 about.append(metadata)
         if not buffers:
@@ -101,7 +103,7 @@ def _slug(text: str) -> str:
     return re.sub(r"[^A-Za-z0-9]+", "-", text).strip("-") or "x"
 
 
-def _episodes(run: Run) -> Iterator[tuple[Any, dict[str, Any]]]:
+def _episodes(run: Run, name: str) -> Iterator[tuple[Any, dict[str, Any]]]:
     """A buffer and its metadata for each recorded train episode."""
     from minari.data_collector import EpisodeBuffer
 
@@ -126,7 +128,7 @@ def _episodes(run: Run) -> Iterator[tuple[Any, dict[str, Any]]]:
                 continue
             known = returns.get((submit.submit, episode))
             about = {
-                "run": str(run.folder),
+                "run": name,
                 "submit": submit.submit,
                 "episode": episode,
                 "policy_mean_return": submit.mean_return,

@@ -5,11 +5,14 @@ from __future__ import annotations
 import csv
 import json
 import os
+import re
 import shutil
+import socket
 import struct
 import subprocess
 import sys
 import threading
+import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -52,6 +55,49 @@ def export(*words: str | Path, **environment: str) -> subprocess.CompletedProces
         timeout=300,
         env=os.environ | known | environment,
     )
+
+
+OUT = {"mlflow": "sqlite:///{}/out/mlflow.db"}
+
+
+@pytest.mark.parametrize(
+    "kind", ["csv", "parquet", "tensorboard", "mlflow", "wandb", "minari", "atif", "inspect"]
+)
+def test_no_export_names_a_path_the_host_or_the_user(kind: str, tmp_path: Path) -> None:
+    run = write_run(tmp_path / "runs", VERSIONS)
+    row = {
+        "t": 0,
+        "obs": [1.0],
+        "action": 1,
+        "reward": 1.5,
+        "terminated": True,
+        "truncated": False,
+        "info": {},
+    }
+    write_episode(run, 0, 0, [row])
+    (run / "logs").mkdir(exist_ok=True)
+    (run / "logs" / "agent.jsonl").write_text('{"type": "prompt", "text": "go"}\n')
+    (tmp_path / "out").mkdir()
+    to = OUT.get(kind, "{}/out").format(tmp_path)
+    user = "zaphod.beeblebrox"
+    done = export(tmp_path / "runs", "--to", kind, "--out", to, LOGNAME=user, USER=user)
+    assert done.returncode == 0, done.stderr
+    files = [path for path in (tmp_path / "out").rglob("*") if path.is_file()]
+    assert files
+    host = socket.gethostname()
+    # A host's name may be as short as two letters, which any bytes contain.
+    is_host = re.compile(rb"(?<![A-Za-z0-9])" + re.escape(host.encode()) + rb"(?![A-Za-z0-9])")
+    for path in files:
+        if path.suffix == ".log":
+            continue  # wandb's own, which it never uploads
+        data = path.read_bytes()
+        if path.suffix == ".eval":
+            with zipfile.ZipFile(path) as archive:
+                data = b"".join(map(archive.read, archive.namelist()))
+        for text in (str(tmp_path), user, sys.prefix, str(Path(__file__).parents[4])):
+            assert text.encode() not in data, (path, text)
+        assert not is_host.search(data), path
+        assert host not in path.name.split("."), path
 
 
 def test_csv_holds_every_record_and_no_formula(tmp_path: Path) -> None:
