@@ -30,7 +30,7 @@ from evopolicy_common.wire.operator_client import TIMEOUT_S, WAIT_S, OperatorCli
 from evopolicy_common.wire.refusals import WRONG_SETTINGS, Refusal
 from evopolicy_common.wire.transport import Link
 from evopolicy_gateway.operator.locks import until_free
-from evopolicy_gateway.run.layout import OpenedRun, RunFolder, saved
+from evopolicy_gateway.run.layout import IntendedRun, OpenedRun, RunFolder, saved
 
 T = TypeVar("T")
 
@@ -61,10 +61,17 @@ class Operations(OperatorClient):
             raise _settings_error(error) from error
 
     async def wait(self, run: str) -> AsyncIterator[RunProgress]:
-        """Yields the run's progress every few seconds; the last one holds the finished run."""
+        """Yields the run's progress every few seconds; the last one holds the finished run.
+
+        Logs once why the coordinator accepts no changes.
+        """
+        trouble = ""
         while True:
             message = WaitRun(token=self._token, run=run, wait_s=WAIT_S)
             progress = await self._requests.until_answered("wait", message, RunProgress, wait_s=WAIT_S)
+            if progress.trouble not in ("", trouble):
+                log.warning(progress.trouble)
+            trouble = progress.trouble
             yield progress
             if progress.finished is not None:
                 return
@@ -114,9 +121,17 @@ class Operations(OperatorClient):
         Waits for the agent of a killed command, which may still be ending. Does nothing without such a run, or when the
         cluster does not know it.
         """
-        if not folder.opened.exists():
+        if folder.opened.exists():
+            run = saved(folder.opened, OpenedRun).run
+        elif folder.intended.exists():
+            # The coordinator may have opened it, and the command was killed before it had the answer.
+            intended = saved(folder.intended, IntendedRun)
+            try:
+                run = (await self.create(intended.settings, intended.key)).run
+            except (ConfigError, RefusedError):
+                return
+        else:
             return
-        run = saved(folder.opened, OpenedRun).run
         with notify_if_slow(f"the agent of {folder.root} to end"):
             await until_free(folder.supervisor_lock, folder.root)
         with contextlib.suppress(EvopolicyError):

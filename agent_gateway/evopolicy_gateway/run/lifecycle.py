@@ -177,7 +177,15 @@ class RunLifecycle:
         if folder.run_json.exists():
             # The command was killed after it wrote `run.json` and before it removed the gateway's folder.
             remove_tree(folder.state)
-            return read_record(folder.root)
+            done = read_record(folder.root)
+            how = "it is finished, and this is its result"
+            if await self._operations.phase(done.run) is None:
+                how += (
+                    f"; the cluster has no run {done.run}, so that nothing of it can be verified or re-scored there (another"
+                    " cluster played it, or the state is of an earlier backup); --overwrite plays it anew"
+                )
+            self._watch.note(self._name, how)
+            return done
         if folder.opened.exists():
             return await self._resume()
         intended = self._plan.intended()
@@ -287,7 +295,11 @@ class RunLifecycle:
                 self._watch.note(self._name, f"stderr: {line}")
             self._watch.note(self._name, f"full log: {self._folder.agent_log}")
         about = {"turns": ended.turns, "retries": ended.retries, "detail": ended.detail, **ended.facts}
-        about["record"] = record.told_at_close(self._folder, self._plan, about)
+        try:
+            about["record"] = record.told_at_close(self._folder, self._plan, about)
+        except Exception as error:  # the agent has ended: no bug in this costs the run
+            why = record.why_failed(error, self._folder.harness_log)
+            self._watch.note(self._name, f"the coordinator does not commit to this side of run.json: {why}")
         self._order = CloseRun(reason=reason, agent=about)
         if self._gateway is not None:
             await self._gateway.tell(self._order)

@@ -307,6 +307,14 @@ async def look(run: Plan, index: Index, operations: Operations) -> Found:
         phase = await operations.phase(identity)
         resumable = harnesses.make(run.agent, run.started_in, run.config).resumable
         has_session = resumable and session.load(folder.session).session is not None
+    entry = index.runs.get(run.name)
+    intended = None if status is not None or opened else run.intended()
+    settings = msgspec.structs.replace(run.settings, attempt=1 if entry is None else entry.attempt)
     return Found(
-        entry=index.runs.get(run.name), status=status, opened=opened, phase=phase, has_session=has_session
+        entry=entry,
+        status=status,
+        opened=opened,
+        intended=intended is not None and intended.settings == settings,
+        phase=phase,
+        has_session=has_session,
     )

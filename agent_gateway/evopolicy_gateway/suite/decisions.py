@@ -44,6 +44,8 @@ class Found(msgspec.Struct, frozen=True, kw_only=True):
     """The status in its `run.json`."""
     opened: bool = False
     """Whether its folder holds an unfinished run."""
+    intended: bool = False
+    """Whether its folder holds no run but the request to open one with the run's settings, which may have been served."""
     phase: str | None = None
     """That run's phase at the cluster; None when the cluster does not know it."""
     has_session: bool = False
@@ -78,6 +80,9 @@ def decide(run: Plan, found: Found, changed: Changed = "refuse") -> Decision:
         why = (entry.error if entry is not None else None) or "it ended in an error"
         return Decision(run=run, kind="restart", attempt=attempt + 1, why=why)
     if not found.opened:
+        if found.intended:
+            why = "its command ended while it was opened"
+            return Decision(run=run, kind="resume", attempt=attempt, why=why)
         if entry is not None and entry.state in ("running", "error", "cancelled"):
             return Decision(run=run, kind="restart", attempt=attempt + 1, why="its folder is gone")
         return Decision(run=run, kind="new", attempt=attempt)

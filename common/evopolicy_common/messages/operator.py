@@ -143,6 +143,8 @@ class RunProgress(Message, frozen=True, kw_only=True, tag="run_progress"):
     total: Int
     waits_for: Text = ""
     finished: RunFinished | None = None
+    trouble: Text = ""
+    """Why the coordinator accepts no changes, of this run or any other; empty: it accepts them."""
 
 
 class PlayedAs(msgspec.Struct, frozen=True, kw_only=True):

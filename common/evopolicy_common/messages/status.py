@@ -63,6 +63,10 @@ class RetriedJobs(msgspec.Struct, frozen=True, kw_only=True):
     jobs: Int = 1
 
 
+ABANDONED_S = 3600.0
+"""A gateway that is connected asks for its run every few seconds."""
+
+
 class RunStatus(msgspec.Struct, frozen=True, kw_only=True):
     """One unfinished run."""
 
@@ -88,6 +92,13 @@ class RunStatus(msgspec.Struct, frozen=True, kw_only=True):
     """Unix time, seconds."""
     retries: Many[RetriedJobs] = ()
     """The last ones since the coordinator started, oldest first."""
+    silent_s: Number = 0.0
+    """Seconds for which an open run has had no gateway, as far as this coordinator has seen."""
+
+    @property
+    def abandoned(self) -> bool:
+        """Whether nobody seems to play it."""
+        return self.silent_s > ABANDONED_S
 
 
 class QueuedJobs(msgspec.Struct, frozen=True, kw_only=True):
@@ -152,3 +163,5 @@ class StatusReply(Message, frozen=True, kw_only=True, tag="status_reply"):
     """None until it is known."""
     cost_s: Number = 0.0
     """CPU seconds that the coordinator spent on its previous status reply; 0.0 before the first."""
+    trouble: Text = ""
+    """Why the coordinator accepts no changes; the rest is as of then. Empty: it accepts them."""

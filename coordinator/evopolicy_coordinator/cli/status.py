@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Awaitable, Callable, Iterator, Sequence
+from collections.abc import Awaitable, Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Literal, TypeVar
 
@@ -22,7 +22,7 @@ from evopolicy_common.cli import Connect, CredentialsFile, fail_on_our_errors
 from evopolicy_common.commands import App
 from evopolicy_common.console import table, terminal
 from evopolicy_common.errors import ConfigError
-from evopolicy_common.messages.status import StatusReply, WorkerStatus
+from evopolicy_common.messages.status import RunStatus, StatusReply, WorkerStatus
 from evopolicy_common.terminal import say, say_json, say_lines
 from evopolicy_common.wire import credentials, transport
 from evopolicy_common.wire.operator_client import OperatorClient
@@ -201,8 +201,13 @@ def list_runs(connect: Connect = None, file: CredentialsFile = None, as_json: Js
     shown = table("run", "entry", "environment", "phase", "budget left", "waits for", whole=("run",))
     for run in reply.runs:
         left = f"{run.remaining_budget}/{run.budget}"
-        shown.add_row(run.run, run.entry, run.env, run.phase, left, run.waits_for)
+        shown.add_row(run.run, run.entry, run.env, _phase(run), left, run.waits_for)
     terminal().print(shown if reply.runs else "no run is open")
+    say_lines(abandoned(reply.runs))
+
+
+def _phase(run: RunStatus) -> str:
+    return f"{run.phase}, abandoned" if run.abandoned else run.phase
 
 
 @runs_app.command(epilog="Example: evopolicy runs cancel r-0f2e9a7c11d04b35")
@@ -324,7 +329,7 @@ def _runs(reply: StatusReply) -> Table:
             run.run,
             run.entry,
             run.env,
-            run.phase,
+            _phase(run),
             f"{run.remaining_budget}/{run.budget}",
             str(run.n_submits),
             str(run.queued),
@@ -336,6 +341,8 @@ def _runs(reply: StatusReply) -> Table:
 
 
 def _remarks(reply: StatusReply) -> Iterator[str]:
+    if reply.trouble:
+        yield f"{reply.trouble}; this is the state of then"
     for name, why in reply.quarantined.items():
         yield f"{name} is quarantined: {why} (evopolicy workers resume {name} takes it back)"
     for one in reply.turned_away:
@@ -345,6 +352,7 @@ def _remarks(reply: StatusReply) -> Iterator[str]:
     for run in reply.runs:
         if run.waits_for:
             yield f"{run.run} waits for {run.waits_for}"
+    yield from abandoned(reply.runs)
     for worker in reply.workers:
         for run_id, why in worker.refused.items():
             yield f"{worker.worker} gets no work of {run_id}: {why}"
@@ -352,6 +360,16 @@ def _remarks(reply: StatusReply) -> Iterator[str]:
         if worker.hidden_bar:
             yield f"{worker.worker} plays no hidden episodes now: {worker.hidden_bar}"
     yield from reply.stalls
+
+
+def abandoned(runs: Iterable[RunStatus]) -> Iterator[str]:
+    """Says of each abandoned run how to end it."""
+    for run in runs:
+        if run.abandoned:
+            yield (
+                f"{run.run} has had no gateway for {_age(run.silent_s)}: give its command again with --resume, or end it with"
+                f" evopolicy runs cancel {run.run}"
+            )
 
 
 def _age(seconds: float) -> str:

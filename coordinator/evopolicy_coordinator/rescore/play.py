@@ -90,21 +90,22 @@ class Written(msgspec.Struct, frozen=True, kw_only=True):
     """Played by this command or an interrupted one before it; 0 when the file was complete."""
 
 
-def read_finished(folders: Sequence[Path]) -> tuple[list[Finished], list[str]]:
-    """The runs in these directories, and why others cannot be re-scored. ConfigError for damaged or unfinished ones."""
-    found, without = [], []
+def read_finished(folders: Sequence[Path]) -> tuple[list[Finished], list[str], list[str]]:
+    """The runs in these directories, those without anything to re-score, and damaged or unfinished ones; with reasons."""
+    found, without, unreadable = [], [], []
     for folder in folders:
         path = folder / RUN_JSON
         try:
             record = read_record(folder)
         except FileNotFoundError:
-            raise ConfigError(
-                f"{folder} has no run.json: the run is not finished; re-score it when it is"
-            ) from None
+            unreadable.append(f"{folder} has no run.json: the run is not finished; re-score it when it is")
+            continue
         except OSError as error:
-            raise ConfigError(f"{path} cannot be read: {error.strerror}") from error
+            unreadable.append(f"{path} cannot be read: {error.strerror}")
+            continue
         except ProtocolError as error:
-            raise ConfigError(f"{path}: {error}") from error
+            unreadable.append(f"{path}: {error}")
+            continue
         best = record.outcome.best_submit_index
         if record.outcome.status != "completed" or best is None:
             without.append(f"{folder}: ended as {record.outcome.status}, without a selected checkpoint")
@@ -112,7 +113,7 @@ def read_finished(folders: Sequence[Path]) -> tuple[list[Finished], list[str]]:
             without.append(f"{folder}: an earlier version wrote it without the coordinator's name of the run")
         else:
             found.append(Finished(folder=folder, record=record, selected=best))
-    return found, without
+    return found, without, unreadable
 
 
 class Rescorer:

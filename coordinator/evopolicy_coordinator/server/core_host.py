@@ -61,6 +61,8 @@ class CoreHost:
         self._outbox: Outbox | None = None
         self.core: Core | None = None
         """None while no core is loaded."""
+        self.last_core: Core | None = None
+        """While the store cannot be written: the core that it refused, for reading."""
         self.incarnation = 0
         """Of the loaded core, or the last one."""
         self.storage_error = ""
@@ -203,7 +205,7 @@ class CoreHost:
             self.meter.loaded(self.core)
         self._outbox = Outbox(self._writer, self._carry_out, self._on_write_failure)
         self._outbox.put(effects)
-        self.storage_error = ""
+        self.storage_error, self.last_core = "", None
         log.info("loaded", incarnation=snapshot.incarnation, runs=len(snapshot.runs))
         self.flush()
 
@@ -225,7 +227,7 @@ class CoreHost:
         if not isinstance(error, StorageError):
             self.fail("writing the store", error)
             return
-        self.storage_error = str(error)
+        self.storage_error, self.last_core = str(error), self.core
         self._drop()
         log.error("the store cannot write; requests are refused until it can", error=str(error))
 

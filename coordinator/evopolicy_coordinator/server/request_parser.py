@@ -171,6 +171,10 @@ class RequestParser:
         """Whether the key is a gateway's: its agent may see the replies."""
         return key.startswith(f"{self._prefix}gw/")
 
+    def is_operators(self, key: str) -> bool:
+        """Whether the key is an operator's."""
+        return key.startswith(f"{self._prefix}ops/")
+
     def asks_for_change(self, key: str, payload: bytes) -> bool:
         """Whether the request would create something (a run, a submit, an evaluation). Does not check the token."""
         room = key.removeprefix(self._prefix).partition("/")[0]

@@ -5,8 +5,9 @@ Rules that this module owns:
   have the reader's threads, and the transport's threads send replies.
 - Every batch of queries is one tick: all its events are handled, then their effects go to the outbox, so that one
   fsync serves them all.
-- While no core is loaded (see `core_host`), the service refuses requests that would change something if the store
-  cannot be written, with the reason, and ends all others without a reply, so that the clients retry.
+- While the store cannot be written, no core is loaded (see `core_host`). The service then refuses requests that would
+  change something, and answers operators who ask for the status or follow a run from the last core, with the reason. It
+  ends all others without a reply, so that the clients retry.
 """
 
 from __future__ import annotations
@@ -46,6 +47,7 @@ from evopolicy_coordinator.core.events import (
 )
 from evopolicy_coordinator.core.machine import Core
 from evopolicy_coordinator.core.model import Worker
+from evopolicy_coordinator.core.runs import finished
 from evopolicy_coordinator.core.settings import CoreSettings
 from evopolicy_coordinator.server.claims import Claims
 from evopolicy_coordinator.server.core_host import CoreHost
@@ -55,6 +57,7 @@ from evopolicy_coordinator.server.pending import PendingQueries
 from evopolicy_coordinator.server.reader import ServiceReader, answer_bytes, answer_to, damaged, lane_of
 from evopolicy_coordinator.server.reason_texts import message, words
 from evopolicy_coordinator.server.refused_workers import RefusedWorkers
+from evopolicy_coordinator.server.request_checks import finite_wait
 from evopolicy_coordinator.server.request_parser import Parsed, RequestParser
 from evopolicy_coordinator.storage.store import Store
 from evopolicy_coordinator.storage.writer import Writer
@@ -66,6 +69,8 @@ _FORGET_S = 120.0
 """Longer than any long poll: the core answers those within `CoreSettings.max_wait_s`."""
 _SWEEP_S = _FORGET_S / 4
 _STALLS_LOGGED = 5
+_LOOK_S = 3.0
+_CANNOT_WRITE = "the coordinator cannot write its store and accepts no changes until it can"
 
 
 class Service:
@@ -98,6 +103,8 @@ class Service:
         self._n_events = 0
         self._last_status: tuple[float, bytes] | None = None
         """When the last status reply was made, and the reply."""
+        self._heard: dict[str, float] = {}
+        """Run to the time of its gateway's last request."""
         self._status_cost_s = 0.0
         self._disk: DiskUse | None = None
 
@@ -154,6 +161,8 @@ class Service:
             return
         try:
             parsed = self._parser.parse(query.key, query.payload, core)
+            if parsed.room == "gw":
+                self._heard[parsed.asker] = self.host.now()
             self._serve(core, query, parsed)
         except RefusedError as error:
             self._refuse(query, error)
@@ -366,8 +375,15 @@ class Service:
         return self._last_status[1]
 
     def _status(self, core: Core) -> StatusReply:
-        part = core.status(self.host.now(), words)._asdict()
+        now = self.host.now()
+        part = core.status(now, words)._asdict()
         part["stalls"] = self._stalls(part["stalls"])
+        part["runs"] = tuple(
+            replace(run, silent_s=now - max(run.created_at, self._heard.get(run.run, self._started_at)))
+            if run.phase == "open"
+            else run
+            for run in part["runs"]
+        )
         return StatusReply(
             cluster=self._cluster,
             version=metadata.version("evopolicy"),
@@ -375,6 +391,7 @@ class Service:
             turned_away=self._refused_workers.recent(self.host.now()),
             disk=self._disk,
             cost_s=self._status_cost_s,
+            trouble=self._trouble,
             **part,
         )
 
@@ -385,16 +402,38 @@ class Service:
         query.reply(answer_bytes(answer))
 
     def _turn_away(self, query: IncomingQuery) -> None:
-        """Without a core, refuses requests that would change something, with the reason, and drops all others."""
+        """Without a core, serves what needs none while the store cannot be written, and drops all others."""
+        core = self.host.last_core
         if self.host.storage_error and self._parser.asks_for_change(query.key, query.payload):
-            why = "the coordinator cannot write its store and accepts no changes until it can"
-            if not self._parser.is_gateways(
-                query.key
-            ):  # the reason contains paths, which agents must not see
-                why += f": {self.host.storage_error}"
+            # The reason contains paths, which agents must not see.
+            why = _CANNOT_WRITE if self._parser.is_gateways(query.key) else self._trouble
             query.reply(answer_bytes(Refused(status=Refusal.UNAVAILABLE, message=why)))
+        elif core is None or not self._parser.is_operators(query.key):
+            query.drop()
+        else:
+            self._serve_reader(core, query)
+
+    def _serve_reader(self, core: Core, query: IncomingQuery) -> None:
+        """Answers an operator from the core that the store refused."""
+        try:
+            message = self._parser.parse(query.key, query.payload, core).message
+        except RefusedError as error:
+            self._refuse(query, error)
+            return
+        run = core.state.runs.get(message.run) if isinstance(message, operator.WaitRun) else None
+        if isinstance(message, StatusRequest):
+            query.reply(answer_bytes(self._status(core)))
+        elif isinstance(message, operator.WaitRun) and run is not None:
+            progress, _ = finished.progress(core.state, run)
+            answer = answer_bytes(replace(progress, trouble=self._trouble))
+            # As late as the operator allows: it asks again at once.
+            self._loop.call_later(min(finite_wait(message.wait_s), _LOOK_S), query.reply, answer)
         else:
             query.drop()
+
+    @property
+    def _trouble(self) -> str:
+        return f"{_CANNOT_WRITE}: {self.host.storage_error}" if self.host.storage_error else ""
 
     def _stimulus_of(self, message: Message) -> str:
         return self._stimulus(type(message).__name__.lower())
@@ -451,6 +490,8 @@ class Service:
         self._tell_stalls()
         self._spawn(self._look_at_disk())
         core = self.host.core
+        if core is not None:
+            self._heard = {run: at for run, at in self._heard.items() if run in core.state.runs}
         # Once all is durable, the store names every bundle that a submit of a closed run ever will.
         if core is not None and self.host.idle:
             runs = core.state.runs

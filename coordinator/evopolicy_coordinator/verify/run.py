@@ -68,6 +68,8 @@ class Report(msgspec.Struct, kw_only=True):
     """Of these, episodes whose actions came from feedback files, as the coordinator no longer stores them."""
     differences: list[Finding] = []
     not_checked: list[Finding] = []
+    unchecked_episodes: int = 0
+    """Of these, episodes whose actions nobody has any more."""
     policy_episodes: int = 0
     """Played again by the checkpoint's policy."""
     policy_differences: list[Finding] = []
@@ -252,6 +254,7 @@ class Verifier:
                 self.report.from_files += 1
             else:
                 if not played.folders:
+                    self.report.unchecked_episodes += 1
                     self.report.not_checked.append(
                         Finding(episode=name, difference="the coordinator has no record of it any more")
                     )

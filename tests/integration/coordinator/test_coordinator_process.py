@@ -222,6 +222,9 @@ def test_full_disk_stops_what_is_new_with_a_clear_error_and_loses_nothing(coordi
                     await asyncio.sleep(0.02)
                 assert refused.status == "unavailable"
                 assert "cannot write its store" in refused.message
+                status = await operator.status()
+                assert "accepts no changes until it can: " in status.trouble
+                assert [run.run for run in status.runs] == [created.run]
                 resource.prlimit(pid, resource.RLIMIT_FSIZE, unlimited)
                 episodes, done = await gateway.results(1)
                 assert (len(episodes), done.status) == (8, "ok")

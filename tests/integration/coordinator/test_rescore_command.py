@@ -260,6 +260,30 @@ def test_runs_that_cannot_be_rescored_are_refused_with_the_reason(played: Played
     assert "toy/none" in refused(changed("env", {"env": "toy/none"}), "--cases", "2")
 
 
+def test_runs_that_the_coordinator_does_not_know_leave_the_others_rescored(
+    played: Played, tmp_path: Path
+) -> None:
+    for name, change in (("a-strange", {"run": "r-other"}), ("mine", {}), ("unfinished", None)):
+        shutil.copytree(played.run("mine"), tmp_path / name)
+        path = tmp_path / name / "run.json"
+        path.chmod(0o644)
+        if change is None:
+            path.unlink()
+            continue
+        path.write_text(json.dumps(json.loads(path.read_text()) | change))
+    folders = [str(tmp_path / name) for name in ("a-strange", "mine", "unfinished")]
+    done = played.rescore(*folders, "--cases", "2", "--name", "some", "--json")
+    assert done.returncode == 3, done.stdout + done.stderr
+    assert [one["path"] for one in json.loads(done.stdout)] == [str(tmp_path / "mine/rescore/some.json")]
+    said = " ".join(done.stderr.split())
+    assert (
+        f"not re-scored: {tmp_path / 'a-strange'}: this cluster's coordinator has no finished run r-other"
+        in said
+    )
+    assert f"not re-scored: {tmp_path / 'unfinished'} has no run.json" in said
+    assert "1 of 3 runs are re-scored" in said
+
+
 def test_a_revealed_epoch_gives_no_further_hidden_cases(played: Played) -> None:
     shutil.copytree(played.root / "st", played.root / "revealed")
     run = str(played.run("mine"))

@@ -128,6 +128,21 @@ def test_an_untouched_run_is_identical_hidden_episodes_too(played: Played, env: 
     assert not report["fingerprint_differences"]
 
 
+def test_episodes_that_garbage_collection_removed_are_told_by_the_exit_code(
+    played: Played, tmp_path: Path
+) -> None:
+    state = tmp_path / "st"
+    shutil.copytree(played.copy, state)
+    gc = [sys.executable, "-m", "evopolicy_gateway.cli", "gc", "--older-than", "0", "--state", str(state)]
+    subprocess.run(gc, check=True, capture_output=True, timeout=150)
+    run, where = played.run(ENVIRONMENTS[0]), ("--local", "--state", str(state))
+    done = played.verify(run, where=where)
+    assert done.returncode == 3, done.stdout + done.stderr
+    report = json.loads(done.stdout)
+    # The actions of train episodes are in the feedback files; validation 1, held-out 2 and random reference 2 are gone.
+    assert (report["identical"], report["episodes"], report["unchecked_episodes"]) == (True, 3, 5)
+
+
 @pytest.mark.timeout(600)
 def test_a_run_with_hidden_cases_of_its_own_is_verified_where_they_are_known(played: Played) -> None:
     on = ("--credentials", played.operator)

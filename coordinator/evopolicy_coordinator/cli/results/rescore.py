@@ -1,7 +1,7 @@
 """`evopolicy rescore RUN…`: stored checkpoints on further hidden cases, written beside `run.json`.
 
-Exit codes: 0 every run is re-scored, 1 the cluster failed or refused, 2 wrong usage (also: a run that cannot be re-scored),
-130 Ctrl-C. The same command continues where an interrupted one stopped.
+Exit codes: 0 every run is re-scored, 1 the cluster failed or refused, 2 wrong usage (also: no run can be re-scored), 3 some
+runs are re-scored and others cannot be, 130 Ctrl-C. The same command continues where an interrupted one stopped.
 """
 
 from __future__ import annotations
@@ -29,6 +29,8 @@ from evopolicy_common.records.run_files import run_folders
 from evopolicy_common.terminal import number, one_line, say, say_json
 from evopolicy_coordinator.cli.results.cluster import Local, Slots, State, Where, play, playing, where_of
 from evopolicy_coordinator.rescore.play import Finished, Rescorer, Wanted, Written, read_finished
+
+PARTIAL = 3
 
 app = App(name="rescore")
 
@@ -83,6 +85,7 @@ def rescore(
 
     Writes rescore/NAME.json beside run.json, which stays as it is. A re-score is post hoc: it never changes which checkpoint was
     selected. `evopolicy report --scores NAME` uses it. Repeat an interrupted command to continue it.
+    Exit codes: 0 all re-scored, 1 the cluster failed, 2 wrong usage or no run can be re-scored, 3 some runs cannot be re-scored.
     """
     if cases is None and data is None:
         fail("name the new cases: --cases 256 for their number, or --data FOLDER for split files")
@@ -98,12 +101,29 @@ def rescore(
         found, empty = run_folders(runs)
         if empty:
             raise ConfigError(f"{empty[0]} holds no run directory")
-        finished, without = read_finished(found)
+        finished, without, failed = read_finished(found)
         for text in without:
             say(f"left out: {one_line(text)}", err=True)
         if not finished:
-            raise ConfigError("none of these runs has a checkpoint to re-score")
-        written = run_to_end(_rescore(finished, wanted, where, slots, console))
+            raise ConfigError(failed[0] if failed else "none of these runs has a checkpoint to re-score")
+        written: list[Written] = []
+        try:
+            run_to_end(_rescore(finished, wanted, where, slots, console, written, failed))
+            if not written:
+                raise ConfigError(failed[0])
+        finally:
+            for text in failed if written else failed[1:]:
+                say(f"not re-scored: {one_line(text)}", err=True)
+            if written:
+                _print(written, as_json, console)
+    if failed:
+        say(f"{len(written)} of {len(written) + len(failed)} runs are re-scored", err=True)
+        raise typer.Exit(PARTIAL)
+    if not as_json:
+        say(f"next: evopolicy report {' '.join(map(str, runs))} --scores {chosen} --out report")
+
+
+def _print(written: list[Written], as_json: bool, console: Terminal) -> None:
     if as_json:
         say_json(written)
         return
@@ -113,14 +133,19 @@ def rescore(
     for one in written:
         shown.add_row(one.env, one.entry, number(one.score), number(one.rescored), str(one.episodes))
     console.print(shown)
-    say(f"next: evopolicy report {' '.join(map(str, runs))} --scores {chosen} --out report")
 
 
 async def _rescore(
-    runs: list[Finished], wanted: Wanted, where: Where, slots: int, console: Terminal
-) -> list[Written]:
+    runs: list[Finished],
+    wanted: Wanted,
+    where: Where,
+    slots: int,
+    console: Terminal,
+    written: list[Written],
+    failed: list[str],
+) -> None:
+    """Adds to `written` what is re-scored, and to `failed` why other runs cannot be."""
     end_on_sigterm()
-    written: list[Written] = []
     packages = _packages(runs) if where.local else ()
     async with where.link("rescore", packages=packages) as (link, cluster):
         with playing(console, "rescore") as shown:
@@ -129,11 +154,13 @@ async def _rescore(
             async def work() -> None:
                 for run in runs:
                     shown.update(title=f"{run.record.agent.entry} on {run.record.env}")
-                    written.append(await rescorer.rescore(run))
+                    try:
+                        written.append(await rescorer.rescore(run))
+                    except ConfigError as error:
+                        failed.append(f"{run.folder}: {error}")
 
             envs = sorted({run.record.env for run in runs})
             await play(cluster, envs, {run.record.sandbox_tier for run in runs}, slots, work)
-    return written
 
 
 def _packages(runs: list[Finished]) -> tuple[str, ...]:

@@ -1,7 +1,7 @@
 """`evopolicy verify RUN_DIR`: a finished run's episodes played again, and what differs.
 
 Exit codes: 0 all that was played again is identical, 1 something differs, 2 wrong usage (also: other cases than the
-run's), 3 it could not be checked (the cluster cannot be reached, or refused).
+run's), 3 it could not be checked, or not all of it (the cluster cannot be reached, refused, or has removed episodes).
 """
 
 from __future__ import annotations
@@ -104,7 +104,8 @@ def verify(
     Also checks all other numbers of the run directory against each other, and against the coordinator's own result if it has the run.
     Without that coordinator, edits that agree with each other are found only where a train episode shows them. Returns of re-scores
     (rescore/NAME.json) are not played again.
-    Exit codes: 0 identical, 1 something differs, 2 wrong usage or other cases than the run's, 3 could not be checked.
+    Exit codes: 0 identical, 1 something differs, 2 wrong usage or other cases than the run's, 3 could not be checked, or not all
+    of it.
     """
     order = _Order(
         run=run,
@@ -127,7 +128,7 @@ def verify(
         say_json(report)
     else:
         _print(report, console)
-    raise typer.Exit(0 if report.identical else DIFFERS)
+    raise typer.Exit(DIFFERS if not report.identical else UNCHECKED if report.unchecked_episodes else 0)
 
 
 async def _verify(order: _Order, where: Where, console: Terminal) -> Report:
@@ -187,7 +188,9 @@ def _print(report: Report, console: Terminal) -> None:
     listed("differs:", [f"{one.episode}: {one.difference}" for one in report.differences])
     source = f", {report.from_files} of them from feedback files" if report.from_files else ""
     verdict = "identical" if report.identical else "NOT identical"
-    say(f"{report.env}: recorded actions of {report.episodes} episodes{source}: {verdict}")
+    unchecked = report.unchecked_episodes
+    rest = f"; {unchecked} further episodes could not be checked" if unchecked else ""
+    say(f"{report.env}: recorded actions of {report.episodes} episodes{source}: {verdict}{rest}")
     if report.policy_episodes:
         others = len(report.policy_differences)
         listed(

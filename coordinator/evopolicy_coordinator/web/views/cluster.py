@@ -111,6 +111,14 @@ def _cluster_notices(cluster: Cluster, status: StatusReply) -> list[dict[str, An
                 "lines": [cluster.trouble],
             }
         )
+    tell(
+        "The coordinator accepts no changes; this is the last state",
+        [status.trouble] if status.trouble else [],
+    )
+    tell(
+        "Abandoned runs, without a gateway for an hour",
+        (f"{run.run}: evopolicy runs cancel {run.run} ends it" for run in status.runs if run.abandoned),
+    )
     tell("Quarantined workers", (f"{name}: {why}" for name, why in status.quarantined.items()))
     tell("Disputes of audits", status.disputes)
     tell(

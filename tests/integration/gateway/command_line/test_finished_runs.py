@@ -169,6 +169,17 @@ def test_a_run_without_code_metrics_tells_so_and_keeps_its_score(
     assert "Traceback" in copied.folder.harness_log.read_text()
 
 
+def test_a_bug_before_the_run_is_closed_does_not_cancel_it(
+    operator_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    agent(tmp_path, "open('starts', 'a').write('x')\nsubmit([0, 1, 2, 3, 4, 5])")
+    monkeypatch.setattr(record, "told_at_close", raises(TypeError("tokens of no known form")))
+    state, said = played(plan_of(tmp_path), operator_file)
+    assert state == "completed"
+    assert "does not commit to this side of run.json: TypeError: tokens of no known form" in said
+    assert (run_dir(tmp_path) / "workspace" / "starts").read_text() == "x"
+
+
 def test_a_failure_of_the_view_after_the_last_episode_does_not_cancel_the_run(
     operator_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

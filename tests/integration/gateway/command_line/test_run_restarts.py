@@ -12,7 +12,7 @@ import time
 import urllib.request
 from pathlib import Path
 
-from commands import agent, command, record_in, run_arguments, run_dir, run_on
+from commands import agent, command, record_in, run_arguments, run_dir, run_on, toy_cluster
 from waiting import TIMEOUT_S, wait_until
 
 from evopolicy_gateway.http import listener
@@ -117,6 +117,14 @@ patient_submit([2, 3], "two")
     before = (run_dir(tmp_path) / "run.json").read_bytes()
     with command(tmp_path, *arguments) as finished:
         assert finished.finish()[0] == 0
+    assert "it is finished, and this is its result" in " ".join(finished.text.split())
+    (tmp_path / "other").mkdir()
+    with (
+        toy_cluster(tmp_path / "other") as other_file,
+        command(tmp_path, *arguments[:-2], str(other_file), "--resume") as elsewhere,
+    ):
+        assert elsewhere.finish()[0] == 0
+    assert f"the cluster has no run {record.run}, so that nothing" in " ".join(elsewhere.text.split())
     assert (run_dir(tmp_path) / "run.json").read_bytes() == before
 
 

@@ -406,3 +406,60 @@ def test_a_terminal_shows_a_live_table(tmp_path: Path, operator_file: Path) -> N
     assert re.search(r"fake codex/toy/line/0 +[0-4]/4 +\d", text)
     assert "0 of 1 runs done, 1 running" in text
     assert "completed, score" in text
+
+
+KILLED = """
+import os, sys
+from evopolicy_gateway.operator.operations import Operations
+from evopolicy_gateway.run import lifecycle
+from evopolicy_gateway.cli.main import main
+
+create, save = Operations.create, lifecycle.save
+
+async def created(*arguments):
+    await create(*arguments)
+    os.kill(os.getpid(), 9)
+
+def saved(path, value):
+    save(path, value)
+    if type(value).__name__ == "OpenedRun":
+        os.kill(os.getpid(), 9)
+
+if sys.argv.pop(1) == "created":
+    Operations.create = created
+else:
+    lifecycle.save = saved
+main()
+"""
+"""`evopolicy`, killed once the coordinator has opened a run, or once the run's folder says so."""
+
+
+@pytest.mark.parametrize("changed", [False, True])
+@pytest.mark.parametrize("at", ["created", "saved"])
+def test_a_run_that_was_just_opened_when_its_sweep_was_killed_does_not_stay_open(
+    tmp_path: Path, operator_file: Path, at: str, changed: bool
+) -> None:
+    write_suite(tmp_path)
+    given = ["--credentials", str(operator_file)]
+    arguments = ["suite", "t.toml", *given, "--only", "evolve/*"]
+    done = subprocess.run(
+        [sys.executable, "-c", KILLED, at, *arguments],
+        cwd=tmp_path,
+        env={**os.environ, "XDG_STATE_HOME": str(tmp_path / "xdg")},
+        capture_output=True,
+        check=False,
+    )
+    assert done.returncode == -signal.SIGKILL, done.stderr
+    if changed:
+        file = tmp_path / "t.toml"
+        file.write_text(file.read_text().replace("budget = 4", "budget = 5"))
+        arguments += ["--changed", "rerun"]
+    with command(tmp_path, *arguments) as again:
+        assert again.wait() == 0, again.text
+    (entry,) = index_in(tmp_path / "runs" / "t").values()
+    assert entry["state"] == "completed"
+    # Nothing was played before: a run that the coordinator alone knew is gone on with.
+    assert entry["attempt"] == (1 if at == "created" and not changed else 2)
+    with command(tmp_path, "runs", "list", "--json", *given) as listed:
+        assert listed.wait() == 0, listed.text
+        assert json.loads(listed.out) == []

@@ -23,6 +23,7 @@ from evopolicy_common.messages.run_settings import RunSettings
 from evopolicy_common.messages.status import StatusRequest
 from evopolicy_common.records.blobs import digest_of
 from evopolicy_common.wire import keys
+from evopolicy_coordinator.cli.status import abandoned
 from evopolicy_coordinator.core.machine import Core
 from evopolicy_coordinator.core.settings import CoreSettings
 from evopolicy_coordinator.server import core_host, process, service
@@ -92,6 +93,55 @@ def test_request_that_could_not_be_written_did_not_happen_and_can_be_asked_again
         asked = world.submit(created, "key")
         world.ask(asked)
         return await asked.message()
+
+    play(tmp_path, scenario)
+
+
+def test_operators_are_answered_while_the_store_cannot_write(tmp_path: Path) -> None:
+    async def scenario(world: World) -> None:
+        created = await world.create()
+        world.full = True
+        lost = world.submit(created, "key")
+        world.ask(lost)
+        assert await lost.message() is None
+        asked = Requested(keys.operator_key("c", "status"), StatusRequest(token="operate"))
+        wait = operator.WaitRun(token="operate", run=created.run, wait_s=0.0)
+        following = Requested(keys.operator_key("c", "wait"), wait)
+        stranger = Requested(keys.operator_key("c", "status"), StatusRequest(token="guessed"))
+        world.ask(asked, following, stranger)
+        status, progress = await asked.message(), await following.message()
+        for answer in (status, progress):
+            assert (
+                "cannot write its store and accepts no changes until it can: database or disk"
+                in answer.trouble
+            )
+        assert [run.run for run in status.runs] == [created.run]
+        assert (progress.phase, progress.total) == ("open", 100)
+        assert isinstance(await stranger.message(), worker.Refused)
+        world.full = False
+        while status.trouble:
+            asked = Requested(keys.operator_key("c", "status"), StatusRequest(token="operate"))
+            world.ask(asked)
+            status = await asked.message()
+            await asyncio.sleep(0.02)
+
+    play(tmp_path, scenario)
+
+
+def test_an_open_run_without_a_gateway_for_an_hour_is_abandoned(tmp_path: Path) -> None:
+    async def scenario(world: World) -> None:
+        created, other = await world.create(), await world.create("other")
+        now = world.service.host.now
+        world.service.host.now = lambda: now() + 3601.0  # type: ignore[method-assign]
+        asked = world.state(other)
+        world.ask(asked)
+        await asked.message()
+        status = world.service.status()
+        assert status is not None
+        assert {run.run: run.abandoned for run in status.runs} == {created.run: True, other.run: False}
+        (line,) = abandoned(status.runs)
+        assert line.endswith(f"end it with evopolicy runs cancel {created.run}")
+        assert "1 h" in line or "60 min" in line
 
     play(tmp_path, scenario)
 

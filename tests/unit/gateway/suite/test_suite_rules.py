@@ -199,6 +199,7 @@ def test_what_becomes_of_each_run(tmp_path: Path) -> None:
         (Found(opened=True, phase="heldout", has_session=False, entry=running), "finish", 1),
         (Found(opened=True, phase=None, has_session=True, entry=running), "restart", 2),
         (Found(entry=running), "restart", 2),
+        (Found(entry=running, intended=True), "resume", 1),
     ]
     for found, kind, attempt in cases:
         decision = decide(run, found)
