@@ -20,7 +20,7 @@ from functools import partial
 from pathlib import Path
 from typing import IO, Any, Literal
 
-from host_faults import Cable, Clock
+from host_faults import Cable, Clock, Disks
 from machines.own_processes import only_what_starts_inside
 from weak_link import WeakLink
 
@@ -50,8 +50,9 @@ KINDS = {
 }
 """Words of a process's program, and of its command line."""
 ZYGOTE_DEPTH = 2 if os.geteuid() == 0 else 0
-Site = Literal["one host", "two hosts", "clock that jumps"]
-"""One host: worker and coordinator by a unix socket that `WeakLink` passes on. Two hosts: by TCP over a cable."""
+Site = Literal["one host", "two hosts", "relay", "clock that jumps", "bad disks"]
+"""One host: worker and coordinator by a unix socket that `WeakLink` passes on. Two hosts: by TCP over a cable. Relay: all by TCP
+that `WeakLink` passes on, gateways and commands too."""
 
 AGENT = '''
 import http.client, json, os, pathlib, sys, time, urllib.error, urllib.request
@@ -152,14 +153,17 @@ class FaultCluster:
         self._environment = {"TMPDIR": str(self.temporary)}
         if self.clock is not None:
             self._environment |= self.clock.environment
+        self.disks = Disks(root, (self.state, self.runs)) if site == "bad disks" else None
+        if self.disks is not None:
+            self._environment |= self.disks.environment
         self.cable = Cable() if site == "two hosts" else None
         if self.cable is not None:
             stack.callback(self.cable.close)
         self._ready = root / "ready.json"
         launcher = Path(__file__).with_name("fixed_coordinator.py")
         coordinator = [sys.executable, str(launcher), str(self.state), str(self._ready)]
-        if self.cable is not None:
-            coordinator.append(f"tcp/{Cable.NEAR}:0")
+        if self.cable is not None or site == "relay":
+            coordinator.append(f"tcp/{Cable.NEAR if self.cable is not None else '127.0.0.1'}:0")
         self.coordinator = Kept(coordinator, root / "coordinator.log", self._environment)
         stack.callback(self.coordinator.end)
         deadline = time.monotonic() + TIMEOUT_S
@@ -168,16 +172,21 @@ class FaultCluster:
             time.sleep(0.02)
         ready = json.loads(self._ready.read_text())
         self.files: dict[str, str] = ready["credentials"]
+        self.link: WeakLink | None = None
+        if site == "relay":
+            port = int(ready["endpoints"][-1].rpartition(":")[2])
+            self.link = WeakLink(("127.0.0.1", 0), ("127.0.0.1", port))
+            stack.callback(self.link.close)
+            self._reach(f"tcp/127.0.0.1:{self.link.port}")
         worker = [sys.executable, str(launcher.with_name("fixed_worker.py"))]
         worker += ["--env", "toy/*", "--slots", "2", "--need-tier", "bwrap"]
         worker += ["--grace", "1", "--credentials", self.files["worker"]]
-        self.link: WeakLink | None = None
-        if self.cable is None:
+        if self.cable is not None:
+            worker = [*self.cable.at_its_far_end, *worker, "--connect", ready["endpoints"][-1]]
+        elif self.link is None:
             self.link = WeakLink(root / "link.sock", self.state / "coordinator.sock")
             stack.callback(self.link.close)
             worker += ["--connect", f"unixsock-stream/{root / 'link.sock'}"]
-        else:
-            worker = [*self.cable.at_its_far_end, *worker, "--connect", ready["endpoints"][-1]]
         self.workers = []
         for name, log in (("w", "worker.log"), ("v", "worker-2.log"))[:workers]:
             self.workers.append(Kept([*worker, "--name", name], root / log, self._environment))
@@ -186,6 +195,16 @@ class FaultCluster:
         """What the coordinator is to be told once a fault is over."""
         self._agent = root / "agent.py"
         self._agent.write_text(AGENT % (SUBMITS, EPISODES))
+
+    def _reach(self, endpoint: str) -> None:
+        """All roles reach the coordinator there alone."""
+        folder = self.root / "credentials"
+        folder.mkdir(mode=0o700)
+        for role, path in self.files.items():
+            found = json.loads(Path(path).read_text())
+            self.files[role] = str(folder / Path(path).name)
+            Path(self.files[role]).touch(mode=0o600)
+            Path(self.files[role]).write_text(json.dumps(found | {"endpoints": [endpoint]}))
 
     @property
     def operators(self) -> credentials.Credentials:

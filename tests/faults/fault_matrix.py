@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import asyncio
 import contextlib
+import errno
 import json
 import os
 import random
@@ -25,11 +26,12 @@ from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Literal
 
 import chaos
+import pytest
 from fault_cluster import EPISODES, SUBMITS, TIMEOUT_S, TOTAL, FaultCluster, Site, fault_cluster, record
-from host_faults import enter_namespaces, full_file_system
+from host_faults import enter_namespaces, full_file_system, out_of_memory
+from weak_link import How
 
 from evopolicy_common.errors import RefusedError, TransportError
 from evopolicy_common.messages import operator
@@ -47,11 +49,15 @@ LONG_FREEZE_S = 4.0
 DISK_FULL_S = 1.5
 CUT_S = 1.5
 SLOW_S = 2.0
-JUMP_S = 5 * 3600
+PARTITION_S = 150.0
+SLOW_DISK_S = 5.0
+JUMPS_H = {"5 h forward": 5, "5 h back": -5, "5 h back, all restarted": -5, "1 h forward": 1, "1 h back": -1}
+DISK_ERRORS = {"over quota": errno.EDQUOT, "read-only": errno.EROFS, "input/output error": errno.EIO}
 TARGETS = ("coordinator", "worker", "slot", "zygote", "gateway", "supervisor", "run")
 ONE_HOST = (
     *((target, "SIGKILL") for target in TARGETS),
     *((target, "SIGSTOP") for target in TARGETS),
+    *((target, "out of memory") for target in TARGETS),
     ("worker", "SIGSTOP past its leases"),
     ("everything", "SIGKILL"),
     ("coordinator", "no file may grow"),
@@ -63,11 +69,21 @@ ONE_HOST = (
 )
 FAULTS: dict[Site, tuple[tuple[str, str], ...]] = {
     "one host": ONE_HOST,
-    "two hosts": (("cable", "cut"), ("cable", "cut past its leases"), ("cable", "slow")),
-    "clock that jumps": (
-        ("clock", "5 h forward"),
-        ("clock", "5 h back"),
-        ("clock", "5 h back, all restarted"),
+    "two hosts": (
+        ("cable", "cut"),
+        ("cable", "cut past its leases"),
+        ("cable", "cut for minutes"),
+        ("cable", "slow"),
+    ),
+    "relay": (
+        ("relay", "cut"),
+        ("relay", "stalled"),
+        ("relay", "stalled for minutes"),
+        ("relay", "reordered"),
+    ),
+    "clock that jumps": tuple(("clock", jump) for jump in JUMPS_H),
+    "bad disks": tuple(
+        (disk, fault) for disk in ("state", "runs") for fault in (*DISK_ERRORS, "1 s more for each fsync")
     ),
 }
 
@@ -80,6 +96,10 @@ SELECTED = frozenset(
         ("run", "file system full"),
         ("link", "cut"),
         ("cable", "cut past its leases"),
+        ("relay", "reordered"),
+        ("worker", "out of memory"),
+        ("state", "read-only"),
+        ("runs", "over quota"),
         ("clock", "5 h forward"),
         ("clock", "5 h back, all restarted"),
     }
@@ -158,20 +178,28 @@ def cases(seeds: int, part: int = 0, parts: int = 1, first: int = 0) -> list[Cas
 
 def strike(cluster: FaultCluster, case: Case, row: Row) -> bool:
     """Carries the fault out; False when there is no such process now."""
-    if case.target == "link":
+    if case.target in ("link", "relay"):
         assert cluster.link is not None
-        how: Literal["cut", "stalled", "slow"] = case.fault.partition(" ")[0]  # type: ignore[assignment]
+        how: How = case.fault.partition(" ")[0]  # type: ignore[assignment]
+        usual_s = {"cut": CUT_S, "stalled": LONG_FREEZE_S, "slow": SLOW_S, "reordered": CUT_S}[how]
         with cluster.link.weak(how):
-            time.sleep({"cut": CUT_S, "stalled": LONG_FREEZE_S, "slow": SLOW_S}[how])
+            time.sleep(PARTITION_S if case.fault.endswith("minutes") else usual_s)
+        return True
+    if case.target in ("state", "runs"):
+        assert cluster.disks is not None
+        error = DISK_ERRORS.get(case.fault, 0)
+        with cluster.disks.bad(getattr(cluster, case.target), error, 0.0 if error else 1.0):
+            time.sleep(DISK_FULL_S if error else SLOW_DISK_S)
         return True
     if case.target == "cable":
         assert cluster.cable is not None
         with cluster.cable.slow() if case.fault == "slow" else cluster.cable.cut():
-            time.sleep({"cut": CUT_S, "slow": SLOW_S}.get(case.fault, LONG_FREEZE_S))
+            usual_s = {"cut": CUT_S, "slow": SLOW_S, "cut for minutes": PARTITION_S}
+            time.sleep(usual_s.get(case.fault, LONG_FREEZE_S))
         return True
     if case.target == "clock":
         assert cluster.clock is not None
-        cluster.clock.jump(JUMP_S if case.fault == "5 h forward" else -JUMP_S)
+        cluster.clock.jump(3600 * JUMPS_H[case.fault])
         if case.fault.endswith("restarted"):
             for kind in ("coordinator", "worker", "gateway"):
                 kill(cluster.find(kind))
@@ -195,6 +223,13 @@ def strike(cluster: FaultCluster, case: Case, row: Row) -> bool:
         elif case.fault == "SIGSTOP":
             with stopped([pid]):
                 time.sleep(FREEZE_S)
+        elif case.fault == "out of memory":
+            try:
+                with out_of_memory(pid) as struck:
+                    return struck
+            except pytest.skip.Exception as error:
+                print(f"not played: {error}", file=sys.stderr)
+                return False
         elif case.fault == "no file may grow":
             with full_disk(pid):
                 time.sleep(DISK_FULL_S)
@@ -306,7 +341,7 @@ def play(cluster: FaultCluster, name: str, case: Case | None = None) -> Row:
             row.struck = command.poll() is None and strike(cluster, case, row)
             asyncio.run(cluster.tell_afterwards())
         output = command.communicate(timeout=TIMEOUT_S)[1]
-        if command.returncode and case is not None and case.target in ("run", "everything"):
+        if command.returncode and case is not None and case.target in ("run", "runs", "everything"):
             row.again = True
             command = cluster.command(name)
             output = command.communicate(timeout=TIMEOUT_S)[1]

@@ -9,10 +9,16 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
+import struct
 import subprocess
 import sys
-from collections.abc import Iterator
+import time
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+
+from machines import cgroups
+
+from evopolicy_common.processes import proc
 
 _INSIDE = "EVOPOLICY_FAULTS_INSIDE"
 
@@ -45,22 +51,72 @@ def full_file_system(folder: Path) -> Iterator[None]:
         ballast.unlink()
 
 
-class Clock:
+@contextlib.contextmanager
+def out_of_memory(pid: int, timeout_s: float = 10.0) -> Iterator[bool]:
+    """The process and what it starts may take no more memory: the kernel kills it, or it cannot fork. False when nobody
+    asked for any in that time."""
+    with cgroups.limited(4096) as group:
+        group.add(pid)
+        try:
+            deadline = time.monotonic() + timeout_s
+            while _alive(pid) and time.monotonic() < deadline:
+                time.sleep(0.02)
+            yield not _alive(pid) or group.was_refused_memory()
+        finally:
+            group.release()
+
+
+def _alive(pid: int) -> bool:
+    found = proc.stat(pid)
+    return found is not None and found.state not in "ZX"
+
+
+class Preloaded:
+    """A library that all processes are started with, and the file by which it is told what to do."""
+
+    def __init__(self, source: str, variable: str, folder: Path, n_bytes: int) -> None:
+        name = source.removesuffix(".c")
+        self._path = folder / name
+        self._path.write_bytes(bytes(n_bytes))
+        library = folder / f"{name}.so"
+        program = Path(__file__).with_name(source)
+        subprocess.run(["cc", "-O2", "-shared", "-fPIC", "-o", library, program], check=True)
+        self.environment = {"LD_PRELOAD": str(library), variable: str(self._path)}
+
+    def _tell(self, data: bytes) -> None:
+        with self._path.open("r+b", buffering=0) as file:
+            file.write(data)
+
+
+class Disks(Preloaded):
+    """The disks below some folders, for all processes that are started with `environment`."""
+
+    def __init__(self, folder: Path, folders: Sequence[Path]) -> None:
+        super().__init__("bad_disk.c", "BAD_DISK", folder, 8 * len(folders))
+        self._folders = list(folders)
+        self.environment["BAD_DISK_FOLDERS"] = ":".join(map(str, folders))
+
+    @contextlib.contextmanager
+    def bad(self, folder: Path, error: int = 0, fsync_s: float = 0.0) -> Iterator[None]:
+        """Whatever is changed there ends with this error, and each fsync takes so much longer."""
+        states = [(error, round(1000 * fsync_s)) if each == folder else (0, 0) for each in self._folders]
+        self._tell(b"".join(struct.pack("ii", *state) for state in states))
+        try:
+            yield
+        finally:
+            self._tell(bytes(8 * len(self._folders)))
+
+
+class Clock(Preloaded):
     """The time of day of all processes that are started with `environment`; elapsed time is left alone, as the kernel
     leaves it when an operator or a time server sets the clock."""
 
     def __init__(self, folder: Path) -> None:
-        self._path = folder / "clock"
-        self._path.write_bytes(bytes(8))
-        library = folder / "set_clock.so"
-        source = Path(__file__).with_name("set_clock.c")
-        subprocess.run(["cc", "-O2", "-shared", "-fPIC", "-o", library, source], check=True)
-        self.environment = {"LD_PRELOAD": str(library), "SET_CLOCK": str(self._path)}
+        super().__init__("set_clock.c", "SET_CLOCK", folder, 8)
 
     def jump(self, offset_s: int) -> None:
         """Sets the clock so many seconds off the true one, at once and for everyone."""
-        with self._path.open("r+b", buffering=0) as file:
-            file.write(offset_s.to_bytes(8, sys.byteorder, signed=True))
+        self._tell(offset_s.to_bytes(8, sys.byteorder, signed=True))
 
 
 class Cable:

@@ -1,4 +1,4 @@
-"""A link between a worker and the coordinator that can be cut, stalled or slowed: bytes passed on between unix sockets."""
+"""A link to the coordinator that can be cut, stalled, slowed or garbled: bytes passed on between sockets, unix or TCP."""
 
 from __future__ import annotations
 
@@ -14,37 +14,50 @@ SLOW_S = 0.03
 """A slow link keeps each piece for so long."""
 
 
-class WeakLink:
-    """Listens on `path` and passes what comes on to `upstream`, as long as it is up."""
+How = Literal["cut", "stalled", "slow", "reordered"]
+Address = Path | tuple[str, int]
 
-    def __init__(self, path: Path, upstream: Path) -> None:
+
+class WeakLink:
+    """Listens at `address` and passes what comes on to `upstream`, as long as it is up."""
+
+    def __init__(self, address: Address, upstream: Address) -> None:
+        """A path is a unix socket's; port 0 is any free one (see `port`)."""
         self._upstream = upstream
         self._open: set[socket.socket] = set()
         self._lock = threading.Lock()
         self._cut = False
         self._slow = False
+        self._reordered = False
         self._flows = threading.Event()
         self._flows.set()
-        self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        self._listener.bind(str(path))
+        self._listener = _socket(address)
+        self._listener.bind(_name(address))
         self._listener.listen()
         threading.Thread(target=self._accept, daemon=True).start()
 
     @contextlib.contextmanager
-    def weak(self, how: Literal["cut", "stalled", "slow"]) -> Iterator[None]:
-        """Cut: connections end and none begins. Stalled: nothing passes, and nobody is told. Slow: all comes late."""
+    def weak(self, how: How) -> Iterator[None]:
+        """Cut: connections end and none begins. Stalled: nothing passes, and nobody is told. Slow: all comes late.
+        Reordered: each piece arrives with its halves exchanged."""
         if how == "cut":
             self._cut = True
             self._end_all()
         elif how == "stalled":
             self._flows.clear()
-        else:
+        elif how == "slow":
             self._slow = True
+        else:
+            self._reordered = True
         try:
             yield
         finally:
-            self._cut = self._slow = False
+            self._cut = self._slow = self._reordered = False
             self._flows.set()
+
+    @property
+    def port(self) -> int:
+        return int(self._listener.getsockname()[1])
 
     def close(self) -> None:
         self._listener.close()
@@ -64,11 +77,11 @@ class WeakLink:
                 near, _ = self._listener.accept()
             except OSError:
                 return
-            far = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+            far = _socket(self._upstream)
             try:
                 if self._cut:
                     raise ConnectionRefusedError
-                far.connect(str(self._upstream))
+                far.connect(_name(self._upstream))
             except OSError:
                 near.close()
                 far.close()
@@ -84,6 +97,8 @@ class WeakLink:
                 self._flows.wait()
                 if self._slow:
                     time.sleep(SLOW_S)
+                if self._reordered:
+                    data = data[len(data) // 2 :] + data[: len(data) // 2]
                 target.sendall(data)
         # Either way down takes the other with it; the last one closes.
         for end in (source, target):
@@ -95,3 +110,11 @@ class WeakLink:
         if done:
             source.close()
             target.close()
+
+
+def _socket(address: Address) -> socket.socket:
+    return socket.socket(socket.AF_UNIX if isinstance(address, Path) else socket.AF_INET, socket.SOCK_STREAM)
+
+
+def _name(address: Address) -> str | tuple[str, int]:
+    return str(address) if isinstance(address, Path) else address

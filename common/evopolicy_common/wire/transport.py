@@ -188,7 +188,7 @@ class Link:
         except (zenoh.ZError, TimeoutError, RuntimeError) as error:
             raise TransportError(f"no answer on {_verb(key)} within {timeout_s:g} s: {error}") from error
         if answer is None:
-            raise TransportError(f"no answer on {_verb(key)}; is the coordinator at {self._where()} up?")
+            raise TransportError(f"no answer on {_verb(key)}; {self._doubt()}")
         return answer
 
     def ask_blocking(self, key: str, payload: bytes, timeout_s: float) -> bytes:
@@ -202,7 +202,7 @@ class Link:
                     return bytes(reply.ok.payload)
         except zenoh.ZError as error:
             raise TransportError(f"no answer on {_verb(key)}: {error}") from error
-        raise TransportError(f"no answer on {_verb(key)}; is the coordinator at {self._where()} up?")
+        raise TransportError(f"no answer on {_verb(key)}; {self._doubt()}")
 
     def declare_alive(self, key: str) -> None:
         """Holds a liveliness token on `key` while this link is open."""
@@ -214,8 +214,9 @@ class Link:
         self._sender.shutdown(wait=False, cancel_futures=True)
         _close(self._session)
 
-    def _where(self) -> str:
-        return ", ".join(self.credentials.endpoints)
+    def _doubt(self) -> str:
+        where = f"is the coordinator at {', '.join(self.credentials.endpoints)} up"
+        return f"{where}?" if self.credentials.tls is None else f"{where}, and {_doubt_of(self.credentials)}"
 
 
 @contextlib.asynccontextmanager
@@ -461,12 +462,9 @@ async def _open_client(credentials: Credentials, timeout_s: float | None) -> zen
             return await asyncio.to_thread(zenoh.open, config)
         except zenoh.ZError as error:
             if loop.time() > deadline:
-                doubt = f"are these the {credentials.role} credentials of its state folder?"
-                if credentials.tls is not None:
-                    doubt = f"are these credentials in its `certs list` ({credentials.user}), neither expired nor revoked?"
                 text = (
                     f"no connection to {', '.join(credentials.endpoints)} within {patience_s:g} s: is the coordinator up"
-                    f" there, and {doubt}"
+                    f" there, and {_doubt_of(credentials)}"
                 )
                 if timeout_s is not None:
                     raise TransportError(text) from error
@@ -474,6 +472,12 @@ async def _open_client(credentials: Credentials, timeout_s: float | None) -> zen
                 deadline = math.inf
         await asyncio.sleep(pause)
         pause = min(0.5, pause * 1.5)
+
+
+def _doubt_of(credentials: Credentials) -> str:
+    if credentials.tls is None:
+        return f"are these the {credentials.role} credentials of its state folder?"
+    return f"are these credentials in its `certs list` ({credentials.user}), neither expired nor revoked?"
 
 
 def _post(loop: asyncio.AbstractEventLoop, call: Callable[[bytes | None], None], value: bytes | None) -> None:
