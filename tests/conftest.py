@@ -46,6 +46,7 @@ _SYSTEM = (
     "integration/install",
     "integration/multihost",
     "integration/python",
+    "integration/report/test_cheats_on_a_board.py",
     "integration/report/test_recordings.py",
     "integration/report/test_tutorial.py",
     "integration/report/test_two_labs.py",
