@@ -53,15 +53,14 @@ def full_file_system(folder: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def out_of_memory(pid: int, timeout_s: float = 10.0) -> Iterator[bool]:
-    """The process and what it starts may take no more memory: the kernel kills it, or it cannot fork. False when nobody
-    asked for any in that time."""
+    """The process may take no more memory, so that the kernel kills it; False when it asked for none in that time."""
     with cgroups.limited(4096) as group:
         group.add(pid)
         try:
             deadline = time.monotonic() + timeout_s
             while _alive(pid) and time.monotonic() < deadline:
                 time.sleep(0.02)
-            yield not _alive(pid) or group.was_refused_memory()
+            yield not _alive(pid)
         finally:
             group.release()
 

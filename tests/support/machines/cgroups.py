@@ -37,13 +37,6 @@ class Cgroup:
     def get(self, name: str) -> str:
         return (self._folder / name).read_text().strip()
 
-    def was_refused_memory(self) -> bool:
-        """Whether its processes asked for more than they may have."""
-        if (self._folder / "memory.failcnt").exists():
-            return self.get("memory.failcnt") != "0"
-        words = self.get("memory.events").split()
-        return words[words.index("max") + 1] != "0"
-
     def release(self) -> None:
         """Its processes go on in the group above."""
         for pid in self.get("cgroup.procs").split():
