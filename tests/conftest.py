@@ -50,6 +50,7 @@ _SYSTEM = (
     "integration/report/test_recordings.py",
     "integration/report/test_tutorial.py",
     "integration/report/test_two_labs.py",
+    "integration/test_every_bad_value.py",
     "integration/web",
     "unit/gateway/public/test_exports.py",
 )
@@ -67,8 +68,8 @@ _FAMILIES = (
 """Files and folders that play environments of families beyond Core16's."""
 
 
-_ONE_BY_ONE = "tests/families/test_proof_of_life.py::"
-"""Its tests share nothing and take minutes together: each is played where there is room."""
+_ONE_BY_ONE = ("tests/families/test_proof_of_life.py::", "tests/integration/test_every_bad_value.py::")
+"""Their tests share nothing and take minutes together: each is played where there is room."""
 
 
 @pytest.hookimpl(optionalhook=True)

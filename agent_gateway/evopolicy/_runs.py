@@ -14,15 +14,10 @@ import msgspec
 from evopolicy._arguments import take
 from evopolicy._records import Records, bars, table
 from evopolicy_common.errors import DECODE_ERRORS, ConfigError, ProtocolError
-from evopolicy_common.records.run_files import (
-    open_regular,
-    read_record,
-    read_regular,
-    run_folders,
-    submit_folders,
-)
+from evopolicy_common.records.run_files import read_record, run_folders, submit_folders
 from evopolicy_common.records.run_record import RunRecord
 from evopolicy_common.records.summary import Summary, decode_summary
+from evopolicy_common.regular_files import open_regular, read_regular
 from evopolicy_gateway.agents.function import RESULT
 
 _MAX_RESULT_BYTES = 1 << 20

@@ -16,7 +16,7 @@ import typer
 
 from evopolicy_common.errors import ConfigError, DamagedStoreError, EvopolicyError, MachineError
 from evopolicy_common.processes.preflight import explained
-from evopolicy_common.terminal import harmless, one_line, say
+from evopolicy_common.terminal import harmless, one_line, say_lines, shortened
 
 T = TypeVar("T")
 
@@ -114,8 +114,8 @@ def setup_notices() -> None:
 
 
 def fail(message: str, code: int = USAGE_ERROR) -> NoReturn:
-    """Ends the command with one line on stderr."""
-    say(f"error: {message}", err=True)
+    """Ends the command with one line on stderr, of bearable length."""
+    say_lines([f"error: {shortened(message)}"], err=True)
     raise SystemExit(code)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import platform
 import re
 import sys
@@ -16,7 +17,7 @@ import evopolicy_common
 from evopolicy_common.cli import USAGE_ERROR, fail, fail_on_our_errors, setup_notices
 from evopolicy_common.entry import interruptible
 from evopolicy_common.processes.preflight import EXTRAS, missing
-from evopolicy_common.terminal import end_without_reader, open_streams, say
+from evopolicy_common.terminal import end_without_reader, harmless, one_line, open_streams, say, shortened
 
 # typer ships click, in newer versions under another name; only its public exceptions lead to `ClickException`.
 _ClickError: Any = next(base for base in typer.BadParameter.__mro__ if base.__name__ == "ClickException")
@@ -31,6 +32,10 @@ _WRONG = {
     "less_than_equal": "is more than {le}",
 }
 """What typer's library finds wrong with an option's value, by its name of the error; its own texts do not tell the value."""
+_MOST_CHARACTERS = 32_768
+"""Of an option's value: no list of cases and no agent's command is longer."""
+SEVERAL_LINES = frozenset({"agent"})
+"""Parameters whose values may have several lines: an agent may be a shell script."""
 _METAVARS = {"str": "TEXT", "int": "N", "float": "X", "path": "PATH", "file": "PATH", "directory": "DIR"}
 """How help shows values, by the name of their type."""
 
@@ -78,6 +83,28 @@ class _Help:
                 formatter.write_dl(records)
         if isinstance(self, TyperGroup):
             self.format_commands(ctx, formatter)
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        if ctx.resilient_parsing:
+            return super().parse_args(ctx, args)  # type: ignore[misc,no-any-return]
+        given, _, _ = self.make_parser(ctx).parse_args(args=list(args))  # type: ignore[attr-defined]
+        named = [
+            (param, value)
+            for param in self.get_params(ctx)  # type: ignore[attr-defined]
+            for value in _texts(given.get(param.name))
+        ]
+        for param, value in named:
+            if why := _unusable(value, several_lines=param.name in SEVERAL_LINES):
+                raise typer.BadParameter(f"{shortened(value)!r} {why}", ctx=ctx, param=param)
+        rest: list[str] = super().parse_args(ctx, args)  # type: ignore[misc]
+        for param, value in named:
+            number = ctx.params.get(param.name)
+            # Python's numbers may be `inf`, `nan` and `1_000`.
+            if isinstance(number, int | float) and (not math.isfinite(number) or "_" in value):
+                raise typer.BadParameter(
+                    f"{shortened(value)!r} is not a finite number in digits", ctx=ctx, param=param
+                )
+        return rest
 
     def invoke(self, ctx: Any) -> Any:
         if not isinstance(self, TyperGroup) or self.invoke_without_command:
@@ -166,6 +193,26 @@ def needed_extras(needed: str | None = None) -> Iterator[None]:
         if {"-h", "--help"} & set(sys.argv):
             advice += "; until then, `evopolicy files docs/reference/cli.md` names a page with all commands and options"
         fail(advice)
+
+
+def _texts(given: Any) -> list[str]:
+    """The words of a parameter on the command line."""
+    values = given if isinstance(given, list | tuple) else [given]
+    return [value for value in values if isinstance(value, str)]
+
+
+def _unusable(value: str, *, several_lines: bool) -> str:
+    """Why no option takes this value; empty if one may."""
+    if not value.strip():
+        return "is empty"
+    if len(value) > _MOST_CHARACTERS:
+        return f"has {len(value):,} characters, and {_MOST_CHARACTERS:,} are the limit"
+    try:
+        value.encode()
+    except UnicodeEncodeError:
+        return "is not UTF-8, which names and messages are"
+    shown = harmless(value) if several_lines else one_line(value)
+    return "" if shown == value else "has characters that cannot be printed"
 
 
 def _value_names(text: str) -> str:

@@ -36,6 +36,12 @@ def one_line(text: str) -> str:
     return harmless(text.replace("\n", " ").replace("\t", " "))
 
 
+def shortened(text: str) -> str:
+    """The text without the middle of each word of over 400 characters, and of a text that has over 4,000 even so."""
+    text = re.sub(r"\S{401,}", lambda word: f"{word[0][:200]}…{word[0][-100:]}", text)
+    return text if len(text) <= 4_000 else f"{text[:2_000]} … {text[-1_900:]}"
+
+
 # A number, or two as in an interval: `-1.5`, `-1.5 to +2e3`.
 _NUMBERS = re.compile(r"[-+]?[0-9][0-9.]*(?:e[-+]?[0-9]+)?(?: to [-+]?[0-9][0-9.]*(?:e[-+]?[0-9]+)?)?")
 

@@ -27,6 +27,7 @@ from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.environment import Case, Split
 from evopolicy_common.records.blobs import fsync_directory
 from evopolicy_common.records.journal import epoch_of
+from evopolicy_common.regular_files import read_given
 
 SPLITS: tuple[Split, ...] = ("train", "validation", "heldout")
 FILE_STEMS: dict[Split, str] = {"train": "train", "validation": "valid", "heldout": "heldout"}
@@ -222,11 +223,9 @@ def _create_secret(path: Path) -> bytes:
 
 def read_split_file(path: Path) -> tuple[SplitFile, str]:
     """Returns the file's content and the SHA-256 (hex) of its bytes. Raises ConfigError with the file and its fault."""
+    data = read_given(path, f"split file {path}")
     try:
-        data = path.read_bytes()
         content = msgspec.json.decode(data, type=SplitFile)
-    except OSError as error:
-        raise ConfigError(f"cannot read {path}: {error.strerror}") from error
     except (msgspec.DecodeError, RecursionError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path} is not a split file: {error}") from error
     for number, case in enumerate(content.cases):

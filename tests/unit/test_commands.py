@@ -158,6 +158,12 @@ LOCAL = ["evopolicy", "local", "--env", "toy", "--agent"]
             "choose another folder with --action-log",
         ),
         (["evopolicy-coordinator", "--state", "new", "--listen", "tcp/127.0.0.1:IN USE"], "with --listen"),
+        (["evopolicy-coordinator", "certs", "revoke", "x", "--state", "EMPTY"], "certs init --state EMPTY"),
+        (["evopolicy-worker", "check-env", "toy/line", "--results", "FILE/x"], "folder with --results"),
+        ([*LOCAL, "random", "--policy-package", ".."], "'..' is no name of a package; leave it out"),
+        ([*LOCAL, "random", "--slots", "1_000"], "'--slots': '1_000' is not a finite number in digits"),
+        (["evopolicy", "gc", "--older-than", "inf"], "'inf' is not a finite number in digits"),
+        (["evopolicy", "diff", "EMPTY", "RUNS"], "EMPTY is no run directory: it has neither run.json nor"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )
@@ -174,6 +180,29 @@ def test_a_wrong_value_is_named_with_the_remedy(words: list[str], problem: str, 
     assert done.stderr.splitlines()[-1].startswith("error: ")
     assert "Traceback" not in done.stderr
     assert ".rs:" not in done.stderr
+    assert not any((tmp_path / "EMPTY").iterdir())
+
+
+def test_a_command_in_a_deleted_folder_says_so(tmp_path: Path) -> None:
+    here = tmp_path / "here"
+    here.mkdir()
+    words = ["evopolicy", "run", "--env", "toy/line", "--agent", "random"]
+    done = subprocess.run(
+        ["sh", "-c", f"cd {here} && rmdir {here} && exec {BIN / words[0]} {' '.join(words[1:])}"],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=120,
+    )
+    assert done.returncode == 1
+    assert done.stderr == "error: the folder in which this command was started is gone: change to another\n"
+
+
+def test_a_long_value_is_shortened_and_the_remedy_stays() -> None:
+    done = started(["evopolicy", "workers", "drain", "x" * 100_000])
+    assert done.returncode == 2
+    assert len(done.stderr) < 1_000
+    assert "has 100,000 characters, and 32,768 are the limit" in done.stderr
 
 
 def test_the_help_of_local_is_in_groups_and_fits_a_narrow_terminal() -> None:

@@ -21,7 +21,9 @@ from evopolicy_common.console import table, terminal
 from evopolicy_common.errors import EvopolicyError, WorkerError
 from evopolicy_common.messages.environment import Case, EnvironmentDescription
 from evopolicy_common.messages.episode import EpisodeSpec, Job, Tier
+from evopolicy_common.processes.preflight import check_writable
 from evopolicy_common.processes.scratch import scratch_folder
+from evopolicy_common.regular_files import read_given
 from evopolicy_common.terminal import say
 from evopolicy_worker import environments
 from evopolicy_worker.environments.actions import compile_actions
@@ -244,6 +246,9 @@ def command(
     use_browser(browser)
     with fail_on_our_errors():
         wanted = catalogue.resolve(env)
+        if results is not None:
+            check_writable(results.parent, "--results")
+            results.parent.mkdir(parents=True, exist_ok=True)
         known = {} if results is None else read(results)
         todo = [each for each in wanted if each not in known]
         divided = installs.divided(todo)
@@ -279,7 +284,8 @@ def command(
 def read(results: Path) -> dict[str, Checked]:
     """Results in the file, by environment id. Skips truncated lines, so that those environments are played again."""
     found: dict[str, Checked] = {}
-    for line in results.read_bytes().splitlines() if results.exists() else ():
+    data = read_given(results, f"--results {results}") if results.exists() else b""
+    for line in data.splitlines():
         try:
             checked = msgspec.json.decode(line, type=Checked)
         except msgspec.MsgspecError:

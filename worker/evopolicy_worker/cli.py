@@ -26,7 +26,7 @@ from evopolicy_common.logs import structlog
 from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_common.messages.episode import Tier
 from evopolicy_common.processes import host
-from evopolicy_common.processes.packages import policy_versions
+from evopolicy_common.processes.packages import checked_names, policy_versions
 from evopolicy_common.processes.preflight import check_scratch
 from evopolicy_common.processes.scratch import scratch_folder
 from evopolicy_common.terminal import say, say_json
@@ -147,6 +147,7 @@ def work(
             )
         if name is not None and not keys.valid_name(name):
             raise ConfigError(f"--name {name!r}: letters, digits, '.', '_' and '-' only, 63 at most")
+        packages = checked_names(allow_package)
         wanted = catalogue.resolve(env)
         environments.check_played(wanted)
         # Until the worker can drain, SIGTERM raises SystemExit, so that processes and temporary folders are cleaned up.
@@ -190,7 +191,7 @@ def work(
                         tiers,
                         missing,
                         scratch,
-                        tuple(allow_package or ()),
+                        packages,
                         grace,
                         Limits(call_s=env_timeout, memory_bytes=env_memory << 20),
                     )

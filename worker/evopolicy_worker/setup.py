@@ -82,6 +82,7 @@ def command(
         folder = (into or installs.root() / "+".join(wanted)).absolute()
         if folder.is_symlink():  # made by an earlier --into, whose folder is written anew
             folder = folder.resolve()
+        _check_free(folder)
         with _alone(folder):
             _make(wanted, folder, python or sys.executable)
         _link(folder, "+".join(wanted))
@@ -111,6 +112,13 @@ def _wanted(names: Sequence[str]) -> dict[str, Install]:
     return wanted
 
 
+def _check_free(folder: Path) -> None:
+    if folder.exists() and not folder.is_dir():
+        raise ConfigError(f"--into {folder} is not a folder; name a new one")
+    if folder.exists() and installs.read(folder) is None and any(folder.iterdir()):
+        raise ConfigError(f"--into {folder}: the folder has other files; name a new one")
+
+
 @contextlib.contextmanager
 def _alone(folder: Path) -> Iterator[None]:
     """Held while the folder is written. Raises ConfigError when another `setup` writes it."""
@@ -128,8 +136,7 @@ def _alone(folder: Path) -> Iterator[None]:
 
 def _make(wanted: Mapping[str, Install], folder: Path, python: str) -> None:
     """Makes the virtual environment in `folder`, in place of an earlier one. Raises ConfigError or MachineError."""
-    if folder.exists() and installs.read(folder) is None and any(folder.iterdir()):
-        raise ConfigError(f"--into {folder}: the folder has other files; name a new one")
+    _check_free(folder)
     _check_python(wanted, python)
     if any(each.browser for each in wanted.values()):
         install_browser()

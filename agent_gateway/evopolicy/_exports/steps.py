@@ -15,7 +15,7 @@ from typing import Any, Literal
 import msgspec
 
 from evopolicy_common.errors import DECODE_ERRORS
-from evopolicy_common.records.run_files import open_regular
+from evopolicy_common.regular_files import open_regular
 
 MAX_LOG_BYTES = 64 << 20
 """Later bytes of a log are not read; a last step says so."""

@@ -25,10 +25,11 @@ import msgspec
 from evopolicy._runs import summaries_in
 from evopolicy_common.errors import DECODE_ERRORS, ConfigError, ProtocolError
 from evopolicy_common.records.blobs import write_atomically
-from evopolicy_common.records.run_files import RUN_JSON, read_record, read_regular, run_folders
+from evopolicy_common.records.run_files import RUN_JSON, read_record, run_folders
 from evopolicy_common.records.run_record import RunRecord
 from evopolicy_common.records.suite_folder import INDEX, Index
 from evopolicy_common.records.summary import Summary
+from evopolicy_common.regular_files import read_regular
 
 POLL_S = 2.0
 _KNOWN = "evopolicy.json"

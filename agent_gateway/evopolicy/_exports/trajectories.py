@@ -22,7 +22,8 @@ from evopolicy._runs import Run, Runs
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.records.episodes.npz import MAX_BYTES, read_arrays
 from evopolicy_common.records.episodes.rendered import MAX_OBSERVATIONS_BYTES, MAX_ROWS_BYTES
-from evopolicy_common.records.run_files import read_regular, submit_folders
+from evopolicy_common.records.run_files import submit_folders
+from evopolicy_common.regular_files import read_regular
 from evopolicy_common.terminal import say
 
 _LAST = "The observation after an episode's last step is a copy of the one before it."

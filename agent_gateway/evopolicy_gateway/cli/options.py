@@ -15,8 +15,8 @@ from evopolicy_common import catalogue
 from evopolicy_common.errors import ConfigError, ProtocolError, RequestError
 from evopolicy_common.messages.episode import LARGEST_LIMIT, LARGEST_LIMITS, ResourceLimits, Tier
 from evopolicy_common.messages.gateway import Profile
-from evopolicy_common.messages.run_settings import PUBLISHED, RunSettings
-from evopolicy_common.processes.packages import packages_in, policy_versions
+from evopolicy_common.messages.run_settings import PUBLISHED, RunSettings, episode_counts
+from evopolicy_common.processes.packages import checked_names, packages_in, policy_versions
 from evopolicy_common.records.run_files import read_record
 from evopolicy_common.wire.credentials import local_state_dir
 from evopolicy_gateway.http.submit_request import Bounds, ids_in
@@ -186,7 +186,7 @@ def run_settings(given: Any, limits: ResourceLimits, **named: Any) -> RunSetting
         raise ConfigError(
             f"feedback {chosen['feedback']} shows no videos, and video {given.video} is asked for: leave out one of them"
         )
-    return RunSettings(
+    settings = RunSettings(
         budget=given.budget,
         min_episodes_per_submit=given.min_episodes,
         max_episodes_per_submit=given.max_episodes,
@@ -200,6 +200,8 @@ def run_settings(given: Any, limits: ResourceLimits, **named: Any) -> RunSetting
         **chosen,
         **named,
     )
+    episode_counts(settings, catalogue.suite_of(settings.env))
+    return settings
 
 
 def state_of(state: Path | None, *, fresh: bool) -> Path | None:
@@ -267,12 +269,13 @@ def cases_of(text: str) -> tuple[int, ...]:
 
 def check_packages(requested: list[str] | None, *, local: bool) -> tuple[str, ...]:
     """The packages of `--policy-package`. ConfigError for a cluster that is not brought up here."""
-    if requested and not local:
+    names = checked_names(requested)
+    if names and not local:
         raise ConfigError(
             "--policy-package is for a cluster that this command brings up; give it to evopolicy-coordinator and to each"
             " evopolicy-worker"
         )
-    return tuple(sorted(set(requested or ())))
+    return names
 
 
 def packages_for(policy: Path, requested: Sequence[str] | None) -> tuple[str, ...]:
@@ -280,7 +283,7 @@ def packages_for(policy: Path, requested: Sequence[str] | None) -> tuple[str, ..
 
     Raises ConfigError when policies cannot have one of those."""
     if requested:
-        return tuple(sorted(set(requested)))
+        return checked_names(requested)
     folder = policy.absolute()
     for run in (folder, *list(folder.parents)[:2]):
         with contextlib.suppress(OSError, ProtocolError):

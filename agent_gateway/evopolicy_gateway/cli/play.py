@@ -280,7 +280,12 @@ def diff_runs(
 
     Exit code 0 if they are equal, 1 if they differ.
     """
-    found = differences(left, right)
+    with fail_on_our_errors():
+        for each in (left, right):
+            root = folder_of(each).root  # for typer a pipe is no file
+            if not ((root / "run.json").exists() or (root / "workspace").is_dir()):
+                raise ConfigError(f"{each} is no run directory: it has neither run.json nor workspace/")
+        found = differences(left, right)
     if as_json:
         say_json(found, indent=False)
     else:

@@ -17,6 +17,7 @@ import msgspec
 from msgspec import Meta
 
 from evopolicy_common.errors import DECODE_ERRORS, ConfigError
+from evopolicy_common.regular_files import read_given
 from evopolicy_gateway.harnesses.prompts import Prompts
 from evopolicy_gateway.harnesses.usage import Prices
 from evopolicy_gateway.inputs.declared import McpServer
@@ -241,9 +242,7 @@ def _is_reachable(url: str) -> bool:
 def read_agent(path: Path) -> AgentConfig:
     """The settings in a TOML file. Raises ConfigError with the file and the fault."""
     try:
-        config = msgspec.toml.decode(path.read_bytes(), type=AgentConfig)
-    except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror}") from error
+        config = msgspec.toml.decode(read_given(path, str(path)), type=AgentConfig)
     except DECODE_ERRORS as error:
         raise ConfigError(f"{path}: {error}") from error
     try:

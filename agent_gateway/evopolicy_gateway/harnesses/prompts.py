@@ -13,6 +13,7 @@ from string import Template
 import msgspec
 
 from evopolicy_common.errors import DECODE_ERRORS, ConfigError
+from evopolicy_common.regular_files import read_given
 
 FIRST = (
     "Read AGENTS.md in the current directory. It says what to improve, how to submit and what is allowed."
@@ -90,13 +91,7 @@ def read_prompts(path: Path) -> Prompts:
 def read_text(path: Path) -> str:
     """An operator's text. Raises ConfigError when the file cannot be read, is not UTF-8, or is over 256 KiB."""
     try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror}") from error
-    if len(data) > _MAX_BYTES:
-        raise ConfigError(f"{path}: {len(data):,} bytes; the limit of a text for agents is {_MAX_BYTES:,}")
-    try:
-        return data.decode()
+        return read_given(path, str(path), _MAX_BYTES).decode()
     except UnicodeDecodeError as error:
         raise ConfigError(f"{path} is not UTF-8: {error}") from error
 

@@ -20,6 +20,7 @@ import msgspec
 
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.records.run_record import AgentInput
+from evopolicy_common.regular_files import open_regular
 from evopolicy_gateway.jail.settings import host
 
 IN_JAIL = "/inputs"
@@ -173,7 +174,7 @@ def _files(field: str, root: Path, prefix: str) -> Iterator[tuple[str, File]]:
             if not stat.S_ISREG(mode):
                 kind = "a symbolic link; put a copy in its place" if stat.S_ISLNK(mode) else "no regular file"
                 raise ConfigError(f"{field}: {path} is {kind}")
-            with open(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC), "rb") as file:
+            with open_regular(path) as file:
                 data = file.read(left + 1)
         except OSError as error:
             raise ConfigError(f"{field}: {path}: {error.strerror}") from error

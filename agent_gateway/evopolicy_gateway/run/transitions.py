@@ -9,7 +9,7 @@ from pathlib import Path
 import msgspec
 
 from evopolicy_common.processes.left_files import left_files
-from evopolicy_common.records.run_files import open_regular
+from evopolicy_common.regular_files import open_regular
 
 MAX_READ_BYTES = 8 << 30
 """Larger feedback is not counted: an agent without a jail may leave sparse files of any size."""

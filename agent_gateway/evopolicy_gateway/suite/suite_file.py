@@ -26,6 +26,7 @@ from evopolicy_common.messages.gateway import (
     SimulationRule,
     VideoOption,
 )
+from evopolicy_common.regular_files import read_given
 from evopolicy_common.wire import keys
 from evopolicy_gateway import harnesses
 from evopolicy_gateway.agent_supervisor.clock import SILENCE_S
@@ -135,7 +136,7 @@ def find(name: str) -> tuple[Path | None, bytes]:
     """
     path = Path(name)
     if path.is_file():
-        return path, path.read_bytes()
+        return path, read_given(path, str(path))
     shipped = resources.files("evopolicy_gateway.suite") / "shipped"
     there = sorted(entry.name for entry in shipped.iterdir() if entry.name.endswith(".toml"))
     wanted = name if name.endswith(".toml") else f"{name}.toml"

@@ -9,7 +9,6 @@ from __future__ import annotations
 import difflib
 import math
 import re
-import stat
 import tomllib
 from pathlib import Path
 from typing import Any, Literal
@@ -17,6 +16,7 @@ from typing import Any, Literal
 import msgspec
 
 from evopolicy_common.errors import ConfigError
+from evopolicy_common.regular_files import read_given
 
 Demand = Literal["synthesis", "tuning"]
 ObservationKind = Literal["state", "image", "symbolic", "dict"]
@@ -117,7 +117,7 @@ def valid_id(env_id: str) -> bool:
 
 def read_file(path: Path) -> tuple[Entry, ...]:
     """The environments of a file. Raises ConfigError that names file, environment, field and remedy."""
-    data = _read(path, f"environment file {path}")
+    data = read_given(path, f"environment file {path}", MAX_FILE_BYTES)
     try:
         table = tomllib.loads(data.decode())
     except (UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError) as error:
@@ -137,20 +137,6 @@ def read_file(path: Path) -> tuple[Entry, ...]:
             f"environment file {path} defines {', '.join(doubled)} more than once: keep one of each"
         )
     return entries
-
-
-def _read(path: Path, what: str) -> bytes:
-    """The bytes of a file of the user's, which need not be an ordinary one. Raises ConfigError."""
-    try:
-        if not stat.S_ISREG(path.stat().st_mode):
-            raise ConfigError(f"{what} is not an ordinary file: name a file with text")
-        with path.open("rb") as file:
-            data = file.read(MAX_FILE_BYTES + 1)
-    except OSError as error:
-        raise ConfigError(f"{what} cannot be read: {error.strerror}") from error
-    if len(data) > MAX_FILE_BYTES:
-        raise ConfigError(f"{what} is longer than {MAX_FILE_BYTES:,} bytes, the limit")
-    return data
 
 
 def _entry(path: Path, table: dict[str, Any]) -> Entry:
@@ -195,7 +181,7 @@ def _task(where: str, path: Path, fields: dict[str, Any], task_file: object) -> 
             f"{what} is {found}, outside the environment file's folder {folder}: copy the text into that folder"
         )
     try:
-        return _read(found, what).decode()
+        return read_given(found, what, MAX_FILE_BYTES).decode()
     except UnicodeDecodeError as error:
         raise ConfigError(f"{what} is not UTF-8: {error}; save it as UTF-8") from error
 

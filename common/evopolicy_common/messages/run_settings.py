@@ -6,6 +6,8 @@ from typing import Literal
 
 import msgspec
 
+from evopolicy_common.catalogue import Suite
+from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.bounds import Int, Named, Text, Word
 from evopolicy_common.messages.environment import ObservationForm, PolicyScope, StepLimit
 from evopolicy_common.messages.episode import ResourceLimits, Tier
@@ -19,6 +21,10 @@ this was recorded."""
 HiddenCases = Literal["shared", "per_run"]
 """Validation and held-out cases: the same for all runs of an environment, or each run's own (no paired statistics)."""
 
+MAX_BUDGET = 20_000
+MAX_EPISODES_PER_SUBMIT = 10_000
+MAX_HIDDEN = 10_000
+"""Validation or held-out cases of a run. The report of a finished run must fit into one message."""
 ELSEWHERE = "elsewhere"
 """Value of `RunSettings.agent_host`: the operator vouches that the agent is on no machine of the cluster."""
 
@@ -93,3 +99,27 @@ def off_profile(settings: RunSettings) -> str:
     return ", ".join(
         f"{name} {values[name]} (not {value})" for name, value in PUBLISHED.items() if values[name] != value
     )
+
+
+def episode_counts(settings: RunSettings, suite: Suite) -> tuple[int, int, int]:
+    """Budget, least and greatest number of episodes of a submit of a run. Raises ConfigError for numbers that no run can have."""
+
+    def given(number: int | None, usual: int) -> int:
+        return usual if number is None else number
+
+    budget = given(settings.budget, suite.budget)
+    least = given(settings.min_episodes_per_submit, suite.min_episodes_per_submit)
+    most = min(given(settings.max_episodes_per_submit, suite.max_episodes_per_submit), budget)
+    if not 1 <= least <= most:
+        raise ConfigError(
+            f"budget {budget} and {least} to {most} episodes a submit contradict each other; all must be at least 1"
+        )
+    for what, n, limit in (
+        ("a budget", budget, MAX_BUDGET),
+        ("submits", most, MAX_EPISODES_PER_SUBMIT),
+        ("validation", settings.n_validation or 0, MAX_HIDDEN),
+        ("held-out", settings.n_heldout or 0, MAX_HIDDEN),
+    ):
+        if n > limit:
+            raise ConfigError(f"{what} of {n:,} episodes; {limit:,} are the limit")
+    return budget, least, most

@@ -23,6 +23,14 @@ _NO_CODE = (".dist-info", ".egg-info", ".pth")
 _NOT_IN_SITE = ("..", "__pycache__", "bin")
 
 
+def checked_names(requested: Iterable[str] | None) -> tuple[str, ...]:
+    """The values of `--policy-package`, sorted, each once. Raises ConfigError for one that is no name of a package."""
+    names = tuple(sorted(set(requested or ())))
+    for name in names:
+        _check_name(name)
+    return names
+
+
 def files_of(names: Iterable[str], *, metadata_too: bool = False) -> dict[str, str]:
     """Modules, packages and bundled libraries of the named distributions (or import names), and of those that they
     require: name in the packages folder → path on this machine. Required distributions that are not installed are left
@@ -115,13 +123,18 @@ def _numpy() -> tuple[dict[str, str], list[str]]:
     return {path.name: str(path) for path in both if path.is_dir()}, []
 
 
+def _check_name(name: str) -> None:
+    # A run.json may be untrusted and name anything; the name appears in a command for the user to copy.
+    if not _NAME.fullmatch(name):
+        raise ConfigError(f"{name!r} is no name of a package; leave it out")
+
+
 def _one(
     name: str, requested: str, *, required: bool, metadata_too: bool
 ) -> tuple[dict[str, str], list[str]]:
     """Folders and modules of one distribution, and what it requires."""
-    # A run.json may be untrusted and name anything; the name appears in a command for the user to copy.
-    if required and not _NAME.fullmatch(name):
-        raise ConfigError(f"{name!r} is no name of a package; leave it out")
+    if required:
+        _check_name(name)
     distribution = _distribution(name)
     if distribution is None:
         if required:

@@ -47,11 +47,21 @@ _MAY_PASS = frozenset(
 def explained(error: OSError) -> str | None:
     """The machine's fault with path and remedy, in one line; None for any other error, which may be a bug of this
     software."""
+    if error.errno == errno.ENOENT and _folder_is_gone():
+        return "the folder in which this command was started is gone: change to another"
     remedy = _REMEDIES.get(error.errno or 0)
     if remedy is None:
         return None
     where = os.fsdecode(error.filename) if isinstance(error.filename, str | bytes) else "a file"
     return f"{where}: {os.strerror(error.errno or 0)}: {remedy}"
+
+
+def _folder_is_gone() -> bool:
+    try:
+        os.getcwd()
+    except FileNotFoundError:
+        return True
+    return False
 
 
 def foreseen(error: Exception) -> str | None:

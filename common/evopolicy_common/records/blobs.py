@@ -16,7 +16,7 @@ import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from evopolicy_common.errors import StorageError
+from evopolicy_common.errors import ConfigError, StorageError
 
 MAX_UNFINISHED = 16
 """Most unfinished uploads of one sender; beyond it the sender's oldest is dropped."""
@@ -67,9 +67,11 @@ def sync_filesystem(path: Path) -> None:
 def write_atomically(path: Path, data: bytes, *, mode: int = 0o644, durable: bool = True) -> None:
     """Replaces `path` by a file with `data`: readers see either the old bytes or the new, never a part.
 
-    Raises StorageError with the path when the file cannot be written.
+    Raises StorageError with the path when the file cannot be written, ConfigError for a pipe, a device or a folder of that name.
     """
     try:
+        if path.exists() and not path.is_file():
+            raise ConfigError(f"{path} is not a regular file; name another")
         fd, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
     except OSError as error:
         raise StorageError(f"cannot write {path}: {error.strerror or error}") from error
@@ -86,6 +88,19 @@ def write_atomically(path: Path, data: bytes, *, mode: int = 0o644, durable: boo
     except OSError as error:
         Path(name).unlink(missing_ok=True)
         raise StorageError(f"cannot write {path}: {error.strerror or error}") from error
+
+
+@contextlib.contextmanager
+def announcing(path: Path | None) -> Iterator[Callable[[bytes], None]]:
+    """Yields a function that writes the private file at `path` (None: nowhere); a file that it wrote is removed at the end."""
+    with contextlib.ExitStack() as written:
+
+        def write(data: bytes) -> None:
+            if path is not None:
+                write_atomically(path, data, mode=0o600)
+                written.callback(path.unlink, missing_ok=True)
+
+        yield write
 
 
 class BlobStore:

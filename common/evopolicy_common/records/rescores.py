@@ -14,7 +14,7 @@ import msgspec
 from evopolicy_common.errors import DECODE_ERRORS, ProtocolError
 from evopolicy_common.messages.bounds import LARGEST, Int, Many, Named, Number, Text, Word
 from evopolicy_common.records.aggregates import mean
-from evopolicy_common.records.run_files import read_regular
+from evopolicy_common.regular_files import read_regular
 
 FORMAT = "evopolicy rescore 1"
 FOLDER = "rescore"

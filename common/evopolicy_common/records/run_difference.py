@@ -16,8 +16,9 @@ from pathlib import Path
 from typing import Any
 
 from evopolicy_common.processes.left_files import left_files
-from evopolicy_common.records.run_files import MAX_BYTES, RUN_JSON, read_regular
+from evopolicy_common.records.run_files import RUN_JSON
 from evopolicy_common.records.run_record import upgraded
+from evopolicy_common.regular_files import MAX_BYTES, read_regular
 
 EXCLUDED_FILES: Mapping[str, str] = {
     "logs/*": "what happened on the way, with its times",

@@ -1,60 +1,27 @@
-"""Finds finished runs below folders and the submits of a run's folder, and reads files that others wrote.
+"""Finds finished runs below folders and the submits of a run's folder, and reads the runs' records.
 
-Rules that this module owns: a file of a run is a regular one of a bearable size. No link is followed below a run directory, which
-could lead to files of the reader's machine, and pipes and devices are not opened.
+Rule that this module owns: no link is followed below a run directory, which could lead to files of the reader's machine.
 """
 
 from __future__ import annotations
 
-import errno
 import os
 import re
-import stat
 from collections.abc import Iterable
 from pathlib import Path
-from typing import BinaryIO
 
 import msgspec
 
 from evopolicy_common.errors import ProtocolError
 from evopolicy_common.records.run_record import Artifacts, RunRecord, decode_run_record
+from evopolicy_common.regular_files import read_regular
 
 _SUBMIT = re.compile(r"submit_([0-9]{3,9})")
 
 
-MAX_BYTES = 64 << 20
-"""Limit of records, sources and logs, bytes."""
 RUN_JSON = "run.json"
 _PLACES = ("workspace/feedback", "checkpoints", "logs")
 """Folders of a run directory whose files are read, whatever `run.json` names."""
-
-
-def open_regular(path: Path | str, dir_fd: int | None = None) -> BinaryIO:
-    """Opens a file that others wrote. Raises OSError for anything but a regular file: to open a pipe would wait for its writer
-    forever, and a link may lead anywhere. Links among the folders on the way are the caller's."""
-    try:
-        fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW | os.O_CLOEXEC, dir_fd=dir_fd)
-    except OSError as error:
-        if error.errno == errno.ELOOP:
-            raise OSError(errno.ELOOP, "a link; put the file itself in its place", str(path)) from error
-        raise
-    if not stat.S_ISREG(os.fstat(fd).st_mode):
-        os.close(fd)
-        raise OSError(errno.EINVAL, "not a regular file", str(path))
-    return os.fdopen(fd, "rb")
-
-
-def read_regular(path: Path, most: int = MAX_BYTES) -> bytes:
-    """The bytes of a file that others wrote. Raises OSError as `open_regular`, and for one of more than `most` bytes."""
-    with open_regular(path) as file:
-        # The file may have holes, and may grow while it is read.
-        size = os.fstat(file.fileno()).st_size
-        data = file.read(size + 1) if size <= most else b""
-        if len(data) > size:
-            data += file.read(most + 1 - len(data))
-    if max(size, len(data)) > most:
-        raise OSError(errno.EFBIG, f"larger than {most >> 20} MiB, which no run has", str(path))
-    return data
 
 
 def read_record(folder: Path) -> RunRecord:

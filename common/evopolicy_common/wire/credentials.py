@@ -23,6 +23,7 @@ import msgspec
 
 from evopolicy_common.errors import DECODE_ERRORS, ConfigError
 from evopolicy_common.records.blobs import digest_of, write_atomically
+from evopolicy_common.regular_files import read_given
 
 Role = Literal["worker", "gateway", "operator"]
 MachineRole = Literal["worker", "gateway", "operator", "router"]
@@ -64,6 +65,8 @@ def local_state_dir() -> Path:
     return state_home() / "local"
 
 
+_MOST_BYTES = 1 << 20
+"""Of a credentials file or a key."""
 SWEEP_STATE = ".cluster"
 """The state folder of `evopolicy suite --local`, in the sweep's folder."""
 
@@ -184,15 +187,10 @@ def find(role: Role, connect: tuple[str, ...] = (), file: Path | None = None) ->
 
 
 def _read_private(path: Path) -> bytes:
-    try:
-        mode = path.stat().st_mode
-        data = path.read_bytes()
-    except OSError as error:
-        raise ConfigError(f"cannot read credentials {path}: {error.strerror}") from error
-    if stat.S_IMODE(mode) & 0o077:
-        raise ConfigError(
-            f"credentials {path} may be read by others (mode {stat.S_IMODE(mode):04o}): chmod 600 it"
-        )
+    data = read_given(path, f"credentials {path}", _MOST_BYTES)
+    mode = stat.S_IMODE(path.stat().st_mode)
+    if mode & 0o077:
+        raise ConfigError(f"credentials {path} may be read by others (mode {mode:04o}): chmod 600 it")
     return data
 
 

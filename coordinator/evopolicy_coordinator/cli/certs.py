@@ -116,13 +116,14 @@ def issue(
     """
     with fail_on_our_errors():
         root = state or default_state_dir()
+        usual = first_endpoint(root)  # first: it makes no folder of a wrong --state
         folder = out or Path(f"{role}-{name}")
         made = machines.issue(
             root,
             cluster_of(root, None),
             role,
             name,
-            tuple(connect or ()) or (first_endpoint(root),),
+            tuple(connect or ()) or (usual,),
             folder,
             _now(),
             days,

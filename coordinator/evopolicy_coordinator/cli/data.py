@@ -19,8 +19,12 @@ from evopolicy_common.commands import App
 from evopolicy_common.console import table, terminal
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.environment import Split
+from evopolicy_common.messages.run_settings import MAX_HIDDEN
 from evopolicy_common.terminal import say, say_json
 from evopolicy_coordinator import splits
+
+MAX_TRAIN = 1_000_000
+"""As many as `--cases` can name."""
 
 app = App(
     name="data",
@@ -43,9 +47,15 @@ def make(
             " are not stored.",
         ),
     ] = None,
-    train: Annotated[int | None, typer.Option(min=1, help="Train cases [the suite's number].")] = None,
-    valid: Annotated[int | None, typer.Option(min=1, help="Validation cases [the suite's number].")] = None,
-    heldout: Annotated[int | None, typer.Option(min=1, help="Held-out cases [the suite's number].")] = None,
+    train: Annotated[
+        int | None, typer.Option(min=1, max=MAX_TRAIN, help="Train cases [the suite's number].")
+    ] = None,
+    valid: Annotated[
+        int | None, typer.Option(min=1, max=MAX_HIDDEN, help="Validation cases [the suite's number].")
+    ] = None,
+    heldout: Annotated[
+        int | None, typer.Option(min=1, max=MAX_HIDDEN, help="Held-out cases [the suite's number].")
+    ] = None,
     force: Annotated[bool, typer.Option("--force", help="Overwrite files that differ.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print what was written as JSON.")] = False,
 ) -> None:

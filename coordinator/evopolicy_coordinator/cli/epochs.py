@@ -120,6 +120,8 @@ def countersign(
     with fail_on_our_errors():
         if not root.is_dir():
             raise ConfigError(f"--state {root}: no such state folder")
+        if out.exists():
+            raise ConfigError(f"--out {out} is there already; name a new file")
         at = round(time.time(), 3)
         key, signature = sign(root, head_digest(head.lower(), at), HEAD)
         signed = Countersignature(head=head.lower(), at=at, key=key, signature=signature)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import signal
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -12,7 +13,8 @@ import typer
 
 from evopolicy_common.cli import fail_on_our_errors, setup_logging
 from evopolicy_common.commands import App, Version, run_app
-from evopolicy_common.records.blobs import write_atomically
+from evopolicy_common.processes.packages import checked_names
+from evopolicy_common.records.blobs import announcing
 from evopolicy_common.terminal import say, say_json
 from evopolicy_common.wire.credentials import default_state_dir
 from evopolicy_common.wire.ready import Ready
@@ -160,7 +162,7 @@ def serve(
             listen=tuple(listen or ()),
             insecure_tcp=insecure_tcp,
             cluster=cluster,
-            allowed_packages=tuple(allow_package or ()),
+            allowed_packages=checked_names(allow_package),
             unjailed=unjailed_agents,
             trust_workers=trust_workers,
             core=CoreSettings(
@@ -171,11 +173,8 @@ def serve(
             ),
             metrics=metrics,
         )
-        try:
-            asyncio.run(_run(options, ready_file))
-        finally:
-            if ready_file is not None:
-                ready_file.unlink(missing_ok=True)
+        with announcing(ready_file) as announce:
+            asyncio.run(_run(options, announce))
 
 
 @app.command(epilog="Example: evopolicy-coordinator backup /backup/monday --state /var/lib/evopolicy")
@@ -201,7 +200,7 @@ def backup(
         say(f"{copied.path}: database and {copied.blobs:,} blobs, {copied.bytes:,} bytes")
 
 
-async def _run(options: Options, ready_file: Path | None) -> None:
+async def _run(options: Options, announce: Callable[[bytes], None]) -> None:
     stop = asyncio.Event()
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
@@ -209,8 +208,7 @@ async def _run(options: Options, ready_file: Path | None) -> None:
 
     def on_ready(ready: Ready) -> None:
         say(_ready_line(ready))
-        if ready_file is not None:
-            write_atomically(ready_file, msgspec.json.format(msgspec.json.encode(ready)) + b"\n", mode=0o600)
+        announce(msgspec.json.format(msgspec.json.encode(ready)) + b"\n")
 
     await process.run(options, stop, on_ready)
 

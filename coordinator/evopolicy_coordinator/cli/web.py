@@ -9,6 +9,7 @@ import asyncio
 import contextlib
 import ipaddress
 import ssl
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -19,7 +20,8 @@ from evopolicy_common.cli import Connect, CredentialsFile, end_on_sigterm, fail_
 from evopolicy_common.commands import App
 from evopolicy_common.errors import ConfigError, EvopolicyError
 from evopolicy_common.processes.preflight import check_writable
-from evopolicy_common.records.blobs import write_atomically
+from evopolicy_common.records.blobs import announcing
+from evopolicy_common.regular_files import read_given
 from evopolicy_common.terminal import say
 from evopolicy_common.wire import credentials, transport
 from evopolicy_common.wire.credentials import Credentials
@@ -127,16 +129,14 @@ def web(
             named=bool(connect or file),
             report=report,
             book=book,
-            url_file=url_file,
         )
-        try:
-            asyncio.run(_serve(address, view))
-        finally:
-            if url_file is not None:
-                url_file.unlink(missing_ok=True)
+        with announcing(url_file) as announce:
+            asyncio.run(_serve(address, view, announce))
 
 
 def _check_certificate(certificate: Path, key: Path) -> None:
+    for option, path in (("--tls-certificate", certificate), ("--tls-key", key)):
+        read_given(path, f"{option} {path}")
     try:
         ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(certificate, key)
     except OSError as error:
@@ -158,10 +158,9 @@ class _Order:
     """The cluster was named: without it nothing hidden is shown."""
     report: Path | None
     book: Path | None
-    url_file: Path | None
 
 
-async def _serve(address: Address, order: _Order) -> None:
+async def _serve(address: Address, order: _Order, announce: Callable[[bytes], None]) -> None:
     from evopolicy_coordinator.web.access import Access
     from evopolicy_coordinator.web.app import Site, listen, serve
 
@@ -188,8 +187,7 @@ async def _serve(address: Address, order: _Order) -> None:
         base = f"{scheme}://{shown}:{port}/login#token="
 
         def ready() -> None:
-            if order.url_file is not None:
-                write_atomically(order.url_file, (base + order.tokens.read).encode(), mode=0o600)
+            announce((base + order.tokens.read).encode())
             say(f"view: {base}{order.tokens.read}")
             if order.book is not None:
                 say(f"view and act: {base}{order.tokens.act}")

@@ -154,6 +154,7 @@ def init(
 
     A new authority invalidates and removes all machines of the old one.
     """
+    (state / "certs").mkdir(mode=0o700, exist_ok=True)
     with _changing(state) as folder:
         kept = not anew and (folder / "ca-key.pem").exists()
         authority = _authority(folder) if kept else certs.make_authority(cluster, now)
@@ -286,7 +287,10 @@ def _make_folder(out: Path, again: bool) -> None:
 def _changing(state: Path) -> Iterator[Path]:
     """The folder of certificates, locked for one command at a time."""
     folder = state / "certs"
-    folder.mkdir(mode=0o700, exist_ok=True)
+    if not folder.is_dir():
+        raise ConfigError(
+            f"{state} has no certificates yet: evopolicy-coordinator certs init --state {state}"
+        )
     fd = os.open(folder / "lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
     try:
         fcntl.flock(fd, fcntl.LOCK_EX)

@@ -18,6 +18,7 @@ from types import TracebackType
 from typing import BinaryIO
 
 from evopolicy_common.errors import ProtocolError
+from evopolicy_common.regular_files import open_regular
 
 MAX_BYTES = (1 << 32) - (1 << 20)
 MAX_FILES = 65_000
@@ -52,7 +53,7 @@ class Archive:
 
     def __init__(self, path: Path) -> None:
         """ProtocolError naming the first thing that is not as it should be; OSError when the file cannot be read."""
-        self._file: BinaryIO = path.open("rb")
+        self._file: BinaryIO = open_regular(path, links=True)
         try:
             self._places = _places(self._file)
         except BaseException:

@@ -27,8 +27,9 @@ from evopolicy_common.records.episodes.rendered import decode
 from evopolicy_common.records.episodes.trajectory import Recorder, Trajectory
 from evopolicy_common.records.journal import Result, SubmitResult
 from evopolicy_common.records.policies.checkpoints import bundle_of
-from evopolicy_common.records.run_files import read_record, read_regular, run_folders
+from evopolicy_common.records.run_files import read_record, run_folders
 from evopolicy_common.records.run_record import RunRecord, encode_run_record
+from evopolicy_common.regular_files import read_regular
 from evopolicy_common.wire.operator_client import TIMEOUT_S, OperatorClient
 from evopolicy_common.wire.transport import Link
 from evopolicy_coordinator.publish import contents, scrub

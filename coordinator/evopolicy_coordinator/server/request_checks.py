@@ -19,10 +19,6 @@ from evopolicy_common.wire import codec, keys
 from evopolicy_common.wire.refusals import Refusal
 
 MAX_COUNT = 2**31 - 1
-MAX_BUDGET = 20_000
-MAX_EPISODES_PER_SUBMIT = 10_000
-MAX_HIDDEN = 10_000
-"""Validation or held-out cases of a run. The report of a finished run must fit into one message."""
 MAX_JOB_BYTES = 8 << 20
 MAX_AGENT_BYTES = 256 << 10
 MAX_REASON = 200
@@ -55,23 +51,6 @@ def check_limits(limits: ResourceLimits) -> None:
             raise RefusedError(
                 Refusal.INVALID_SETTINGS, f"limit {name} is {value}; it must be above 0 and at most {most:,}"
             )
-
-
-def check_counts(budget: int, least: int, most: int, n_validation: int | None, n_heldout: int | None) -> None:
-    """Checks the episode counts of a run."""
-    if not 1 <= least <= most:
-        raise RefusedError(
-            Refusal.INVALID_SETTINGS,
-            f"budget {budget} and {least} to {most} episodes a submit contradict each other; all must be at least 1",
-        )
-    for what, n, limit in (
-        ("a budget", budget, MAX_BUDGET),
-        ("submits", most, MAX_EPISODES_PER_SUBMIT),
-        ("validation", n_validation or 0, MAX_HIDDEN),
-        ("held-out", n_heldout or 0, MAX_HIDDEN),
-    ):
-        if n > limit:
-            raise RefusedError(Refusal.INVALID_SETTINGS, f"{what} of {n:,} episodes; {limit:,} are the limit")
 
 
 def check_job(cases: Sequence[Case], n: int) -> None:

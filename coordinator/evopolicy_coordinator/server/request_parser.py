@@ -21,7 +21,13 @@ from evopolicy_common.errors import ConfigError, ProtocolError, RefusedError
 from evopolicy_common.messages import gateway, operator, worker
 from evopolicy_common.messages.environment import Split, StepLimit
 from evopolicy_common.messages.episode import BlobRef
-from evopolicy_common.messages.run_settings import PUBLISHED_TRAIN, RunSettings, off_profile
+from evopolicy_common.messages.run_settings import (
+    MAX_EPISODES_PER_SUBMIT,
+    PUBLISHED_TRAIN,
+    RunSettings,
+    episode_counts,
+    off_profile,
+)
 from evopolicy_common.messages.worker import BlobGet, BlobPut, Message
 from evopolicy_common.records.blobs import BlobStore, is_digest
 from evopolicy_common.records.journal import SALT_BYTES
@@ -36,11 +42,9 @@ from evopolicy_coordinator.pki.machines import Machines
 from evopolicy_coordinator.server.definitions import Definitions
 from evopolicy_coordinator.server.request_checks import (
     MAX_COUNT,
-    MAX_EPISODES_PER_SUBMIT,
     MAX_REASON,
     bounded_agent,
     check_begun,
-    check_counts,
     check_idempotency_key,
     check_inline,
     check_job,
@@ -309,10 +313,7 @@ class RequestParser:
         check_limits(wanted.limits)
         try:
             suite = catalogue.suite_of(wanted.env)
-            budget = suite.budget if wanted.budget is None else wanted.budget
-            least = _or(wanted.min_episodes_per_submit, suite.min_episodes_per_submit)
-            most = min(_or(wanted.max_episodes_per_submit, suite.max_episodes_per_submit), budget)
-            check_counts(budget, least, most, wanted.n_validation, wanted.n_heldout)
+            budget, least, most = episode_counts(wanted, suite)
             self._check_profile(wanted)
             cases = self._source.splits(
                 suite.name,

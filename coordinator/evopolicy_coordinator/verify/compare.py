@@ -32,7 +32,7 @@ from evopolicy_common.records.episodes.rendered import (
     files_of,
 )
 from evopolicy_common.records.episodes.trajectory import Recorder, Trajectory
-from evopolicy_common.records.run_files import read_regular
+from evopolicy_common.regular_files import read_regular
 
 _NAMES = {"NaN": float("nan"), "Inf": float("inf"), "-Inf": float("-inf")}
 _MARKS = frozenset({"policy_failed"})

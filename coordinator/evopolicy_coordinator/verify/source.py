@@ -15,9 +15,10 @@ from evopolicy_common.errors import ConfigError, ProtocolError
 from evopolicy_common.messages.environment import Split
 from evopolicy_common.records.aggregates import mean
 from evopolicy_common.records.policies.checkpoints import CheckpointMeta, read_meta
-from evopolicy_common.records.run_files import RUN_JSON, read_record, read_regular, submit_folders
+from evopolicy_common.records.run_files import RUN_JSON, read_record, submit_folders
 from evopolicy_common.records.run_record import RunRecord
 from evopolicy_common.records.summary import Summary, decode_summary
+from evopolicy_common.regular_files import read_regular
 
 RANDOM = -1
 """Submit index of the random reference."""

@@ -29,6 +29,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from evopolicy_common.errors import DECODE_ERRORS, ConfigError
 from evopolicy_common.records.blobs import write_atomically
+from evopolicy_common.regular_files import read_given
 
 Role = Literal["read", "act"]
 
@@ -70,7 +71,7 @@ def kept_tokens(path: Path) -> Tokens:
     try:
         if path.stat().st_mode & 0o077:
             raise ConfigError(f"--token-file {path} may be read by others: chmod 600 it")
-        found = msgspec.json.decode(path.read_bytes(), type=Tokens)
+        found = msgspec.json.decode(read_given(path, f"--token-file {path}"), type=Tokens)
     except FileNotFoundError:
         found = Tokens.drawn()
         write_atomically(path, msgspec.json.encode(found), mode=0o600)

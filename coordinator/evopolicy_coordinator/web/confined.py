@@ -11,7 +11,7 @@ import stat
 from pathlib import Path
 from typing import NamedTuple
 
-from evopolicy_common.records.run_files import open_regular
+from evopolicy_common.regular_files import open_regular
 
 _MAX_DEPTH = 64
 _MAX_NAMES = 5000

@@ -22,10 +22,11 @@ import msgspec
 from evopolicy_common.errors import DECODE_ERRORS, ProtocolError
 from evopolicy_common.messages.run_settings import RunSettings
 from evopolicy_common.messages.status import RunStatus
-from evopolicy_common.records.run_files import RUN_JSON, read_record, read_regular
+from evopolicy_common.records.run_files import RUN_JSON, read_record
 from evopolicy_common.records.run_record import RunRecord
 from evopolicy_common.records.suite_folder import INDEX, PAUSED, Entry, Index
 from evopolicy_common.records.summary import Summary, decode_summary
+from evopolicy_common.regular_files import read_regular
 from evopolicy_coordinator.analysis.reading.reader import find_run_dirs
 from evopolicy_coordinator.analysis.scoring.scores import learn_names
 from evopolicy_coordinator.web.confined import Confined, NotThereError

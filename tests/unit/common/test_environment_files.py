@@ -146,16 +146,16 @@ def test_a_task_text_comes_from_an_ordinary_file_in_the_folder(tmp_path: Path) -
         str(tmp_path / "secret"): outside,
         "link.md": outside,
         "away/secret": outside,
-        "pipe": "is not an ordinary file",
-        ".": "is not an ordinary file",
-        "long.md": "is longer than 1,048,576 bytes",
+        "pipe": "not a regular file",
+        ".": "not a regular file",
+        "long.md": "larger than 1,048,576 bytes",
         "latin.md": "is not UTF-8",
         "nul\\u0000": "cannot be read",
     }.items():
         (home / "env.toml").write_text(f'id = "acme/x"\ngymnasium_id = "a:B-v0"\ntask_file = "{name}"')
         with pytest.raises(ConfigError, match=f"environment acme/x: task_file .*{why}"):
             read_file(home / "env.toml")
-    with pytest.raises(ConfigError, match="is not an ordinary file"):
+    with pytest.raises(ConfigError, match="not a regular file"):
         read_file(home / "pipe")
     (home / "texts").mkdir()
     (home / "texts" / "x.md").write_text("# X")

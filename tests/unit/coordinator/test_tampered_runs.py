@@ -28,8 +28,9 @@ from evopolicy._exports import tables, tracking, transcripts
 from evopolicy_common.errors import ConfigError, EvopolicyError, ProtocolError
 from evopolicy_common.records.episodes.npz import read_arrays
 from evopolicy_common.records.run_difference import differences
-from evopolicy_common.records.run_files import read_regular, submit_folders
+from evopolicy_common.records.run_files import submit_folders
 from evopolicy_common.records.run_record import encode_run_record
+from evopolicy_common.regular_files import read_regular
 from evopolicy_coordinator.analysis.reading import published
 from evopolicy_coordinator.analysis.reading.reader import load_runs
 from evopolicy_coordinator.publish.collect import find_runs
@@ -320,7 +321,7 @@ def test_an_error_names_the_file_the_reason_and_the_remedy(tmp_path: Path) -> No
     for name, make, reason in (
         ("link", lambda path: path.symlink_to("/etc/passwd"), "put the file itself in its place"),
         ("folder", Path.mkdir, "not a regular file"),
-        ("large", lambda path: [path.touch(), _sparse(path)], "larger than 64 MiB"),
+        ("large", lambda path: [path.touch(), _sparse(path)], "larger than 67,108,864 bytes"),
     ):
         make(tmp_path / name)  # type: ignore[operator]
         with pytest.raises(OSError, match=reason) as caught:

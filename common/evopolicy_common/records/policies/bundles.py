@@ -8,16 +8,21 @@ accepts plain relative paths only.
 
 from __future__ import annotations
 
+import functools
 import itertools
 import os
 import stat
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from pathlib import Path, PurePosixPath
+from typing import TypeVar
 
 import msgspec
 
 from evopolicy_common.errors import DECODE_ERRORS, BundleError
 from evopolicy_common.records.blobs import digest_of
+from evopolicy_common.regular_files import open_regular
+
+T = TypeVar("T")
 
 MAX_FILES = 2000
 MAX_ENTRIES = 5000
@@ -130,7 +135,9 @@ class _Reader:
             mode = os.stat(name, dir_fd=fd, follow_symlinks=False).st_mode
             if stat.S_ISDIR(mode):
                 if name not in IGNORED_FOLDERS:
-                    child = _open(name, fd, path, os.O_DIRECTORY)
+                    # O_NOFOLLOW: a hostile agent may replace the entry with a link between the stat and the open.
+                    flags = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
+                    child = _opened(path, functools.partial(os.open, name, flags, dir_fd=fd))
                     try:
                         self.collect(child, path)
                     finally:
@@ -145,13 +152,8 @@ class _Reader:
     def _read(self, name: str, folder_fd: int, path: PurePosixPath) -> BundleFile:
         if len(self.files) >= MAX_FILES:
             raise BundleError(f"system/ holds more than {MAX_FILES} files; pack data into fewer")
-        fd = _open(name, folder_fd, path, os.O_NONBLOCK)
-        with os.fdopen(fd, "rb") as file:
+        with _opened(path, functools.partial(open_regular, name, folder_fd)) as file:
             info = os.fstat(file.fileno())
-            if not stat.S_ISREG(info.st_mode):
-                raise BundleError(
-                    f"{path} is a {_kind(info.st_mode)}; system/ may hold regular files and folders only"
-                )
             if info.st_nlink > 1:
                 raise BundleError(f"{path} is a hard link to another file; copy the file instead")
             data = file.read(self._left + 1) if info.st_size <= self._left else b""
@@ -165,10 +167,9 @@ class _Reader:
         return BundleFile(_text(path), bool(info.st_mode & stat.S_IXUSR), data)
 
 
-def _open(name: str, folder_fd: int, path: PurePosixPath, flags: int) -> int:
-    # O_NOFOLLOW: a hostile agent may replace the entry with a link between the stat and the open.
+def _opened(path: PurePosixPath, opened: Callable[[], T]) -> T:
     try:
-        return os.open(name, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC | flags, dir_fd=folder_fd)
+        return opened()
     except OSError as error:
         raise BundleError(
             f"{path} cannot be read: {error.strerror}; was it changed during the submit?"

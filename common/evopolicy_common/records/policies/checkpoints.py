@@ -19,7 +19,7 @@ from evopolicy_common.records.blobs import write_atomically
 from evopolicy_common.records.policies import bundles
 from evopolicy_common.records.policies.bundles import Bundle, BundleFile
 from evopolicy_common.records.policies.code_metrics import PUBLISHED_SCHEMA, CodeMetrics, code_metrics
-from evopolicy_common.records.run_files import read_regular
+from evopolicy_common.regular_files import read_regular
 from evopolicy_common.simulators import SIMULATORS
 
 META = "_meta.json"

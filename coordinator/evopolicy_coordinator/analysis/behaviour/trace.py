@@ -14,7 +14,7 @@ import msgspec
 
 from evopolicy_common.processes.left_files import left_files
 from evopolicy_common.records.policies.checkpoints import policy_folder
-from evopolicy_common.records.run_files import read_regular
+from evopolicy_common.regular_files import read_regular
 from evopolicy_coordinator.analysis.behaviour.edits import Transition, classify
 from evopolicy_coordinator.analysis.behaviour.line_diff import unified
 from evopolicy_coordinator.analysis.reading.agent_log import Evidence, LogReading, read_agent_log

@@ -27,7 +27,7 @@ import msgspec
 
 from evopolicy_common.errors import DECODE_ERRORS
 from evopolicy_common.records.json_lines import objects
-from evopolicy_common.records.run_files import open_regular
+from evopolicy_common.regular_files import open_regular
 from evopolicy_coordinator.analysis.reading.records import Submit
 
 MAX_LOG_BYTES = 64 << 20

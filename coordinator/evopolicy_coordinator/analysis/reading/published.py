@@ -18,7 +18,6 @@ from evopolicy_common import catalogue
 from evopolicy_common.errors import DECODE_ERRORS, ProtocolError
 from evopolicy_common.records.policies.checkpoints import read_meta
 from evopolicy_common.records.policies.code_metrics import PUBLISHED_SCHEMA
-from evopolicy_common.records.run_files import read_regular
 from evopolicy_common.records.run_record import (
     Agent,
     Artifacts,
@@ -28,6 +27,7 @@ from evopolicy_common.records.run_record import (
     Timing,
     Versions,
 )
+from evopolicy_common.regular_files import read_regular
 
 PUBLISHED = 0
 """`record_version` of a record that was read from the published software's files."""

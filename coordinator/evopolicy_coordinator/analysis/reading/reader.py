@@ -19,15 +19,10 @@ import msgspec
 from evopolicy_common.errors import ProtocolError
 from evopolicy_common.messages.bounds import check_plausible
 from evopolicy_common.records.policies.checkpoints import policy_folder, read_meta
-from evopolicy_common.records.run_files import (
-    RUN_JSON,
-    check_places,
-    read_regular,
-    run_folders,
-    submit_folders,
-)
+from evopolicy_common.records.run_files import RUN_JSON, check_places, run_folders, submit_folders
 from evopolicy_common.records.run_record import RunRecord, decode_run_record
 from evopolicy_common.records.summary import Summary, decode_summary
+from evopolicy_common.regular_files import read_regular
 from evopolicy_coordinator.analysis.behaviour.line_diff import n_changed
 from evopolicy_coordinator.analysis.behaviour.topology import describe
 from evopolicy_coordinator.analysis.reading import published

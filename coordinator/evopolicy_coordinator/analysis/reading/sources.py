@@ -15,7 +15,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from evopolicy_common.records.policies.code_metrics import parse
-from evopolicy_common.records.run_files import read_regular
+from evopolicy_common.regular_files import read_regular
 
 MAX_FILE_BYTES = 1 << 20
 """Larger Python files are not parsed: they are data in disguise, and would stall a report."""

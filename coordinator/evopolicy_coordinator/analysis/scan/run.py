@@ -10,7 +10,7 @@ import msgspec
 
 from evopolicy_common.errors import DECODE_ERRORS
 from evopolicy_common.processes.left_files import left_files
-from evopolicy_common.records.run_files import open_regular, read_regular
+from evopolicy_common.regular_files import open_regular, read_regular
 from evopolicy_coordinator.analysis.scan.code import code_signals
 from evopolicy_coordinator.analysis.scan.copies import copied_actions
 from evopolicy_coordinator.analysis.scan.log import log_signals

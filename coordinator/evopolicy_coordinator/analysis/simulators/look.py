@@ -17,7 +17,7 @@ from typing import Any
 import msgspec
 
 from evopolicy_common.processes.left_files import left_files
-from evopolicy_common.records.run_files import open_regular, read_regular
+from evopolicy_common.regular_files import open_regular, read_regular
 from evopolicy_coordinator.analysis.reading.sources import MAX_FILE_BYTES
 from evopolicy_coordinator.analysis.simulators.code import Code
 from evopolicy_coordinator.analysis.simulators.signs import FLAGGED, Kind, Sign, signs_of, with_numbers

@@ -21,6 +21,8 @@ from evopolicy_common.cli import Connect, CredentialsFile, end_on_sigterm, fail,
 from evopolicy_common.commands import App
 from evopolicy_common.console import table, terminal
 from evopolicy_common.errors import DECODE_ERRORS, ConfigError, ProtocolError
+from evopolicy_common.processes.packages import checked_names
+from evopolicy_common.regular_files import read_given
 from evopolicy_common.terminal import one_line, say, say_json
 from evopolicy_coordinator.cli.results.cluster import Local, State, where_of
 from evopolicy_coordinator.publish import replay as replays
@@ -160,10 +162,10 @@ def check(
     share, policy_share = _share("--replay", replay), _share("--policies", policies)
     if policy_package and policy_share is None:
         fail("--policy-package goes with --policies")
-    play_them = functools.partial(play_policies, packages=frozenset(policy_package or ()))
     noted = [_noted(each) for each in head or ()]
     drawn = random.SystemRandom().randrange(2**32) if seed is None else seed
     with fail_on_our_errors():
+        play_them = functools.partial(play_policies, packages=frozenset(checked_names(policy_package)))
         try:
             with Archive(file) as archive:
                 checked = rules.check(archive, identity or "", noted)
@@ -207,11 +209,9 @@ def _noted(text: str) -> str | Countersignature:
     if re.fullmatch(r"[0-9a-fA-F]{64}", text):
         return text.lower()
     try:
-        with Path(text).open("rb") as file:
-            return msgspec.json.decode(file.read(4096), type=Countersignature)
-    except (OSError, *DECODE_ERRORS) as error:
-        why = (error.strerror or str(error)) if isinstance(error, OSError) else str(error)
-        fail(f"--head {text!r} is neither 64 hexadecimal digits nor a countersignature's file: {why}")
+        return msgspec.json.decode(read_given(Path(text), "a file of that name", 4096), type=Countersignature)
+    except (ConfigError, *DECODE_ERRORS) as error:
+        fail(f"--head {text!r} is neither 64 hexadecimal digits nor a countersignature's file: {error}")
 
 
 def _share(option: str, text: str | None) -> float | None:

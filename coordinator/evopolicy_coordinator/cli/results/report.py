@@ -21,6 +21,7 @@ from evopolicy_common.console import terminal
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.processes.preflight import check_writable
 from evopolicy_common.records.rescores import is_name
+from evopolicy_common.regular_files import read_given
 from evopolicy_common.terminal import say, say_json, say_lines
 from evopolicy_coordinator.analysis.reading.comparability import REMEDIES, UNKNOWN_ISOLATION, MixedRunsError
 from evopolicy_coordinator.analysis.reading.reader import load_runs
@@ -171,8 +172,8 @@ def _study(
 
 def _read_table(path: Path) -> ScoreTable:
     try:
-        return read_score_csv(path.read_text(encoding="utf-8"), source=str(path))
-    except (OSError, UnicodeDecodeError) as error:
+        return read_score_csv(read_given(path, str(path)).decode(), source=str(path))
+    except UnicodeDecodeError as error:
         raise ConfigError(f"{path} cannot be read: {error}") from error
 
 
