@@ -85,9 +85,15 @@ def _hidden(
         elif not played:
             _end_overdue(state, reversal, step)
         return
-    known = [kernel for kernel in there if kernel.boot_id != EVERYWHERE]
-    barred = [kernel for kernel in known if conflicts.hidden_conflict(state, family, kernel)]
-    if played or not barred or any(kernel not in barred and _at_work(state, kernel) for kernel in known):
+    barred = []
+    for kernel in there:
+        if kernel.boot_id == EVERYWHERE:
+            continue
+        if conflicts.hidden_conflict(state, family, kernel):
+            barred.append(kernel)
+        elif _at_work(state, kernel):
+            return
+    if played or not barred:
         return
     kept_s = lane.kept_s[family] = lane.kept_s.get(family, 0.0) + passed_s
     if kept_s >= state.settings.hidden_wait_s:
