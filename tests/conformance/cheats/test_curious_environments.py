@@ -117,6 +117,7 @@ def test_text_in_info_is_passed_on_where_the_definition_declares_its_key(
     description, info = played(slots, tier, entries(project))
     assert info == {"near": 1.0, "steps": 1}
     assert set(description.info_left_out) == {"where", "phase"}
+    assert "'where', 'phase'; to pass them on, name their keys in info_strings" in description.notes()
     named, info = played(slots, tier, entries(project, info_strings=["phase"]))
     assert info == {"near": 1.0, "phase": "helped inside", "steps": 1}
     assert named.info_left_out == ("where",)

@@ -76,10 +76,10 @@ N_STOPS = 2
 
 def place(folder: Path) -> None:
     """The environment's package, and its cases."""
-    package, cases = folder / "package", folder / "data" / "acme_held"
-    package.mkdir()
-    cases.mkdir(parents=True)
-    source = HELD.format(train=CASES["train"], end=str(package / "end"))
+    package, told, cases = folder / "package", folder / "told", folder / "data" / "acme_held"
+    for each in (package, told, cases):
+        each.mkdir(parents=True)
+    source = HELD.format(train=CASES["train"], end=str(told / "end"))
     register = f"\ngymnasium.register({ENTRY.gymnasium_id.partition(':')[2]!r}, Held)\n"
     (package / "held_env.py").write_text(source + register)
     for split, seed in CASES.items():
@@ -92,7 +92,8 @@ def actions_of(recording: bytes) -> list[float]:
 
 
 def slot_of(scratch: Path) -> Slot:
-    return Slot(None, "bwrap", scratch, definitions=(ENTRY,))
+    entry = msgspec.structs.replace(ENTRY, data=(str(scratch.parent / "told"),))
+    return Slot(None, "bwrap", scratch, definitions=(entry,))
 
 
 async def described(folder: Path) -> EnvironmentDescription:
@@ -198,7 +199,7 @@ def test_an_agent_that_stops_its_validation_again_and_again_gets_one_throw(
                 # An episode that has yet to go on repeats what it began, so the end lies beyond that.
                 furthest = max(len(actions) for attempts in thrown.values() for actions in attempts)
                 (tmp_path / "length").write_text(str(furthest + 3))
-                (tmp_path / "length").rename(tmp_path / "package" / "end")
+                (tmp_path / "length").rename(tmp_path / "told" / "end")
                 await gateway.close()
             finished = await operator.finished(created.run)
             worker.drain()

@@ -130,7 +130,7 @@ def _not_shown(error: BaseException, text: str) -> str:
     for folder in own_folders if isinstance(error, OSError | ValueError) else ():
         found = re.search(rf"{re.escape(folder)}/([^'\"\n]+)", text)
         if found is not None and not os.path.exists(found[0]):
-            return f"; {found[1]} is not shown to the environment: if it exists, declare it in data of its environment file"
+            return f"; {found[1]} is not shown to the environment: if it exists, declare it in data of an environment file"
     if isinstance(error, ModuleNotFoundError) and own_folders:
         return f"; if {error.name} is a folder on PYTHONPATH, it needs an __init__.py to be shown"
     return ""
