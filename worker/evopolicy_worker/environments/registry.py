@@ -86,7 +86,7 @@ def describe(env_id: str) -> EnvironmentDescription:
     left_out, found = tuple(foreign.left_out.get(env_id, ())), _entry(env_id)
     if found.success in left_out:
         raise WorkerError(
-            f"environment {env_id}, info[{found.success!r}]: it is a text; success is true or false"
+            f"environment {env_id}, step, info[{found.success!r}]: it is a text; success is true or false"
         )
     told = {"info_strings": list(found.info_strings)} if found.info_strings else {}
     description = msgspec.structs.replace(

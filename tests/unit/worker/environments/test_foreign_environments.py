@@ -212,7 +212,7 @@ def test_an_observation_is_not_turned_into_one_of_its_space(what: str, why: str)
 
 def test_a_success_that_is_no_truth_value_is_refused() -> None:
     with pytest.raises(
-        WorkerError, match=r"acme/Bad, step 0, info\['near'\]: it is 'no' \(str\); success is true or"
+        WorkerError, match=r"acme/Bad, step, info\['near'\]: it is a text; success is true or"
     ):
         describe(defined("Bad", kwargs={"how": "success in words"}, success="near"))
     assert [solved(each) for each in (True, 0.0, [1], [0.0], [], [1, 1], "False", {}, math.nan)] == [

@@ -28,7 +28,7 @@ _PAGES = "evopolicy_worker.environments.browser.registered"
 """Registers pages with options of one's own."""
 
 left_out: dict[str, dict[str, None]] = {}
-"""By id, the keys of `info` whose texts were left out in this process, the first `_MAX_NAMED`."""
+"""By id, the keys of `info` whose texts were left out since it was last made for a description or a job, the first `_MAX_NAMED`."""
 
 
 class ForeignFamily(GymnasiumFamily):
@@ -41,7 +41,7 @@ class ForeignFamily(GymnasiumFamily):
         name = entry.gymnasium_id or ""
         self._module = name.partition(":")[0] if ":" in name else ""
         self._told = frozenset(entry.info_strings)
-        self._left_out = left_out.setdefault(entry.id, {})
+        self._left_out = left_out[entry.id] = {}
 
     def installed(self) -> bool:
         return super().installed() and (not self._module or _package(self._module) is not None)
