@@ -38,7 +38,7 @@ from evopolicy_coordinator.leaderboard.bundles import LabBundle, LabRun
 from evopolicy_coordinator.leaderboard.compare import Board, boards
 from evopolicy_coordinator.publish.findings import KINDS
 
-_SHOWN = ("leaderboard", "heldout", "cells", "pairs", "resolution")
+_SHOWN = ("leaderboard", "incomplete", "heldout", "cells", "pairs", "resolution")
 """Tables on the front page, by the first part of their names."""
 _FOLDED = ("cells", "pairs")
 _WORDS = {"ok": "ok", "open": "open", "failed": "FAILED", "": "–"}

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Mapping
+from statistics import NormalDist
 
 import msgspec
 import numpy as np
@@ -11,8 +13,9 @@ from numpy.typing import NDArray
 
 from evopolicy_coordinator.analysis.scoring.normalised import Scale
 from evopolicy_coordinator.analysis.statistics.aggregates import aggregates
-from evopolicy_coordinator.analysis.statistics.intervals import difference
+from evopolicy_coordinator.analysis.statistics.intervals import difference, mean, of_runs
 from evopolicy_coordinator.analysis.statistics.pairs import pairs
+from evopolicy_coordinator.analysis.statistics.repeats import Spread, half_width, repeats_needed
 from evopolicy_coordinator.analysis.statistics.resampling import RESAMPLES
 from evopolicy_coordinator.analysis.statistics.samples import RunReturns, Sample
 from evopolicy_coordinator.analysis.statistics.standings import standings
@@ -163,20 +166,71 @@ def run_coverage(
     return coverage(lambda g: runs_of(kind, g, n_runs, n_cases), trials, seed=seed, resamples=resamples)
 
 
-def suite_samples(g: Generator, means: Floats, n_runs: int, n_cases: int) -> dict[tuple[str, str], Sample]:
-    """Samples of a suite; `means` is environments × entries, noise by case has variance 1, by run 0.04."""
-    found: dict[tuple[str, str], Sample] = {}
-    for place, row in enumerate(means):
-        env, case = f"env-{place:02d}", g.normal(0, 1, n_cases)
-        for number, mean in enumerate(row):
-            spread = 0.2 * g.normal(size=(n_runs, 1)) if n_runs > 1 else 0.0
-            returns = mean + case + spread + g.normal(size=(n_runs, n_cases))
-            runs = tuple(
+class World(msgspec.Struct, frozen=True, kw_only=True):
+    """Suites of entries whose means are equal unless `spread` is above 0. Noise by case has variance 1."""
+
+    n_runs: tuple[int, ...] = (4,)
+    """Of each entry; repeated."""
+    interaction: float = 0.0
+    """Standard deviation of agent × case: a deviation of one agent on one case, common to its runs."""
+    run: float = 0.2
+    """Standard deviation between runs of an agent; 0 for entries of one run, whose checkpoints are compared."""
+    noise: tuple[float, ...] = (1.0,)
+    """Factor of an entry's deviations by run and episode; repeated."""
+    spread: float = 0.0
+    """Standard deviation of the entries' true means; half of it varies by environment."""
+    n_entries: int = 4
+    n_environments: int = 8
+    n_cases: int = 32
+    shape: str = "normal"
+    """`normal`, `skewed` (exponential), or `0/1` (thresholds at the normal values)."""
+
+    @property
+    def names(self) -> list[str]:
+        return [f"entry-{i:02d}" for i in range(self.n_entries)]
+
+    @property
+    def environments(self) -> list[str]:
+        return [f"env-{i:02d}" for i in range(self.n_environments)]
+
+    def means(self, g: Generator) -> Floats:
+        """Environments × entries."""
+        size = (self.n_environments, self.n_entries)
+        return g.normal(0, self.spread, self.n_entries) + g.normal(0, 0.5 * self.spread, size)
+
+    def returns(self, g: Generator, means: Floats) -> dict[tuple[str, str], Floats]:
+        """Matrices runs × cases by (entry, env)."""
+
+        def drawn(*size: int) -> Floats:
+            found: Floats = g.exponential(1, size) - 1.0 if self.shape == "skewed" else g.normal(size=size)
+            return found
+
+        found = {}
+        for env, row in zip(self.environments, means, strict=True):
+            case = g.normal(0, 1, self.n_cases)
+            for number, (name, level) in enumerate(zip(self.names, row, strict=True)):
+                n = self.n_runs[number % len(self.n_runs)]
+                noise = self.noise[number % len(self.noise)]
+                own = noise * (self.run * drawn(n, 1) * (n > 1) + drawn(n, self.n_cases))
+                found[name, env] = level + case + self.interaction * drawn(self.n_cases) + own
+                if self.shape == "0/1":
+                    found[name, env] = (found[name, env] > 0.0).astype(np.float64)
+        return found
+
+
+def suite_samples(returns: Mapping[tuple[str, str], Floats]) -> dict[tuple[str, str], Sample]:
+    """Samples of matrices runs × cases; runs of an environment share its cases."""
+    return {
+        (entry, env): Sample(
+            entry=entry,
+            env=env,
+            runs=tuple(
                 RunReturns(score=float(one.mean()), returns=tuple(one.tolist()), case_set=env)
-                for one in returns
-            )
-            found[f"entry-{number}", env] = Sample(entry=f"entry-{number}", env=env, runs=runs)
-    return found
+                for one in matrix
+            ),
+        )
+        for (entry, env), matrix in returns.items()
+    }
 
 
 def rank_scores(means: Floats) -> Floats:
@@ -184,6 +238,41 @@ def rank_scores(means: Floats) -> Floats:
     above = (means[..., None, :] > means[..., :, None]).sum(axis=-1)
     found: Floats = (1.0 - above / (means.shape[-1] - 1)).mean(axis=-2)
     return found
+
+
+class FalseGaps(msgspec.Struct, frozen=True, kw_only=True):
+    """Of simulated suites of equal entries."""
+
+    raw: Rate
+    """Pairs with an uncorrected p of at most 5 %."""
+    holm: Rate
+    """Suites in which the corrected p of some pair tells it apart."""
+    ties: Rate
+    """Suites in which tie groups tell some pair apart."""
+
+
+def false_gaps(world: World, trials: int, *, seed: int = 0) -> FalseGaps:
+    g = np.random.default_rng(seed)
+    raw = tests = wrong = split = 0
+    for _ in range(trials):
+        samples = suite_samples(world.returns(g, world.means(g)))
+        found = pairs(samples, world.names, world.environments, resamples=1000)
+        known = [pair.p for pair in found if pair.p is not None]
+        raw, tests = raw + sum(p <= 0.05 for p in known), tests + len(known)
+        wrong += any(pair.verdict in ("first", "second") for pair in found)
+        board = standings(samples, observed_scores(world, samples), world.environments, resamples=800)
+        split += any(not set(one.ties) & set(other.ties) for one in board.rows for other in board.rows)
+    return FalseGaps(
+        raw=Rate(held=raw, given=tests, trials=tests),
+        holm=Rate(held=wrong, given=trials, trials=trials),
+        ties=Rate(held=split, given=trials, trials=trials),
+    )
+
+
+def observed_scores(world: World, samples: Mapping[tuple[str, str], Sample]) -> dict[str, float]:
+    """Rank scores by entry."""
+    means = [[np.mean(samples[name, env].scores or ()) for name in world.names] for env in world.environments]
+    return dict(zip(world.names, rank_scores(np.array(means)).tolist(), strict=True))
 
 
 class RankRates(msgspec.Struct, frozen=True, kw_only=True):
@@ -199,105 +288,153 @@ class RankRates(msgspec.Struct, frozen=True, kw_only=True):
     """Share of the pairs with unequal average scores that are told apart."""
 
 
-def rank_rates(
-    spread: float,
-    trials: int,
-    *,
-    n_runs: int = 1,
-    n_entries: int = 5,
-    n_environments: int = 16,
-    n_cases: int = 32,
-    seed: int = 0,
-) -> RankRates:
-    """`spread`: standard deviation of the entries' true means, in standard deviations of a return; 0: all are equal."""
+def rank_rates(world: World, trials: int, *, seed: int = 0) -> RankRates:
     g = np.random.default_rng(seed)
-    names = [f"entry-{i}" for i in range(n_entries)]
+    n_runs, n_cases = world.n_runs[0], world.n_cases
     held = ranks_held = false_gaps = apart = unequal = 0
     for _ in range(trials):
-        level = g.normal(0, spread, n_entries)
-        means = level + g.normal(0, 0.5 * spread, (n_environments, n_entries))
-        noise = math.sqrt(1.0 / (n_runs * n_cases) + (0.04 / n_runs if n_runs > 1 else 0.0))
-        average = np.full(n_entries, 0.5)
-        if spread:
-            average = rank_scores(means + g.normal(0, noise, (2000, n_environments, n_entries))).mean(axis=0)
-        samples = suite_samples(g, means, n_runs, n_cases)
-        observed = rank_scores(
-            np.array(
-                [
-                    [np.mean(samples[name, f"env-{e:02d}"].scores) for name in names]
-                    for e in range(n_environments)
-                ]
-            )
+        means = world.means(g)
+        noise = (1.0 / n_runs + world.interaction**2) / n_cases + (
+            world.run**2 / n_runs if n_runs > 1 else 0.0
         )
-        environments = [f"env-{e:02d}" for e in range(n_environments)]
-        found = standings(
-            samples, dict(zip(names, observed.tolist(), strict=True)), environments, resamples=800
-        )
+        average = np.full(world.n_entries, 0.5)
+        if world.spread:
+            drawn = means + g.normal(0, math.sqrt(noise), (2000, *means.shape))
+            average = rank_scores(drawn).mean(axis=0)
+        samples = suite_samples(world.returns(g, means))
+        scores = observed_scores(world, samples)
+        found = standings(samples, scores, world.environments, resamples=800)
+        true = dict(zip(world.names, average.tolist(), strict=True))
+        rows = {row.entry: row for row in found.rows}
+        assert set(rows) == set(true)
         all_ranks = True
-        for name, true in zip(names, average, strict=True):
-            row = found.of(name)
-            assert row is not None
-            held += row.score_low - 1e-9 <= true <= row.score_high + 1e-9
-            rank = 1 + int((average > true + 1e-12).sum())
-            worst = n_entries - int((average < true - 1e-12).sum())
+        for name, row in rows.items():
+            held += row.score_low - 1e-9 <= true[name] <= row.score_high + 1e-9
+            rank = 1 + sum(other > true[name] + 1e-12 for other in true.values())
+            worst = len(true) - sum(other < true[name] - 1e-12 for other in true.values())
             all_ranks = all_ranks and row.rank_low <= worst and rank <= row.rank_high
         ranks_held += all_ranks
         wrong = False
-        for i in range(n_entries):
-            for j in range(n_entries):
-                one, other = found.of(names[i]), found.of(names[j])
-                assert one is not None
-                assert other is not None
-                distinguished = not set(one.ties) & set(other.ties) and observed[i] > observed[j]
-                unequal += average[i] > average[j]
-                apart += distinguished and average[i] > average[j]
-                wrong = wrong or (distinguished and average[i] <= average[j])
+        for one, other in itertools.permutations(world.names, 2):
+            distinguished = not set(rows[one].ties) & set(rows[other].ties) and scores[one] > scores[other]
+            unequal += true[one] > true[other]
+            apart += distinguished and true[one] > true[other]
+            wrong = wrong or (distinguished and true[one] <= true[other])
         false_gaps += wrong
     return RankRates(
-        score=Rate(held=held, given=trials * n_entries, trials=trials * n_entries),
+        score=Rate(held=held, given=trials * world.n_entries, trials=trials * world.n_entries),
         rank=Rate(held=ranks_held, given=trials, trials=trials),
         false_gap=Rate(held=false_gaps, given=trials, trials=trials),
         pairs_apart=apart / unequal if unequal else math.nan,
     )
 
 
-def false_gaps_by_holm(
-    n_runs: int, trials: int, *, n_entries: int = 4, n_environments: int = 8, seed: int = 0
-) -> Rate:
-    """How often suites of equal entries have any pair that the corrected tests tell apart."""
+def mean_coverage(n_runs: int, shape: str, trials: int, *, seed: int = 0) -> Rate:
+    """How often the interval of one entry's mean on 32 cases holds the true mean."""
     g = np.random.default_rng(seed)
-    names, environments = (
-        [f"entry-{i}" for i in range(n_entries)],
-        [f"env-{e:02d}" for e in range(n_environments)],
-    )
-    wrong = 0
+    world = World(n_runs=(n_runs,), interaction=0.5, n_entries=1, n_environments=1, shape=shape)
+    true = 0.5 if shape == "0/1" else 0.0
+    held = given = 0
     for _ in range(trials):
-        samples = suite_samples(g, np.zeros((n_environments, n_entries)), n_runs, 32)
-        wrong += any(
-            pair.verdict in ("first", "second") for pair in pairs(samples, names, environments, resamples=50)
-        )
-    return Rate(held=wrong, given=trials, trials=trials)
+        (returns,) = world.returns(g, np.zeros((1, 1))).values()
+        found = mean(returns)
+        if found.low is not None and found.high is not None:
+            given += 1
+            held += found.low <= true <= found.high
+    return Rate(held=held, given=given, trials=trials)
 
 
-def iqm_coverage(n_runs: int, trials: int, *, n_environments: int = 16, seed: int = 0) -> Rate:
-    """How often the interval of an IQM holds the IQM of infinitely many runs."""
+def welch_coverage(kind: str, n_runs: int, trials: int, *, seed: int = 0) -> Rate:
+    """How often the interval over runs with cases of their own holds the true gap of 0.5."""
     g = np.random.default_rng(seed)
-    levels = np.linspace(0.0, 1.0, n_environments)
-    many = np.sort((levels + 0.2 * np.random.default_rng(99).normal(size=(200_000, n_environments))).ravel())
-    true = float(many[len(many) // 4 : -(len(many) // 4)].mean())
     held = 0
     for _ in range(trials):
-        samples = {
-            ("A", f"env-{e:02d}"): Sample(
-                entry="A", env=f"env-{e:02d}",
-                runs=tuple(RunReturns(score=float(level + 0.2 * g.normal())) for _ in range(n_runs)),
-            )
-            for e, level in enumerate(levels)
-        }  # fmt: skip
-        scales = {env: Scale(random=0.0, best=1.0) for _, env in samples}
-        (found,), _ = aggregates(samples, ["A"], scales, resamples=1000)
-        assert found.iqm is not None
-        assert found.iqm.low is not None
-        assert found.iqm.high is not None
-        held += found.iqm.low <= true <= found.iqm.high
+        found = of_runs(_run_effects(kind, g, n_runs) + 0.5, 2.0 * _run_effects(kind, g, n_runs))
+        assert found.low is not None
+        assert found.high is not None
+        held += found.low <= 0.5 <= found.high
     return Rate(held=held, given=trials, trials=trials)
+
+
+class AggregateRates(msgspec.Struct, frozen=True, kw_only=True):
+    """Coverage of the true values with infinitely many runs and cases, on the true scale."""
+
+    iqm: Rate
+    """Of the agents below the best."""
+    profile: Rate
+    """Share of the lowest agent's runs above 0.5."""
+    improvement: Rate
+    """Of the lowest agent over the second."""
+
+
+def aggregate_rates(
+    n_runs: int, levels: tuple[float, ...], trials: int, *, n_environments: int = 16, seed: int = 0
+) -> AggregateRates:
+    """`levels`: true means of agents on each environment, the best last, in standard deviations of a return; random has
+    0. Runs vary with a standard deviation of 0.5."""
+    g, best, run = np.random.default_rng(seed), max(levels), 0.5
+    world = World(
+        n_runs=(n_runs,), interaction=0.3, run=run, n_entries=len(levels), n_environments=n_environments
+    )
+    held: dict[str, list[bool]] = {"iqm": [], "profile": [], "improvement": []}
+    phi = NormalDist().cdf
+    above = phi((levels[0] - 0.5 * best) / run)
+    better = phi((levels[0] - levels[1]) / (run * math.sqrt(2.0)))
+    for _ in range(trials):
+        returns = world.returns(g, np.tile(levels, (n_environments, 1)))
+        samples = suite_samples(returns)
+        scales = {}
+        for env in world.environments:
+            reference = g.normal(0, 0.5, (1, world.n_cases))
+            (fixed,) = suite_samples({("R", env): reference}).values()
+            samples["R", env] = msgspec.structs.replace(fixed, is_fixed=True)
+            scales[env] = Scale(
+                random=float(np.mean(fixed.scores or ())),
+                best=max(float(np.mean(samples[name, env].scores or ())) for name in world.names),
+            )
+        found, against = aggregates(samples, world.names, scales, resamples=600)
+        for level, one in zip(levels[:-1], found, strict=False):
+            if one.iqm is not None and one.iqm.low is not None and one.iqm.high is not None:
+                held["iqm"].append(one.iqm.low <= level / best <= one.iqm.high)
+        for name, bounded, true in (
+            ("profile", found[0].profile[10], above),
+            ("improvement", against[0].probability, better),
+        ):
+            if bounded.low is not None and bounded.high is not None:
+                held[name].append(bounded.low <= true <= bounded.high)
+    rates = {name: Rate(held=sum(one), given=len(one), trials=max(1, len(one))) for name, one in held.items()}
+    return AggregateRates(**rates)
+
+
+def resolved(n_runs: int, trials: int, *, level: float = 0.05, seed: int = 0) -> Rate:
+    """How often a true gap as large as the smallest difference of `n_runs` runs is resolved; for 0 runs, a gap of 1 with
+    the runs that it needs at `level`."""
+    g = np.random.default_rng(seed)
+    spread = Spread(run=0.5**2 + 1.0 / 32, case=2 * 0.5**2 / 32, n_cases=32)
+    if n_runs:
+        gap = half_width(spread, n_runs)
+    else:
+        gap, needed = 1.0, repeats_needed(spread, 1.0, level=level).n
+        assert needed is not None
+        n_runs = needed
+    held = 0
+    for _ in range(trials):
+        one, other, _ = runs_of("normal", g, n_runs, 32, gap)
+        found = difference(one, other)
+        held += found.p is not None and found.p <= level and found.value > 0.0
+    return Rate(held=held, given=trials, trials=trials)
+
+
+def optimism_rates(trials: int, *, n_submits: int = 10, seed: int = 0) -> tuple[Rate, Rate]:
+    """Of agents whose submits are all equally good: how often the mean optimism over 16 environments is above 0, and how
+    often its interval holds the true one."""
+    g = np.random.default_rng(seed)
+    true = float(np.random.default_rng(1).normal(0, 1, (200_000, n_submits)).max(axis=1).mean())
+    above = held = 0
+    for _ in range(trials):
+        found = of_runs((g.normal(0, 1, (16, n_submits)).max(axis=1) - g.normal(0, 1, 16)).tolist())
+        assert found.low is not None
+        assert found.high is not None
+        above += found.value > 0.0
+        held += found.low <= true <= found.high
+    return Rate(held=above, given=trials, trials=trials), Rate(held=held, given=trials, trials=trials)

@@ -30,12 +30,12 @@ def performance_profiles(suite: Suite, looks: Mapping[str, Look]) -> Plot | None
             )  # fmt: skip
             bounds = [
                 (share.low, share.high)
-                for share in one.profile
                 if share.low is not None and share.high is not None
+                else (share.value, share.value)
+                for share in one.profile
             ]
-            if len(bounds) == len(TAUS):
-                low, high = zip(*bounds, strict=True)
-                panel.fill_between(TAUS, low, high, color=look.colour, alpha=0.13, linewidth=0)
+            low, high = zip(*bounds, strict=True)
+            panel.fill_between(TAUS, low, high, color=look.colour, alpha=0.13, linewidth=0)
         panel.set_xlim(0.0, 1.0)
         panel.set_ylim(-0.02, 1.02)
         panel.set_xlabel("Normalised held-out score (0 = random, 1 = best agent's mean)")
@@ -45,7 +45,7 @@ def performance_profiles(suite: Suite, looks: Mapping[str, Look]) -> Plot | None
         name=f"profiles_{suite.name}",
         title=f"{suite_title(suite.name)} performance profiles",
         caption="Share of an agent's runs whose normalised score is above each value, over all environments with a scale; higher is better. "
-        "Bands: pointwise 95 % intervals of a stratified bootstrap over runs, or over cases where a cell has one run.",
+        "Bands: pointwise 95 % intervals of a stratified bootstrap over runs and their cases, or over the cases of single runs; none where resamples show no spread.",
         alt=f"Performance profiles of {len(found)} agents.",
         data=rows(found),
         figure=figure,

@@ -68,7 +68,7 @@ def rank_scores(suite: Suite, looks: Mapping[str, Look]) -> Plot | None:
         name=f"rank_scores_{suite.name}",
         title=f"{suite_title(suite.name)} rank scores",
         caption="Mean rank score over the suite and over each family of environments."
-        + (f" Thin bars: 95 % bootstrap interval over {resampled.over}." if resampled.rows else ""),
+        + (f" Thin bars: 95 % interval over {resampled.over}." if resampled.rows else ""),
         alt=f"Dot plot of rank scores, suite and {len(families)} families. Best: {first.entry}"
         + (f" at {first.score:.2f}." if first.score is not None else "."),
         data=rows(standings),
@@ -205,15 +205,17 @@ def normalised_performance(suite: Suite, looks: Mapping[str, Look]) -> Plot | No
                 ]
                 if not values:
                     continue
-                mean = groups[demand, agent].value or 0.0
-                panel.barh(place, mean, height=0.56, color=look.colour, alpha=0.35, linewidth=0)
-                panel.vlines(mean, place - 0.28, place + 0.28, color=look.colour, linewidth=2.0)
+                group = groups.get((demand, agent))
+                mean = None if group is None else group.value
+                if mean is not None:
+                    panel.barh(place, mean, height=0.56, color=look.colour, alpha=0.35, linewidth=0)
+                    panel.vlines(mean, place - 0.28, place + 0.28, color=look.colour, linewidth=2.0)
                 panel.plot(
                     values, [place] * len(values), look.marker, color=look.colour, markersize=4.2, alpha=0.8,
                     markeredgewidth=0, clip_on=False,
                 )  # fmt: skip
                 panel.annotate(
-                    f"{mean:.2f}",
+                    "incomplete" if mean is None else f"{mean:.2f}",
                     (1.0, place),
                     xytext=(9, 0),
                     textcoords="offset points",

@@ -107,14 +107,15 @@ def index_page(
             "leaderboard",
             "Leaderboard",
             figures=shown_figures(*(f"rank_scores_{s}" for s in suites)),
-            tables=[v for s in suites for v in shown_tables(f"leaderboard_{s}", f"heldout_{s}")]
+            tables=[v for s in suites for v in shown_tables(f"leaderboard_{s}", f"incomplete_{s}", f"heldout_{s}")]
             + [{**v, "folded": True} for s in suites for v in shown_tables(f"cells_{s}")],
         ),
         _section(
             "statistics",
             "Statistics",
             title="How sure the scores are",
-            texts=["Intervals are at 95 %. Each table says over what: the cases of one run, or runs and cases."],
+            texts=["Intervals are at 95 %. Each table says over what: the cases of one run, or runs and cases. No verdict contradicts the interval "
+                   "beside it; the correction for many pairs can only withhold one."],
             figures=shown_figures(*(f"profiles_{s}" for s in suites)),
             tables=[v for s in suites for v in shown_tables(f"resolution_{s}", f"aggregates_{s}", f"improvement_{s}")]
             + [{**v, "folded": True} for s in suites for v in shown_tables(f"pairs_{s}", f"generalisation_{s}")],

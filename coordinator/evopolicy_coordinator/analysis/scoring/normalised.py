@@ -32,8 +32,9 @@ class GroupMean(msgspec.Struct, frozen=True, kw_only=True):
     entry: str
     demand: str
     value: float | None
+    """None unless the agent has a value on each environment of the group that has a scale."""
     n_environments: int
-    """Number of averaged environments: those with a value."""
+    """Number of environments on which the agent has a value."""
 
 
 class Normalised(msgspec.Struct, frozen=True, kw_only=True):
@@ -83,11 +84,8 @@ def normalised(table: ScoreTable) -> Normalised:
     groups: list[GroupMean] = []
     for demand in DEMANDS:
         for entry in table.agents:
-            values = [
-                cell.value
-                for cell in cells.values()
-                if cell.entry == entry and demand_of(cell.env) == demand and cell.value is not None
-            ]
-            mean = fmean(values) if values else None
+            own = [cells.get((entry, env)) for env in scales if demand_of(env) == demand]
+            values = [cell.value for cell in own if cell is not None and cell.value is not None]
+            mean = fmean(values) if values and len(values) == len(own) else None
             groups.append(GroupMean(entry=entry, demand=demand, value=mean, n_environments=len(values)))
     return Normalised(cells=cells, groups=tuple(groups))

@@ -17,6 +17,16 @@ def normal_quantile(p: float) -> float:
     return NormalDist().inv_cdf(p)
 
 
+def normal_two_sided(z: float) -> float:
+    """P(|Z| ≥ z) of a standard normal Z, for z ≥ 0."""
+    return math.erfc(z / math.sqrt(2.0))
+
+
+def t_two_sided(t: float, df: float) -> float:
+    """P(|T| ≥ t) of Student's t, for t ≥ 0 and any `df` > 0."""
+    return normal_two_sided(t) if math.isinf(df) else 2.0 * _t_upper(t, df)
+
+
 @lru_cache(maxsize=65536)
 def t_quantile(p: float, df: float) -> float:
     """Quantile of Student's t for 0.5 ≤ p < 1 and any `df` > 0, to about 1e-10; infinite `df` gives the normal's.
@@ -29,15 +39,16 @@ def t_quantile(p: float, df: float) -> float:
         )
     if math.isinf(df):
         return normal_quantile(p)
-    low, high = 0.0, 1.0
-    while _t_upper(high, df) > 1.0 - p:
-        low, high = high, high * 2.0
+    # Newton's method from below: the tail is convex, so it never steps past the quantile.
+    log_scale = math.lgamma(0.5 * (df + 1.0)) - math.lgamma(0.5 * df) - 0.5 * math.log(df * math.pi)
+    t = normal_quantile(p)
     for _ in range(200):
-        middle = 0.5 * (low + high)
-        if high - low <= 1e-12 * high:
+        density = math.exp(log_scale - 0.5 * (df + 1.0) * math.log1p(t * t / df))
+        step = (_t_upper(t, df) - (1.0 - p)) / density
+        t += step
+        if abs(step) <= 1e-13 * t:
             break
-        low, high = (middle, high) if _t_upper(middle, df) > 1.0 - p else (low, middle)
-    return 0.5 * (low + high)
+    return t
 
 
 def _t_upper(t: float, df: float) -> float:

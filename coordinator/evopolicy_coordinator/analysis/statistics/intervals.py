@@ -1,23 +1,21 @@
-"""95 % intervals of means and of paired differences. `docs/explanation/statistics.md` has the measured coverage of
-each method.
+"""95 % intervals of means and of paired differences, and the p values of the same distributions: a p value is at most
+0.05 exactly if its interval excludes 0. `docs/explanation/statistics.md` has the measured coverage of each method.
 
 The method depends on the data, as chosen by measured coverage:
 
-- One run: over cases. Differences of returns with two values (such as 0 and 1) get Bonett and Price's (2012) adjusted
-  Wald interval, all others the symmetric studentised bootstrap (Hall 1988). Fewer than `LEAST_CASES` cases get no
-  interval.
-- Several runs: over runs and cases, which are crossed, as every run plays the same cases. From `BOOTSTRAP_RUNS` runs
-  on, the percentiles of a hierarchical bootstrap with runs as the unit. Below that, a t interval whose variance is
-  that of runs plus the part of the cases' variance that runs share (random-effects analysis of variance,
-  Satterthwaite's degrees of freedom).
+- One run: over cases. Differences of returns with two values (such as 0 and 1) get Tango's (1998) score interval, all
+  others the symmetric studentised bootstrap (Hall 1988). Fewer than `LEAST_CASES` cases get no interval.
+- Several runs: over runs and cases, which are crossed, as every run plays the same cases. A t interval whose variance
+  is that of runs plus the part of the cases' variance that runs share, which contains agent × case (random-effects
+  analysis of variance). Degrees of freedom are Satterthwaite's, and those of unequal numbers of runs at most twice the
+  smaller number's: otherwise a small variance of few runs counts as known.
 - Several runs without common cases: Welch's t interval over run means.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from statistics import NormalDist
+from collections.abc import Callable, Sequence
 from typing import Literal
 
 import msgspec
@@ -28,23 +26,22 @@ from evopolicy_coordinator.analysis.statistics.distributions import (
     ALPHA,
     CONFIDENCE,
     normal_quantile,
+    normal_two_sided,
     t_quantile,
+    t_two_sided,
 )
 from evopolicy_coordinator.analysis.statistics.resampling import RESAMPLES, weights
 from evopolicy_coordinator.analysis.statistics.samples import Floats
 
 LEAST_CASES = 5
 """With fewer cases no method reaches its coverage."""
-BOOTSTRAP_RUNS = 10
-"""Runs per entry from which the hierarchical bootstrap reaches its coverage."""
 _NOUGHT = 1e-9
 """Relative bound: a smaller spread is rounding error."""
 
-Method = Literal["bootstrap-t", "adjusted Wald", "hierarchical bootstrap", "crossed t", "Welch t", "none"]
+Method = Literal["bootstrap-t", "adjusted Wald", "score", "crossed t", "Welch t", "none"]
 Over = Literal["cases", "runs and cases", "runs", "nothing"]
 
 TOO_FEW_CASES = "too few cases"
-NO_SPREAD = "no spread"
 TOO_FEW_RUNS = "too few runs"
 
 
@@ -58,7 +55,14 @@ class Estimate(msgspec.Struct, frozen=True, kw_only=True):
     method: Method = "none"
     over: Over = "nothing"
     """The units that a repetition of the experiment would draw again."""
+    p: float | None = None
+    """Two-sided p value of the true value 0, from the interval's own distribution; None without an interval."""
     reason: str = ""
+
+
+def no_spread(n: int, unit: str = "repeats") -> str:
+    """Why there is no interval where all of `n` units are equal: their variance cannot be estimated."""
+    return f"no spread: {n} identical {unit}"
 
 
 class Components(msgspec.Struct, frozen=True, kw_only=True):
@@ -106,22 +110,14 @@ def difference(first: Floats, second: Floats, *, resamples: int = RESAMPLES, fix
             resamples=resamples,
         )
     parts = [components(one) for one in (first, second) if len(one) > 1]
-    shared = components((first.mean(axis=0) - second.mean(axis=0))[None, :]).cases
-    groups = [one for one in (first, second) if len(one) > 1]
-    if min(map(len, groups)) < BOOTSTRAP_RUNS:
-        return _crossed(value, parts, shared, first.shape[1])
-    return _hierarchical(value, groups, parts, first.mean(axis=0) - second.mean(axis=0), resamples)
+    return _crossed(value, parts, first.mean(axis=0) - second.mean(axis=0))
 
 
 def mean(returns: Floats, *, resamples: int = RESAMPLES) -> Estimate:
     """The mean of a matrix runs × cases: over runs and cases, or over the cases of a single run."""
     if len(returns) == 1:
         return over_cases(returns[0], (returns,), resamples=resamples)
-    value = float(returns.mean())
-    part = components(returns)
-    if len(returns) < BOOTSTRAP_RUNS:
-        return _crossed(value, [part], part.cases, returns.shape[1])
-    return _hierarchical(value, [returns], [part], returns.mean(axis=0), resamples)
+    return _crossed(float(returns.mean()), [components(returns)], returns.mean(axis=0))
 
 
 def of_runs(first: Sequence[float], second: Sequence[float] = ()) -> Estimate:
@@ -133,9 +129,8 @@ def of_runs(first: Sequence[float], second: Sequence[float] = ()) -> Estimate:
     variances = [float(group.var(ddof=1)) / len(group) for group in groups]
     total = sum(variances)
     if _is_nought(total, groups):
-        return Estimate(value=value, reason=NO_SPREAD)
-    df = 1.0 / sum((v / total) ** 2 / (len(g) - 1) for v, g in zip(variances, groups, strict=True))
-    return _t_interval(value, total, df, "Welch t", "runs")
+        return Estimate(value=value, reason=no_spread(min(map(len, groups))))
+    return _t_interval(value, total, _runs_df(variances, [len(one) for one in groups]), "Welch t", "runs")
 
 
 def over_cases(values: Floats, returns: Sequence[Floats] = (), *, resamples: int = RESAMPLES) -> Estimate:
@@ -146,15 +141,18 @@ def over_cases(values: Floats, returns: Sequence[Floats] = (), *, resamples: int
     if n < LEAST_CASES:
         return Estimate(value=value, method="none", over="cases", reason=TOO_FEW_CASES)
     levels = _two_levels(returns)
+    if levels is not None and len(returns) > 1:
+        return score_interval(values, levels[1] - levels[0])
     if levels is not None:
-        low, high = adjusted_wald(values, levels[1] - levels[0], paired=len(returns) > 1)
-        if len(returns) == 1:
-            low, high = low + levels[0], high + levels[0]
+        low, high = (levels[0] + bound for bound in adjusted_wald(values - levels[0], levels[1] - levels[0]))
         return Estimate(value=value, low=low, high=high, method="adjusted Wald", over="cases")
     half = float(bootstrap_t(values[:, None], resamples=resamples)[0])
     if not math.isfinite(half):
-        return Estimate(value=value, over="cases", reason=NO_SPREAD if _constant(values) else TOO_FEW_CASES)
-    return Estimate(value=value, low=value - half, high=value + half, method="bootstrap-t", over="cases")
+        reason = no_spread(n, "cases") if _constant(values) else TOO_FEW_CASES
+        return Estimate(value=value, over="cases", reason=reason)
+    # Few resamples have no small quantiles, so the tail is that of Student's t, on the scale of the 95 % quantile.
+    p = t_two_sided(abs(value) / half * t_quantile(1.0 - ALPHA / 2.0, n - 1), n - 1)
+    return Estimate(value=value, low=value - half, high=value + half, method="bootstrap-t", over="cases", p=p)
 
 
 def bootstrap_t(columns: Floats, *, resamples: int = RESAMPLES, seed: int = 0) -> Floats:
@@ -178,101 +176,94 @@ def bootstrap_t(columns: Floats, *, resamples: int = RESAMPLES, seed: int = 0) -
     return half
 
 
-def adjusted_wald(values: Floats, step: float, *, paired: bool) -> tuple[float, float]:
-    """Interval of the mean of two-valued returns (0 or `step`), or of the paired difference of two such.
-
-    Paired: Bonett and Price (2012), one case added to each kind of disagreement. One sample: Agresti and Coull
-    (1998).
-    """
+def adjusted_wald(values: Floats, step: float) -> tuple[float, float]:
+    """Interval of the mean of two-valued returns, 0 or `step` (Agresti and Coull 1998)."""
     z = normal_quantile(1.0 - ALPHA / 2.0)
     n = len(values)
-    up = float((values > 0.5 * step).sum())
-    if paired:
-        down = float((values < -0.5 * step).sum())
-        up, down, n = up + 1.0, down + 1.0, n + 2
-        centre = (up - down) / n
-        half = z * math.sqrt(max(0.0, (up + down) / n - centre**2) / n)
-        return step * max(-1.0, centre - half), step * min(1.0, centre + half)
     total = n + z * z
-    centre = (up + 0.5 * z * z) / total
+    centre = (float((values > 0.5 * step).sum()) + 0.5 * z * z) / total
     half = z * math.sqrt(centre * (1.0 - centre) / total)
     return step * max(0.0, centre - half), step * min(1.0, centre + half)
 
 
-def resampled_means(
-    returns: Floats, resamples: int, seed: int, *, unbiased: bool = False, cases_seed: int = 0
-) -> Floats:
-    """(resamples,) means of a matrix runs × cases.
+def score_interval(values: Floats, step: float) -> Estimate:
+    """Mean of paired differences −`step`, 0 or `step` of two-valued returns: Tango's (1998) score interval. Its p value
+    is McNemar's. All differences 0 have no spread."""
+    n = len(values)
+    up, down = int((values > 0.5 * step).sum()), int((values < -0.5 * step).sum())
+    if up + down == 0:
+        return Estimate(value=0.0, over="cases", reason=no_spread(n, "cases"))
+    z = normal_quantile(1.0 - ALPHA / 2.0)
+    value = (up - down) / n
 
-    Cases are drawn by `cases_seed` alone, so runs on the same cases share their draws; runs are drawn by `seed`, and
-    a single run is kept. `unbiased` draws one unit fewer: the variance over resamples is then that of the mean
-    without the factor (n − 1)/n, which matters for few runs (McCarthy and Snowden 1985).
-    """
-    n_runs, n_cases = returns.shape
-    fewer = int(unbiased)
-    n_drawn = n_cases - fewer if n_cases > 1 else n_cases
-    by_run = returns @ (weights(n_cases, n_drawn, resamples, cases_seed) / n_drawn).T
-    if n_runs == 1:
-        single: Floats = by_run[0]
-        return single
-    n_drawn = n_runs - fewer
-    found: Floats = (weights(n_runs, n_drawn, resamples, seed) * by_run.T).sum(axis=1) / n_drawn
-    return found
+    def beyond(delta: float) -> bool:
+        """Whether the data are further than z from a true difference of `delta`."""
+        b = -up - down + (2 * n - up + down) * delta
+        c = -down * delta * (1.0 - delta)
+        q = (math.sqrt(max(0.0, b * b - 8.0 * n * c)) - b) / (4.0 * n)
+        variance = n * (2.0 * q + delta * (1.0 - delta))
+        return (up - down - n * delta) ** 2 > z * z * variance
 
-
-def _hierarchical(
-    value: float, groups: Sequence[Floats], parts: Sequence[Components], by_case: Floats, resamples: int
-) -> Estimate:
-    """Percentile interval over draws of runs, and of cases, which all runs share.
-
-    Run means already contain the residual of their cases, so the draw of cases is shrunk to the part of its variance
-    that is not residual. With one draw fewer than units, both variances are unbiased (Davison and Hinkley 1997,
-    section 3.8).
-    """
-    drawn = np.full(resamples, value)
-    for number, group in enumerate(groups):
-        by_run = group.mean(axis=1)
-        n = len(by_run)
-        change = weights(n, n - 1, resamples, 1 + number) @ (by_run - by_run.mean()) / (n - 1)
-        drawn += -change if number else change
-    n = len(by_case)
-    shared = components(by_case[None, :]).cases
-    beyond = max(0.0, shared - sum(part.residual for part in parts))
-    if beyond > 0.0:
-        change = weights(n, n - 1, resamples, 0) @ (by_case - by_case.mean()) / (n - 1)
-        drawn += math.sqrt(beyond / shared) * change
-    if _constant(drawn):
-        return Estimate(value=value, over="runs and cases", reason=NO_SPREAD)
-    # Percentiles are too narrow by the ratio of normal to t quantile (Hesterberg 2015, expanded percentile interval).
-    tail = 1.0 - NormalDist().cdf(t_quantile(1.0 - ALPHA / 2.0, round(_variance(parts, shared, n)[1], 6)))
-    low, high = np.quantile(drawn, [tail, 1.0 - tail])
-    return Estimate(
-        value=value, low=float(low), high=float(high), method="hierarchical bootstrap", over="runs and cases"
-    )
+    low, high = (_edge(value, end, beyond) for end in (-1.0, 1.0))
+    p = normal_two_sided(abs(up - down) / math.sqrt(up + down))
+    return Estimate(value=step * value, low=step * low, high=step * high, method="score", over="cases", p=p)
 
 
-def _crossed(value: float, parts: Sequence[Components], shared: float, n_cases: int) -> Estimate:
+def _edge(inside: float, outside: float, beyond: Callable[[float], bool]) -> float:
+    """The point between both where `beyond` becomes true; `outside` if it never does."""
+    if not beyond(outside):
+        return outside
+    for _ in range(60):
+        middle = 0.5 * (inside + outside)
+        inside, outside = (inside, middle) if beyond(middle) else (middle, outside)
+    return inside
+
+
+def _crossed(value: float, parts: Sequence[Components], by_case: Floats) -> Estimate:
     """t interval from the runs' variance, which contains the residual, plus the rest of the cases' variance."""
-    total, df = _variance(parts, shared, n_cases)
+    n_cases = len(by_case)
+    if n_cases < 2:
+        return Estimate(value=value, over="runs and cases", reason=TOO_FEW_CASES)
+    total, df = _variance(parts, components(by_case[None, :]).cases, n_cases)
     if total <= (_NOUGHT * abs(value)) ** 2:
-        return Estimate(value=value, over="runs and cases", reason=NO_SPREAD)
+        reason = no_spread(min(part.n_runs for part in parts))
+        return Estimate(value=value, over="runs and cases", reason=reason)
     return _t_interval(value, total, df, "crossed t", "runs and cases")
 
 
 def _variance(parts: Sequence[Components], shared: float, n_cases: int) -> tuple[float, float]:
-    """Variance of a mean over runs and crossed cases, with Satterthwaite's degrees of freedom, at least 1."""
+    """Variance of a mean over runs and crossed cases, and its degrees of freedom, at least 1.
+
+    The cases' part is a difference of mean squares, so its own are those of all of them.
+    """
     beyond = max(0.0, shared - sum(part.residual for part in parts))
-    total = sum(part.runs for part in parts) + beyond
+    runs = sum(part.runs for part in parts)
+    total = runs + beyond
     if total <= 0.0:
         return 0.0, 1.0
-    below = sum((part.runs / total) ** 2 / (part.n_runs - 1) for part in parts)
-    below += (beyond / total) ** 2 / (n_cases - 1) if n_cases > 1 else 0.0
-    return total, max(1.0, 1.0 / below) if below > 0.0 else 1.0
+    below = 0.0
+    if runs > 0.0:
+        df = _runs_df([part.runs for part in parts], [part.n_runs for part in parts])
+        below += (runs / total) ** 2 / df
+    if beyond > 0.0:
+        below += (shared / total) ** 2 / (n_cases - 1)
+        below += sum((part.residual / total) ** 2 / ((part.n_runs - 1) * (n_cases - 1)) for part in parts)
+    return total, max(1.0, 1.0 / below)
+
+
+def _runs_df(variances: Sequence[float], n_runs: Sequence[int]) -> float:
+    """Welch and Satterthwaite's degrees of freedom of a sum of variances of means, at most those of as many runs of
+    each as the fewest."""
+    total = sum(variances)
+    welch = 1.0 / sum((v / total) ** 2 / (n - 1) for v, n in zip(variances, n_runs, strict=True))
+    return min(welch, len(n_runs) * (min(n_runs) - 1.0))
 
 
 def _t_interval(value: float, variance: float, df: float, method: Method, over: Over) -> Estimate:
-    half = t_quantile(1.0 - ALPHA / 2.0, round(df, 6)) * math.sqrt(variance)
-    return Estimate(value=value, low=value - half, high=value + half, method=method, over=over)
+    df, error = round(df, 6), math.sqrt(variance)
+    half = t_quantile(1.0 - ALPHA / 2.0, df) * error
+    p = t_two_sided(abs(value) / error, df)
+    return Estimate(value=value, low=value - half, high=value + half, method=method, over=over, p=p)
 
 
 def _two_levels(returns: Sequence[Floats]) -> tuple[float, float] | None:

@@ -1,8 +1,13 @@
-"""Each pair of entries on every environment: gap, interval, permutation test, and Holm's correction over the suite."""
+"""Each pair of entries on every environment: gap, interval, p value, and Holm's correction over all pairs of the suite.
+
+The verdict rests on the interval's own distribution, so it never contradicts the interval: the uncorrected p is at most
+0.05 exactly if the interval excludes 0, and the corrected p is no smaller.
+"""
 
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Mapping, Sequence
 from typing import Literal
 
@@ -10,28 +15,19 @@ import msgspec
 import numpy as np
 
 from evopolicy_coordinator.analysis.statistics import intervals
-from evopolicy_coordinator.analysis.statistics.distributions import ALPHA, holm
-from evopolicy_coordinator.analysis.statistics.intervals import (
-    TOO_FEW_CASES,
-    TOO_FEW_RUNS,
-    Estimate,
-    difference,
-    of_runs,
-)
-from evopolicy_coordinator.analysis.statistics.permutation import (
-    Test,
-    label_test,
-    patterns_for,
-    sign_test,
-)
+from evopolicy_coordinator.analysis.statistics.distributions import ALPHA, holm, normal_quantile
+from evopolicy_coordinator.analysis.statistics.intervals import Estimate, difference, of_runs
+from evopolicy_coordinator.analysis.statistics.permutation import Test, label_test
+from evopolicy_coordinator.analysis.statistics.repeats import repeats_needed, spread_of
 from evopolicy_coordinator.analysis.statistics.resampling import RESAMPLES
-from evopolicy_coordinator.analysis.statistics.samples import Floats, Sample, matched
+from evopolicy_coordinator.analysis.statistics.samples import Matched, Sample, matched
 
-Verdict = Literal["first", "second", "not told apart", "too few cases", "too few runs", "not comparable"]
+Verdict = Literal["first", "second", "not told apart", "not comparable"]
 
 NO_COMMON_CASES = "no common cases"
 NO_RETURNS = "returns by case are not known"
 NO_SCORE = "a run has no ok submit"
+MAX_CASES = 100_000
 
 
 class Pair(msgspec.Struct, frozen=True, kw_only=True):
@@ -50,27 +46,35 @@ class Pair(msgspec.Struct, frozen=True, kw_only=True):
     n_left_out: int
     """Cases that only some of the runs have; they cannot be paired."""
     p: float | None
-    """p value of the permutation test; None without a test."""
-    p_least: float | None
-    """The smallest p that the test could give."""
+    """Two-sided p value of no difference, from the interval's distribution; None without an interval."""
     p_holm: float | None
-    """Corrected over the suite's pairs of agents, or over its pairs with the random reference."""
+    """Corrected over all pairs of the suite, those with the random reference included."""
+    p_these_cases: float | None
+    """p value of an exchange of runs, which takes these cases as given; None unless both have several runs. No verdict rests
+    on it."""
     verdict: Verdict
     """The better entry by the corrected p at 5 %."""
+    n_needed: int | None
+    """Where agents are not told apart, runs of each (else held-out cases) with which every second experiment would resolve a
+    difference of this size at the level that Holm's correction leaves; None where unknown or where more do not help."""
     reason: str
-    """Why there is no interval, or no test that could reject; empty otherwise."""
+    """Why there is no interval; empty otherwise."""
 
 
 class _Draft(msgspec.Struct, kw_only=True):
     samples: tuple[Sample, Sample]
     gap: Estimate | None = None
-    n_cases: int = 0
-    n_left_out: int = 0
-    test: Test | None = None
+    common: Matched | None = None
     reason: str = ""
-    signs: Floats | None = None
-    """Differences by case (or by run, against a fixed policy) whose signs are flipped; those of equal length share a
-    test."""
+
+    @property
+    def agents(self) -> bool:
+        first, second = self.samples
+        return len(first.runs) > 1 and (len(second.runs) > 1 or second.is_fixed)
+
+    @property
+    def p(self) -> float | None:
+        return None if self.gap is None else self.gap.p
 
 
 def pairs(
@@ -87,19 +91,9 @@ def pairs(
         for one, other in itertools.combinations(entries, 2)
         if (one, env) in samples and (other, env) in samples
     ]
-    families = [any(sample.is_fixed for sample in draft.samples) for draft in drafts]
-    _test(drafts, patterns_for(max(1, len(drafts)), ALPHA))
-    corrected: list[float | None] = [None] * len(drafts)
-    sizes: dict[bool, int] = {}
-    for family in (False, True):
-        own = [i for i, fixed in enumerate(families) if fixed is family]
-        found = [test.p if (test := drafts[i].test) is not None else None for i in own]
-        sizes[family] = sum(p is not None for p in found)
-        for i, p in zip(own, holm(found), strict=True):
-            corrected[i] = p
-    return [
-        _pair(draft, p, sizes[family]) for draft, p, family in zip(drafts, corrected, families, strict=True)
-    ]
+    corrected = holm([draft.p for draft in drafts])
+    n_open = sum(p is not None and p > ALPHA for p in corrected)
+    return [_pair(draft, p, n_open) for draft, p in zip(drafts, corrected, strict=True)]
 
 
 def _draft(samples: tuple[Sample, Sample], resamples: int) -> _Draft:
@@ -108,78 +102,69 @@ def _draft(samples: tuple[Sample, Sample], resamples: int) -> _Draft:
     if first.scores is None or second.scores is None:
         draft.reason = NO_SCORE
         return draft
-    many = len(first.runs) > 1 and (len(second.runs) > 1 or second.is_fixed)
-    common = matched(samples)
-    if common is not None:
-        one, other = common.returns
-        draft.gap = difference(one, other, resamples=resamples, fixed=second.is_fixed)
-        draft.n_cases, draft.n_left_out = one.shape[1], common.n_left_out
-        draft.reason = draft.gap.reason
-        if not many:
-            draft.signs = one.mean(axis=0) - other.mean(axis=0)
-        elif len(other) == 1:
-            draft.signs = (one - other).mean(axis=1)
-        return draft
-    if many and len(second.runs) > 1:
+    draft.common = matched(samples)
+    if draft.common is not None:
+        draft.gap = difference(*draft.common.returns, resamples=resamples, fixed=second.is_fixed)
+    elif len(first.runs) > 1 and len(second.runs) > 1:
         draft.gap = of_runs(first.scores, second.scores)
-        draft.reason = draft.gap.reason
-        return draft
-    draft.gap = Estimate(value=float(np.mean(first.scores) - np.mean(second.scores)))
-    draft.reason = NO_RETURNS if not all(run.returns for s in samples for run in s.runs) else NO_COMMON_CASES
+    else:
+        known = all(run.returns for sample in samples for run in sample.runs)
+        gap = float(np.mean(first.scores) - np.mean(second.scores))
+        draft.gap = Estimate(value=gap, reason=NO_COMMON_CASES if known else NO_RETURNS)
+    draft.reason = draft.gap.reason
     return draft
 
 
-def _test(drafts: Sequence[_Draft], n_random: int) -> None:
-    """Runs the tests: those over cases share their sign patterns, those over runs are separate."""
-    together: dict[int, list[_Draft]] = {}
-    for draft in drafts:
-        if draft.signs is not None:
-            together.setdefault(len(draft.signs), []).append(draft)
-        elif draft.gap is not None and draft.reason not in (NO_RETURNS, NO_COMMON_CASES):
-            draft.test = label_test(*(_run_means(draft)), n_random)
-    for group in together.values():
-        columns = np.stack([draft.signs for draft in group if draft.signs is not None], axis=1)
-        for draft, test in zip(group, sign_test(columns, n_random), strict=True):
-            draft.test = test
-
-
-def _run_means(draft: _Draft) -> tuple[list[float], list[float]]:
-    common = matched(draft.samples)
-    if common is None:
-        first, second = (sample.scores or [] for sample in draft.samples)
-        return first, second
-    one, other = (matrix.mean(axis=1).tolist() for matrix in common.returns)
-    return one, other
-
-
-def _pair(draft: _Draft, p_holm: float | None, n_tests: int) -> Pair:
+def _pair(draft: _Draft, p_holm: float | None, n_open: int) -> Pair:
     first, second = draft.samples
-    agents = len(first.runs) > 1 and (len(second.runs) > 1 or second.is_fixed)
-    reason, test = draft.reason, draft.test
     verdict: Verdict = "not comparable"
-    if test is not None and p_holm is not None and draft.gap is not None:
-        if p_holm <= ALPHA and draft.gap.value != 0.0:
+    if draft.gap is not None and p_holm is not None:
+        verdict = "not told apart"
+        if p_holm <= ALPHA:
             verdict = "first" if draft.gap.value > 0.0 else "second"
-        elif test.least * n_tests > ALPHA:
-            verdict = "too few runs" if agents else "too few cases"
-            reason = reason or (TOO_FEW_RUNS if agents else TOO_FEW_CASES)
-        else:
-            verdict = "not told apart"
+    test = _these_cases(draft)
+    common = draft.common
     return Pair(
         env=first.env,
         first=first.entry,
         second=second.entry,
         gap=draft.gap,
-        compares="agents" if agents else "checkpoints",
+        compares="agents" if draft.agents else "checkpoints",
         n_runs=(len(first.runs), len(second.runs)),
-        n_cases=draft.n_cases,
-        n_left_out=draft.n_left_out,
-        p=test.p if test is not None else None,
-        p_least=test.least if test is not None else None,
+        n_cases=0 if common is None else common.returns[0].shape[1],
+        n_left_out=0 if common is None else common.n_left_out,
+        p=draft.p,
         p_holm=p_holm,
+        p_these_cases=None if test is None else test.p,
         verdict=verdict,
-        reason=reason,
+        n_needed=_needed(draft, n_open) if verdict == "not told apart" else None,
+        reason=draft.reason,
     )
+
+
+def _these_cases(draft: _Draft) -> Test | None:
+    if draft.common is None or min(map(len, draft.common.returns)) < 2:
+        return None
+    one, other = (matrix.mean(axis=1).tolist() for matrix in draft.common.returns)
+    return label_test(one, other)
+
+
+def _needed(draft: _Draft, n_open: int) -> int | None:
+    """`n_open`: pairs of the suite that are not told apart; the smallest p of them must be at most 5 % over their
+    number."""
+    if draft.gap is None or draft.p is None or draft.common is None or draft.gap.value == 0.0:
+        return None
+    level, one_and_other = ALPHA / n_open, draft.common.returns
+    if draft.agents:
+        n = repeats_needed(spread_of(*one_and_other), abs(draft.gap.value), level=level).n
+        return (
+            None if n is None else max(n, 1 + max(len(matrix) for matrix in one_and_other if len(matrix) > 1))
+        )
+    if draft.p >= 1.0 - 1e-9:
+        return None
+    factor = normal_quantile(1.0 - level / 2.0) / normal_quantile(1.0 - draft.p / 2.0)
+    n_cases = math.ceil(one_and_other[0].shape[1] * factor**2)
+    return n_cases if n_cases <= MAX_CASES else None
 
 
 def cell_mean(sample: Sample, *, resamples: int = RESAMPLES) -> Estimate | None:

@@ -1,7 +1,7 @@
-"""Two-sided permutation tests of no difference.
+"""Permutation test about *these cases*: whether runs of two agents could have been exchanged.
 
-Over cases, the signs of the paired differences are flipped: under the null hypothesis the two checkpoints are
-exchangeable on every case. Over runs, the labels of runs are permuted. The statistic is Welch's t, so that entries of
+It takes the cases as given. Agents that differ by case therefore differ here even if they are equal on average over all
+cases, and more so with more runs: no verdict of a report rests on it. The statistic is Welch's t, so that entries of
 equal mean and unequal spread are not reported as different when there are many runs (Janssen 1997). All patterns are
 tried if they are few, otherwise a random sample plus the observed pattern.
 """
@@ -13,10 +13,10 @@ from collections.abc import Sequence
 import msgspec
 import numpy as np
 
-from evopolicy_coordinator.analysis.statistics.resampling import label_patterns, sign_patterns
+from evopolicy_coordinator.analysis.statistics.resampling import label_patterns
 from evopolicy_coordinator.analysis.statistics.samples import Floats
 
-LEAST_PATTERNS = 9999
+N_RANDOM = 1999
 _CHUNK = 20_000
 _CLOSE = 1e-9
 """Relative tolerance: statistics that differ only by rounding count as equal."""
@@ -31,26 +31,7 @@ class Test(msgspec.Struct, frozen=True, kw_only=True):
     exact: bool
 
 
-def patterns_for(n_tests: int, alpha: float) -> int:
-    """Number of random patterns with which a family of `n_tests` can still reject under Holm's correction at level
-    `alpha`."""
-    return max(LEAST_PATTERNS, int(4 * n_tests / alpha) - 1)
-
-
-def sign_test(columns: Floats, n_random: int = LEAST_PATTERNS) -> list[Test]:
-    """Tests for each column of a (cases, m) matrix that its values are symmetric about 0."""
-    n = len(columns)
-    patterns, exact = sign_patterns(n, n_random)
-    observed = np.abs(columns.sum(axis=0))
-    bound = observed - _CLOSE * np.abs(columns).sum(axis=0)
-    reached = np.zeros(columns.shape[1])
-    for start in range(0, len(patterns), _CHUNK):
-        reached += (np.abs(patterns[start : start + _CHUNK] @ columns) >= bound).sum(axis=0)
-    least = 2.0 / len(patterns) if exact else max(2.0 ** (1 - n), 1.0 / (len(patterns) + 1))
-    return [Test(p=_p(float(count), len(patterns), exact), least=least, exact=exact) for count in reached]
-
-
-def label_test(first: Sequence[float], second: Sequence[float], n_random: int = LEAST_PATTERNS) -> Test:
+def label_test(first: Sequence[float], second: Sequence[float], n_random: int = N_RANDOM) -> Test:
     """Tests that two groups of run scores, of two or more runs each, come from one distribution."""
     n_first, n_second = len(first), len(second)
     pooled = np.array([*first, *second])

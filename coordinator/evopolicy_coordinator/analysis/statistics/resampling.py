@@ -11,7 +11,7 @@ from evopolicy_coordinator.analysis.statistics.samples import Floats
 
 RESAMPLES = 2000
 EXACT_UP_TO = 1 << 13
-"""Up to this number, all sign or label patterns are used; above, a random sample of them."""
+"""Up to this number, all patterns of labels are used; above, a random sample of them."""
 
 
 @lru_cache(maxsize=8)
@@ -24,17 +24,18 @@ def weights(n: int, n_drawn: int, resamples: int, seed: int) -> Floats:
     return found
 
 
-@lru_cache(maxsize=4)
-def sign_patterns(n: int, n_random: int) -> tuple[Floats, bool]:
-    """(patterns, n) of ±1, and whether these are all 2ⁿ; otherwise they are `n_random` random ones. Read-only."""
-    if 2**n <= EXACT_UP_TO:
-        found = np.array(list(itertools.product((1.0, -1.0), repeat=n)))
-        exact = True
-    else:
-        found = np.random.default_rng([11, n]).integers(0, 2, (n_random, n)) * 2.0 - 1.0
-        exact = False
+@lru_cache(maxsize=8)
+def t_weights(n: int, draws: int, seed: int) -> Floats:
+    """(draws, n) weights w such that `mean + w @ (values − mean)` is distributed as Student's t with n − 1 degrees of
+    freedom about the mean of n values, with its standard error as scale. Values of several variables get a common
+    multivariate t. Zeros for n = 1. Read-only."""
+    if n == 1:
+        return np.zeros((draws, 1))
+    generator = np.random.default_rng([13, seed, n])
+    found: Floats = generator.normal(size=(draws, n))
+    found /= np.sqrt(n * generator.chisquare(n - 1, size=(draws, 1)))
     found.setflags(write=False)
-    return found, exact
+    return found
 
 
 @lru_cache(maxsize=4)

@@ -10,32 +10,12 @@ from statistics import fmean, median
 import msgspec
 
 from evopolicy_coordinator.analysis.scoring.normalised import Scale
-from evopolicy_coordinator.analysis.statistics.distributions import ALPHA, t_quantile
-from evopolicy_coordinator.analysis.statistics.intervals import components
 from evopolicy_coordinator.analysis.statistics.pairs import Pair
+from evopolicy_coordinator.analysis.statistics.repeats import Repeats, Spread, repeats_needed, spread_of
 from evopolicy_coordinator.analysis.statistics.samples import Sample, matched
 
 GAPS = (0.05, 0.1, 0.2)
 """Gaps on the random-to-best scale for which a report gives the repeats."""
-MAX_REPEATS = 1000
-
-
-class Spread(msgspec.Struct, frozen=True, kw_only=True):
-    """Variances of a difference between two agents on one environment, mean over its pairs."""
-
-    run: float
-    """Variance between runs of one agent, of their held-out means."""
-    case: float
-    """Variance of the difference that more runs do not reduce: agents differ by case, and these cases are a sample."""
-    n_cases: int
-
-
-class Repeats(msgspec.Struct, frozen=True, kw_only=True):
-    """Number of runs per agent that resolve a gap."""
-
-    gap: float
-    n: int | None
-    """None if no number up to `MAX_REPEATS` does: the gap needs more cases."""
 
 
 class Resolution(msgspec.Struct, frozen=True, kw_only=True):
@@ -62,33 +42,6 @@ class Resolution(msgspec.Struct, frozen=True, kw_only=True):
         if self.spread is None or self.scale is None:
             return None
         return repeats_needed(self.spread, share * self.scale)
-
-
-def half_width(spread: Spread, n: int) -> float:
-    """Half width of the 95 % interval of a difference between two agents of n ≥ 2 runs each."""
-    by_run, by_case = 2.0 * spread.run / n, spread.case
-    total = by_run + by_case
-    if total <= 0.0:
-        return 0.0
-    below = (by_run / total) ** 2 / (2.0 * (n - 1))
-    below += (by_case / total) ** 2 / (spread.n_cases - 1) if spread.n_cases > 1 else 0.0
-    df = 1.0 / below if below > 0.0 else math.inf
-    return t_quantile(1.0 - ALPHA / 2.0, round(df, 3)) * math.sqrt(total)
-
-
-def repeats_needed(spread: Spread, gap: float) -> Repeats:
-    """The fewest runs per agent, from 2, whose 95 % interval of a difference is no wider than ± `gap`. A true gap of
-    that size is then distinguished from 0 in half of all experiments. Raises ValueError for a gap that is not above
-    0."""
-    if not gap > 0.0:
-        raise ValueError(f"a gap of {gap} cannot be resolved; give one above 0")
-    if half_width(spread, MAX_REPEATS) > gap:
-        return Repeats(gap=gap, n=None)
-    low, high = 1, MAX_REPEATS
-    while high - low > 1:
-        middle = (low + high) // 2
-        low, high = (low, middle) if half_width(spread, middle) <= gap else (middle, high)
-    return Repeats(gap=gap, n=high)
 
 
 def resolutions(
@@ -154,15 +107,9 @@ def _spread(samples: Sequence[Sample]) -> Spread | None:
     common = matched(samples)
     if common is None or any(len(matrix) < 2 for matrix in common.returns):
         return None
-    runs = [components(matrix) for matrix in common.returns]
-    beyond = [
-        components((common.returns[a].mean(axis=0) - common.returns[b].mean(axis=0))[None, :]).cases
-        - runs[a].residual
-        - runs[b].residual
-        for a, b in itertools.combinations(range(len(samples)), 2)
-    ]
+    found = [spread_of(one, other) for one, other in itertools.combinations(common.returns, 2)]
     return Spread(
-        run=fmean(part.runs * part.n_runs for part in runs),
-        case=max(0.0, fmean(beyond)),
+        run=fmean(one.run for one in found),
+        case=fmean(one.case for one in found),
         n_cases=common.returns[0].shape[1],
     )

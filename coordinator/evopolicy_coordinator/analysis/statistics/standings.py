@@ -1,11 +1,12 @@
-"""Intervals of rank scores and ranks, and tie groups, by resampling the whole suite.
+"""Intervals of rank scores and ranks, and tie groups, by drawing the whole suite again.
 
 A rank score depends only on the order of noisy means. Its interval is for the entry's average score over repetitions
-of the experiment with as many new runs and cases, on the same environments against the same entries. Each resample
-draws cases (the same for all entries, as they are shared) and runs, ranks all entries again, and averages. Two
-entries are distinguished if the resampled differences of their scores are significant at 5 % after Holm's correction
-over all pairs. An entry's rank then lies between 1 + (better distinguished entries) and N − (worse distinguished
-entries), as in Mogstad et al. (2024).
+of the experiment with as many new runs and cases, on the same environments against the same entries. Each draw moves
+the entries' means by Student's t noise of their runs and of their cases (the same cases for all entries, as they are
+shared), ranks all entries again, and averages. Resampled runs would vary too little: three runs have few resamples. Two
+entries are distinguished if the drawn differences of their scores are significant at 5 % after Holm's correction over
+all pairs. An entry's rank then lies between 1 + (better distinguished entries) and N − (worse distinguished entries),
+as in Mogstad et al. (2024).
 """
 
 from __future__ import annotations
@@ -19,8 +20,8 @@ import msgspec
 import numpy as np
 
 from evopolicy_coordinator.analysis.statistics.distributions import ALPHA, holm
-from evopolicy_coordinator.analysis.statistics.intervals import resampled_means
-from evopolicy_coordinator.analysis.statistics.resampling import RESAMPLES, weights
+from evopolicy_coordinator.analysis.statistics.pairs import Pair
+from evopolicy_coordinator.analysis.statistics.resampling import RESAMPLES, t_weights
 from evopolicy_coordinator.analysis.statistics.samples import Floats, Sample, matched
 
 MAX_GROUPS = 200
@@ -60,21 +61,32 @@ def standings(
     scores: Mapping[str, float | None],
     environments: Sequence[str],
     *,
+    found: Sequence[Pair] = (),
     resamples: int = RESAMPLES,
 ) -> Standings:
-    """Rank estimates of the entries of `scores` (entry to its observed rank score), best first."""
+    """Rank estimates of the entries of `scores` (entry to its observed rank score), best first. All have a sample on each
+    environment.
+
+    On a single environment two entries are distinguished only if `found` tells them apart as well.
+    """
     entries = sorted(scores, key=lambda entry: (-_or_least(scores[entry]), entry.casefold(), entry))
     n_pairs = len(entries) * (len(entries) - 1) // 2
     resamples = max(resamples, math.ceil(4 * n_pairs / ALPHA))
+    if len(entries) < 2:
+        return Standings(rows=(), gap=None, over="")
     drawn, spread = _drawn_scores(samples, entries, environments, resamples)
-    sure = [
-        i
-        for i, entry in enumerate(entries)
-        if entry in spread and np.isfinite(drawn[i]).all() and scores[entry] is not None
-    ]
+    sure = [i for i, entry in enumerate(entries) if entry in spread and scores[entry] is not None]
     if len(sure) < 2:
         return Standings(rows=(), gap=None, over="")
     apart = _distinguished(drawn, sure)
+    if len(environments) == 1:
+        told = {frozenset((pair.first, pair.second)) for pair in found if pair.verdict in ("first", "second")}
+        failed = {entry for entry in entries if _known_failure(samples[entry, environments[0]])}
+        apart = {
+            (a, b)
+            for a, b in apart
+            if (both := frozenset((entries[sure[a]], entries[sure[b]]))) in told or both & failed
+        }
     letters = dict(zip(sure, _letters(len(sure), apart), strict=True))
     rows: list[RankEstimate] = []
     for place, i in enumerate(sure):
@@ -113,33 +125,28 @@ def _drawn_scores(
     environments: Sequence[str],
     resamples: int,
 ) -> tuple[Floats, set[str]]:
-    """(entries, resamples) rank scores, NaN for entries without scores, and the entries that vary wherever they
-    played."""
-    total, n_scored = np.zeros((len(entries), resamples)), np.zeros(len(entries))
+    """(entries, resamples) rank scores, and the entries that vary on every environment."""
+    total = np.zeros((len(entries), resamples))
     spread = set(entries)
     for number, env in enumerate(environments):
-        here = [i for i, entry in enumerate(entries) if (entry, env) in samples]
-        drawn = {i: _drawn_mean(samples[entries[i], env], i, number, resamples) for i in here}
+        here = [samples[entry, env] for entry in entries]
+        drawn = [_drawn_mean(sample, i, number, resamples) for i, sample in enumerate(here)]
         spread -= {
-            entries[i]
-            for i, found in drawn.items()
-            if found is None and not _known_failure(samples[entries[i], env])
+            sample.entry
+            for sample, found in zip(here, drawn, strict=True)
+            if found is None and not _known_failure(sample)
         }
         means = np.stack(
             [
-                _fixed_mean(samples[entries[i], env], resamples) if (found := drawn[i]) is None else found
-                for i in here
+                _fixed_mean(sample, resamples) if found is None else found
+                for sample, found in zip(here, drawn, strict=True)
             ]
         )
-        if len(here) < 2:
-            continue
-        above = np.zeros((len(here), resamples))
+        above = np.zeros_like(means)
         for row in means:
-            above += row[None, :] > means
-        total[here] += 1.0 - above / (len(here) - 1)
-        n_scored[here] += 1
-    with np.errstate(invalid="ignore"):
-        return total / n_scored[:, None], spread  # fmt: skip
+            above += row > means
+        total += 1.0 - above / (len(here) - 1)
+    return total / len(environments), spread
 
 
 def _known_failure(sample: Sample) -> bool:
@@ -158,13 +165,17 @@ def _drawn_mean(sample: Sample, entry: int, env: int, resamples: int) -> Floats 
         return None
     common = matched([sample])
     seed = 1000 + 97 * entry + 10_007 * env
+    scores, returns = np.array(sample.scores), np.zeros((1, 1))
     if common is not None:
-        return resampled_means(common.returns[0], resamples, seed, unbiased=True, cases_seed=env)
-    if len(sample.runs) < 2:
+        returns = common.returns[0]
+        scores = returns.mean(axis=1)
+    if len(scores) < 2 and returns.shape[1] < 2:
         return None
-    n = len(sample.scores)
-    found: Floats = weights(n, n - 1, resamples, seed) @ np.array(sample.scores) / (n - 1)
-    return found
+    by_case = returns.mean(axis=0)
+    drawn: Floats = scores.mean() + t_weights(len(scores), resamples, seed) @ (scores - scores.mean())
+    # By `env` alone: all entries play the same cases.
+    drawn += t_weights(len(by_case), resamples, env) @ (by_case - by_case.mean())
+    return drawn
 
 
 def _distinguished(drawn: Floats, sure: Sequence[int]) -> set[tuple[int, int]]:

@@ -52,15 +52,15 @@ def suite_statistics(
     found = pairs(samples, table.entries, environments, resamples=resamples)
     means = {key: mean for key, sample in samples.items() if (mean := cell_mean(sample, resamples=resamples))}
     resolved = resolutions(samples, found, table.agents, scales, environments)
-    shares, against = aggregates(samples, table.agents, scales, resamples=resamples)
+    shares, against = aggregates(samples, board.agents, scales, resamples=resamples)
     wanted = set(environments)
     general = generalisation((run for run in runs if run.env in wanted), scales)
-    optimism = [optimism_of(agent, general) for agent in table.agents]
+    optimism = [optimism_of(agent, general) for agent in board.agents]
     scores = {row.entry: row.score for row in board.standings}
     return SuiteStatistics(
         means=means,
         pairs=tuple(found),
-        standings=standings(samples, scores, environments, resamples=resamples),
+        standings=standings(samples, scores, environments, found=found, resamples=resamples),
         resolutions=tuple(resolved),
         overall=overall(resolved),
         aggregates=tuple(shares),

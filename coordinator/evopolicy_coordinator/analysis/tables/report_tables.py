@@ -46,7 +46,7 @@ def tables_of(study: Study, link_of: LinkOf = no_link) -> list[Table]:
     """Every table of the report in order. Tables without rows are omitted, except for `left_out`."""
     found: list[Table] = []
     for suite in study.suites:
-        scored = [_aggregate(suite, study), _heldout(suite), _cells(suite)]
+        scored = [_aggregate(suite, study), _incomplete(suite), _heldout(suite), _cells(suite)]
         scored += [*statistics_tables(suite), _normalised(suite)]
         found += [_labelled(table, study.post_hoc) for table in scored]
     found += [
@@ -126,6 +126,33 @@ def _aggregate(suite: Suite, study: Study) -> Table:
     )
 
 
+def _incomplete(suite: Suite) -> Table:
+    n = len(suite.board.environments)
+    return Table(
+        name=f"incomplete_{suite.name}",
+        title=f"{suite_title(suite.name)} incomplete entries",
+        caption="Entries that have not played every environment of this report are not ranked and have no mean over environments: "
+        "it would not be comparable. Their returns are in the tables of single environments and of differences.",
+        columns=(
+            ENTRY,
+            HARNESS,
+            Column("environments", "Environments"),
+            Column("missing", "Not played"),
+            Column("runs", "Runs", "integer"),
+        ),
+        rows=tuple(
+            {
+                "entry": one.entry,
+                "harness": one.harness,
+                "environments": f"{one.n_environments} of {n}",
+                "missing": ", ".join(map(title_of, one.missing)),
+                "runs": None if one.is_reference else one.n_runs,
+            }
+            for one in suite.board.incomplete
+        ),
+    )
+
+
 def _key(family: str) -> str:
     """A column's key. Families that do not ship could have the name of another column."""
     return family if family in catalogue.families() else f"family_{family}"
@@ -135,7 +162,9 @@ def _sure(row: RankEstimate | None) -> dict[str, Any]:
     if row is None:
         return {}
     return {
-        "score_interval": span(row.score_low, row.score_high, 3),
+        "score_interval": span(row.score_low, row.score_high, 3)
+        if row.score_low < row.score_high
+        else "no spread: the same in each draw",
         "rank_interval": f"{row.rank_low} to {row.rank_high}",
         "ties": row.ties,
     }
@@ -153,13 +182,14 @@ def _budgets(suite: Suite, study: Study) -> dict[str, Any]:
 def _heldout(suite: Suite) -> Table:
     rows: list[dict[str, Any]] = []
     marks: dict[tuple[int, str], int] = {}
-    for i, standing in enumerate(suite.board.standings):
-        row: dict[str, Any] = {"entry": standing.entry, "harness": standing.harness}
+    entries = [row.entry for row in suite.board.standings] + [row.entry for row in suite.board.incomplete]
+    for i, entry in enumerate(entries):
+        row: dict[str, Any] = {"entry": entry, "harness": suite.table.harness[entry]}
         for env in suite.board.environments:
-            cell = suite.board.cells.get((standing.entry, env))
+            cell = suite.board.cells.get((entry, env))
             if cell is not None:
                 row[env] = cell.mean
-                if cell.mean is not None and cell.rank <= 2 and len(suite.board.standings) > 1:
+                if cell.mean is not None and cell.rank in (1, 2) and len(suite.board.standings) > 1:
                     marks[i, env] = cell.rank
         rows.append(row)
     columns = [Column(env, title_of(env), "number") for env in suite.board.environments]
@@ -168,7 +198,7 @@ def _heldout(suite: Suite) -> Table:
         title=f"{suite_title(suite.name)} held-out returns",
         caption="Mean return of the validation-selected policy on the held-out cases, in each environment's own units: compare "
         "within a column only. Best and second-best are marked. The random reference plays the same cases. A dash is a cell "
-        "that was not run, or a run with no ok submit.",
+        "that was not run, or a run with no ok submit. Incomplete entries come last, without marks.",
         columns=(ENTRY, HARNESS, *columns),
         rows=tuple(rows),
         marks=marks,
@@ -191,14 +221,14 @@ def _cells(suite: Suite) -> Table:
         for env in suite.board.environments
         for cell in sorted(
             (c for (_, e), c in suite.board.cells.items() if e == env),
-            key=lambda c: (c.rank, c.entry.casefold()),
+            key=lambda c: (c.rank is None, c.rank or 0, c.entry.casefold()),
         )
     ]
     return Table(
         name=f"cells_{suite.name}",
         title=f"{suite_title(suite.name)} cells",
         caption="Every entry on every environment: mean over its runs, 95 % interval of the mean over what the column Over names, rank "
-        "and rank score. Entries share their cases, so two of these intervals may overlap where the difference is sure: compare by the "
+        "and rank score (of entries that played every environment). Entries share their cases, so two of these intervals may overlap where the difference is sure: compare by the "
         "table of differences.",
         columns=(
             ENV,
@@ -239,7 +269,7 @@ def _normalised(suite: Suite) -> Table:
         title=f"{suite_title(suite.name)} normalised performance",
         caption="Held-out return on the random-to-best scale, clipped to 0 … 1, by dominant task demand: 0 is the random reference "
         "on the same cases, 1 the best agent on that environment. Bold: means of a group's environments. A dash: no agent beats random, no "
-        "reference, or no score.",
+        "reference, or no score; for a mean, no score on one of the group's environments.",
         columns=(
             ENV,
             _DEMAND,

@@ -6,16 +6,17 @@ from typing import Any
 
 from evopolicy_coordinator.analysis.scoring.scores import suite_title, title_of
 from evopolicy_coordinator.analysis.statistics.aggregates import LEAST_RUNS, TAUS, Bounded
+from evopolicy_coordinator.analysis.statistics.distributions import ALPHA
 from evopolicy_coordinator.analysis.statistics.intervals import Estimate
 from evopolicy_coordinator.analysis.statistics.pairs import Pair
-from evopolicy_coordinator.analysis.statistics.resolution import GAPS, MAX_REPEATS, Repeats, Resolution
+from evopolicy_coordinator.analysis.statistics.repeats import MAX_REPEATS, Repeats
+from evopolicy_coordinator.analysis.statistics.resolution import GAPS, Resolution
 from evopolicy_coordinator.analysis.study import Suite
 from evopolicy_coordinator.analysis.tables.run_tables import ENTRY, ENV
 from evopolicy_coordinator.analysis.tables.table import Column, Table
 
 CHECKPOINTS = "With one run a cell this compares the selected checkpoints, not the agents: how an agent's runs vary is not known."
 _SHOWN_TAUS = (0.1, 0.25, 0.5, 0.75, 0.9)
-_VERDICTS = {"not told apart": "no", "not comparable": None}
 
 
 def statistics_tables(suite: Suite) -> list[Table]:
@@ -47,7 +48,7 @@ def interval_text(estimate: Estimate | None, digits: int = 3) -> str | None:
 
 
 def _bounds(bounded: Bounded | None, digits: int = 2) -> str | None:
-    return None if bounded is None else span(bounded.low, bounded.high, digits)
+    return None if bounded is None else span(bounded.low, bounded.high, digits) or bounded.reason or None
 
 
 def has_single_runs(suite: Suite) -> bool:
@@ -62,9 +63,13 @@ def _pairs(suite: Suite) -> Table:
         name=f"pairs_{suite.name}",
         title=f"{suite_title(suite.name)} differences",
         caption="Every two entries on every environment: first minus second, in held-out returns of the cases that both have. Interval: "
-        "95 %, for one environment and pair alone, over what the column Over names. p: permutation test of no difference, two-sided (over "
-        "cases signs are flipped, over runs labels change). Corrected p: Holm, over all pairs of agents of the "
-        "suite; comparisons with the random reference are a family of their own. Significant: corrected p at most 0.05."
+        "95 %, for one environment and pair alone, over what the column Over names. p: of no difference, two-sided, from the "
+        "interval's own distribution; it is at most 0.05 exactly if the interval excludes 0. Corrected p: Holm, over all rows of this "
+        "table together, so a false difference in any row has a probability of at most 5 %. Significant: corrected p at most 0.05. "
+        "About how many runs (or cases) would be needed: so many that every second experiment resolves a true difference of the size "
+        "seen here, whose own size is uncertain. These cases only: permutation test that exchanges runs and takes the cases as "
+        "given; with other cases the difference may vanish, and no verdict rests on it. The tie groups of the leaderboard are a "
+        "second family of comparisons at 5 %, so both together have at most 10 %."
         + (f" {CHECKPOINTS}" if has_single_runs(suite) else "")
         + (
             f" In {left_out} rows the entries' cases differ: only common cases pair, and the others are left out."
@@ -82,6 +87,8 @@ def _pairs(suite: Suite) -> Table:
             Column("p", "p", "number", digits=4, below=True),
             Column("p_holm", "Corrected p", "number", digits=4, below=True),
             Column("told_apart", "Significantly better", note="The better entry, or the reason for none."),
+            Column("needed", "Needed", "integer", note="Runs of each agent, or cases of checkpoints."),
+            Column("p_these_cases", "p, these cases only", "number", digits=4, below=True),
             Column("compares", "Compares", note="Checkpoints, where an entry has one run; else agents."),
             Column("runs", "Runs"),
             Column("cases", "Cases", "integer"),
@@ -93,7 +100,7 @@ def _pairs(suite: Suite) -> Table:
 
 def _pair(pair: Pair) -> dict[str, Any]:
     gap = pair.gap
-    named = {"first": pair.first, "second": pair.second, **_VERDICTS}
+    named = {"first": pair.first, "second": pair.second, "not told apart": _not_told(pair)}
     return {
         "env": title_of(pair.env),
         "first": pair.first,
@@ -104,12 +111,28 @@ def _pair(pair: Pair) -> dict[str, Any]:
         "method": gap.method if gap is not None and gap.low is not None else None,
         "p": pair.p,
         "p_holm": pair.p_holm,
-        "told_apart": named.get(pair.verdict, pair.verdict),
+        "told_apart": named.get(pair.verdict),
+        "needed": pair.n_needed,
+        "p_these_cases": pair.p_these_cases,
         "compares": pair.compares,
         "runs": f"{pair.n_runs[0]} and {pair.n_runs[1]}",
         "cases": pair.n_cases or None,
         "left_out": pair.n_left_out,
     }
+
+
+def _not_told(pair: Pair) -> str:
+    checkpoints = pair.compares == "checkpoints"
+    # One run is that of the random reference.
+    n = str(pair.n_cases) if checkpoints else " and ".join(map(str, sorted({*pair.n_runs} - {1})))
+    # The interval beside it is for this pair alone.
+    alone = pair.p is not None and pair.p <= ALPHA
+    text = "not after the correction for all pairs" if alone else "not distinguishable"
+    text += f" on {n} cases" if checkpoints else f" with {n} runs"
+    if pair.n_needed is not None:
+        return f"{text}; about {pair.n_needed} would be needed"
+    more_cases = not checkpoints and pair.n_cases and pair.gap is not None and pair.gap.value != 0.0
+    return f"{text}; more cases would be needed" if more_cases else text
 
 
 def _resolution(suite: Suite) -> Table:
@@ -187,8 +210,10 @@ def _aggregates(suite: Suite) -> Table:
         title=f"{suite_title(suite.name)} aggregates",
         caption="Over the normalised scores of single runs, not clipped, on the environments that have a random-to-best scale (Agarwal et al. "
         "2021). IQM: mean of the middle half. Above: share of the runs whose normalised score is above it (the performance "
-        "profile). Intervals: 95 %, percentiles of a bootstrap stratified by environment; over runs, or where a cell has one run, over "
-        f"its cases. Two runs to {LEAST_RUNS - 1} are too few for those of shares."
+        "profile). Intervals: 95 %, percentiles of a bootstrap stratified by environment, over what the column Over names; the scale is "
+        "estimated again in each resample. The best agent's observed mean is the scale's end; where several agents are about as good "
+        "it is too high on average, IQMs are too low, and their intervals miss: compare such agents by their differences. "
+        f"Two runs to {LEAST_RUNS - 1} are too few for the intervals of shares."
         + (f" {CHECKPOINTS}" if has_single_runs(suite) else ""),
         columns=(
             ENTRY,
@@ -223,8 +248,8 @@ def _improvements(suite: Suite) -> Table:
         name=f"improvement_{suite.name}",
         title=f"{suite_title(suite.name)} probability of improvement",
         caption="How probably a run of the first agent scores above a run of the second, ties counting half, mean over the environments that "
-        "both have played and that have a scale (Agarwal et al. 2021). Interval: 95 %, stratified bootstrap over runs, or "
-        "over cases where a cell has one run." + (f" {CHECKPOINTS}" if has_single_runs(suite) else ""),
+        "have a scale (Agarwal et al. 2021). Interval: 95 %, stratified bootstrap over runs and their cases, or over the cases of single "
+        "runs." + (f" {CHECKPOINTS}" if has_single_runs(suite) else ""),
         columns=(
             Column("first", "First"),
             Column("second", "Second"),

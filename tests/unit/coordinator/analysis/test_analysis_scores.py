@@ -94,13 +94,37 @@ def test_leaderboard_of_a_small_table_is_as_computed_by_hand() -> None:
     assert r.is_reference
 
 
-def test_entry_that_has_not_played_an_environment_is_scored_over_the_others() -> None:
-    board = leaderboard(
-        table({"A": {"gym/acrobot": (1.0,)}, "B": {"gym/acrobot": (0.0,), "gym/ant5": (1.0,)}})
+def test_an_entry_that_lacks_an_environment_is_not_ranked() -> None:
+    scores = {
+        "A": {"gym/acrobot": (1.0,), "gym/ant5": (1.0,)},
+        "B": {"gym/acrobot": (9.0,)},
+        "C": {"gym/acrobot": (0.0,), "gym/ant5": (None,)},
+    }
+    board = leaderboard(table(scores))
+    assert [(row.entry, row.rank, row.score) for row in board.standings] == [("A", 1, 1.0), ("C", 2, 0.0)]
+    (lacking,) = board.incomplete
+    assert (lacking.entry, lacking.missing, lacking.n_environments) == ("B", ("gym/ant5",), 1)
+    cell = board.cells["B", "gym/acrobot"]
+    assert (cell.mean, cell.rank, cell.score) == (9.0, None, None)
+    # It does not move the complete ones either.
+    del scores["B"]
+    assert leaderboard(table(scores)).standings == board.standings
+
+
+def test_a_group_mean_needs_every_environment_of_the_group() -> None:
+    found = normalised(
+        table(
+            {
+                "A": {"gym/acrobot": (1.0,), "gym/ant5": (1.0,)},
+                "B": {"gym/acrobot": (1.0,)},
+                "C": {"gym/acrobot": (0.5,), "gym/ant5": (None,)},
+                "R": {"gym/acrobot": (0.0,), "gym/ant5": (0.0,)},
+            },
+            reference="R",
+        )
     )
-    b = next(row for row in board.standings if row.entry == "B")
-    assert (b.n_environments, b.score) == (2, 0.0)
-    assert b.families["mujoco"] is None
+    means = {group.entry: group.value for group in found.groups if group.demand == "tuning"}
+    assert means == {"A": 1.0, "B": None, "C": None}
 
 
 def test_repeats_give_their_mean() -> None:

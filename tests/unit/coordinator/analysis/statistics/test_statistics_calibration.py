@@ -8,17 +8,18 @@ from invented.simulated_entries import (
     CASE_SHAPES,
     RUN_SHAPES,
     Rate,
+    World,
+    aggregate_rates,
     case_coverage,
     coverage,
-    false_gaps_by_holm,
-    iqm_coverage,
+    false_gaps,
     rank_rates,
+    resolved,
     run_coverage,
     runs_of,
 )
 
-from evopolicy_coordinator.analysis.statistics.intervals import components, difference
-from evopolicy_coordinator.analysis.statistics.resolution import Spread, half_width
+from evopolicy_coordinator.analysis.statistics.intervals import components
 
 TRIALS = 300
 # Four standard errors of a share of 0.95 in 300 trials are 5 %.
@@ -40,7 +41,8 @@ def test_interval_of_one_run_covers_from_32_cases(shape: str) -> None:
 def test_interval_over_runs_covers(kind: str, n_runs: int) -> None:
     found = run_coverage(kind, n_runs, TRIALS, resamples=800)
     assert found.given >= 0.97 * found.trials  # two runs of 0/1 returns may have equal means
-    assert 0.92 - SLACK <= found.share <= 0.98
+    # Two runs have few degrees of freedom; Satterthwaite's are then too few rather than too many.
+    assert 0.92 - SLACK <= found.share <= (1.0 if n_runs == 2 else 0.98)
 
 
 def test_an_interval_that_forgot_the_runs_would_not_cover() -> None:
@@ -52,37 +54,48 @@ def test_an_interval_that_forgot_the_runs_would_not_cover() -> None:
     assert coverage(one_run_each, TRIALS).share < 0.75
 
 
-def test_equal_entries_are_told_apart_as_rarely_as_stated() -> None:
-    equal = rank_rates(0.0, 60)
+@pytest.mark.parametrize("n_runs", [(4,), (10,), (2, 10, 3, 5)])
+@pytest.mark.parametrize("interaction", [0.5, 1.0])
+def test_agents_that_differ_by_case_are_told_apart_as_rarely_as_stated(
+    n_runs: tuple[int, ...], interaction: float
+) -> None:
+    found = false_gaps(World(n_runs=n_runs, interaction=interaction), 40)
+    # Four standard errors of the stated 5 % in 40 suites are 14 %.
+    assert found.holm.share <= 0.19
+    assert found.ties.share <= 0.19
+    assert found.raw.share <= 0.07
+
+
+@pytest.mark.parametrize("shape", ["normal", "0/1"])
+def test_equal_checkpoints_are_told_apart_as_rarely_as_stated(shape: str) -> None:
+    found = false_gaps(World(n_runs=(1,), shape=shape), 60)
+    assert found.holm.share <= 0.05 + 0.12
+    assert found.raw.share <= 0.07
+
+
+def test_equal_entries_keep_their_rank_scores() -> None:
+    equal = rank_rates(World(n_runs=(1,), n_entries=5, n_environments=16), 60)
     assert equal.false_gap.share <= 0.15
     assert equal.score.share >= 0.9
-    assert false_gaps_by_holm(1, 60).share <= 0.15
-    assert false_gaps_by_holm(10, 20, n_environments=3).share <= 0.25
 
 
 def test_unequal_entries_are_told_apart_and_ranks_hold() -> None:
-    unequal = rank_rates(1.0, 20)
+    unequal = rank_rates(World(n_runs=(1,), n_entries=5, n_environments=16, spread=1.0), 20)
     assert unequal.pairs_apart > 0.6
     assert unequal.rank.share >= 0.85
     assert unequal.false_gap.share <= 0.15
     assert unequal.score.share >= 0.85
 
 
-def test_interval_of_an_iqm_covers() -> None:
-    assert_covers(iqm_coverage(5, TRIALS), low=0.9, high=0.98)
+def test_intervals_of_aggregates_cover_on_a_scale_of_the_same_runs() -> None:
+    found = aggregate_rates(5, (1.0, 2.0, 3.0, 4.0), 60, n_environments=8)
+    for rate in (found.iqm, found.profile, found.improvement):
+        assert rate.share >= 0.85
 
 
 def test_a_gap_of_the_stated_size_is_resolved_every_second_time() -> None:
-    generator = np.random.default_rng(3)
-    spread = Spread(run=0.5**2 + 1.0 / 32, case=2 * 0.5**2 / 32, n_cases=32)
-    gap = half_width(spread, 5)
-    resolved = 0
-    for _ in range(TRIALS):
-        one, other, _ = runs_of("normal", generator, 5, 32, gap)
-        found = difference(one, other)
-        assert found.low is not None
-        resolved += found.low > 0.0
-    assert 0.4 <= resolved / TRIALS <= 0.6
+    assert 0.4 <= resolved(5, TRIALS).share <= 0.6
+    assert 0.4 <= resolved(0, TRIALS, level=0.001).share <= 0.75
 
 
 def test_components_find_the_variances_that_made_the_returns() -> None:
