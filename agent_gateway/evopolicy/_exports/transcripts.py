@@ -14,6 +14,7 @@ import msgspec
 
 from evopolicy._exports.steps import Step, read_steps
 from evopolicy._runs import Run, Runs
+from evopolicy_common.records import secrets
 
 ATIF = "ATIF-v1.7"
 """The version of the format that is written."""
@@ -51,7 +52,8 @@ def _each(
         steps = read_steps(run.folder / "logs" / "agent.jsonl") or [_nothing()]
         path = path_of(run)
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(made(run, steps), ensure_ascii=True, indent=1), encoding="utf-8")
+        data = json.dumps(made(run, steps), ensure_ascii=True, indent=1).encode()
+        path.write_bytes(secrets.redacted(data, secrets.read_passed(run.folder)))
         yield path
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import orjson
 
-from evopolicy_gateway.agent_supervisor.redaction import Redaction
+from evopolicy_common.records.secrets import Redaction
 
 MAX_LINE_BYTES = 1 << 20
 MAX_LOG_BYTES = 1 << 30

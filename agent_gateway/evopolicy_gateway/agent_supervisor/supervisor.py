@@ -19,10 +19,10 @@ import msgspec
 from evopolicy_common.cli import setup_logging
 from evopolicy_common.errors import ConfigError, EvopolicyError
 from evopolicy_common.logs import structlog
+from evopolicy_common.records.secrets import Redaction, note_passed, without_keys
 from evopolicy_gateway.agent_supervisor.agent_log import AgentLog
 from evopolicy_gateway.agent_supervisor.agent_process import environment_of
 from evopolicy_gateway.agent_supervisor.clock import Activity, AgentClock
-from evopolicy_gateway.agent_supervisor.redaction import Redaction
 from evopolicy_gateway.harnesses import config_of, make
 from evopolicy_gateway.harnesses.agent_config import AgentConfig
 from evopolicy_gateway.harnesses.base import Stage
@@ -65,7 +65,10 @@ async def keep(order: StartAgent, orders: Orders) -> AgentEnded:
     except ConfigError as error:
         # The agent's file has changed since the run was opened.
         return AgentEnded(reason="agent_failed", detail=str(error))
-    agent_log = AgentLog(Path(order.agent_log), Redaction.of(secrets_in(environment, config), order.urls))
+    on_command_line: list[str] = []
+    shown = without_keys([order.agent, msgspec.to_builtins(config)], on_command_line)[0]
+    redact = Redaction.of(secrets_in(environment, config), order.urls).knowing(on_command_line)
+    agent_log = AgentLog(Path(order.agent_log), redact)
     clock = AgentClock(order.wall_limit_s)
     activity = None if order.silence_s is None else Activity(order.silence_s, Path(order.workspace))
     stage = Stage(
@@ -84,7 +87,7 @@ async def keep(order: StartAgent, orders: Orders) -> AgentEnded:
     stopped = asyncio.create_task(_stopped(orders, clock, activity))
     late = asyncio.create_task(clock.run_out())
     telling = asyncio.create_task(_tell_time(clock))
-    log.info("agent started", agent=order.agent)
+    log.info("agent started", agent=shown)
     try:
         await asyncio.wait([play, stopped, late], return_when=asyncio.FIRST_COMPLETED)
         reason = None if play.done() else "told" if stopped.done() else "wall_limit"
@@ -116,7 +119,9 @@ def _stderr_tail(agent_log: AgentLog) -> tuple[str, ...]:
 
 async def _play(order: StartAgent, stage: Stage, config: AgentConfig | None) -> AgentEnded:
     harness = make(order.agent, Path(order.started_in), config)
+    passed = [*harness.variables]
     if order.jail is not None:
+        passed += order.jail.settings.environment
         kept = inputs.Kept()
         if config is not None and order.inputs:
             folder, started_in = Path(order.jail.private) / "inputs", Path(order.started_in)
@@ -141,6 +146,9 @@ async def _play(order: StartAgent, stage: Stage, config: AgentConfig | None) -> 
         )
         inside = jail.environment(stage.environment, {**order.urls, **order.variables})
         stage = msgspec.structs.replace(stage, environment=inside, jail=jail)
+    if order.passed_file is not None:
+        values = (*stage.log.redact.secrets, *(stage.environment.get(name, "") for name in passed))
+        await asyncio.to_thread(note_passed, Path(order.passed_file), values)
     return await harness.play(stage)
 
 

@@ -17,7 +17,7 @@ from typing import Any
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.processes.left_files import keep_to_owner
 from evopolicy_common.processes.scratch import remove_tree
-from evopolicy_gateway.agent_supervisor.redaction import is_secret
+from evopolicy_common.records.secrets import is_secret
 
 _CLAUDE = (
     *("~/.claude.json", "~/.claude/.credentials.json", "~/.claude/settings.json", "~/.claude/CLAUDE.md"),

@@ -156,6 +156,8 @@ class StartAgent(Order, frozen=True, kw_only=True, tag="start_agent"):
     inputs: tuple[AgentInput, ...] = ()
     """Skills and MCP servers with which the run was opened; they need a jail."""
     session_file: str | None = None
+    passed_file: str | None = None
+    """`Passed`: gets digests of values that the agent's variables and command line hold."""
     silence_s: float | None = None
     """A program without activity for this long is ended, seconds; None: no such limit."""
     jail: JailOrder | None = None

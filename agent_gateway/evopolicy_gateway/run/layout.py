@@ -16,6 +16,7 @@ from evopolicy_common.errors import DECODE_ERRORS, ConfigError
 from evopolicy_common.messages.run_settings import RunSettings
 from evopolicy_common.records.blobs import write_atomically
 from evopolicy_common.records.run_record import Artifacts
+from evopolicy_common.records.secrets import PASSED
 from evopolicy_common.wire import keys
 
 T = TypeVar("T")
@@ -72,6 +73,11 @@ class RunFolder(msgspec.Struct, frozen=True):
     def env_log(self) -> Path:
         """Played episodes with their results, written at the end."""
         return self.root / "logs" / "env.log"
+
+    @property
+    def passed(self) -> Path:
+        """Digests of values that the agent got; stays when the run ends, and is never published."""
+        return self.root / PASSED
 
     def artifacts(self) -> Artifacts:
         """The existing files of a finished run, under their names in `run.json`."""

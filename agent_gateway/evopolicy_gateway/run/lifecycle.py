@@ -34,6 +34,7 @@ from evopolicy_common.processes.notices import Waiting
 from evopolicy_common.processes.scratch import remove_tree
 from evopolicy_common.records.run_files import read_record
 from evopolicy_common.records.run_record import RunRecord
+from evopolicy_common.records.secrets import without_keys
 from evopolicy_common.wire import credentials
 from evopolicy_common.wire.credentials import Credentials
 from evopolicy_gateway import harnesses
@@ -294,7 +295,8 @@ class RunLifecycle:
             for line in ended.stderr_tail or ("nothing",):
                 self._watch.note(self._name, f"stderr: {line}")
             self._watch.note(self._name, f"full log: {self._folder.agent_log}")
-        about = {"turns": ended.turns, "retries": ended.retries, "detail": ended.detail, **ended.facts}
+        facts = without_keys(ended.facts)
+        about = {"turns": ended.turns, "retries": ended.retries, "detail": ended.detail, **facts}
         try:
             about["record"] = record.told_at_close(self._folder, self._plan, about)
         except Exception as error:  # the agent has ended: no bug in this costs the run
@@ -448,6 +450,7 @@ class RunLifecycle:
                 inputs=self._plan.texts.inputs,
                 config=None if self._plan.config is None else msgspec.to_builtins(self._plan.config),
                 session_file=str(self._folder.session),
+                passed_file=str(self._folder.passed),
                 lock=str(self._folder.supervisor_lock),
                 jail=self._jail(),
             )

@@ -51,6 +51,7 @@ from evopolicy_common.records.run_record import (
     encode_run_record,
     sha256_text,
 )
+from evopolicy_common.records.secrets import without_keys
 from evopolicy_common.records.summary import utc_text
 from evopolicy_gateway.operator.operations import Operations
 from evopolicy_gateway.run import replays
@@ -249,13 +250,15 @@ def _agent(plan: Plan, facts: dict[str, Any]) -> Agent:
         harness=facts.get("harness") or plan.agent.partition(":")[0],
         cli_version=facts.get("cli_version"),
         model_string=facts.get("model_string"),
-        settings={
-            "agent": plan.agent,
-            "wall_limit_s": plan.wall_limit_s,
-            "silence_limit_s": plan.silence_s,
-            **({"jail": plan.jail.chosen()} if plan.jail.chosen() else {}),
-            **facts.get("settings", {}),
-        },
+        settings=without_keys(
+            {
+                "agent": plan.agent,
+                "wall_limit_s": plan.wall_limit_s,
+                "silence_limit_s": plan.silence_s,
+                **({"jail": plan.jail.chosen()} if plan.jail.chosen() else {}),
+                **facts.get("settings", {}),
+            }
+        ),
         retries=int(facts.get("retries", 0)),
         turns=int(facts.get("turns", 0)),
         tokens=None if tokens is None else msgspec.convert(tokens, Tokens),

@@ -3,7 +3,8 @@
 Rules that this module owns:
 - The coordinator is asked to disclose the runs' cases before anything of them is read: it refuses while it must.
 - What is collected depends on the runs and the journal alone, and is written in a fixed order: publishing again gives the same bytes.
-- Every file goes through the search of `scrub` before it is written.
+- Every file goes through the searches of `scrub` before it is written. A secret stops the publication, before anything is
+  disclosed if it is in a file of a run directory, unless its line is accepted or its file left out.
 """
 
 from __future__ import annotations
@@ -14,11 +15,12 @@ import socket
 from collections.abc import AsyncIterator, Callable, Sequence
 from importlib.metadata import version
 from pathlib import Path
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
 
-from evopolicy_common.errors import BundleError, ConfigError, EvopolicyError, ProtocolError, RefusedError
+from evopolicy_common.errors import ConfigError, EvopolicyError, ProtocolError, RefusedError
 from evopolicy_common.messages.environment import Split
 from evopolicy_common.messages.episode import EpisodeOutcome
 from evopolicy_common.records import journal
@@ -26,9 +28,11 @@ from evopolicy_common.records.canary import CANARY
 from evopolicy_common.records.episodes.rendered import decode
 from evopolicy_common.records.episodes.trajectory import Recorder, Trajectory
 from evopolicy_common.records.journal import Result, SubmitResult
+from evopolicy_common.records.policies.bundles import Bundle
 from evopolicy_common.records.policies.checkpoints import bundle_of
 from evopolicy_common.records.run_files import read_record, run_folders
 from evopolicy_common.records.run_record import RunRecord, encode_run_record
+from evopolicy_common.records.secrets import Passed, read_passed
 from evopolicy_common.regular_files import read_regular
 from evopolicy_common.wire.operator_client import TIMEOUT_S, OperatorClient
 from evopolicy_common.wire.transport import Link
@@ -37,6 +41,7 @@ from evopolicy_coordinator.publish.archive import Writer
 from evopolicy_coordinator.publish.contents import Episode, Group, Listed, Manifest, Removed
 
 Tell = Callable[[str], None]
+_SHOWN = 20
 
 _LOGS = Removed(what="logs/", why="agents' and programs' logs name paths, hosts and variables")
 _OTHER_LOGS = Removed(what="logs/, but agent.jsonl", why="programs' logs name paths, hosts and variables")
@@ -109,9 +114,19 @@ class Publisher:
     """One publication."""
 
     def __init__(
-        self, link: Link, tell: Tell, needles: Sequence[scrub.Needle], *, with_logs: bool = False
+        self,
+        link: Link,
+        tell: Tell,
+        needles: Sequence[scrub.Needle],
+        *,
+        with_logs: bool = False,
+        remove_findings: bool = False,
+        accepted: Sequence[str] = (),
     ) -> None:
-        """`with_logs`: publish agents' logs too, with everything replaced that the search finds."""
+        """`with_logs`: publish agents' logs too, with everything replaced that the search finds. `remove_findings`: leave
+        out policies and recordings with secrets. `accepted`: `FILE:LINE` of each secret to be published as it is."""
+        self._remove_findings = remove_findings
+        self._accepted = frozenset(accepted)
         self._with_logs = with_logs
         self._ask = OperatorClient(link)
         self._tell = tell
@@ -124,6 +139,14 @@ class Publisher:
         """Writes `out` atomically. Raises ConfigError when the coordinator refuses. `left`: folders that are left out."""
         left = list(left)
         ids: list[str] = []
+        passed = [read_passed(folder) for folder, _ in runs]
+        self._stop_at(
+            [
+                secret
+                for (folder, _), each in zip(runs, passed, strict=True)
+                for secret in self._in_folder(folder, each)
+            ]
+        )
         try:
             await self._ask.disclose(tuple(record.run for _, record in runs))
         except RefusedError as error:
@@ -142,7 +165,7 @@ class Publisher:
                 inner: dict[str, str] = {}
                 before = len(self._removed)
                 try:
-                    async for name, data in self._run_files(folder, record, place):
+                    async for name, data in self._run_files(folder, record, place, passed[number]):
                         writer.add(f"{place}/{name}", data)
                         inner[name] = contents.digest(data)
                 except _GoneError as error:  # before the first file
@@ -197,7 +220,7 @@ class Publisher:
         )
 
     async def _run_files(
-        self, folder: Path, record: RunRecord, place: str
+        self, folder: Path, record: RunRecord, place: str, passed: Passed | None
     ) -> AsyncIterator[tuple[str, bytes]]:
         opened = await self._ask.opening(record.run)
         result = msgspec.json.decode(opened.result, type=Result)
@@ -206,7 +229,7 @@ class Publisher:
         groups: list[Group] = []
         recorded: list[tuple[str, bytes]] = []
         for split, index, n in contents.wanted_groups(result):
-            group, recordings = await self._group(record.run, split, index, n)
+            group, recordings = await self._group(record.run, split, index, n, place, passed)
             groups.append(group)
             if recordings is not None:
                 recorded.append((f"actions/{group.name}", recordings))
@@ -217,18 +240,20 @@ class Publisher:
             (contents.RESULT, opened.result),
             (contents.EPISODES, contents.document(tuple(groups))),
         ):
-            self._must_be_clean(f"{place}/{name}", data)
+            self._must_be_clean(f"{place}/{name}", data, passed)
             yield name, data
         for name, data in recorded:
             yield name, data
         for submit in result.submits:
-            packed = self._checkpoint(folder, submit, place)
+            packed = self._checkpoint(folder, submit, place, passed)
             if packed is not None:
                 yield contents.checkpoint_path(submit.submit_index), packed
-        if self._with_logs and (log := self._log(folder, record, place)) is not None:
+        if self._with_logs and (log := self._log(folder, record, place, passed)) is not None:
             yield contents.LOG, log
 
-    async def _group(self, run: str, split: Split, index: int, n: int) -> tuple[Group, bytes | None]:
+    async def _group(
+        self, run: str, split: Split, index: int, n: int, place: str, passed: Passed | None
+    ) -> tuple[Group, bytes | None]:
         """A group's returns, and its recordings packed; None where something in them must not be published."""
         outcomes: dict[int, EpisodeOutcome] = {}
         async for outcome in self._ask.recorded(run, split, index, timeout_s=TIMEOUT_S):
@@ -240,7 +265,7 @@ class Publisher:
             )
         episodes = []
         recordings: list[bytes | None] = []
-        found: list[str] = []
+        found: list[str | _Secret] = []
         for number in sorted(outcomes):
             outcome = outcomes[number]
             episodes.append(
@@ -254,39 +279,81 @@ class Publisher:
             data = None
             if outcome.trajectory is not None:
                 trajectory = decode(await self._ask.fetch(outcome.trajectory))
-                found += scrub.search(_texts(trajectory), self._needles)
+                texts = _texts(trajectory)
+                found += scrub.search(texts, self._needles)
+                found += self._secrets(f"{place}/actions/{name}/{number}", texts, passed)
                 data = actions_only(trajectory)
             recordings.append(data)
         group = Group(split=split, submit_index=index, episodes=tuple(episodes))
         if found:
-            self._removed.append(Removed(what=f"run {run}: actions of {name}", why=f"they held {found[0]}"))
+            self._stop_at([each for each in found if isinstance(each, _Secret)])
+            self._removed.append(
+                Removed(what=f"run {run}: actions of {name}", why=f"they held {_kind(found[0])}")
+            )
             return group, None
         return group, contents.pack_recordings(recordings)
 
-    def _checkpoint(self, folder: Path, submit: SubmitResult, place: str) -> bytes | None:
+    def _checkpoint(
+        self, folder: Path, submit: SubmitResult, place: str, passed: Passed | None
+    ) -> bytes | None:
         if submit.bundle is None:
             return None
         what = f"{place}/{contents.checkpoint_path(submit.submit_index)}"
         matches = sorted((folder / "checkpoints").glob(f"submit_*{submit.submit_index:03d}"))
-        try:
-            bundle = bundle_of(matches[0]) if matches else None
-        except (BundleError, EvopolicyError):
-            bundle = None
+        bundle = _bundle(matches[0]) if matches else None
         if bundle is None or bundle.digest != submit.bundle:
             why = "the run directory does not hold the policy that was submitted"
             self._removed.append(Removed(what=what, why=why))
             return None
-        if found := scrub.search(bundle.packed, self._needles):
-            self._removed.append(Removed(what=what, why=f"it holds {found[0]}"))
+        kept_back = self._in_policy(matches[0], bundle, passed)
+        # Of files that have changed since the first look.
+        self._stop_at(kept_back)
+        found: list[str | _Secret] = [*scrub.search(bundle.packed, self._needles), *kept_back]
+        if found:
+            self._removed.append(Removed(what=what, why=f"it holds {_kind(found[0])}"))
             return None
         return bundle.packed
 
-    def _log(self, folder: Path, record: RunRecord, place: str) -> bytes | None:
+    def _in_folder(self, folder: Path, passed: Passed | None) -> list[_Secret]:
+        """Secrets in a run directory's files, apart from the log, in which they are replaced."""
+        found: list[_Secret] = []
+        for path in sorted((folder / "checkpoints").glob("submit_*")):
+            if (bundle := _bundle(path)) is not None:
+                found += self._in_policy(path, bundle, passed)
+        return found
+
+    def _in_policy(self, folder: Path, bundle: Bundle, passed: Passed | None) -> list[_Secret]:
+        names = "\n".join(file.path for file in bundle.files).encode()
+        found = self._secrets(f"{folder} (names of files)", names, passed)
+        for file in bundle.files:
+            found += self._secrets(str(folder / file.path), file.data, passed)
+        return found
+
+    def _secrets(self, name: str, data: bytes, passed: Passed | None) -> list[_Secret]:
+        """Secrets whose lines are not accepted."""
+        lines = scrub.secret_lines(data, passed)
+        found = [_Secret(f"{name}:{line}", what) for line, what in sorted(lines.items())]
+        return [each for each in found if each.place not in self._accepted]
+
+    def _stop_at(self, found: Sequence[_Secret], *, always: bool = False) -> None:
+        """Raises ConfigError for secrets, unless what holds them is left out."""
+        if not found or (self._remove_findings and not always):
+            return
+        shown = "; ".join(f"{each.place}: {each.what}" for each in found[:_SHOWN])
+        more = f"; and {len(found) - _SHOWN} more" if len(found) > _SHOWN else ""
+        left_out = "" if always else "leave out these policies and recordings with --remove-findings, or "
+        raise ConfigError(
+            f"nothing is published, as this looks like secrets: {shown}{more}. Revoke real keys; then {left_out}publish a"
+            " line as it is with --accept-finding FILE:LINE"
+        )
+
+    def _log(self, folder: Path, record: RunRecord, place: str, passed: Passed | None) -> bytes | None:
         """The agent's log without what the search finds; None where there is none to publish."""
         path = folder / (record.artifacts.logs_agent or "logs/agent.jsonl")
         what = f"{place}/{contents.LOG}"
         try:
-            data, counts = scrub.redact(read_regular(path, contents.MAX_DOCUMENT_BYTES), self._needles)
+            log = read_regular(path, contents.MAX_DOCUMENT_BYTES)
+            data, counts = scrub.redact(log, self._needles, passed)
         except FileNotFoundError:
             return None
         except OSError as error:
@@ -294,15 +361,33 @@ class Publisher:
             return None
         for found, n in sorted(counts.items()):
             self._removed.append(Removed(what=f"{what}: {n} places", why=f"they held {found}"))
-        self._must_be_clean(what, data)
+        self._must_be_clean(what, data, passed)
         return data
 
-    def _must_be_clean(self, name: str, data: bytes) -> None:
+    def _must_be_clean(self, name: str, data: bytes, passed: Passed | None = None) -> None:
+        self._stop_at(self._secrets(name, data, passed), always=True)
         if found := scrub.search(data, self._needles):
             raise ConfigError(
                 f"{name} would reveal {found[0]}; nothing is published. Names of entries, models and experiments are published as"
                 " they are: use other names for the runs, or unset a variable whose value is such a name"
             )
+
+
+class _Secret(NamedTuple):
+    place: str
+    """`FILE:LINE`."""
+    what: str
+
+
+def _kind(found: str | _Secret) -> str:
+    return found.what if isinstance(found, _Secret) else found
+
+
+def _bundle(checkpoint: Path) -> Bundle | None:
+    try:
+        return bundle_of(checkpoint)
+    except EvopolicyError:
+        return None
 
 
 def actions_only(trajectory: Trajectory) -> bytes:

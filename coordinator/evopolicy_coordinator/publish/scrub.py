@@ -1,7 +1,8 @@
 """Removes unpublishable data from records, and searches for it in all other files. Pure.
 
-A record keeps the fields that this module lists; all other fields are removed and named. If the search finds a match in
-a file that may be omitted (a policy, recorded actions), the whole file is omitted; otherwise nothing is published.
+A record keeps the fields that this module lists; all other fields are removed and named. If the search finds a term of
+this machine in a file that may be omitted (a policy, recorded actions), the whole file is omitted; otherwise nothing is
+published. A secret in any file stops the publication (`collect`).
 """
 
 from __future__ import annotations
@@ -12,7 +13,9 @@ from collections.abc import Iterable, Iterator, Mapping
 
 import msgspec
 
+from evopolicy_common.records import secrets
 from evopolicy_common.records.run_record import PUBLISHED_SETTINGS, Artifacts, RunRecord
+from evopolicy_common.records.secrets import Passed
 from evopolicy_coordinator.publish.contents import Removed
 
 _MIN_NEEDLE = 4
@@ -37,11 +40,7 @@ _NOBODY = frozenset(
     {"root", "user", "admin", "ubuntu", "debian", "runner", "nobody", "localhost", "evopolicy"}
 )
 """Names that identify nobody."""
-_PATTERNS = (
-    (re.compile(rb"/(?:home|Users)/[A-Za-z0-9._-]+"), "a home folder"),
-    (re.compile(rb"-----BEGIN [A-Z ]*PRIVATE KEY-----"), "a private key"),
-    (re.compile(rb"(?:\b|(?<=\\[nrtbf]))(?:sk-[A-Za-z0-9_-]{20,}|gh[pousr]_[A-Za-z0-9]{30,}|AKIA[A-Z0-9]{16}|xox[abp]-[A-Za-z0-9-]{20,})"), "an API key"),
-)  # fmt: skip
+_HOME = re.compile(rb"/(?:home|Users)/[A-Za-z0-9._-]+")
 
 
 class Needle(msgspec.Struct, frozen=True):
@@ -124,27 +123,40 @@ def needles(
 
 
 def search(data: bytes, needles: Iterable[Needle]) -> list[str]:
-    """The kinds of terms found in `data`, without their texts; a name counts only if no letter or digit adjoins it."""
-    found = [what for pattern, what in _PATTERNS if pattern.search(data)]
+    """The kinds of terms of this machine in `data`, without their texts; a name counts only if no letter or digit adjoins
+    it."""
+    found = ["a home folder"] if _HOME.search(data) else []
     found += [needle.what for needle in needles if next(_places(data, needle.text), None) is not None]
     return found
+
+
+def secret_lines(data: bytes, passed: Passed | None) -> dict[int, str]:
+    """The lines with a secret, counted from 1, each with the kind of its first one."""
+    lines: dict[int, str] = {}
+    line, counted = 1, 0
+    for at, what in sorted(secrets.found(data, passed)):
+        line, counted = line + data.count(b"\n", counted, at), at
+        lines.setdefault(line, what)
+    return lines
 
 
 REDACTED = b"[removed]"
 
 
-def redact(data: bytes, needles: Iterable[Needle]) -> tuple[bytes, dict[str, int]]:
-    """`data` with everything replaced that `search` would find, and how often each kind was."""
+def redact(
+    data: bytes, needles: Iterable[Needle], passed: Passed | None = None
+) -> tuple[bytes, dict[str, int]]:
+    """`data` with everything replaced that the searches would find, and how often each kind was."""
     counts: dict[str, int] = {}
-    for pattern, what in _PATTERNS:
-        data, n = pattern.subn(REDACTED, data)
-        counts[what] = counts.get(what, 0) + n
+    if passed is not None:
+        data, counts[secrets.PASSED_VALUE] = secrets.replaced(data, passed.places(data), REDACTED)
+    for pattern, what in ((_HOME, "a home folder"), *secrets.looks(data)):
+        data, counts[what] = pattern.subn(REDACTED, data)
     # The longest first: a folder's path may begin with another's.
     for needle in sorted(needles, key=lambda needle: -len(needle.text)):
-        places = list(_places(data, needle.text))
-        begins = [0, *(at + len(needle.text) for at in places)]
-        data = REDACTED.join(data[begin:end] for begin, end in zip(begins, [*places, len(data)], strict=True))
-        counts[needle.what] = counts.get(needle.what, 0) + len(places)
+        places = [(at, at + len(needle.text)) for at in _places(data, needle.text)]
+        data, n = secrets.replaced(data, places, REDACTED)
+        counts[needle.what] = counts.get(needle.what, 0) + n
     return data, {what: n for what, n in counts.items() if n}
 
 

@@ -34,7 +34,6 @@ seeds_from = 100
 PROBLEMS = {
     "hang": "environment acme/bad, step 0: it has not returned for 4 s, the limit of one call",
     "hang in reset": "environment acme/bad, reset: it has not returned for 4 s",
-    "hold": "environment acme/bad, reset or step: it has not returned for 4 s",
     "exit": "environment acme/bad: its process ended while it played",
     "nan": "environment acme/bad, step 0, reward: it is nan",
     "raise in reset": "environment acme/bad, reset: it raised RuntimeError: no level of that seed",

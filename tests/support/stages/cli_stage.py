@@ -15,9 +15,9 @@ from typing import Any
 
 from machines.own_processes import only_what_starts_inside
 
+from evopolicy_common.records.secrets import Redaction
 from evopolicy_gateway.agent_supervisor.agent_log import AgentLog
 from evopolicy_gateway.agent_supervisor.clock import AgentClock
-from evopolicy_gateway.agent_supervisor.redaction import Redaction
 from evopolicy_gateway.agent_supervisor.supervisor import secrets_in
 from evopolicy_gateway.harnesses import make
 from evopolicy_gateway.harnesses.agent_config import AgentConfig

@@ -6,6 +6,7 @@ import json
 
 import pytest
 
+from evopolicy_common.records.secrets import Passed
 from evopolicy_coordinator.publish import scrub
 
 VARIABLES = {
@@ -33,8 +34,6 @@ def needles() -> tuple[scrub.Needle, ...]:
         ("key = 'k-0123456789'", "variable API_KEY"),
         ("/srv/marie/tools/run", "variable PATH"),
         ("/home/jean/policy.py", "a home folder"),
-        ("sk-" + "a1B2" * 8, "an API key"),
-        ("-----BEGIN OPENSSH PRIVATE KEY-----", "a private key"),
     ],
 )
 def test_what_tells_of_a_machine_is_found(text: str, what: str) -> None:
@@ -62,9 +61,11 @@ def test_a_log_keeps_everything_but_what_the_search_finds() -> None:
         {"text": "summaries\nsk-" + "a1B2" * 8 + "\tk-0123456789"},
     ]
     data = "".join(json.dumps(line) + "\n" for line in lines).encode()
-    assert len(scrub.search(data, needles())) == 5
+    assert len(scrub.search(data, needles())) == 4
+    assert scrub.secret_lines(data, None) == {2: "an API key"}
     clean, counts = scrub.redact(data, needles())
     assert scrub.search(clean, needles()) == []
+    assert scrub.secret_lines(clean, None) == {}
     texts = [json.loads(line)["text"] for line in clean.splitlines()]
     assert texts[0] == "hello\n[removed] is at [removed]/x\n[removed]/runs"
     assert texts[1] == "summaries\n[removed]\t[removed]"
@@ -77,3 +78,12 @@ def test_a_name_that_json_spells_otherwise_is_found() -> None:
     for text in (json.dumps({"by": "renée"}), "by renée"):
         assert scrub.search(text.encode(), named) == ["the user's name"]
         assert b"[removed]" in scrub.redact(text.encode(), named)[0]
+
+
+def test_each_line_with_a_secret_is_named_once_with_its_number() -> None:
+    passed = Passed(key="00" * 32).with_values(["value of the run"])
+    key = "hf_" + "a1B2c3D4e5" * 3
+    data = f"one\n{key} {key}\nthree\nfour = 'value of the run'\n{key}".encode()
+    kinds = {2: "an API key", 4: "a value that the run passed to its agent", 5: "an API key"}
+    assert scrub.secret_lines(data, passed) == kinds
+    assert scrub.secret_lines(data, None) == {line: what for line, what in kinds.items() if line != 4}

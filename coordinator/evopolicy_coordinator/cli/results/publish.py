@@ -58,12 +58,25 @@ def publish(
         bool,
         typer.Option("--with-logs", help="Publish the agents' logs too, with the same removals."),
     ] = False,
+    remove_findings: Annotated[
+        bool,
+        typer.Option("--remove-findings", help="Leave out policies and recordings that hold keys or tokens."),
+    ] = False,
+    accept_finding: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="FILE:LINE",
+            help="Publish this line as it is, though it looks like a secret; may be repeated.",
+            show_default=False,
+        ),
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print what was published as JSON.")] = False,
 ) -> None:
     """Write finished runs into one signed file that anyone can check, and make their cases public.
 
     This cannot be undone: no new run plays cases of the same epoch (see `evopolicy-coordinator epoch`). Paths, host names, users,
-    variables and tokens are removed; removed.json in the file lists them.
+    variables and tokens are removed; removed.json in the file lists them. Keys in policies or recordings, and values that a run
+    passed to its agent, stop the command: see --remove-findings and --accept-finding.
     """
     where = where_of(connect, file, local, state, runs=runs)
     if out.exists():
@@ -77,7 +90,12 @@ def publish(
         async with where.link("publish") as (link, _):
             needles = needles_of_this_machine(link, *runs, *([state] if state else []))
             publisher = Publisher(
-                link, lambda text: say(one_line(text), err=True), needles, with_logs=with_logs
+                link,
+                lambda text: say(one_line(text), err=True),
+                needles,
+                with_logs=with_logs,
+                remove_findings=remove_findings,
+                accepted=accept_finding or (),
             )
             return await publisher.publish(found, out, left)
 

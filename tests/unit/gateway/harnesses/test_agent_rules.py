@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from stages.cli_stage import FAKES, play, settings
 
 from evopolicy_common.errors import ConfigError
+from evopolicy_common.records.secrets import Redaction
 from evopolicy_gateway.agent_supervisor.clock import AgentClock
-from evopolicy_gateway.agent_supervisor.redaction import Redaction
 from evopolicy_gateway.harnesses import entry_name, make
 from evopolicy_gateway.harnesses.agent_config import AgentConfig, Cli, Events, TokenPaths, read_agent
 from evopolicy_gateway.harnesses.coding_agents.claude_code import ClaudeReader

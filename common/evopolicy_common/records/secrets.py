@@ -1,0 +1,312 @@
+"""Keys and tokens: their looks, their removal from texts and command lines, and the values that a run has passed on.
+
+One table (`PATTERNS`) serves agents' logs, `run.json`, published results, and exports. Values without a known look are
+found by keyed digests in the private file `PASSED` of the run's folder, which is never published.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+import re
+import shlex
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+from msgspec import Meta
+
+from evopolicy_common.errors import DECODE_ERRORS, ConfigError
+from evopolicy_common.records.blobs import write_atomically
+from evopolicy_common.regular_files import read_regular
+
+REDACTED = b"[redacted]"
+PASSED = ".passed.json"
+"""In a run's folder, mode 0600: `Passed`."""
+PASSED_VALUE = "a value that the run passed to its agent"
+MIN_PASSED = 12
+"""Characters of the shortest value that is recorded: a shorter one could be guessed from its digest."""
+_MAX_PASSED = 1024
+_MAX_FILE_BYTES = 1 << 20
+_MIN_SECRET = 8
+"""Minimal length of a known secret; shorter values are words, and would remove half of a log."""
+_SECRET_NAME = re.compile(r"KEY|TOKEN|SECRET|PASSW|CREDENTIAL|AUTH|COOKIE", re.IGNORECASE)
+_NO_SECRET_NAME = re.compile(r"SSH_AUTH_SOCK|XAUTHORITY|_FILE$|_PATH$|_SOCK$", re.IGNORECASE)
+_TOKEN_IN_URL = re.compile(r"://[^/]+/([0-9A-Za-z_-]{16,})/")
+_KEY_OPTION = re.compile(
+    r"-k|(?:--?)?(?:[\w.-]*[_.-])?(?:\w*(?:api|access|auth|secret))?"
+    r"(?:key|token|secret|passw(?:or)?d|passphrase|credentials?|auth|cookie|pat)",
+    re.IGNORECASE,
+)
+"""An option or variable whose value is a secret, such as `--api-key` and `HF_TOKEN`, not `--max-tokens` or `--monkey`."""
+# In a JSON line, the letter before a key may be that of an escape. Repetitions are bounded where a match may fail after
+# them: otherwise a line of many beginnings would take quadratic time.
+_START = rb"(?:\b|(?<=\\[nrtbf]))"
+PATTERNS: tuple[tuple[re.Pattern[bytes], str, tuple[bytes, ...]], ...] = (
+    (
+        re.compile(
+            rb"-----BEGIN [A-Z0-9 ]{0,40}PRIVATE KEY(?: BLOCK)?-----(?:[A-Za-z0-9+/=\s]|\\[nrt])*"
+            rb"(?:-----END [A-Z0-9 ]{0,40}PRIVATE KEY(?: BLOCK)?-----)?"
+        ),
+        "a private key",
+        (b"PRIVATE KEY",),
+    ),
+    (
+        re.compile(
+            _START + rb"(?:(?:sk|pk|rk)-[A-Za-z0-9_-]{16,}"
+            rb"|(?:sk|pk|rk)_(?:live|test)_[A-Za-z0-9]{16,}"
+            rb"|AIza[A-Za-z0-9_-]{30,}"
+            rb"|gh[pousr]_[A-Za-z0-9]{20,}|github_pat_[A-Za-z0-9_]{20,}|glpat-[A-Za-z0-9_-]{20,}"
+            rb"|xox[abeprs]-[A-Za-z0-9-]{10,}"
+            rb"|hf_[A-Za-z0-9]{20,}"
+            rb"|A[KS]IA[A-Z0-9]{16}\b)"
+        ),
+        "an API key",
+        (
+            *(
+                b"sk-",
+                b"pk-",
+                b"rk-",
+                b"_live_",
+                b"_test_",
+                b"AIza",
+                b"AKIA",
+                b"ASIA",
+                b"hf_",
+                b"xox",
+                b"glpat-",
+            ),
+            *(b"ghp_", b"gho_", b"ghu_", b"ghs_", b"ghr_", b"github_pat_"),
+        ),
+    ),
+    (
+        re.compile(
+            _START + rb"eyJ[A-Za-z0-9_-]{10,1024}\.[A-Za-z0-9_-]{10,2048}\.[A-Za-z0-9_-]{5,}",
+        ),
+        "a JSON web token",
+        (b"eyJ",),
+    ),
+    (re.compile(rb"(?<=[Bb]earer\s)\s{0,8}[A-Za-z0-9._~+/=-]{12,}"), "a bearer token", (b"earer",)),
+)
+"""Looks of secrets, each with its kind, and with texts of which each match holds one."""
+
+
+def looks(data: bytes) -> Iterator[tuple[re.Pattern[bytes], str]]:
+    """The patterns that may match in `data`, each with its kind."""
+    return ((pattern, what) for pattern, what, parts in PATTERNS if any(part in data for part in parts))
+
+
+def found(data: bytes, passed: Passed | None = None) -> Iterator[tuple[int, str]]:
+    """Positions and kinds of secrets: of what looks like one, and of the values that a run has passed.
+
+    A text without a digit is none, and neither is one of few characters, such as the placeholder `sk-xxxxxxxxxxxxxxxx1`.
+    """
+    for pattern, what in looks(data):
+        for match in pattern.finditer(data):
+            text = match[0]
+            if text.startswith(b"-----") or (any(48 <= each < 58 for each in text) and len(set(text)) > 5):
+                yield match.start(), what
+    if passed is not None:
+        for begin, _ in passed.places(data):
+            yield begin, PASSED_VALUE
+
+
+def redacted(data: bytes, passed: Passed | None = None) -> bytes:
+    """The data without what looks like a secret, and without the values that a run has passed. JSON stays JSON."""
+    data, _ = replaced(data, passed.places(data) if passed is not None else (), REDACTED)
+    for pattern, _ in looks(data):
+        data = pattern.sub(REDACTED, data)
+    return data
+
+
+def replaced(data: bytes, places: Iterable[tuple[int, int]], by: bytes) -> tuple[bytes, int]:
+    """The data with `by` at these places, of which overlapping ones count as one, and their number."""
+    parts: list[bytes] = []
+    last = 0
+    for begin, end in sorted(places):
+        if begin >= last:
+            parts += (data[last:begin], by)
+        last = max(last, end)
+    return b"".join([*parts, data[last:]]), len(parts) // 2
+
+
+class Redaction:
+    """The secrets to remove, compiled once."""
+
+    def __init__(self, secrets: Iterable[str] = ()) -> None:
+        self.secrets = tuple(secrets)
+        words = {form for secret in self.secrets if len(secret) >= _MIN_SECRET for form in _forms(secret)}
+        # Longest first, so that a secret that contains another one is removed as a whole.
+        ordered = sorted(words, key=lambda word: (-len(word), word))
+        self._known = re.compile(b"|".join(re.escape(word) for word in ordered)) if ordered else None
+
+    @classmethod
+    def of(cls, environment: Mapping[str, str], urls: Mapping[str, str]) -> Redaction:
+        """The redaction for an agent with these variables and URLs."""
+        named = [value for name, value in environment.items() if is_secret(name)]
+        tokens = [found.group(1) for url in urls.values() if (found := _TOKEN_IN_URL.search(url))]
+        return cls([*named, *tokens])
+
+    def knowing(self, secrets: Iterable[str]) -> Redaction:
+        """The redaction that also removes these."""
+        return Redaction((*self.secrets, *secrets))
+
+    def __call__(self, line: bytes) -> bytes:
+        """Returns the line without secrets. A JSON line stays valid JSON."""
+        return redacted(line if self._known is None else self._known.sub(REDACTED, line))
+
+    def text(self, text: str) -> str:
+        """Returns the text without secrets."""
+        return self(text.encode("utf-8", "backslashreplace")).decode("utf-8", "replace")
+
+
+def is_secret(name: str) -> bool:
+    """Whether a variable or field of this name may hold a secret."""
+    return bool(_SECRET_NAME.search(name)) and not _NO_SECRET_NAME.search(name)
+
+
+def without_keys(value: Any, removed: list[str] | None = None) -> Any:
+    """A document without keys in its texts, command lines and lists of words; `removed` collects them."""
+    removed = [] if removed is None else removed
+    if isinstance(value, str):
+        return _line(value, removed)
+    if isinstance(value, dict):
+        return {name: _value(name, each, removed) for name, each in value.items()}
+    if isinstance(value, list | tuple):
+        if all(isinstance(each, str) for each in value):
+            return _words(value, removed)
+        return [without_keys(each, removed) for each in value]
+    return value
+
+
+def _value(name: str, value: Any, removed: list[str]) -> Any:
+    # Other settings of such names, such as `auth`, only name a variable or a method.
+    if isinstance(value, str) and value and name.isupper() and _KEY_OPTION.fullmatch(name):
+        removed.append(value)
+        return REDACTED.decode()
+    return without_keys(value, removed)
+
+
+def _line(text: str, removed: list[str]) -> str:
+    """A command line, as it was written if it holds no key."""
+    words: list[str] = []
+    with contextlib.suppress(ValueError):  # quotes that do not match
+        words = shlex.split(text)
+    n = len(removed)
+    shown = _words(words, removed) if len(words) > 1 else []
+    if len(removed) == n:
+        return _look(text, removed)
+    return " ".join(word if REDACTED.decode() in word else shlex.quote(word) for word in shown)
+
+
+def _words(words: Iterable[str], removed: list[str]) -> list[str]:
+    shown: list[str] = []
+    follows = False
+    for word in words:
+        name, equals, value = word.partition("=")
+        is_key = _KEY_OPTION.fullmatch(name) is not None
+        if follows and not word.startswith("--"):
+            removed.append(word)
+            word = REDACTED.decode()
+            follows = False
+        elif is_key and value:
+            removed.append(value)
+            word = f"{name}={REDACTED.decode()}"
+            follows = False
+        else:
+            follows = is_key and not equals and word.startswith("-")
+            word = _line(word, removed)
+        shown.append(word)
+    return shown
+
+
+def _look(text: str, removed: list[str]) -> str:
+    data = text.encode("utf-8", "surrogateescape")
+    for pattern, _ in looks(data):
+        removed += [match[0].decode("utf-8", "surrogateescape") for match in pattern.finditer(data)]
+        data = pattern.sub(REDACTED, data)
+    return data.decode("utf-8", "surrogateescape")
+
+
+class PassedValue(msgspec.Struct, frozen=True, kw_only=True):
+    """One spelling of a value: how long it is, and its digest."""
+
+    length: int
+    """Bytes."""
+    mark: Annotated[int, Meta(ge=0, le=255)]
+    """One byte, which tells quickly where the value cannot be."""
+    digest: str
+
+
+class Passed(msgspec.Struct, frozen=True, kw_only=True):
+    """Values that a run has passed to its agent, by keyed digests."""
+
+    key: Annotated[str, Meta(pattern="^[0-9a-f]{64}$")]
+    """32 random bytes, hex."""
+    values: Annotated[tuple[PassedValue, ...], Meta(max_length=_MAX_PASSED)] = ()
+
+    def with_values(self, values: Iterable[str]) -> Passed:
+        """These too, as far as they are long enough."""
+        key, weights = bytes.fromhex(self.key), self._weights()
+        forms = {form for each in values if len(each) >= MIN_PASSED for form in _forms(each)}
+        known = dict.fromkeys(self.values)
+        for form in sorted(forms):
+            mark = sum(weights[each] for each in form) % 256
+            known[PassedValue(length=len(form), mark=mark, digest=_digest(form, key))] = None
+        return Passed(key=self.key, values=tuple(known)[:_MAX_PASSED])
+
+    def places(self, data: bytes) -> Iterator[tuple[int, int]]:
+        """Begin and end of each value in `data`. Takes time linear in its size, for each length of a value."""
+        # Here, as an agent's supervisor needs none of it.
+        import numpy as np
+
+        key = bytes.fromhex(self.key)
+        weights = np.frombuffer(self._weights(), np.uint8)
+        # A window's mark is the sum of its bytes' weights, a difference of two of these. One in 256 has that of a value.
+        sums = np.zeros(len(data) + 1, np.uint8)
+        np.cumsum(weights[np.frombuffer(data, np.uint8)], dtype=np.uint8, out=sums[1:])
+        for length in sorted({each.length for each in self.values}):
+            if not 0 < length <= len(data):
+                continue
+            same = [each for each in self.values if each.length == length]
+            digests = {each.digest for each in same}
+            marked = np.zeros(256, np.bool_)
+            marked[[each.mark for each in same]] = True
+            for at in np.flatnonzero(marked[sums[length:] - sums[:-length]]).tolist():
+                if _digest(data[at : at + length], key) in digests:
+                    yield at, at + length
+
+    def _weights(self) -> bytes:
+        return hashlib.shake_256(bytes.fromhex(self.key)).digest(256)
+
+
+def note_passed(path: Path, values: Iterable[str]) -> None:
+    """Adds the values to the file at `path`, which is made where it is not there. Raises StorageError."""
+    kept = read_passed(path.parent) or Passed(key=os.urandom(32).hex())
+    write_atomically(path, msgspec.json.encode(kept.with_values(values)), mode=0o600)
+
+
+def read_passed(folder: Path) -> Passed | None:
+    """What a run's folder records; None where it has no such file, as those of earlier versions. Raises ConfigError for a
+    damaged file."""
+    path = folder / PASSED
+    try:
+        kept = msgspec.json.decode(read_regular(path, _MAX_FILE_BYTES), type=Passed)
+    except FileNotFoundError:
+        return None
+    except (OSError, *DECODE_ERRORS) as error:
+        raise ConfigError(f"{path}: {error}; restore it, as it finds keys in what is published") from error
+    return kept
+
+
+def _digest(value: bytes, key: bytes) -> str:
+    return hashlib.blake2b(value, key=key, digest_size=16).hexdigest()
+
+
+def _forms(secret: str) -> set[bytes]:
+    """The secret's bytes, plain and as JSON spells it."""
+    quoted = secret.replace("\\", "\\\\").replace('"', '\\"')
+    spelt = {secret, quoted, quoted.replace("\n", "\\n").replace("\t", "\\t").replace("\r", "\\r")}
+    return {each.encode("utf-8", "surrogateescape") for each in spelt}
