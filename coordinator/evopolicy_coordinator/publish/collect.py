@@ -126,7 +126,7 @@ class Publisher:
         """`with_logs`: publish agents' logs too, with everything replaced that the search finds. `remove_findings`: leave
         out policies and recordings with secrets. `accepted`: `FILE:LINE` of each secret to be published as it is."""
         self._remove_findings = remove_findings
-        self._accepted = frozenset(accepted)
+        self._accepted = frozenset(map(os.path.abspath, accepted))
         self._with_logs = with_logs
         self._ask = OperatorClient(link)
         self._tell = tell
@@ -333,13 +333,14 @@ class Publisher:
         """Secrets whose lines are not accepted."""
         lines = scrub.secret_lines(data, passed)
         found = [_Secret(f"{name}:{line}", what) for line, what in sorted(lines.items())]
-        return [each for each in found if each.place not in self._accepted]
+        return [each for each in found if os.path.abspath(each.place) not in self._accepted]
 
     def _stop_at(self, found: Sequence[_Secret], *, always: bool = False) -> None:
         """Raises ConfigError for secrets, unless what holds them is left out."""
         if not found or (self._remove_findings and not always):
             return
-        shown = "; ".join(f"{each.place}: {each.what}" for each in found[:_SHOWN])
+        here = f"{os.getcwd()}/"
+        shown = "; ".join(f"{each.place.removeprefix(here)}: {each.what}" for each in found[:_SHOWN])
         more = f"; and {len(found) - _SHOWN} more" if len(found) > _SHOWN else ""
         left_out = "" if always else "leave out these policies and recordings with --remove-findings, or "
         raise ConfigError(

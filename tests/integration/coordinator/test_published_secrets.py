@@ -115,7 +115,7 @@ def test_a_passed_value_in_a_policy_stops_publish_until_it_is_decided_on(folder:
     code, text = publish(folder, "removed.evp", "--remove-findings", "--with-logs")
     assert code == 0, text
     assert is_revealed(root)
-    code, text = publish(folder, "accepted.evp", "--accept-finding", place)
+    code, text = publish(folder, "accepted.evp", "--accept-finding", f"./{place}")
     assert code == 0, text
     held: dict[str, dict[str, bytes]] = {}
     for name in ("removed.evp", "accepted.evp"):
