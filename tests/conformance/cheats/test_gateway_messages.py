@@ -58,6 +58,7 @@ ALLOWED: dict[str, dict[str, str]] = {
         "adapter": "str",
         "packages": "{str: str}",
         "step_us": "float",
+        "info_left_out": "[str]",
     },
     "ResourceLimits": {
         "episode_wall_s": "float",
