@@ -18,6 +18,7 @@ from evopolicy._exports.steps import read_steps
 from evopolicy._exports.tracking import Curve, Point, track
 from evopolicy._exports.transcripts import write_atif, write_inspect
 from evopolicy_common.records.run_record import Tokens
+from evopolicy_common.records.secrets import PASSED, note_passed
 
 VERSIONS = [
     Version({"policy.py": "x = 1"}, (1.0, 2.0), 0.5, says="I begin."),
@@ -243,3 +244,16 @@ def test_a_run_whose_times_are_none_is_exported_with_the_others(tmp_path: Path) 
 
     list(track([tmp_path / "runs"], Times(), follow=False))
     assert min(times) <= 0.0
+
+
+def test_transcripts_hold_no_keys_and_no_values_that_the_run_passed(tmp_path: Path) -> None:
+    write_run(tmp_path / "runs", VERSIONS)
+    folder = next((tmp_path / "runs").rglob("run.json")).parent
+    key, phrase = "hf_" + "a1B2c3D4e5" * 3, 'correct "horse" battery'
+    note_passed(folder / PASSED, [phrase])
+    log_of(folder / "logs", {"type": "prompt", "turn": 0, "message": f"Use {key}, or say {phrase}."})
+    runs = load_runs(tmp_path / "runs")
+    for written in (*write_atif(runs, tmp_path / "atif"), *write_inspect(runs, tmp_path / "inspect")):
+        text = written.read_text()
+        json.loads(text)
+        assert "Use [redacted], or say [redacted]." in text
