@@ -6,6 +6,7 @@ import itertools
 import json
 import math
 import re
+import shutil
 import warnings
 from pathlib import Path
 
@@ -36,7 +37,8 @@ from evopolicy_coordinator.analysis.statistics.pairs import (
 from evopolicy_coordinator.analysis.statistics.samples import RunReturns, Sample, matched
 from evopolicy_coordinator.analysis.statistics.standings import Standings, standings
 from evopolicy_coordinator.analysis.study import study_of
-from evopolicy_coordinator.analysis.tables.table import Table
+from evopolicy_coordinator.analysis.tables.latex import to_latex
+from evopolicy_coordinator.analysis.tables.table import Table, to_csv, to_markdown
 
 
 def run(*returns: float, case_set: str = "cases", score: float | None = math.nan) -> RunReturns:
@@ -360,6 +362,38 @@ def test_report_of_repeats_compares_agents_and_tells_repeats(tmp_path: Path) -> 
         re.fullmatch(r"not distinguishable with 3 runs; about \d+ would be needed", v) for v in verdicts
     )
     assert all(row["repeats_0_2"] for row in table_named(tables, "resolution_core16").rows)
+
+
+def test_an_incomplete_entry_stands_beside_no_complete_one_by_a_mean(tmp_path: Path) -> None:
+    for folder in write_suite(tmp_path / "runs", environments=ENVS, repeats=2):
+        record = json.loads((folder / "run.json").read_bytes())
+        if (record["agent"]["entry"], record["env"]) == ("Kestrel", ENVS[2]):
+            shutil.rmtree(folder)
+    found = study([tmp_path / "runs"])
+    tables = tables_of(found)
+    (lacking,) = table_named(tables, "incomplete_core16").rows
+    assert (lacking["entry"], lacking["environments"], lacking["missing"]) == ("Kestrel", "2 of 3", "Ant")
+    for name in ("leaderboard", "aggregates", "improvement"):
+        table = table_named(tables, f"{name}_core16")
+        for text in (to_csv(table), to_latex(table), to_markdown(table)):
+            assert "Northwind" in text
+            assert "Kestrel" not in text
+    means = [row for row in table_named(tables, "normalised_core16").rows if row["env"] == "Tuning mean"]
+    assert [row["Kestrel"] for row in means] == [None]
+    optimism = table_named(tables, "generalisation_core16").rows
+    assert "Kestrel" not in {row["entry"] for row in optimism if row["env"] == "Mean of all"}
+    # Single environments and differences keep it.
+    assert {row["env"] for row in table_named(tables, "cells_core16").rows if row["entry"] == "Kestrel"} == {
+        "Acrobot", "FourRooms",
+    }  # fmt: skip
+    assert "Kestrel" in to_csv(table_named(tables, "pairs_core16"))
+    plots = {plot.name: plot for plot in figures_of(found)}
+    for name in ("rank_scores_core16", "profiles_core16"):
+        assert "Kestrel" not in {row["entry"] for row in plots[name].data}
+    (group,) = [
+        r for r in plots["normalised_core16"].data if (r["entry"], r["demand"]) == ("Kestrel", "tuning")
+    ]
+    assert group["value"] is None
 
 
 def test_the_papers_own_table_has_scores_only_and_says_so() -> None:
