@@ -162,6 +162,11 @@ LOCAL = ["evopolicy", "local", "--env", "toy", "--agent"]
         (["evopolicy-worker", "check-env", "toy/line", "--results", "FILE/x"], "folder with --results"),
         ([*LOCAL, "random", "--policy-package", ".."], "'..' is no name of a package; leave it out"),
         ([*LOCAL, "random", "--slots", "1_000"], "'--slots': '1_000' is not a finite number in digits"),
+        ([*LOCAL, "random", "--budget", "20001"], "a budget of 20,001 episodes; 20,000 are the limit"),
+        (
+            ["evopolicy", "random", "--env", "toy/line", "--cases", "0,32"],
+            "no heldout case 32; the cases are 0 to 31",
+        ),
         (["evopolicy", "gc", "--older-than", "inf"], "'inf' is not a finite number in digits"),
         (["evopolicy", "diff", "EMPTY", "RUNS"], "EMPTY is no run directory: it has neither run.json nor"),
     ],

@@ -26,6 +26,7 @@ from evopolicy_common.logs import structlog
 from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_common.messages.episode import Tier
 from evopolicy_common.processes import host
+from evopolicy_common.processes.notices import notify_of_many_slots
 from evopolicy_common.processes.packages import checked_names, policy_versions
 from evopolicy_common.processes.preflight import check_scratch
 from evopolicy_common.processes.scratch import scratch_folder
@@ -281,6 +282,7 @@ async def _run(
     limits: Limits,
 ) -> None:
     cores = Cores()
+    notify_of_many_slots(slots or 0)
     taken = [cores.take() for _ in range(slots or cores.count)]
     packages, definitions = ("numpy", *allowed_packages), foreign(env_ids)
     importable = policy_versions(allowed_packages)

@@ -84,7 +84,7 @@ def run(
         options.check_browser(browser, local=local)
         held = jail.of_remote_agent() if given.agent == listener.AGENT else jail.settings()
         plans = _plans(given, [options.one_environment(env)], held, served)
-        where = Cluster(connect=tuple(connect or ()), file=credentials_file)
+        where = Cluster(connect=tuple(connect or ()), file=credentials_file, patient=given.resume)
         if local:
             where = Cluster(
                 local_slots=slots,
@@ -219,6 +219,7 @@ def try_policy(
             trial.policy,
         )
         where = msgspec.structs.replace(where, unjailed=tier == "none")
+        where.check_ids([trial.env], trial.split, trial.cases)
         _exit(run_to_end(trials.try_policy(trial, where, as_json=as_json)))
 
 
@@ -252,7 +253,9 @@ def play_random(
         chosen = None if cases is None else options.cases_of(cases)
         kept = options.state_of(state, fresh=fresh)
         where = _trial_cluster(connect, credentials_file, slots, kept, data, browser, policy_package)
-        _exit(run_to_end(trials.play_random(catalogue.resolve(env), split, chosen, where, as_json=as_json)))
+        env_ids = catalogue.resolve(env)
+        where.check_ids(env_ids, split, chosen or ())
+        _exit(run_to_end(trials.play_random(env_ids, split, chosen, where, as_json=as_json)))
 
 
 def _tell_left_out(wanted: bool) -> None:

@@ -120,7 +120,7 @@ def suite(
             wanted = msgspec.structs.replace(wanted, defaults=defaults)
         root = (runs or Path("runs") / wanted.name).absolute()
         expanded = suite_file.expand(wanted, root, Path.cwd(), tuple(only or ()))
-        where = Cluster(connect=tuple(connect or ()), file=credentials_file)
+        where = Cluster(connect=tuple(connect or ()), file=credentials_file, patient=(root / INDEX).exists())
         if local:
             kept = state or root / SWEEP_STATE
             new = not kept.exists()  # then a dry run keeps none

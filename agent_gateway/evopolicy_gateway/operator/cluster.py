@@ -10,8 +10,10 @@ from typing import NamedTuple
 
 import msgspec
 
+from evopolicy_common import catalogue
 from evopolicy_common.cli import end_on_sigterm
 from evopolicy_common.errors import ConfigError
+from evopolicy_common.messages.environment import Split
 from evopolicy_common.messages.episode import Tier
 from evopolicy_common.messages.run_settings import RunSettings
 from evopolicy_common.processes.local_cluster import LocalCluster, Workers, local_cluster
@@ -20,6 +22,9 @@ from evopolicy_common.wire import transport
 from evopolicy_common.wire.credentials import Credentials
 from evopolicy_gateway.operator.live_view import live_view
 from evopolicy_gateway.operator.operations import Operations, find_credentials
+
+CONNECT_S = 10.0
+"""Patience with a coordinator that was not reached yet, seconds."""
 
 
 class Cluster(msgspec.Struct, frozen=True, kw_only=True):
@@ -42,6 +47,8 @@ class Cluster(msgspec.Struct, frozen=True, kw_only=True):
     """For a local cluster: packages that policies may import besides numpy."""
     browser: Path | None = None
     """For a local cluster: Chromium's program; None for the machine's own."""
+    patient: bool = False
+    """The command continues earlier work, and waits for a coordinator that is away."""
     web: Path | None = None
     """Folder of runs that a live view shows meanwhile; None for no view."""
 
@@ -56,6 +63,17 @@ class Cluster(msgspec.Struct, frozen=True, kw_only=True):
                 "--profile published plays the published case files: give --data FOLDER, the folder data/main-128 of the"
                 " published software, which holds gym/acrobot/train.json and so on"
             )
+
+    def check_ids(self, env_ids: Iterable[str], split: Split, cases: Sequence[int]) -> None:
+        """Raises ConfigError for cases that a local cluster does not have. How many others have, their files say."""
+        for suite in (
+            map(catalogue.suite_of, env_ids) if self.local_slots is not None and self.data is None else ()
+        ):
+            n = {"train": suite.n_train, "validation": suite.n_validation, "heldout": suite.n_heldout}[split]
+            if cases and max(cases) >= n:
+                raise ConfigError(
+                    f"--cases: there is no {split} case {max(cases)}; the cases are 0 to {n - 1}"
+                )
 
 
 class Reached(NamedTuple):
@@ -92,7 +110,9 @@ async def reached(where: Cluster, workers: Workers | None = None) -> AsyncIterat
                 say(f"note: {local.note}", err=True)
             file, opened = local.operator_file, local.opened
         operator, gateway = find_credentials(where.connect, file)
-        link = await stack.enter_async_context(transport.connect(operator))
+        link = await stack.enter_async_context(
+            transport.connect(operator, timeout_s=None if where.patient else CONNECT_S)
+        )
         if where.web is not None:
             await stack.enter_async_context(live_view(where.web, where.connect, file))
         yield Reached(Operations(link, opened), gateway, local)

@@ -135,26 +135,40 @@ class RunLifecycle:
         """Whether the agent's side is open and its closing was not requested yet."""
         return self._supervisor is not None and self._order is None and not self._closed.is_set()
 
-    async def play(self) -> RunRecord:
-        """Plays the run to `run.json`. Raises EvopolicyError. Cancellation cancels the run; `run.json` records it."""
+    async def play(self, put_aside: Callable[[], None] | None = None) -> RunRecord:
+        """Plays the run to `run.json`. Raises EvopolicyError. Cancellation cancels the run; `run.json` records it.
+
+        `put_aside` moves the folder's earlier run away, which is deleted without it. A refused run leaves it as it is.
+        """
         with alone(self._folder.lock, self._folder.root):
-            return await self._play()
+            return await self._play(put_aside)
 
     async def go_on(self) -> RunRecord:
         """Plays a new run, resumes an open one, or returns the record of a finished one, as the folder requires."""
         with alone(self._folder.lock, self._folder.root):
             return await self._go_on()
 
-    async def _play(self) -> RunRecord:
-        plan = self._plan
+    async def _play(self, put_aside: Callable[[], None] | None = None) -> RunRecord:
+        plan, key = self._plan, uuid.uuid4().hex
         # Checking starts programs that try the jail; the orphan search of another run would take them for orphans.
         async with child_process.starting():
             plan.check_held()
-        await self._operations.drop(self._folder)
-        async with child_process.starting():
-            plan.claim()
+        if self._folder.root.exists():
+            # A refusal must come before the earlier run's files are gone.
+            self.run = (await self._operations.create(plan.settings, key)).run
+        try:
+            await self._operations.drop(self._folder)
+            if put_aside is not None:
+                put_aside()
+            async with child_process.starting():
+                plan.claim()
+        except BaseException:
+            if self.run:
+                with contextlib.suppress(EvopolicyError):
+                    await self._operations.cancel(self.run)
+                self.run = ""
+            raise
         self._folder.state.mkdir(mode=0o700)
-        key = uuid.uuid4().hex
         save(self._folder.intended, IntendedRun(key=key, settings=plan.settings))
         if plan.listener is not None:
             save(self._folder.listener, plan.listener)

@@ -18,6 +18,7 @@ import hashlib
 import socket
 import time
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +34,6 @@ from evopolicy_common.wire.credentials import Credentials
 from evopolicy_gateway import harnesses
 from evopolicy_gateway.harnesses.coding_agents import session
 from evopolicy_gateway.operator.child_messages import AgentDoing
-from evopolicy_gateway.operator.locks import alone
 from evopolicy_gateway.operator.operations import Operations
 from evopolicy_gateway.run.layout import OpenedRun, RunFolder, saved
 from evopolicy_gateway.run.plan import Plan
@@ -171,11 +171,13 @@ class ClaimedSweep(Sweep):
     async def _record(self, decision: Decision, begun: Entry) -> Entry:
         run = decision.run
         self._view.started(run.name, decision.attempt)
-        if decision.kind in ("restart", "new"):
-            with alone(run.folder.lock, run.folder.root):
-                await self._put_aside(run.folder, decision.attempt - 1)
         settings = msgspec.structs.replace(run.settings, attempt=decision.attempt)
-        record = await self._played(decision, msgspec.structs.replace(run, settings=settings))
+        aside = None
+        if is_new := decision.kind in ("restart", "new"):
+            aside = partial(self._put_aside, run.folder, decision.attempt - 1)
+        record = await self._played(
+            decision, msgspec.structs.replace(run, settings=settings, overwrite=is_new), aside
+        )
         if record.outcome.status == "cancelled" and await self._is_taken_over(run):
             self._view.note(run.name, "another host has it now and has cancelled it here")
             self._anew(run.name)
@@ -223,11 +225,10 @@ class ClaimedSweep(Sweep):
             result,
         )
 
-    async def _put_aside(self, folder: RunFolder, attempt: int) -> None:
-        """Keeps the files of an earlier attempt, and ends its run at the cluster."""
+    def _put_aside(self, folder: RunFolder, attempt: int) -> None:
+        """Keeps the files of an earlier attempt."""
         if not folder.root.exists():
             return
-        await self._operations.drop(folder)
         kept = self._root / ATTEMPTS / folder.root.relative_to(self._root)
         target = kept.with_name(f"{kept.name}.{max(attempt, 1)}")
         while target.exists():

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import asyncio
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 
 import msgspec
@@ -174,7 +174,7 @@ class Sweep(ABC):
         self._moved.set()
 
     async def _play(self, decision: Decision) -> None:
-        begun = self._begun(decision)
+        before, begun = self._index.runs.get(decision.run.name), self._begun(decision)
         self._put(begun)
         pauses = list(FINISH_AGAIN_S)
         done: Entry | None = None
@@ -188,11 +188,22 @@ class Sweep(ABC):
                     await asyncio.sleep(pauses.pop(0))
                 else:
                     done = msgspec.structs.replace(begun, state="error", error=why, tokens=tokens)
+                    play = self._plays.get(begun.name)
+                    if before is not None and (play is None or not play.run):
+                        # The folder still holds the earlier run, if there was one.
+                        known = {
+                            "digest": before.digest,
+                            "settings": before.settings,
+                            "attempt": before.attempt,
+                        }
+                        done = msgspec.structs.replace(done, **known)
             finally:
                 self._plays.pop(begun.name, None)
         self._put(done)
 
-    async def _played(self, decision: Decision, plan: Plan) -> RunRecord:
+    async def _played(
+        self, decision: Decision, plan: Plan, put_aside: Callable[[], None] | None = None
+    ) -> RunRecord:
         play = RunLifecycle(
             plan,
             self._operations,
@@ -202,4 +213,4 @@ class Sweep(ABC):
             on_agent_gone=partial(self._agent_gone, plan.name),
         )
         self._plays[plan.name] = play
-        return await (play.go_on() if decision.kind in ("resume", "finish") else play.play())
+        return await (play.go_on() if decision.kind in ("resume", "finish") else play.play(put_aside))

@@ -22,7 +22,7 @@ from evopolicy_common.cli import USAGE_ERROR
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.episode import Tier
 from evopolicy_common.processes.child_process import ChildProcess, last_words
-from evopolicy_common.processes.notices import notify_if_slow
+from evopolicy_common.processes.notices import notify_if_slow, notify_of_many_slots
 from evopolicy_common.processes.preflight import LOCAL, check_installed, check_scratch, check_writable
 from evopolicy_common.processes.scratch import scratch_folder
 from evopolicy_common.records.blobs import write_atomically
@@ -110,6 +110,7 @@ async def _start_workers(
     audited: bool,
     options: Sequence[str],
 ) -> None:
+    notify_of_many_slots(wanted.slots)
     divided = installs.divided(wanted.env_ids)
     suffixes = ("", "-2") if audited else ("",)
     for python, env_ids in divided.items():

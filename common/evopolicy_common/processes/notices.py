@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import os
 from collections.abc import Iterator
 
 from evopolicy_common.logs import structlog
@@ -11,6 +12,17 @@ from evopolicy_common.logs import structlog
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
 AFTER_S = 3.0
+MANY_SLOTS = 8
+"""Slots for each core beyond which a command says so."""
+
+
+def notify_of_many_slots(slots: int) -> None:
+    """Warns of slots that only wait for each other."""
+    cores = len(os.sched_getaffinity(0))
+    if slots > MANY_SLOTS * cores:
+        log.warning(
+            f"{slots:,} slots on {cores} cores: each takes memory for a simulator, and they wait for each other; give fewer with --slots"
+        )
 
 
 @contextlib.contextmanager

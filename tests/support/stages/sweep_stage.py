@@ -134,8 +134,10 @@ class Stage:
         stage = self
 
         class Play(Lifecycle):
-            async def play(self) -> RunRecord:
+            async def play(self, put_aside: Callable[[], None] | None = None) -> RunRecord:
                 assert self.stays_open
+                if put_aside is not None:
+                    put_aside()
                 stage.begun.append(self.name)
                 stage.going.add(self.name)
                 stage.most.add(frozenset(stage.going))
@@ -203,8 +205,9 @@ class Direct:
         ]
 
         class Play(Lifecycle):
-            async def play(self, kind: str = "play") -> RunRecord:
+            async def play(self, put_aside: object = None, kind: str = "play") -> RunRecord:
                 assert not self.stays_open
+                assert put_aside is None
                 stage.kinds.append(kind)
                 try:
                     await stage.act(self.plan.name)
@@ -213,7 +216,7 @@ class Direct:
                 return run_record(self.plan, finished(self.plan), None, [], Times())
 
             async def go_on(self) -> RunRecord:
-                return await self.play("go_on")
+                return await self.play(kind="go_on")
 
         @contextlib.asynccontextmanager
         async def connected(*_: object) -> AsyncIterator[tuple[object, object, None]]:

@@ -13,6 +13,7 @@ import urllib.request
 from pathlib import Path
 
 from commands import agent, command, record_in, run_arguments, run_dir, run_on, toy_cluster
+from coordinator_harness import Coordinator
 from waiting import TIMEOUT_S, wait_until
 
 from evopolicy_gateway.http import listener
@@ -42,6 +43,25 @@ open("again", "w").write(json.dumps(again))
     record = record_in(run_dir(tmp_path))
     assert record.outcome.budget_used == 4
     assert sorted(path.name for path in (workspace / "feedback").iterdir()) == ["submit_000", "submit_001"]
+
+
+def test_a_resumed_run_waits_for_a_coordinator_that_is_away(tmp_path: Path) -> None:
+    coordinator = Coordinator(tmp_path / "state")
+    try:
+        operator_file = tmp_path / "state/credentials/operator.json"
+        arguments = run_arguments(operator_file, agent(tmp_path, "submit([0])"))
+        with command(tmp_path, *arguments) as running:
+            wait_until(lambda: [*tmp_path.glob("runs/*/*/t/.gateway/run.json")])
+            running.kill_all()
+        coordinator.stop()
+        with command(tmp_path, *arguments, "--resume") as running:
+            # Longer than the patience of a new run.
+            wait_until(lambda: "no connection to" in running.err)
+            assert "within 30 s" in running.err
+            coordinator = Coordinator(tmp_path / "state")
+            wait_until(lambda: "goes on with run" in running.text)
+    finally:
+        coordinator.stop()
 
 
 def test_a_killed_supervisor_leaves_nothing_of_its_agent_which_is_started_again(

@@ -294,6 +294,36 @@ def test_a_wrong_key_is_no_result_and_is_played_again_once_it_is_right(
     assert (entry["state"], entry["attempt"]) == ("completed", 2)
 
 
+def test_runs_on_published_cases_stay_where_a_rerun_of_them_is_refused(tmp_path: Path) -> None:
+    file, root = tmp_path / "t.toml", tmp_path / "runs" / "t"
+    write_suite(tmp_path)
+    arguments = ("--local", "--only", "evolve/*")
+    with sweep(tmp_path, *arguments) as first:
+        assert first.wait() == 0, first.text
+    words = ("publish", str(root), "--local", "--state", str(root / ".cluster"), "--out", "r.evp")
+    with command(tmp_path, *words) as publishing:
+        assert publishing.wait() == 0, publishing.text
+    run = root / "evolve/toy_line/t-0"
+    before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
+    file.write_text(file.read_text().replace("budget = 4", "budget = 3"))
+    with sweep(tmp_path, *arguments, "--changed", "rerun") as second:
+        assert second.wait() == 1, second.text
+        assert "are public" in second.text
+    assert {path: path.read_bytes() for path in run.rglob("*") if path.is_file()} == before
+    assert not (root / ".attempts").exists()
+    with sweep(tmp_path, *arguments) as third:
+        assert third.wait() == 2, third.text
+        assert "budget is 3, was 4" in third.text
+    with sweep(tmp_path, *arguments, "--changed", "keep") as fourth:
+        assert fourth.wait() == 0, fourth.text
+    options = ["--env", "toy/line", "--agent", "random", "--budget", "3", "--overwrite", "--exp-id", "t-0"]
+    options += ["--entry", "evolve", "--runs", str(root), "--state", str(root / ".cluster")]
+    with command(tmp_path, "local", *options) as over:
+        assert over.wait() == 2, over.text
+        assert "are public" in over.text
+    assert {path: path.read_bytes() for path in run.rglob("*") if path.is_file()} == before
+
+
 def test_json_events_tell_the_plan_and_the_results(tmp_path: Path, operator_file: Path) -> None:
     write_suite(tmp_path)
     arguments = ("--credentials", str(operator_file), "--only", "evolve/*", "--json")
