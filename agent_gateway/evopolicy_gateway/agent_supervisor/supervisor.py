@@ -148,7 +148,9 @@ async def _play(order: StartAgent, stage: Stage, config: AgentConfig | None) -> 
         stage = msgspec.structs.replace(stage, environment=inside, jail=jail)
     if order.passed_file is not None:
         values = (*stage.log.redact.secrets, *(stage.environment.get(name, "") for name in passed))
-        await asyncio.to_thread(note_passed, Path(order.passed_file), values)
+        # A token in the run's URLs opens nothing once the run has ended.
+        kept_secret = [value for value in values if not any(value in url for url in order.urls.values())]
+        await asyncio.to_thread(note_passed, Path(order.passed_file), kept_secret)
     return await harness.play(stage)
 
 

@@ -22,6 +22,7 @@ from evopolicy_common.regular_files import MAX_BYTES, read_regular
 
 EXCLUDED_FILES: Mapping[str, str] = {
     "logs/*": "what happened on the way, with its times",
+    ".passed.json": "digests with a key of the run's own",
     "workspace/AGENTS.md": "names the gateway's port and its random token",
 }
 """Path patterns in a run directory that are not compared, with the reason."""

@@ -283,9 +283,11 @@ class Passed(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def note_passed(path: Path, values: Iterable[str]) -> None:
-    """Adds the values to the file at `path`, which is made where it is not there. Raises StorageError."""
+    """Adds the values to the file at `path`, which is made with the first that is long enough. Raises StorageError."""
     kept = read_passed(path.parent) or Passed(key=os.urandom(32).hex())
-    write_atomically(path, msgspec.json.encode(kept.with_values(values)), mode=0o600)
+    more = kept.with_values(values)
+    if more.values != kept.values:
+        write_atomically(path, msgspec.json.encode(more), mode=0o600)
 
 
 def read_passed(folder: Path) -> Passed | None:

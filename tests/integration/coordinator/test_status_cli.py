@@ -162,7 +162,7 @@ def test_run_goes_on_with_workers_of_another_class_when_an_operator_says_why(
                     assert "pinned" in shown.refused[created.run]
                     assert worker.jobs == []
                     repin = ("repin", created.run, shown.fingerprint, "--reason")
-                    assert (await called(coordinator, "runs", *repin, " ")).exit_code == 1
+                    assert (await called(coordinator, "runs", *repin, " ")).exit_code == 2
                     assert (await called(coordinator, "runs", *repin, "old ones gone")).exit_code == 0
                     _, done = await gateway.results(1)
                     assert done.status == "ok"

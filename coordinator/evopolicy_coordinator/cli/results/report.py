@@ -110,11 +110,13 @@ def report(
             }
         )
         same = dict.fromkeys(REMEDIES[one.what] for one in error.mixtures if one.what in REMEDIES)
-        advice = f"\nRuns compare that were played with {'; '.join(same)}." if same else ""
-        fail(
-            f"{error}{advice}\nGive the folders of runs that agree, or {' '.join(options)} to compare them all the same.",
-            MIXED,
+        advice = [f"Runs compare that were played with {'; '.join(same)}."] if same else []
+        say_lines([f"error: {error}".splitlines()[0], *str(error).splitlines()[1:], *advice], err=True)
+        say(
+            f"Give the folders of runs that agree, or {' '.join(options)} to compare them all the same.",
+            err=True,
         )
+        raise SystemExit(MIXED) from error
     except ConfigError as error:
         fail(str(error), code_of(error))
     if unknown := sum(

@@ -168,3 +168,10 @@ def test_searching_takes_time_linear_in_the_size_of_a_file(piece: bytes) -> None
     data = (piece * (size // len(piece) + 1))[:size]
     list(secrets.found(data, passed))
     secrets.redacted(data)
+
+
+def test_a_run_that_passed_no_value_has_no_file_of_digests(tmp_path: Path) -> None:
+    note_passed(tmp_path / PASSED, ["", "short"])
+    assert not (tmp_path / PASSED).exists()
+    note_passed(tmp_path / PASSED, ["a value of a good length"])
+    assert (tmp_path / PASSED).exists()
