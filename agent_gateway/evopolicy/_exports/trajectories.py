@@ -7,6 +7,7 @@ numbers, bytes for pictures, and `Discrete` for whole numbers.
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import re
@@ -15,7 +16,7 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from evopolicy._exports.tables import names
 from evopolicy._runs import Run, Runs
@@ -23,7 +24,7 @@ from evopolicy_common.errors import ConfigError
 from evopolicy_common.records.episodes.npz import MAX_BYTES, read_arrays
 from evopolicy_common.records.episodes.rendered import MAX_OBSERVATIONS_BYTES, MAX_ROWS_BYTES
 from evopolicy_common.records.run_files import submit_folders
-from evopolicy_common.regular_files import read_regular
+from evopolicy_common.regular_files import open_regular, read_regular
 from evopolicy_common.terminal import say
 
 _LAST = "The observation after an episode's last step is a copy of the one before it."
@@ -116,17 +117,6 @@ def _episodes(run: Run, name: str) -> Iterator[tuple[Any, dict[str, Any]]]:
             path = folder / "trajectory.jsonl"
             if not path.is_file():
                 continue
-            rows = [json.loads(line) for line in read_regular(path, MAX_ROWS_BYTES).splitlines()]
-            pictures = path.with_name("observations.npz")
-            if rows and rows[0]["obs"] is None and pictures.is_file():
-                observations = read_arrays(read_regular(pictures, MAX_OBSERVATIONS_BYTES), MAX_BYTES)
-                columns: Any = (
-                    observations["observations"] if list(observations) == ["observations"] else observations
-                )
-            elif rows and rows[0]["obs"] is not None:
-                columns = None
-            else:
-                continue
             known = returns.get((submit.submit, episode))
             about = {
                 "run": name,
@@ -138,9 +128,16 @@ def _episodes(run: Run, name: str) -> Iterator[tuple[Any, dict[str, Any]]]:
                 "failed": None if known is None else known.failed,
             }
             try:
-                if columns is None:
-                    columns = _columns([row["obs"] for row in rows])
-                actions = _columns([row["action"] for row in rows])
+                rows = list(_rows(path))
+                pictures = path.with_name("observations.npz")
+                if rows and rows[0].obs is not None:
+                    columns = _columns([row.obs for row in rows])
+                elif rows and pictures.is_file():
+                    columns = read_arrays(read_regular(pictures, MAX_OBSERVATIONS_BYTES), MAX_BYTES)
+                    columns = columns["observations"] if list(columns) == ["observations"] else columns
+                else:
+                    continue
+                actions = _columns([row.action for row in rows])
             except (TypeError, ValueError, KeyError, OverflowError):
                 _left_out(about, "it has values without a fixed form, such as actions of several kinds")
                 continue
@@ -148,12 +145,41 @@ def _episodes(run: Run, name: str) -> Iterator[tuple[Any, dict[str, Any]]]:
                 EpisodeBuffer(
                     observations=_repeat_last(columns),
                     actions=actions,
-                    rewards=[_number(row["reward"]) for row in rows],
-                    terminations=[row["terminated"] for row in rows],
-                    truncations=[row["truncated"] for row in rows],
+                    rewards=[row.reward for row in rows],
+                    terminations=[row.terminated for row in rows],
+                    truncations=[row.truncated for row in rows],
                 ),
                 about,
             )
+
+
+class _Row(NamedTuple):
+    """The values of a step, with arrays for lists of numbers: a row as it was read takes ten times as much memory."""
+
+    obs: Any
+    action: Any
+    reward: float
+    terminated: bool
+    truncated: bool
+
+
+def _rows(path: Path) -> Iterator[_Row]:
+    """The steps of an episode. Raises as `_columns`, and OSError for a file longer than any trajectory."""
+    with open_regular(path) as file:
+        if os.fstat(file.fileno()).st_size > MAX_ROWS_BYTES:
+            raise OSError(errno.EFBIG, f"larger than {MAX_ROWS_BYTES:,} bytes, the limit", str(path))
+        for line in file:
+            row = json.loads(line)
+            values = _packed(row["obs"]), _packed(row["action"]), _number(row["reward"])
+            yield _Row(*values, row["terminated"], row["truncated"])
+
+
+def _packed(value: Any) -> Any:
+    import numpy as np
+
+    if isinstance(value, dict):
+        return {name: _packed(each) for name, each in value.items()}
+    return np.asarray(_floats(value), dtype=np.float64) if isinstance(value, list) else value
 
 
 def _number(value: Any) -> float:
@@ -180,6 +206,8 @@ def _columns(values: list[Any]) -> Any:
         isinstance(first, int) and all(isinstance(value, int) for value in values)
     ):
         return np.asarray(values, dtype=np.int64)
+    if isinstance(first, np.ndarray):
+        return np.stack(values)
     return np.asarray(_floats(values), dtype=np.float64)
 
 

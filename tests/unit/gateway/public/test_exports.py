@@ -285,6 +285,24 @@ def test_minari_reads_episodes_with_their_observations(tmp_path: Path) -> None:
     assert "is there already" in again.stderr
 
 
+def test_steps_of_an_episode_are_read_one_by_one(tmp_path: Path) -> None:
+    import tracemalloc
+
+    from evopolicy._exports.trajectories import _columns, _rows
+
+    path, steps = tmp_path / "trajectory.jsonl", 2_000
+    row = {"obs": {"v": [t / 7 for t in range(200)]}, "action": 1, "reward": 1, "terminated": False}
+    path.write_text((json.dumps({**row, "truncated": False, "info": {"x": ["y"] * 200}}) + "\n") * steps)
+    tracemalloc.start()
+    try:
+        rows = list(_rows(path))
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak < path.stat().st_size
+    assert _columns([each.obs for each in rows])["v"].shape == (steps, 200)
+
+
 def test_minari_leaves_out_odd_episodes_and_keeps_each_with_its_own_facts(tmp_path: Path) -> None:
     import minari
 
