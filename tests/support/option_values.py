@@ -382,8 +382,10 @@ def _judged(case: Case, parameter: Any, given: str, base: Outcome, done: Outcome
             yield f"not one line: {done.out[-200:]!r} {shown!r}"
         if len(done.err) > MOST_TEXT:
             yield f"{len(done.err)} characters: {shown!r}"
-        shown_as = "/w/home" if case.value == "parent" else given.strip()[:12]
-        if not (shown_as and shown_as in done.err) and not _named(parameter, done):
+        # A folder may be named by its whole path, a number with commas.
+        shown_as = [given.strip()[:12] or "?", *(["/w/home "] if case.value == "parent" else [])]
+        plain = done.err.replace(",", "")
+        if not any(each in done.err or each in plain for each in shown_as) and not _named(parameter, done):
             yield f"does not name the value: {shown!r}"
     may_write = not refused or _same(parameter, base, done)
     harmed = [

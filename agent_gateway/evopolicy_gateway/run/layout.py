@@ -148,6 +148,11 @@ class RunFolder(msgspec.Struct, frozen=True):
         return self.root.with_name(f".{self.root.name}.lock")
 
     @property
+    def asked(self) -> Path:
+        """`IntendedRun` of a run that is to take the place of the folder's; beside it, as the lock."""
+        return self.root.with_name(f".{self.root.name}.asked")
+
+    @property
     def supervisor_lock(self) -> Path:
         """Lock of the agent supervisor while the agent may be alive, even if the command that started it was killed."""
         return self.state / "keeper.lock"

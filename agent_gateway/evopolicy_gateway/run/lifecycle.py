@@ -149,15 +149,13 @@ class RunLifecycle:
             return await self._go_on()
 
     async def _play(self, put_aside: Callable[[], None] | None = None) -> RunRecord:
-        plan, key = self._plan, uuid.uuid4().hex
+        plan, folder = self._plan, self._folder
         # Checking starts programs that try the jail; the orphan search of another run would take them for orphans.
         async with child_process.starting():
             plan.check_held()
-        if self._folder.root.exists():
-            # A refusal must come before the earlier run's files are gone.
-            self.run = (await self._operations.create(plan.settings, key)).run
+        key = await self._ask() if folder.root.exists() or folder.asked.exists() else uuid.uuid4().hex
         try:
-            await self._operations.drop(self._folder)
+            await self._operations.drop(folder)
             if put_aside is not None:
                 put_aside()
             async with child_process.starting():
@@ -166,18 +164,41 @@ class RunLifecycle:
             if self.run:
                 with contextlib.suppress(EvopolicyError):
                     await self._operations.cancel(self.run)
+                folder.asked.unlink(missing_ok=True)
                 self.run = ""
             raise
-        self._folder.state.mkdir(mode=0o700)
-        save(self._folder.intended, IntendedRun(key=key, settings=plan.settings))
+        folder.state.mkdir(mode=0o700)
+        save(folder.intended, IntendedRun(key=key, settings=plan.settings))
+        folder.asked.unlink(missing_ok=True)
         if plan.listener is not None:
-            save(self._folder.listener, plan.listener)
+            save(folder.listener, plan.listener)
         try:
             run = await self._open(key)
         except BaseException:
-            remove_tree(self._folder.root)
+            remove_tree(folder.root)
             raise
         return await self._played(run, agents_side=True)
+
+    async def _ask(self) -> str:
+        """Opens the run, and returns its key, before the folder's earlier run is gone: a refusal shall not cost that one. The request
+        is kept beside the folder, so that a command that is killed meanwhile finds the run again."""
+        folder, settings, key = self._folder, self._plan.settings, uuid.uuid4().hex
+        if folder.asked.exists():
+            before = saved(folder.asked, IntendedRun)
+            if before.settings == settings:
+                key = before.key
+            else:
+                with contextlib.suppress(EvopolicyError):
+                    await self._operations.cancel(
+                        (await self._operations.create(before.settings, before.key)).run
+                    )
+        save(folder.asked, IntendedRun(key=key, settings=settings))
+        try:
+            self.run = (await self._operations.create(settings, key)).run
+        except EvopolicyError:
+            folder.asked.unlink()
+            raise
+        return key
 
     async def _open(self, key: str) -> str:
         created = await self._operations.create(self._plan.settings, key)

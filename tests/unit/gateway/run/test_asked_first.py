@@ -1,0 +1,74 @@
+"""A run that takes another's place is opened before that one is gone."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from evopolicy_common.errors import ConfigError
+from evopolicy_common.messages.operator import RunCreated
+from evopolicy_common.messages.run_settings import RunSettings
+from evopolicy_gateway.run.lifecycle import RunLifecycle
+from evopolicy_gateway.run.plan import Plan
+
+
+class Operations:
+    """Opens a run for each key, and refuses on request."""
+
+    def __init__(self) -> None:
+        self.open: dict[str, RunSettings] = {}
+        self.refuses = False
+
+    async def create(self, settings: RunSettings, key: str) -> RunCreated:
+        if self.refuses:
+            raise ConfigError("the cases are public")
+        self.open[key] = settings
+        return RunCreated(run=key, capability="c")
+
+    async def cancel(self, run: str) -> None:
+        del self.open[run]
+
+
+def ask(folder: Path, operations: Operations, budget: int = 8) -> str:
+    """The key of the run that a command opens before it is killed."""
+    settings = RunSettings(env="toy/line", entry="a", model="a", exp_id="t", budget=budget)
+    plan = Plan(
+        name="toy/line",
+        settings=settings,
+        agent="random",
+        runs=folder,
+        started_in=folder,
+        wall_limit_s=60.0,
+        overwrite=True,
+    )
+    plan.folder.root.mkdir(parents=True, exist_ok=True)
+    (plan.folder.run_json).write_text("earlier")
+
+    async def main() -> str:
+        nothing: Any = object()
+        return await RunLifecycle(plan, operations, nothing, nothing)._ask()  # type: ignore[arg-type]
+
+    key = asyncio.run(main())
+    assert plan.folder.run_json.read_text() == "earlier"
+    return key
+
+
+def test_a_command_killed_after_it_asked_finds_its_run_again(tmp_path: Path) -> None:
+    operations = Operations()
+    first = ask(tmp_path, operations)
+    assert ask(tmp_path, operations) == first
+    other = ask(tmp_path, operations, budget=4)
+    assert [*operations.open] == [other]
+    assert other != first
+
+
+def test_a_refused_run_leaves_no_request_and_the_earlier_run(tmp_path: Path) -> None:
+    operations = Operations()
+    operations.refuses = True
+    with pytest.raises(ConfigError, match="are public"):
+        ask(tmp_path, operations)
+    left = [path.name for path in tmp_path.rglob("*") if path.is_file()]
+    assert left == ["run.json"]
