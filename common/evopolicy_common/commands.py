@@ -95,7 +95,9 @@ class _Help:
         ]
         for param, value in named:
             if why := _unusable(value, several_lines=param.name in SEVERAL_LINES):
-                raise typer.BadParameter(f"{shortened(value)!r} {why}", ctx=ctx, param=param)
+                # A byte that is not UTF-8 is shown as the shell has it.
+                shown = repr(shortened(value)).replace(r"\udc", r"\x")
+                raise typer.BadParameter(f"{shown} {why}", ctx=ctx, param=param)
         rest: list[str] = super().parse_args(ctx, args)  # type: ignore[misc]
         for param, value in named:
             number = ctx.params.get(param.name)

@@ -149,7 +149,14 @@ async def _play(order: StartAgent, stage: Stage, config: AgentConfig | None) -> 
     if order.passed_file is not None:
         values = (*stage.log.redact.secrets, *(stage.environment.get(name, "") for name in passed))
         # A token in the run's URLs opens nothing once the run has ended.
-        kept_secret = [value for value in values if not any(value in url for url in order.urls.values())]
+        # Of the operator's variables, only what the agent got.
+        own = set(os.environ.values()) - set(stage.environment.values())
+        kept_secret = [
+            value
+            for value in values
+            if (value not in own or value in order.agent)
+            and not any(value in url for url in order.urls.values())
+        ]
         await asyncio.to_thread(note_passed, Path(order.passed_file), kept_secret)
     return await harness.play(stage)
 
