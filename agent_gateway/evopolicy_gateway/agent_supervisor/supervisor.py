@@ -19,7 +19,7 @@ import msgspec
 from evopolicy_common.cli import setup_logging
 from evopolicy_common.errors import ConfigError, EvopolicyError
 from evopolicy_common.logs import structlog
-from evopolicy_common.records.secrets import Redaction, note_passed, without_keys
+from evopolicy_common.records.secrets import Redaction, is_secret, note_passed, without_keys
 from evopolicy_gateway.agent_supervisor.agent_log import AgentLog
 from evopolicy_gateway.agent_supervisor.agent_process import environment_of
 from evopolicy_gateway.agent_supervisor.clock import Activity, AgentClock
@@ -119,7 +119,7 @@ def _stderr_tail(agent_log: AgentLog) -> tuple[str, ...]:
 
 async def _play(order: StartAgent, stage: Stage, config: AgentConfig | None) -> AgentEnded:
     harness = make(order.agent, Path(order.started_in), config)
-    passed = [*harness.variables]
+    passed = [name for name in harness.variables if is_secret(name)]
     if order.jail is not None:
         passed += order.jail.settings.environment
         kept = inputs.Kept()
@@ -147,16 +147,9 @@ async def _play(order: StartAgent, stage: Stage, config: AgentConfig | None) -> 
         inside = jail.environment(stage.environment, {**order.urls, **order.variables})
         stage = msgspec.structs.replace(stage, environment=inside, jail=jail)
     if order.passed_file is not None:
-        values = (*stage.log.redact.secrets, *(stage.environment.get(name, "") for name in passed))
-        # A token in the run's URLs opens nothing once the run has ended.
-        # Of the operator's variables, only what the agent got.
-        own = set(os.environ.values()) - set(stage.environment.values())
-        kept_secret = [
-            value
-            for value in values
-            if (value not in own or value in order.agent)
-            and not any(value in url for url in order.urls.values())
-        ]
+        written = [value for value in stage.log.redact.secrets if value in order.agent]
+        copied = own_config.secrets(harness.own_files) if order.jail is not None else ()
+        kept_secret = [*written, *copied, *(stage.environment.get(name, "") for name in passed)]
         await asyncio.to_thread(note_passed, Path(order.passed_file), kept_secret)
     return await harness.play(stage)
 
