@@ -22,9 +22,9 @@ from evopolicy._loop import awaited, call, loop
 from evopolicy._runs import Run, read_run
 from evopolicy_common.console import terminal
 from evopolicy_common.errors import ConfigError
+from evopolicy_common.local.cluster import unless_failed
 from evopolicy_common.messages.episode import EpisodeOutcome, Tier
 from evopolicy_common.messages.operator import Evaluate
-from evopolicy_common.processes.local_cluster import unless_failed
 from evopolicy_common.processes.packages import policy_versions
 from evopolicy_common.processes.preflight import check_installed
 from evopolicy_common.processes.scratch import scratch_folder

@@ -7,7 +7,7 @@ import threading
 from collections.abc import Coroutine
 from typing import Any, TypeVar
 
-from evopolicy_common.cli import setup_notices
+from evopolicy_common.cli.conventions import setup_notices
 
 T = TypeVar("T")
 

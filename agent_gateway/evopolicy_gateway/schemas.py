@@ -16,7 +16,7 @@ import msgspec
 
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.records import suite_folder
-from evopolicy_common.records.policies.code_metrics import PUBLISHED_SCHEMA
+from evopolicy_common.records.code_metrics import PUBLISHED_SCHEMA
 from evopolicy_common.records.run_record import RECORD_VERSION, RunRecord
 from evopolicy_common.records.summary import Summary
 from evopolicy_gateway.harnesses.agent_config import AgentConfig

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from evopolicy_common.wire.refusals import Refusal
+from evopolicy_common.refusals import Refusal
 
 if TYPE_CHECKING:
     import msgspec

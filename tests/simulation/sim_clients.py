@@ -12,7 +12,7 @@ from evopolicy_common.messages import gateway, operator
 from evopolicy_common.messages import worker as wire
 from evopolicy_common.messages.environment import Case
 from evopolicy_common.messages.run_settings import RunSettings
-from evopolicy_common.wire.refusals import NOT_NOW, RUN_OVER
+from evopolicy_common.refusals import NOT_NOW, RUN_OVER
 
 if TYPE_CHECKING:
     from sim_scenario import Simulation

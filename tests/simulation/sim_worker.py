@@ -17,7 +17,7 @@ from sim_oracle import failure_of, return_of
 from evopolicy_common.messages import worker as wire
 from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome, EpisodeSpec, Job, PolicyFailure
-from evopolicy_common.wire.refusals import Refusal
+from evopolicy_common.refusals import Refusal
 
 if TYPE_CHECKING:
     from sim_scenario import Simulation

@@ -27,9 +27,9 @@ from evopolicy_common.messages.run_settings import RunSettings
 from evopolicy_common.messages.status import StatusReply, StatusRequest
 from evopolicy_common.records.policies import bundles
 from evopolicy_common.records.policies.bundles import Bundle, BundleFile
+from evopolicy_common.refusals import Refusal
 from evopolicy_common.wire import codec, credentials, keys
 from evopolicy_common.wire.credentials import Credentials, Role
-from evopolicy_common.wire.refusals import Refusal
 from evopolicy_common.wire.requests import Requester
 from evopolicy_common.wire.transport import Link, connect
 

@@ -221,7 +221,7 @@ def test_the_help_of_local_is_in_groups_and_fits_a_narrow_terminal() -> None:
 
 def test_ctrl_c_is_told_whatever_a_command_was_doing() -> None:
     program = """
-from evopolicy_common.commands import App, run_app
+from evopolicy_common.cli.frame import App, run_app
 app = App()
 @app.command()
 def interrupted() -> None:

@@ -16,7 +16,7 @@ import typer
 
 from evopolicy_common import catalogue
 from evopolicy_common.catalogue import Entry, installs
-from evopolicy_common.cli import fail_on_our_errors
+from evopolicy_common.cli.conventions import fail_on_our_errors
 from evopolicy_common.console import table, terminal
 from evopolicy_common.errors import EvopolicyError, WorkerError
 from evopolicy_common.messages.environment import Case, EnvironmentDescription

@@ -18,8 +18,8 @@ import msgspec
 import typer
 
 from evopolicy_common import catalogue
-from evopolicy_common.cli import fail, fail_on_our_errors, setup_logging
-from evopolicy_common.commands import App, Version, run_app
+from evopolicy_common.cli.conventions import fail, fail_on_our_errors, setup_logging
+from evopolicy_common.cli.frame import App, Version, run_app
 from evopolicy_common.console import filled_table, terminal
 from evopolicy_common.errors import ConfigError, MachineError, SandboxError
 from evopolicy_common.logs import structlog

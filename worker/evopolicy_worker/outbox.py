@@ -25,8 +25,8 @@ from evopolicy_common.logs import structlog
 from evopolicy_common.messages.episode import BlobRef
 from evopolicy_common.messages.worker import JobResult, ReportResults, ResultsReported, WorkerReply
 from evopolicy_common.records.blobs import digest_of
+from evopolicy_common.refusals import NOT_NOW, Refusal
 from evopolicy_common.wire import codec
-from evopolicy_common.wire.refusals import NOT_NOW, Refusal
 from evopolicy_common.wire.requests import Requester
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger()

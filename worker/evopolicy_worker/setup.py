@@ -31,7 +31,7 @@ import evopolicy_common
 from evopolicy_common import catalogue
 from evopolicy_common.catalogue import installs
 from evopolicy_common.catalogue.installs import Install, Made
-from evopolicy_common.cli import fail_on_our_errors
+from evopolicy_common.cli.conventions import fail_on_our_errors
 from evopolicy_common.errors import ConfigError, MachineError
 from evopolicy_common.processes.parent_death import ending_with_parent
 from evopolicy_common.processes.preflight import check_writable

@@ -50,8 +50,8 @@ from evopolicy_common.messages.worker import (
     WorkerReply,
 )
 from evopolicy_common.records.blobs import digest_of
+from evopolicy_common.refusals import Refusal
 from evopolicy_common.wire import codec, keys
-from evopolicy_common.wire.refusals import Refusal
 from evopolicy_common.wire.requests import Requester
 from evopolicy_common.wire.transport import Link
 from evopolicy_worker.bundle_cache import BundleCache

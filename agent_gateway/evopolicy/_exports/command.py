@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from evopolicy_common.cli import fail_on_our_errors
-from evopolicy_common.commands import App
+from evopolicy_common.cli.conventions import fail_on_our_errors
+from evopolicy_common.cli.frame import App
 from evopolicy_common.errors import ConfigError, EvopolicyError
 from evopolicy_common.processes.preflight import check_writable
 from evopolicy_common.terminal import say, say_lines

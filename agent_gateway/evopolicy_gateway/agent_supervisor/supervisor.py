@@ -16,7 +16,7 @@ from pathlib import Path
 
 import msgspec
 
-from evopolicy_common.cli import setup_logging
+from evopolicy_common.cli.conventions import setup_logging
 from evopolicy_common.errors import ConfigError, EvopolicyError
 from evopolicy_common.logs import structlog
 from evopolicy_common.records.secrets import Redaction, is_secret, note_passed, without_keys

@@ -8,8 +8,8 @@ from typing import Annotated, Literal
 
 import typer
 
-from evopolicy_common.cli import fail_on_our_errors
-from evopolicy_common.commands import App
+from evopolicy_common.cli.conventions import fail_on_our_errors
+from evopolicy_common.cli.frame import App
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.terminal import say_lines
 from evopolicy_gateway import shipped

@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
-from evopolicy_common.cli import end_on_sigterm, fail_on_our_errors, run_to_end
-from evopolicy_common.commands import App
+from evopolicy_common.cli.conventions import end_on_sigterm, fail_on_our_errors, run_to_end
+from evopolicy_common.cli.frame import App
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.terminal import say
 from evopolicy_common.wire.http import bound, serving

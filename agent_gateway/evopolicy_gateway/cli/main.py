@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import typer
 
-from evopolicy_common.commands import App, Group, Version, run_app
+from evopolicy_common.cli.frame import App, Group, Version, run_app
 from evopolicy_gateway.run import processes
 
 

@@ -9,8 +9,8 @@ import msgspec
 import typer
 
 from evopolicy_common import catalogue
-from evopolicy_common.cli import Connect, CredentialsFile, fail, fail_on_our_errors, run_to_end
-from evopolicy_common.commands import App
+from evopolicy_common.cli.conventions import Connect, CredentialsFile, fail, fail_on_our_errors, run_to_end
+from evopolicy_common.cli.frame import App
 from evopolicy_common.console import terminal
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.environment import Split

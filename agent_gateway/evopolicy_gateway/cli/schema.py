@@ -6,8 +6,8 @@ from typing import Annotated
 
 import typer
 
-from evopolicy_common.cli import fail_on_our_errors
-from evopolicy_common.commands import App
+from evopolicy_common.cli.conventions import fail_on_our_errors
+from evopolicy_common.cli.frame import App
 from evopolicy_common.terminal import say_json, say_lines
 from evopolicy_gateway import schemas
 

@@ -14,8 +14,8 @@ from typing import Annotated
 import orjson
 import typer
 
-from evopolicy_common.cli import FAILURE, code_of, fail_on_our_errors, setup_logging
-from evopolicy_common.commands import App, Version, run_app
+from evopolicy_common.cli.conventions import FAILURE, code_of, fail_on_our_errors, setup_logging
+from evopolicy_common.cli.frame import App, Version, run_app
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.logs import structlog
 from evopolicy_common.processes.preflight import foreseen

@@ -14,11 +14,18 @@ from typing import Annotated
 import msgspec
 import typer
 
-from evopolicy_common.cli import Connect, CredentialsFile, bytes_text, fail, fail_on_our_errors, run_to_end
-from evopolicy_common.commands import App
+from evopolicy_common.cli.conventions import (
+    Connect,
+    CredentialsFile,
+    bytes_text,
+    fail,
+    fail_on_our_errors,
+    run_to_end,
+)
+from evopolicy_common.cli.frame import App
 from evopolicy_common.console import Terminal, terminal
 from evopolicy_common.errors import ConfigError
-from evopolicy_common.processes.local_cluster import unless_failed
+from evopolicy_common.local.cluster import unless_failed
 from evopolicy_common.processes.preflight import check_installed, check_loopback, check_writable
 from evopolicy_common.records.run_files import read_record
 from evopolicy_common.records.suite_folder import FINISHED, INDEX, Index

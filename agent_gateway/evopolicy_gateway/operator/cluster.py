@@ -11,12 +11,12 @@ from typing import NamedTuple
 import msgspec
 
 from evopolicy_common import catalogue
-from evopolicy_common.cli import end_on_sigterm
+from evopolicy_common.cli.conventions import end_on_sigterm
 from evopolicy_common.errors import ConfigError
+from evopolicy_common.local.cluster import LocalCluster, Workers, local_cluster
 from evopolicy_common.messages.environment import Split
 from evopolicy_common.messages.episode import Tier
 from evopolicy_common.messages.run_settings import RunSettings
-from evopolicy_common.processes.local_cluster import LocalCluster, Workers, local_cluster
 from evopolicy_common.terminal import say
 from evopolicy_common.wire import transport
 from evopolicy_common.wire.credentials import Credentials

@@ -24,10 +24,10 @@ from evopolicy_common.messages.operator import (
 from evopolicy_common.messages.run_settings import RunSettings
 from evopolicy_common.messages.worker import Message
 from evopolicy_common.processes.notices import notify_if_slow
+from evopolicy_common.refusals import WRONG_SETTINGS, Refusal
 from evopolicy_common.wire import credentials
 from evopolicy_common.wire.credentials import Credentials
 from evopolicy_common.wire.operator_client import TIMEOUT_S, WAIT_S, OperatorClient
-from evopolicy_common.wire.refusals import WRONG_SETTINGS, Refusal
 from evopolicy_common.wire.transport import Link
 from evopolicy_gateway.operator.locks import until_free
 from evopolicy_gateway.run.layout import IntendedRun, OpenedRun, RunFolder, saved

@@ -13,10 +13,10 @@ from rich.progress import Progress
 from evopolicy_common import catalogue
 from evopolicy_common.console import Terminal, table, terminal
 from evopolicy_common.errors import BundleError, ConfigError
+from evopolicy_common.local.cluster import unless_failed
 from evopolicy_common.messages.environment import Split
 from evopolicy_common.messages.episode import EpisodeOutcome, ResourceLimits, Tier
 from evopolicy_common.messages.operator import Evaluate
-from evopolicy_common.processes.local_cluster import unless_failed
 from evopolicy_common.processes.notices import Waiting
 from evopolicy_common.processes.preflight import check_writable
 from evopolicy_common.records.aggregates import mean, std

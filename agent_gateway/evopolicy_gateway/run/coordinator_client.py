@@ -35,8 +35,8 @@ from evopolicy_common.messages.gateway import (
     SubmitAccepted,
 )
 from evopolicy_common.messages.worker import Message
+from evopolicy_common.refusals import NOT_NOW
 from evopolicy_common.wire import codec, keys
-from evopolicy_common.wire.refusals import NOT_NOW
 from evopolicy_common.wire.requests import Requester
 from evopolicy_common.wire.transport import Link
 from evopolicy_gateway.http.listener import AgentPlace

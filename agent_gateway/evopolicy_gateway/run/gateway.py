@@ -25,9 +25,9 @@ import msgspec
 from evopolicy_common.errors import ConfigError, RefusedError
 from evopolicy_common.logs import structlog
 from evopolicy_common.records.blobs import BlobStore
+from evopolicy_common.refusals import RUN_OVER
 from evopolicy_common.wire import credentials, transport
 from evopolicy_common.wire.http import serving
-from evopolicy_common.wire.refusals import RUN_OVER
 from evopolicy_gateway.http.listener import AgentPlace, agent_place, ends_unseen
 from evopolicy_gateway.http.server import bind
 from evopolicy_gateway.http.service import make_app

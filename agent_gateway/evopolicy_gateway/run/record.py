@@ -29,11 +29,11 @@ from evopolicy_common.processes.preflight import foreseen
 from evopolicy_common.processes.scratch import remove_tree
 from evopolicy_common.records.aggregates import mean, std
 from evopolicy_common.records.blobs import BlobStore, write_atomically
+from evopolicy_common.records.code_metrics import TREND, CodeMetrics
 from evopolicy_common.records.journal import GATEWAY_SIDE
 from evopolicy_common.records.policies import bundles, checkpoints
 from evopolicy_common.records.policies.bundles import Bundle
 from evopolicy_common.records.policies.checkpoints import CheckpointMeta
-from evopolicy_common.records.policies.code_metrics import TREND, CodeMetrics
 from evopolicy_common.records.run_record import (
     PUBLISHED_SETTINGS,
     Agent,

@@ -33,7 +33,7 @@ from evopolicy_common.messages.gateway import (
     SubmitDone,
 )
 from evopolicy_common.records.blobs import BlobStore, digest_of
-from evopolicy_common.wire.refusals import RUN_OVER, Refusal
+from evopolicy_common.refusals import RUN_OVER, Refusal
 from evopolicy_gateway.http.submit_request import Bounds, parse
 from evopolicy_gateway.run.coordinator_client import HELD_WAIT_S, RESULTS_WAIT_S, CoordinatorClient
 from evopolicy_gateway.submits import formatting, snapshots

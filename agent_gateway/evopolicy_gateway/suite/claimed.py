@@ -25,8 +25,8 @@ from typing import Any
 import msgspec
 
 from evopolicy_common.errors import EvopolicyError, StorageError
+from evopolicy_common.local.cluster import unless_failed
 from evopolicy_common.messages.operator import ClaimState
-from evopolicy_common.processes.local_cluster import unless_failed
 from evopolicy_common.processes.scratch import remove_tree
 from evopolicy_common.records.run_files import read_record
 from evopolicy_common.records.suite_folder import FINISHED, INDEX, PAUSED, Entry, Index

@@ -11,7 +11,7 @@ import msgspec
 
 from evopolicy_common.console import Terminal, table
 from evopolicy_common.errors import ConfigError
-from evopolicy_common.processes.local_cluster import unless_failed
+from evopolicy_common.local.cluster import unless_failed
 from evopolicy_common.records.run_record import RunRecord
 from evopolicy_common.records.suite_folder import Entry, Index
 from evopolicy_common.terminal import number

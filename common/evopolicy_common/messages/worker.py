@@ -12,7 +12,7 @@ from msgspec.structs import replace
 from evopolicy_common.messages.bounds import Bytes, Int, Many, Named, Number, Text, Word
 from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome, Job, Tier
-from evopolicy_common.wire.refusals import Refusal
+from evopolicy_common.refusals import Refusal
 
 DEFINITION_DIGITS = 16
 """Leading hex digits of a definition's digest that fingerprints and command lines use."""

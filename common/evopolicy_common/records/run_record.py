@@ -24,7 +24,7 @@ from evopolicy_common.messages.gateway import FeedbackDetail, FinishRule, Profil
 from evopolicy_common.messages.journal import Committed
 from evopolicy_common.messages.operator import RunEnd
 from evopolicy_common.messages.run_settings import HiddenCases, HiddenIsolation
-from evopolicy_common.records.policies.code_metrics import PUBLISHED_SCHEMA
+from evopolicy_common.records.code_metrics import PUBLISHED_SCHEMA
 
 RECORD_VERSION = 2
 """Version of our own fields. Incremented only when older readers would misunderstand a file, not for added fields."""

@@ -15,7 +15,7 @@ import msgspec
 from evopolicy_common.errors import DECODE_ERRORS, ProtocolError
 from evopolicy_common.messages.bounds import check_plausible
 from evopolicy_common.messages.gateway import SubmitStatus
-from evopolicy_common.records.policies.code_metrics import PUBLISHED_SCHEMA
+from evopolicy_common.records.code_metrics import PUBLISHED_SCHEMA
 
 SCHEMA_VERSION = PUBLISHED_SCHEMA
 _READ = (SCHEMA_VERSION, 1)

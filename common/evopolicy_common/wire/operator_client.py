@@ -42,7 +42,7 @@ from evopolicy_common.messages.operator import (
     SignRequest,
 )
 from evopolicy_common.messages.status import StatusReply, StatusRequest
-from evopolicy_common.wire.refusals import Refusal
+from evopolicy_common.refusals import Refusal
 from evopolicy_common.wire.requests import operator_requests
 from evopolicy_common.wire.transport import Link
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from evopolicy_common.commands import needed_extras
+from evopolicy_common.cli.frame import needed_extras
 
 
 def program() -> None:

@@ -11,8 +11,8 @@ from typing import Annotated
 import msgspec
 import typer
 
-from evopolicy_common.cli import fail_on_our_errors
-from evopolicy_common.commands import App
+from evopolicy_common.cli.conventions import fail_on_our_errors
+from evopolicy_common.cli.frame import App
 from evopolicy_common.console import table, terminal
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.terminal import say, say_json

@@ -15,7 +15,7 @@ import msgspec
 import typer
 
 from evopolicy_common import catalogue
-from evopolicy_common.commands import App
+from evopolicy_common.cli.frame import App
 from evopolicy_common.console import table, terminal
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.environment import Split

@@ -11,8 +11,8 @@ import typer
 
 from evopolicy_common import catalogue
 from evopolicy_common.catalogue import installs
-from evopolicy_common.cli import Connect, CredentialsFile, fail_on_our_errors
-from evopolicy_common.commands import App
+from evopolicy_common.cli.conventions import Connect, CredentialsFile, fail_on_our_errors
+from evopolicy_common.cli.frame import App
 from evopolicy_common.console import table, terminal
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.operator import OfferedEnvironment

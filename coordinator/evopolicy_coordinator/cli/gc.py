@@ -11,8 +11,8 @@ from typing import Annotated
 import typer
 
 from evopolicy_common import catalogue
-from evopolicy_common.cli import bytes_text, fail_on_our_errors
-from evopolicy_common.commands import App
+from evopolicy_common.cli.conventions import bytes_text, fail_on_our_errors
+from evopolicy_common.cli.frame import App
 from evopolicy_common.processes.preflight import check_writable
 from evopolicy_common.terminal import say, say_json
 from evopolicy_common.wire.credentials import default_state_dir

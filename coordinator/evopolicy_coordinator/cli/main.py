@@ -11,8 +11,8 @@ from typing import Annotated, Literal
 import msgspec
 import typer
 
-from evopolicy_common.cli import fail_on_our_errors, setup_logging
-from evopolicy_common.commands import App, Version, run_app
+from evopolicy_common.cli.conventions import fail_on_our_errors, setup_logging
+from evopolicy_common.cli.frame import App, Version, run_app
 from evopolicy_common.processes.packages import checked_names
 from evopolicy_common.records.blobs import announcing
 from evopolicy_common.terminal import say, say_json

@@ -20,7 +20,7 @@ from typing import Annotated, Any
 
 import typer
 
-from evopolicy_common.cli import fail_on_our_errors
+from evopolicy_common.cli.conventions import fail_on_our_errors
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.records.blobs import write_atomically
 from evopolicy_common.terminal import say

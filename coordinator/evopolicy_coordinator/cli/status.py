@@ -18,8 +18,8 @@ from rich.table import Table
 from rich.text import Text
 
 from evopolicy_common import catalogue
-from evopolicy_common.cli import Connect, CredentialsFile, fail_on_our_errors
-from evopolicy_common.commands import App
+from evopolicy_common.cli.conventions import Connect, CredentialsFile, fail_on_our_errors
+from evopolicy_common.cli.frame import App
 from evopolicy_common.console import table, terminal
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.status import RunStatus, StatusReply, WorkerStatus

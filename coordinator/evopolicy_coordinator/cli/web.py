@@ -16,8 +16,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from evopolicy_common.cli import Connect, CredentialsFile, end_on_sigterm, fail_on_our_errors, setup_logging
-from evopolicy_common.commands import App
+from evopolicy_common.cli.conventions import (
+    Connect,
+    CredentialsFile,
+    end_on_sigterm,
+    fail_on_our_errors,
+    setup_logging,
+)
+from evopolicy_common.cli.frame import App
 from evopolicy_common.errors import ConfigError, EvopolicyError
 from evopolicy_common.processes.preflight import check_writable
 from evopolicy_common.records.blobs import announcing

@@ -16,7 +16,7 @@ from typing import Any, Literal
 import msgspec
 
 from evopolicy_common.messages.worker import Message
-from evopolicy_common.wire.refusals import Refusal
+from evopolicy_common.refusals import Refusal
 
 from .events import RequestId
 from .reasons import Reason

@@ -13,7 +13,7 @@ from typing import Any
 
 from evopolicy_common.messages import gateway, operator
 from evopolicy_common.messages import worker as wire
-from evopolicy_common.wire.refusals import Refusal
+from evopolicy_common.refusals import Refusal
 
 from . import events, invariants, loading, status, step
 from .agents import open_runs, permits, precedence, requests

@@ -19,7 +19,7 @@ import msgspec
 
 from evopolicy_common.messages.episode import EpisodeOutcome
 from evopolicy_common.messages.worker import JobResult, Message
-from evopolicy_common.wire.refusals import Refusal
+from evopolicy_common.refusals import Refusal
 
 from . import transitions
 from .effects import Effect, Log, Persist, Refuse, Reply

@@ -23,9 +23,9 @@ import numpy as np
 
 from evopolicy_common import catalogue
 from evopolicy_common.errors import EvopolicyError, ProtocolError
+from evopolicy_common.local.cluster import local_cluster
 from evopolicy_common.messages.episode import BlobRef
 from evopolicy_common.messages.operator import DescribeEnvironment, Evaluate
-from evopolicy_common.processes.local_cluster import local_cluster
 from evopolicy_common.processes.scratch import scratch_folder
 from evopolicy_common.records.blobs import digest_of
 from evopolicy_common.records.episodes.rendered import decode

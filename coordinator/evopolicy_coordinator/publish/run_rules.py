@@ -12,11 +12,11 @@ from evopolicy_common import catalogue
 from evopolicy_common.errors import BundleError, ProtocolError
 from evopolicy_common.records import journal
 from evopolicy_common.records.aggregates import mean
+from evopolicy_common.records.code_metrics import TREND, code_metrics
 from evopolicy_common.records.episodes.trajectory import Trajectory, decode
 from evopolicy_common.records.journal import Ended, Opened, Opening, Result, Revealed
 from evopolicy_common.records.policies import bundles
 from evopolicy_common.records.policies.bundles import Bundle
-from evopolicy_common.records.policies.code_metrics import TREND, code_metrics
 from evopolicy_common.records.run_record import PROTOCOL_VERSION, decode_run_record, inputs_digest
 from evopolicy_common.records.summary import utc_text
 from evopolicy_coordinator.publish import contents, fields

@@ -17,7 +17,7 @@ import msgspec
 
 from evopolicy_common.errors import DECODE_ERRORS, DamagedStoreError, RefusedError
 from evopolicy_common.messages.operator import Claim, ClaimState
-from evopolicy_common.wire.refusals import Refusal
+from evopolicy_common.refusals import Refusal
 from evopolicy_coordinator.storage.store import Store, unreadable
 from evopolicy_coordinator.storage.writer import Writer
 

@@ -14,9 +14,9 @@ import msgspec
 
 from evopolicy_common import catalogue
 from evopolicy_common.errors import ConfigError
+from evopolicy_common.local.cluster import PROCESSES, WORKERS_ENDED
 from evopolicy_common.logs import structlog
 from evopolicy_common.processes import host
-from evopolicy_common.processes.local_cluster import PROCESSES, WORKERS_ENDED
 from evopolicy_common.records.blobs import BlobStore
 from evopolicy_common.simulators import SIMULATORS
 from evopolicy_common.wire import credentials, transport

@@ -36,8 +36,8 @@ from evopolicy_common.messages.status import DiskUse
 from evopolicy_common.messages.worker import BlobAck, BlobChunk, BlobGet, BlobPut, Message, Refused
 from evopolicy_common.records import journal
 from evopolicy_common.records.blobs import BlobStore, FileState, digest_of, is_digest
+from evopolicy_common.refusals import Refusal
 from evopolicy_common.wire import codec
-from evopolicy_common.wire.refusals import Refusal
 from evopolicy_common.wire.transport import IncomingQuery
 from evopolicy_coordinator.core import records
 from evopolicy_coordinator.core.effects import AuditEffect, ReadEvaluation, ReadFinished, ReadResults

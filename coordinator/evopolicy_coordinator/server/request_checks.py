@@ -15,8 +15,8 @@ from evopolicy_common.messages.environment import Case
 from evopolicy_common.messages.episode import LARGEST_LIMIT, LARGEST_LIMITS, BlobRef, ResourceLimits, Tier
 from evopolicy_common.processes.packages import POLICY
 from evopolicy_common.records.blobs import digest_of
+from evopolicy_common.refusals import Refusal
 from evopolicy_common.wire import codec, keys
-from evopolicy_common.wire.refusals import Refusal
 
 MAX_COUNT = 2**31 - 1
 MAX_JOB_BYTES = 8 << 20

@@ -31,9 +31,9 @@ from evopolicy_common.messages.run_settings import (
 from evopolicy_common.messages.worker import BlobGet, BlobPut, Message
 from evopolicy_common.records.blobs import BlobStore, is_digest
 from evopolicy_common.records.journal import SALT_BYTES
+from evopolicy_common.refusals import Refusal
 from evopolicy_common.wire import codec, keys
 from evopolicy_common.wire.credentials import Role
-from evopolicy_common.wire.refusals import Refusal
 from evopolicy_coordinator.core import events
 from evopolicy_coordinator.core.events import AnyEvent
 from evopolicy_coordinator.core.records import EvaluationRow, RunRow

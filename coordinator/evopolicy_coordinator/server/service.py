@@ -34,8 +34,8 @@ from evopolicy_common.messages import operator
 from evopolicy_common.messages.status import DiskUse, StatusReply, StatusRequest
 from evopolicy_common.messages.worker import BlobGet, BlobPut, LeaseRequest, Message, Refused
 from evopolicy_common.records.policies import bundles
+from evopolicy_common.refusals import Refusal
 from evopolicy_common.wire import codec
-from evopolicy_common.wire.refusals import Refusal
 from evopolicy_common.wire.transport import IncomingQuery
 from evopolicy_coordinator.core.effects import AuditEffect, Effect, Log, ReadEffect, Refuse, Reply
 from evopolicy_coordinator.core.events import (

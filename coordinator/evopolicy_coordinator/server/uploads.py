@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 
 from evopolicy_common.errors import RefusedError
 from evopolicy_common.records.blobs import FileState
-from evopolicy_common.wire.refusals import Refusal
+from evopolicy_common.refusals import Refusal
 
 MAX_RUNS = 10_000
 """Beyond this number, the runs with the oldest uploads are forgotten. Only open runs are recorded, so no gateway can

@@ -16,7 +16,7 @@ from evopolicy_common.records.run_difference import differences
 from evopolicy_coordinator.analysis.reading.reader import read_run
 from evopolicy_coordinator.cli.results.report import app as report
 
-VERIFY = "from evopolicy_common.commands import run_app; from evopolicy_coordinator.cli.results.verify import app; run_app(app)"
+VERIFY = "from evopolicy_common.cli.frame import run_app; from evopolicy_coordinator.cli.results.verify import app; run_app(app)"
 
 
 pytestmark = pytest.mark.timeout(600)

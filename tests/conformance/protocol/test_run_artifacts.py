@@ -13,7 +13,7 @@ from published_checker import check_run
 from published_checker import code_metrics as published_metrics
 
 from evopolicy_common import catalogue
-from evopolicy_common.records.policies.code_metrics import code_metrics
+from evopolicy_common.records.code_metrics import code_metrics
 
 ROOT = Path(__file__).parents[3]
 

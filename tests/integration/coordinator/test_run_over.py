@@ -10,7 +10,7 @@ from coordinator_harness import Coordinator, GatewayClient, bundle_of, gateway_o
 
 from evopolicy_common.errors import RefusedError
 from evopolicy_common.messages import gateway, operator
-from evopolicy_common.wire.refusals import RUN_OVER, Refusal
+from evopolicy_common.refusals import RUN_OVER, Refusal
 
 WORDS = {
     "closed": Refusal.RUN_CLOSED,

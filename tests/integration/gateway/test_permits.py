@@ -14,7 +14,7 @@ from evopolicy_common.messages.gateway import CloseRun, OpenRun, RequestPermit
 from evopolicy_common.messages.run_settings import ELSEWHERE, RunSettings
 from evopolicy_common.messages.worker import Message, Refused
 from evopolicy_common.processes import host
-from evopolicy_common.wire.refusals import Refusal
+from evopolicy_common.refusals import Refusal
 from evopolicy_gateway.http import listener
 from evopolicy_gateway.http.listener import AgentPlace, Listener
 from evopolicy_gateway.run import coordinator_client

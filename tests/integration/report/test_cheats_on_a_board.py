@@ -17,10 +17,10 @@ from publications import AGENT, ENV, Forger
 
 from evopolicy_common.records import journal
 from evopolicy_common.records.aggregates import mean
+from evopolicy_common.records.code_metrics import TREND, code_metrics
 from evopolicy_common.records.episodes.trajectory import Recorder, decode
 from evopolicy_common.records.policies import bundles
 from evopolicy_common.records.policies.bundles import BundleFile
-from evopolicy_common.records.policies.code_metrics import TREND, code_metrics
 from evopolicy_coordinator.leaderboard.bundles import LabBundle, read_bundles
 from evopolicy_coordinator.leaderboard.compare import boards
 from evopolicy_coordinator.pki import identity

@@ -11,7 +11,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from evopolicy_common.cli import fail, setup_logging
+from evopolicy_common.cli.conventions import fail, setup_logging
 from evopolicy_common.console import Terminal, filled_table, table
 from evopolicy_common.terminal import harmless, one_line, say, say_json, say_lines
 

@@ -23,7 +23,7 @@ import pytest
 import yaml
 from documents import APPS, blocks_of_commands, parse
 
-from evopolicy_common.cli import USAGE_ERROR
+from evopolicy_common.cli.conventions import USAGE_ERROR
 
 ROOT = Path(__file__).parents[3]
 DEPLOY = ROOT / "deploy"

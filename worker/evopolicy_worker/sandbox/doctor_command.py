@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from evopolicy_common.commands import App
+from evopolicy_common.cli.frame import App
 from evopolicy_common.console import filled_table, terminal
 from evopolicy_common.terminal import say, say_json
 from evopolicy_worker.sandbox.doctor import Check, best_tier, examine

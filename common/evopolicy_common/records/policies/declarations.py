@@ -5,7 +5,7 @@ from __future__ import annotations
 import ast
 from collections.abc import Mapping
 
-from evopolicy_common.records.policies.code_metrics import parse
+from evopolicy_common.records.code_metrics import parse
 
 _MAX_BYTES = 1 << 20
 

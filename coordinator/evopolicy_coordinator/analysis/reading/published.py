@@ -16,8 +16,8 @@ import msgspec
 
 from evopolicy_common import catalogue
 from evopolicy_common.errors import DECODE_ERRORS, ProtocolError
+from evopolicy_common.records.code_metrics import PUBLISHED_SCHEMA
 from evopolicy_common.records.policies.checkpoints import read_meta
-from evopolicy_common.records.policies.code_metrics import PUBLISHED_SCHEMA
 from evopolicy_common.records.run_record import (
     Agent,
     Artifacts,

@@ -14,7 +14,7 @@ import stat
 from collections.abc import Mapping
 from pathlib import Path
 
-from evopolicy_common.records.policies.code_metrics import parse
+from evopolicy_common.records.code_metrics import parse
 from evopolicy_common.regular_files import read_regular
 
 MAX_FILE_BYTES = 1 << 20

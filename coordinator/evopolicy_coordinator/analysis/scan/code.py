@@ -15,7 +15,7 @@ from functools import lru_cache
 
 import msgspec
 
-from evopolicy_common.records.policies.code_metrics import parse
+from evopolicy_common.records.code_metrics import parse
 from evopolicy_common.simulators import SIMULATORS
 from evopolicy_coordinator.analysis.reading.sources import MAX_FILE_BYTES
 from evopolicy_coordinator.analysis.scan.signals import Kind, Signal, signal

@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
+from evopolicy_common.records.code_metrics import parse
 from evopolicy_common.records.episodes.npz import read_arrays
-from evopolicy_common.records.policies.code_metrics import parse
 from evopolicy_coordinator.analysis.scan.signals import Files, Signal, Trajectories, signal
 
 _WINDOW = 24

@@ -20,7 +20,7 @@ from typing import Literal
 
 import msgspec
 
-from evopolicy_common.records.policies.code_metrics import parse
+from evopolicy_common.records.code_metrics import parse
 from evopolicy_common.simulators import SIMULATORS
 from evopolicy_coordinator.analysis.simulators.code import (
     Code,

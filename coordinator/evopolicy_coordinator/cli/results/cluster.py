@@ -13,11 +13,11 @@ import msgspec
 import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from evopolicy_common.cli import CLUSTER, fail
+from evopolicy_common.cli.conventions import CLUSTER, fail
 from evopolicy_common.console import Terminal
 from evopolicy_common.errors import ConfigError
+from evopolicy_common.local.cluster import LocalCluster, local_cluster, unless_failed
 from evopolicy_common.messages.episode import Tier
-from evopolicy_common.processes.local_cluster import LocalCluster, local_cluster, unless_failed
 from evopolicy_common.wire import credentials, transport
 
 Local = Annotated[

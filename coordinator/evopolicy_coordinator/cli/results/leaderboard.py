@@ -13,8 +13,8 @@ from typing import Annotated
 
 import typer
 
-from evopolicy_common.cli import fail, fail_on_our_errors
-from evopolicy_common.commands import App
+from evopolicy_common.cli.conventions import fail, fail_on_our_errors
+from evopolicy_common.cli.frame import App
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.processes.preflight import check_writable
 from evopolicy_common.processes.scratch import scratch_folder

@@ -17,8 +17,14 @@ from typing import Annotated
 import msgspec
 import typer
 
-from evopolicy_common.cli import Connect, CredentialsFile, end_on_sigterm, fail, fail_on_our_errors
-from evopolicy_common.commands import App
+from evopolicy_common.cli.conventions import (
+    Connect,
+    CredentialsFile,
+    end_on_sigterm,
+    fail,
+    fail_on_our_errors,
+)
+from evopolicy_common.cli.frame import App
 from evopolicy_common.console import table, terminal
 from evopolicy_common.errors import DECODE_ERRORS, ConfigError, ProtocolError
 from evopolicy_common.processes.packages import checked_names

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from evopolicy_common.cli import code_of, fail
-from evopolicy_common.commands import App
+from evopolicy_common.cli.conventions import code_of, fail
+from evopolicy_common.cli.frame import App
 from evopolicy_common.console import terminal
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.processes.preflight import check_writable

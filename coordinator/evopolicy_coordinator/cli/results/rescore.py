@@ -12,7 +12,7 @@ from typing import Annotated
 
 import typer
 
-from evopolicy_common.cli import (
+from evopolicy_common.cli.conventions import (
     Connect,
     CredentialsFile,
     end_on_sigterm,
@@ -20,7 +20,7 @@ from evopolicy_common.cli import (
     fail_on_our_errors,
     run_to_end,
 )
-from evopolicy_common.commands import App
+from evopolicy_common.cli.frame import App
 from evopolicy_common.console import Terminal, table, terminal
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.processes.packages import packages_in

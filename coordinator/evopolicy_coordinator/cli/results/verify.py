@@ -13,7 +13,7 @@ from typing import Annotated
 import msgspec
 import typer
 
-from evopolicy_common.cli import (
+from evopolicy_common.cli.conventions import (
     CLUSTER,
     Connect,
     CredentialsFile,
@@ -22,7 +22,7 @@ from evopolicy_common.cli import (
     fail_on_our_errors,
     run_to_end,
 )
-from evopolicy_common.commands import App
+from evopolicy_common.cli.frame import App
 from evopolicy_common.console import Terminal, terminal
 from evopolicy_common.errors import ConfigError, EvopolicyError
 from evopolicy_common.messages.episode import Tier

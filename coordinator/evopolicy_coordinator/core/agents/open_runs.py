@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from evopolicy_common.wire.refusals import Refusal
+from evopolicy_common.refusals import Refusal
 from evopolicy_coordinator.core.events import RequestId
 from evopolicy_coordinator.core.model import Run
 from evopolicy_coordinator.core.reasons import Reason, because

@@ -16,7 +16,7 @@ import msgspec
 
 from evopolicy_common.messages import gateway
 from evopolicy_common.messages.run_settings import ELSEWHERE
-from evopolicy_common.wire.refusals import Refusal
+from evopolicy_common.refusals import Refusal
 from evopolicy_coordinator.core.isolation import conflicts, kernels
 from evopolicy_coordinator.core.isolation.kernels import all_related, put, related, take
 from evopolicy_coordinator.core.leasing import leases

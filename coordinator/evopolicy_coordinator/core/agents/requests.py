@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from evopolicy_common.messages import gateway, operator
 from evopolicy_common.messages.run_settings import ELSEWHERE, HiddenIsolation
-from evopolicy_common.wire.refusals import Refusal
+from evopolicy_common.refusals import Refusal
 from evopolicy_coordinator.core import events
 from evopolicy_coordinator.core.agents.open_runs import over
 from evopolicy_coordinator.core.isolation import conflicts, kernels

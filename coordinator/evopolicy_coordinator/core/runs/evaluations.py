@@ -10,7 +10,7 @@ from __future__ import annotations
 import msgspec
 
 from evopolicy_common.messages import operator
-from evopolicy_common.wire.refusals import Refusal
+from evopolicy_common.refusals import Refusal
 from evopolicy_coordinator.core import events
 from evopolicy_coordinator.core.effects import ReadEvaluation
 from evopolicy_coordinator.core.leasing import groups, pins

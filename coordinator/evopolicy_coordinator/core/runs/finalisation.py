@@ -15,7 +15,7 @@ Rules that this module owns:
 from __future__ import annotations
 
 from evopolicy_common.messages import gateway, operator
-from evopolicy_common.wire.refusals import Refusal
+from evopolicy_common.refusals import Refusal
 from evopolicy_coordinator.core import events
 from evopolicy_coordinator.core.agents import permits
 from evopolicy_coordinator.core.leasing import groups, queue

@@ -6,7 +6,7 @@ from typing import Literal
 
 from evopolicy_common.messages import operator
 from evopolicy_common.records.aggregates import mean
-from evopolicy_common.wire.refusals import Refusal
+from evopolicy_common.refusals import Refusal
 from evopolicy_coordinator.core import events
 from evopolicy_coordinator.core.model import Run
 from evopolicy_coordinator.core.reasons import Reason, because

@@ -16,7 +16,7 @@ import msgspec
 from evopolicy_common.messages.journal import Committed
 from evopolicy_common.messages.operator import Done, RunFinished
 from evopolicy_common.records import journal
-from evopolicy_common.wire.refusals import Refusal
+from evopolicy_common.refusals import Refusal
 from evopolicy_coordinator.core import events
 from evopolicy_coordinator.core.reasons import Reason, because
 from evopolicy_coordinator.core.records import DocumentRow, JournalRow, RunRow

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from evopolicy_common.messages import gateway
-from evopolicy_common.wire.refusals import Refusal
+from evopolicy_common.refusals import Refusal
 from evopolicy_coordinator.core import events
 from evopolicy_coordinator.core.effects import ReadFinished, ReadResults
 from evopolicy_coordinator.core.events import RequestId

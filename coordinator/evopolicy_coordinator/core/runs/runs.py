@@ -14,7 +14,7 @@ from msgspec.structs import replace
 from evopolicy_common.messages import gateway, operator
 from evopolicy_common.messages.gateway import CANCELLED
 from evopolicy_common.messages.status import RetriedJobs
-from evopolicy_common.wire.refusals import Refusal
+from evopolicy_common.refusals import Refusal
 from evopolicy_coordinator.core import events
 from evopolicy_coordinator.core.agents import requests
 from evopolicy_coordinator.core.agents.open_runs import live

@@ -17,7 +17,7 @@ from typing import cast
 from evopolicy_common.messages import gateway
 from evopolicy_common.messages.episode import NO_POLICY, PolicyFailure
 from evopolicy_common.messages.gateway import SubmitStatus
-from evopolicy_common.wire.refusals import Refusal
+from evopolicy_common.refusals import Refusal
 from evopolicy_coordinator.core import events
 from evopolicy_coordinator.core.agents import requests
 from evopolicy_coordinator.core.agents.open_runs import live, over

@@ -9,7 +9,7 @@ Rules that this module owns:
 
 from __future__ import annotations
 
-from evopolicy_common.wire.refusals import Refusal
+from evopolicy_common.refusals import Refusal
 from evopolicy_coordinator.core.reasons import Reason, because
 
 from .trace import InvariantError

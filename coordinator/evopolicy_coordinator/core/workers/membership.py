@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from evopolicy_common.messages import operator
 from evopolicy_common.messages import worker as wire
-from evopolicy_common.wire.refusals import Refusal
+from evopolicy_common.refusals import Refusal
 from evopolicy_coordinator.core import events
 from evopolicy_coordinator.core.isolation import conflicts, kernels, occupancies
 from evopolicy_coordinator.core.leasing import fleet, leases, pins

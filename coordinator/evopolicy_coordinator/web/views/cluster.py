@@ -11,7 +11,7 @@ from typing import Any
 
 from markupsafe import Markup
 
-from evopolicy_common.cli import bytes_text
+from evopolicy_common.cli.conventions import bytes_text
 from evopolicy_common.messages.status import DiskUse, StatusReply, WorkerStatus
 from evopolicy_coordinator.analysis.scoring.scores import title_of
 from evopolicy_coordinator.web.charts import Line, chart

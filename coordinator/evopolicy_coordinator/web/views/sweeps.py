@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from evopolicy_common.cli import bytes_text
+from evopolicy_common.cli.conventions import bytes_text
 from evopolicy_coordinator.analysis.palette import Look, looks
 from evopolicy_coordinator.analysis.scoring.scores import title_of
 from evopolicy_coordinator.web.cluster import Cluster

@@ -9,8 +9,8 @@ import pytest
 from commands import SMALL, Command, agent, command, record_in, run_dir
 from waiting import wait_until
 
+from evopolicy_common.local.cluster import WORKERS_ENDED
 from evopolicy_common.messages.environment import Split
-from evopolicy_common.processes.local_cluster import WORKERS_ENDED
 from evopolicy_coordinator.core.records import KernelRow
 from evopolicy_coordinator.splits import SPLITS, cases_hash, derive
 from evopolicy_coordinator.storage.store import Store

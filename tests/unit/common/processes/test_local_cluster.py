@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from evopolicy_common.errors import ConfigError
-from evopolicy_common.processes import local_cluster
+from evopolicy_common.local import cluster as local_cluster
 from evopolicy_common.processes.child_process import ChildProcess
 
 SOON_S = 0.2

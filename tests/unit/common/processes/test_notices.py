@@ -6,7 +6,7 @@ import os
 
 import pytest
 
-from evopolicy_common.cli import setup_notices
+from evopolicy_common.cli.conventions import setup_notices
 from evopolicy_common.processes.notices import MANY_SLOTS, notify_of_many_slots
 
 

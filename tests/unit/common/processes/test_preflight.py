@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from evopolicy_common.cli import fail_on_our_errors
+from evopolicy_common.cli.conventions import fail_on_our_errors
 from evopolicy_common.errors import ConfigError, DamagedStoreError
 from evopolicy_common.processes.preflight import check_text, check_writable, explained
 

@@ -12,7 +12,7 @@ from rigs.core_rig import Rig, describe, fingerprint, result, split_of
 from evopolicy_common.messages import gateway, operator
 from evopolicy_common.messages import worker as wire
 from evopolicy_common.messages.run_settings import ELSEWHERE
-from evopolicy_common.wire.refusals import Refusal
+from evopolicy_common.refusals import Refusal
 from evopolicy_coordinator.core.agents import permits
 from evopolicy_coordinator.core.isolation import kernels
 from evopolicy_coordinator.core.records import PermitRow

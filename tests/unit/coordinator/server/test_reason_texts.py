@@ -13,7 +13,7 @@ import pytest
 import evopolicy_coordinator.core
 from evopolicy_common.messages import gateway
 from evopolicy_common.messages.worker import Refused
-from evopolicy_common.wire.refusals import Refusal
+from evopolicy_common.refusals import Refusal
 from evopolicy_coordinator.core.effects import Refuse, Reply
 from evopolicy_coordinator.core.reasons import Code, because
 from evopolicy_coordinator.server.reason_texts import TEXTS, message, words

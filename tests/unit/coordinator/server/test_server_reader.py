@@ -15,8 +15,8 @@ from evopolicy_common.messages.gateway import EpisodeFeedback, ResultsPage
 from evopolicy_common.messages.operator import EvaluationPage
 from evopolicy_common.messages.worker import BlobAck, BlobChunk, BlobGet, BlobPut, Message, Refused
 from evopolicy_common.records.blobs import BlobStore
+from evopolicy_common.refusals import Refusal
 from evopolicy_common.wire import codec
-from evopolicy_common.wire.refusals import Refusal
 from evopolicy_coordinator.core import records
 from evopolicy_coordinator.core.effects import ReadEvaluation, ReadFinished, ReadResults
 from evopolicy_coordinator.server import uploads as uploads_module

@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 from evopolicy_common import catalogue
 from evopolicy_common.catalogue import installs
-from evopolicy_common.cli import USAGE_ERROR
+from evopolicy_common.cli.conventions import USAGE_ERROR
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.episode import Tier
 from evopolicy_common.processes.child_process import ChildProcess, last_words

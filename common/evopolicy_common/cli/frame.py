@@ -14,7 +14,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 import evopolicy_common
-from evopolicy_common.cli import USAGE_ERROR, fail, fail_on_our_errors, setup_notices
+from evopolicy_common.cli.conventions import USAGE_ERROR, fail, fail_on_our_errors, setup_notices
 from evopolicy_common.entry import interruptible
 from evopolicy_common.processes.preflight import EXTRAS, missing
 from evopolicy_common.terminal import end_without_reader, harmless, one_line, open_streams, say, shortened

@@ -1,0 +1,1 @@
+"""A local cluster: coordinator and workers of one command, as child processes on this machine."""
