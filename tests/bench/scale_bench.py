@@ -44,7 +44,7 @@ from evopolicy_common.messages.episode import EpisodeOutcome, Job
 from evopolicy_common.records.blobs import BlobStore
 from evopolicy_common.records.episodes import rendered
 from evopolicy_common.wire import credentials, transport
-from evopolicy_coordinator.core.records import train_group
+from evopolicy_coordinator.core.contract.records import train_group
 from evopolicy_coordinator.storage.store import Reader
 from evopolicy_gateway.run.layout import OpenedRun, RunFolder, save
 from evopolicy_worker import environments

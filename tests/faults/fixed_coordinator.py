@@ -14,7 +14,7 @@ import msgspec
 
 from evopolicy_common.cli.conventions import setup_logging
 from evopolicy_common.records.blobs import write_atomically
-from evopolicy_coordinator.core.settings import CoreSettings
+from evopolicy_coordinator.core.contract.settings import CoreSettings
 from evopolicy_coordinator.server import process, request_parser
 
 SETTINGS = CoreSettings(

@@ -29,10 +29,10 @@ from evopolicy_common.messages import worker as wire
 from evopolicy_common.messages.environment import Case, EnvironmentDescription
 from evopolicy_common.messages.episode import EpisodeOutcome
 from evopolicy_common.messages.run_settings import RunSettings
-from evopolicy_coordinator.core.effects import Effect, ReadResults, Reply
+from evopolicy_coordinator.core.contract.effects import Effect, ReadResults, Reply
+from evopolicy_coordinator.core.contract.records import Snapshot
+from evopolicy_coordinator.core.contract.settings import CoreSettings
 from evopolicy_coordinator.core.machine import Core
-from evopolicy_coordinator.core.records import Snapshot
-from evopolicy_coordinator.core.settings import CoreSettings
 
 ENVS = tuple(f"toy/env{index}" for index in range(16))
 EPISODES = 128

@@ -14,14 +14,14 @@ from typing import Any
 
 from evopolicy_coordinator.core import loading, machine
 from evopolicy_coordinator.core.agents import permits, precedence, requests
-from evopolicy_coordinator.core.families import Families
 from evopolicy_coordinator.core.isolation import conflicts, occupancies
 from evopolicy_coordinator.core.leasing import expiry, fleet, groups, leases, queue
-from evopolicy_coordinator.core.model import JobGroup, Profile
 from evopolicy_coordinator.core.runs import audits, finalisation, finished, result_polls, submits
-from evopolicy_coordinator.core.state import State
-from evopolicy_coordinator.core.step import Step
 from evopolicy_coordinator.core.structures.ledger import Ledger
+from evopolicy_coordinator.core.tables.model import JobGroup, Profile
+from evopolicy_coordinator.core.tables.related import Families
+from evopolicy_coordinator.core.tables.state import State
+from evopolicy_coordinator.core.tables.step import Step
 from evopolicy_coordinator.core.workers import membership, results, scheduler
 
 

@@ -15,12 +15,9 @@ from sim_worker import begun_of
 from evopolicy_common.messages import gateway, operator
 from evopolicy_common.messages import worker as wire
 from evopolicy_common.messages.worker import Message
-from evopolicy_coordinator.core import events
-from evopolicy_coordinator.core.effects import Log
-from evopolicy_coordinator.core.leasing import fleet
-from evopolicy_coordinator.core.machine import Core
-from evopolicy_coordinator.core.model import EARLY_VALIDATION, TRAIN
-from evopolicy_coordinator.core.records import (
+from evopolicy_coordinator.core.contract import events
+from evopolicy_coordinator.core.contract.effects import Log
+from evopolicy_coordinator.core.contract.records import (
     AuditRow,
     OutcomeRow,
     Row,
@@ -29,6 +26,9 @@ from evopolicy_coordinator.core.records import (
     WorkerRow,
     train_group,
 )
+from evopolicy_coordinator.core.leasing import fleet
+from evopolicy_coordinator.core.machine import Core
+from evopolicy_coordinator.core.tables.model import EARLY_VALIDATION, TRAIN
 from evopolicy_coordinator.server.reason_texts import words
 
 if TYPE_CHECKING:

@@ -17,8 +17,8 @@ from sim_world import World
 
 from evopolicy_common.messages import worker as wire
 from evopolicy_common.messages.episode import BlobRef
-from evopolicy_coordinator.core import events
-from evopolicy_coordinator.core.effects import (
+from evopolicy_coordinator.core.contract import events
+from evopolicy_coordinator.core.contract.effects import (
     AuditEffect,
     CompareAudit,
     Effect,
@@ -31,9 +31,9 @@ from evopolicy_coordinator.core.effects import (
     Refuse,
     Reply,
 )
+from evopolicy_coordinator.core.contract.records import evaluation_group, submit_done, train_group
+from evopolicy_coordinator.core.contract.settings import CoreSettings
 from evopolicy_coordinator.core.machine import Core
-from evopolicy_coordinator.core.records import evaluation_group, submit_done, train_group
-from evopolicy_coordinator.core.settings import CoreSettings
 from evopolicy_coordinator.server.reason_texts import message
 
 PAGE = 5

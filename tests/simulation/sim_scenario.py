@@ -20,8 +20,8 @@ from sim_world import World
 from evopolicy_common.messages import worker as wire
 from evopolicy_common.messages.episode import EpisodeSpec, Job
 from evopolicy_common.messages.operator import SetWorker
-from evopolicy_coordinator.core import events
-from evopolicy_coordinator.core.settings import CoreSettings
+from evopolicy_coordinator.core.contract import events
+from evopolicy_coordinator.core.contract.settings import CoreSettings
 from evopolicy_coordinator.server.reason_texts import words
 
 HORIZON_S = 1500.0

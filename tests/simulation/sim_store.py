@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from evopolicy_coordinator.core.records import (
+from evopolicy_coordinator.core.contract.records import (
     AuditRow,
     BegunRow,
     EvaluationRow,

@@ -45,7 +45,7 @@ from evopolicy_common.records.policies import bundles
 from evopolicy_common.records.policies.bundles import BundleFile
 from evopolicy_common.wire import codec, credentials, keys, transport
 from evopolicy_common.wire.credentials import Credentials
-from evopolicy_coordinator.core.settings import CoreSettings
+from evopolicy_coordinator.core.contract.settings import CoreSettings
 from evopolicy_gateway.run.gateway import Close, Gateway
 from evopolicy_gateway.run.layout import OpenedRun, RunFolder, save
 from evopolicy_gateway.submits.pipeline import SubmitPipeline

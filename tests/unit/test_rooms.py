@@ -135,10 +135,9 @@ def test_no_module_of_the_product_is_in_an_import_circle() -> None:
 
 CORE = "evopolicy_coordinator.core"
 CORE_LAYERS = (
-    ("events", "effects", "reasons", "records", "settings"),
+    ("contract",),
     ("structures",),
-    ("transitions",),
-    ("model", "families", "state", "step"),
+    ("tables",),
     ("isolation",),
     ("leasing",),
     ("agents",),

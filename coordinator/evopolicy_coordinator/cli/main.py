@@ -21,7 +21,7 @@ from evopolicy_common.wire.ready import Ready
 from evopolicy_coordinator.cli import certs as certs_cli
 from evopolicy_coordinator.cli import epochs as epochs_cli
 from evopolicy_coordinator.cli import router_config
-from evopolicy_coordinator.core.settings import CoreSettings
+from evopolicy_coordinator.core.contract.settings import CoreSettings
 from evopolicy_coordinator.server import process
 from evopolicy_coordinator.server.process import Options
 from evopolicy_coordinator.storage.backup import back_up

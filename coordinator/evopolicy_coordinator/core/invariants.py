@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections import Counter
 
-from . import transitions
-from .isolation.kernels import all_related, related
-from .model import N_PRIORITIES, TRAIN, JobState
-from .records import train_group
-from .state import State
-from .structures.trace import InvariantError
+from evopolicy_coordinator.core.contract.records import train_group
+from evopolicy_coordinator.core.isolation.kernels import all_related, related
+from evopolicy_coordinator.core.structures.trace import InvariantError
+from evopolicy_coordinator.core.tables import transitions
+from evopolicy_coordinator.core.tables.model import N_PRIORITIES, TRAIN, JobState
+from evopolicy_coordinator.core.tables.state import State
 
 
 def check(state: State) -> None:

@@ -11,14 +11,20 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from .agents import permits, requests
-from .isolation import occupancies
-from .leasing import fleet, pins
-from .model import Ended, JobGroup, Run
-from .records import AuditRow, RunStateRow, Snapshot, SubmitRow, validation_group
-from .runs import audits, evaluations, finalisation, runs, submits
-from .state import Loading, State
-from .step import EpisodesDone, Step
+from evopolicy_coordinator.core.agents import permits, requests
+from evopolicy_coordinator.core.contract.records import (
+    AuditRow,
+    RunStateRow,
+    Snapshot,
+    SubmitRow,
+    validation_group,
+)
+from evopolicy_coordinator.core.isolation import occupancies
+from evopolicy_coordinator.core.leasing import fleet, pins
+from evopolicy_coordinator.core.runs import audits, evaluations, finalisation, runs, submits
+from evopolicy_coordinator.core.tables.model import Ended, JobGroup, Run
+from evopolicy_coordinator.core.tables.state import Loading, State
+from evopolicy_coordinator.core.tables.step import EpisodesDone, Step
 
 
 def load(state: State, snapshot: Snapshot, step: Step, drain: Callable[[State, Step], None]) -> None:

@@ -14,16 +14,16 @@ from typing import Any
 from evopolicy_common.messages import gateway, operator
 from evopolicy_common.messages import worker as wire
 from evopolicy_common.refusals import Refusal
-
-from . import events, invariants, loading, status, step
-from .agents import open_runs, permits, precedence, requests
-from .effects import Effect
-from .isolation import occupancies
-from .leasing import expiry, fleet, queue
-from .model import LaneKey
-from .reasons import Reason
-from .records import Snapshot
-from .runs import (
+from evopolicy_coordinator.core import invariants, loading, status
+from evopolicy_coordinator.core.agents import open_runs, permits, precedence, requests
+from evopolicy_coordinator.core.contract import events
+from evopolicy_coordinator.core.contract.effects import Effect
+from evopolicy_coordinator.core.contract.reasons import Reason
+from evopolicy_coordinator.core.contract.records import Snapshot
+from evopolicy_coordinator.core.contract.settings import CoreSettings
+from evopolicy_coordinator.core.isolation import occupancies
+from evopolicy_coordinator.core.leasing import expiry, fleet, queue
+from evopolicy_coordinator.core.runs import (
     audits,
     evaluations,
     finalisation,
@@ -33,12 +33,13 @@ from .runs import (
     runs,
     submits,
 )
-from .settings import CoreSettings
-from .state import State
-from .status import CoreStatus, Words
-from .step import Step
-from .structures.trace import TraceEntry
-from .workers import membership, results, scheduler
+from evopolicy_coordinator.core.status import CoreStatus, Words
+from evopolicy_coordinator.core.structures.trace import TraceEntry
+from evopolicy_coordinator.core.tables import step
+from evopolicy_coordinator.core.tables.model import LaneKey
+from evopolicy_coordinator.core.tables.state import State
+from evopolicy_coordinator.core.tables.step import Step
+from evopolicy_coordinator.core.workers import membership, results, scheduler
 
 TICK_S = 1.0
 """While leases are out, the core requests a call at least this often, so that it notices when the loop is blocked."""

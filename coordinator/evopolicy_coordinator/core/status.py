@@ -10,11 +10,13 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from evopolicy_common.messages.status import QueuedJobs, RunStatus, WorkerStatus
-
-from .agents import permits
-from .isolation import conflicts
-from .leasing import pins
-from .model import (
+from evopolicy_coordinator.core.agents import permits
+from evopolicy_coordinator.core.contract.reasons import Reason
+from evopolicy_coordinator.core.isolation import conflicts
+from evopolicy_coordinator.core.leasing import pins
+from evopolicy_coordinator.core.runs import audits, finished
+from evopolicy_coordinator.core.runs.waits import waits_for
+from evopolicy_coordinator.core.tables.model import (
     AUDIT,
     EARLY_VALIDATION,
     PRIORITY_NAMES,
@@ -26,10 +28,7 @@ from .model import (
     Run,
     Worker,
 )
-from .reasons import Reason
-from .runs import audits, finished
-from .runs.waits import waits_for
-from .state import State
+from evopolicy_coordinator.core.tables.state import State
 
 Words = Callable[[Reason | None], str]
 """Puts a reason into words; returns an empty string for None."""

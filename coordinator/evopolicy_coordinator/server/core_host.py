@@ -20,11 +20,11 @@ from typing import TYPE_CHECKING
 
 from evopolicy_common.errors import DamagedStoreError, PartFailedError, StorageError
 from evopolicy_common.logs import structlog
-from evopolicy_coordinator.core.effects import Effect
-from evopolicy_coordinator.core.events import AnyEvent
+from evopolicy_coordinator.core.contract.effects import Effect
+from evopolicy_coordinator.core.contract.events import AnyEvent
+from evopolicy_coordinator.core.contract.records import latest_time
+from evopolicy_coordinator.core.contract.settings import CoreSettings
 from evopolicy_coordinator.core.machine import Core
-from evopolicy_coordinator.core.records import latest_time
-from evopolicy_coordinator.core.settings import CoreSettings
 from evopolicy_coordinator.storage.store import Store
 from evopolicy_coordinator.storage.writer import Outbox, Writer
 

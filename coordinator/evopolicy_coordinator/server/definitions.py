@@ -26,7 +26,7 @@ from evopolicy_common.messages.operator import OfferedEnvironment
 from evopolicy_common.messages.worker import DEFINITION_DIGITS
 from evopolicy_common.records.blobs import write_atomically
 from evopolicy_common.refusals import Refusal
-from evopolicy_coordinator.core.model import Worker
+from evopolicy_coordinator.core.tables.model import Worker
 
 MAX_TEXT = 64 << 10
 MAX_SPACE_BYTES = 1 << 20

@@ -39,10 +39,10 @@ from evopolicy_common.records.blobs import BlobStore, FileState, digest_of, is_d
 from evopolicy_common.refusals import Refusal
 from evopolicy_common.wire import codec
 from evopolicy_common.wire.transport import IncomingQuery
-from evopolicy_coordinator.core import records
-from evopolicy_coordinator.core.effects import AuditEffect, ReadEvaluation, ReadFinished, ReadResults
-from evopolicy_coordinator.core.events import AuditEvent
-from evopolicy_coordinator.core.records import RunRow
+from evopolicy_coordinator.core.contract import records
+from evopolicy_coordinator.core.contract.effects import AuditEffect, ReadEvaluation, ReadFinished, ReadResults
+from evopolicy_coordinator.core.contract.events import AuditEvent
+from evopolicy_coordinator.core.contract.records import RunRow
 from evopolicy_coordinator.pki import identity
 from evopolicy_coordinator.server.reason_texts import words
 from evopolicy_coordinator.server.uploads import Uploads

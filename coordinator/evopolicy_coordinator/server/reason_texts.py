@@ -14,9 +14,9 @@ from evopolicy_common.catalogue import installs
 from evopolicy_common.messages.gateway import FREE_SLOT, Permit, RunOpened, RunState, StateReply
 from evopolicy_common.messages.operator import RunProgress
 from evopolicy_common.messages.worker import Message, Refused
-from evopolicy_coordinator.core.effects import Refuse, Reply
+from evopolicy_coordinator.core.contract.effects import Refuse, Reply
+from evopolicy_coordinator.core.contract.reasons import Code, Reason
 from evopolicy_coordinator.core.isolation.conflicts import NO_BOOT_ID
-from evopolicy_coordinator.core.reasons import Code, Reason
 
 
 def _workers(

@@ -34,9 +34,9 @@ from evopolicy_common.records.journal import SALT_BYTES
 from evopolicy_common.refusals import Refusal
 from evopolicy_common.wire import codec, keys
 from evopolicy_common.wire.credentials import Role
-from evopolicy_coordinator.core import events
-from evopolicy_coordinator.core.events import AnyEvent
-from evopolicy_coordinator.core.records import EvaluationRow, RunRow
+from evopolicy_coordinator.core.contract import events
+from evopolicy_coordinator.core.contract.events import AnyEvent
+from evopolicy_coordinator.core.contract.records import EvaluationRow, RunRow
 from evopolicy_coordinator.core.runs.templates import RANDOM
 from evopolicy_coordinator.pki.machines import Machines
 from evopolicy_coordinator.server.definitions import Definitions

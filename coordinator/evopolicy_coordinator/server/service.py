@@ -37,18 +37,18 @@ from evopolicy_common.records.policies import bundles
 from evopolicy_common.refusals import Refusal
 from evopolicy_common.wire import codec
 from evopolicy_common.wire.transport import IncomingQuery
-from evopolicy_coordinator.core.effects import AuditEffect, Effect, Log, ReadEffect, Refuse, Reply
-from evopolicy_coordinator.core.events import (
+from evopolicy_coordinator.core.contract.effects import AuditEffect, Effect, Log, ReadEffect, Refuse, Reply
+from evopolicy_coordinator.core.contract.events import (
     AnyEvent,
     AuditEvent,
     DescriptionAwaited,
     DisclosureRequested,
     LivenessLost,
 )
+from evopolicy_coordinator.core.contract.settings import CoreSettings
 from evopolicy_coordinator.core.machine import Core
-from evopolicy_coordinator.core.model import Worker
 from evopolicy_coordinator.core.runs import finished
-from evopolicy_coordinator.core.settings import CoreSettings
+from evopolicy_coordinator.core.tables.model import Worker
 from evopolicy_coordinator.server.claims import Claims
 from evopolicy_coordinator.server.core_host import CoreHost
 from evopolicy_coordinator.server.definitions import undescribed

@@ -24,7 +24,7 @@ import msgspec
 from evopolicy_common.messages.status import DiskUse
 from evopolicy_common.records.blobs import BlobStore
 from evopolicy_common.wire.credentials import no_state
-from evopolicy_coordinator.core.records import (
+from evopolicy_coordinator.core.contract.records import (
     AuditRow,
     BegunRow,
     EvaluationRow,

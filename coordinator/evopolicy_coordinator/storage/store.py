@@ -24,8 +24,8 @@ import msgspec
 from evopolicy_common.errors import DECODE_ERRORS, ConfigError, DamagedStoreError, StorageError
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome
 from evopolicy_common.messages.operator import RunFinished
-from evopolicy_coordinator.core import records
-from evopolicy_coordinator.core.records import (
+from evopolicy_coordinator.core.contract import records
+from evopolicy_coordinator.core.contract.records import (
     AuditRow,
     BegunRow,
     DocumentRow,

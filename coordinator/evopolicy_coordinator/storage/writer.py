@@ -19,8 +19,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
-from evopolicy_coordinator.core.effects import Effect, Persist
-from evopolicy_coordinator.core.records import Row
+from evopolicy_coordinator.core.contract.effects import Effect, Persist
+from evopolicy_coordinator.core.contract.records import Row
 from evopolicy_coordinator.storage.store import Store
 
 T = TypeVar("T")

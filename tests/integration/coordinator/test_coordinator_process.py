@@ -21,7 +21,7 @@ from coordinator_harness import TIMEOUT_S, Coordinator, bundle_of, gateway_of, o
 
 from evopolicy_common.errors import RefusedError
 from evopolicy_common.wire import credentials
-from evopolicy_coordinator.core.records import RunRow
+from evopolicy_coordinator.core.contract.records import RunRow
 
 
 async def refusal(answer: Awaitable[object]) -> RefusedError:

@@ -25,7 +25,7 @@ from evopolicy_common.messages.episode import Job
 from evopolicy_common.records.blobs import BlobStore
 from evopolicy_common.records.episodes.trajectory import decode
 from evopolicy_common.wire.transport import connect
-from evopolicy_coordinator.core.records import BegunRow, OutcomeRow, validation_group
+from evopolicy_coordinator.core.contract.records import BegunRow, OutcomeRow, validation_group
 from evopolicy_worker.episodes import begun
 from evopolicy_worker.slots.slot import Slot
 from evopolicy_worker.supervisor import Options, Supervisor

@@ -6,8 +6,8 @@ from typing import Any
 
 from evopolicy_common.messages import operator, worker
 from evopolicy_common.messages.worker import Message
-from evopolicy_coordinator.core import events
-from evopolicy_coordinator.core.records import EvaluationRow, RunRow
+from evopolicy_coordinator.core.contract import events
+from evopolicy_coordinator.core.contract.records import EvaluationRow, RunRow
 
 _USUAL: dict[str, Any] = {"token": "", "protocol": 0, "cases": None}
 _RENAMED = {"sandbox_tier": "tier"}

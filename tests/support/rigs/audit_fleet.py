@@ -10,9 +10,9 @@ from evopolicy_common.errors import RefusedError
 from evopolicy_common.messages import operator
 from evopolicy_common.messages import worker as wire
 from evopolicy_common.messages.episode import BlobRef
-from evopolicy_coordinator.core import events
-from evopolicy_coordinator.core.effects import PrepareAudit
-from evopolicy_coordinator.core.records import OutcomeRow
+from evopolicy_coordinator.core.contract import events
+from evopolicy_coordinator.core.contract.effects import PrepareAudit
+from evopolicy_coordinator.core.contract.records import OutcomeRow
 from rigs.asking import asked
 from rigs.core_rig import ENV, Rig, describe, fingerprint, outcome_of, result
 

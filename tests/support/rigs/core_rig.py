@@ -16,8 +16,8 @@ from evopolicy_common.messages.episode import (
 )
 from evopolicy_common.messages.operator import RunFinished
 from evopolicy_common.messages.run_settings import RunSettings
-from evopolicy_coordinator.core import events
-from evopolicy_coordinator.core.effects import (
+from evopolicy_coordinator.core.contract import events
+from evopolicy_coordinator.core.contract.effects import (
     AuditEffect,
     CompareAudit,
     Effect,
@@ -30,8 +30,7 @@ from evopolicy_coordinator.core.effects import (
     Refuse,
     Reply,
 )
-from evopolicy_coordinator.core.machine import Core
-from evopolicy_coordinator.core.records import (
+from evopolicy_coordinator.core.contract.records import (
     AuditRow,
     BegunRow,
     DocumentRow,
@@ -49,7 +48,8 @@ from evopolicy_coordinator.core.records import (
     WorkerRow,
     head_of,
 )
-from evopolicy_coordinator.core.settings import CoreSettings
+from evopolicy_coordinator.core.contract.settings import CoreSettings
+from evopolicy_coordinator.core.machine import Core
 from evopolicy_coordinator.core.status import CoreStatus
 from evopolicy_coordinator.server.reason_texts import message, words
 from rigs.asking import asked

@@ -16,7 +16,7 @@ from evopolicy_common.messages.run_settings import RunSettings
 from evopolicy_common.messages.worker import Message
 from evopolicy_common.records.blobs import BlobStore
 from evopolicy_common.wire import codec, keys
-from evopolicy_coordinator.core.settings import CoreSettings
+from evopolicy_coordinator.core.contract.settings import CoreSettings
 from evopolicy_coordinator.server.reader import ServiceReader
 from evopolicy_coordinator.server.request_parser import RequestParser
 from evopolicy_coordinator.server.service import Service

@@ -8,7 +8,7 @@ from typing import Any
 from evopolicy_common.messages.environment import Case
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome
 from evopolicy_common.messages.run_settings import RunSettings
-from evopolicy_coordinator.core.records import OutcomeRow, RunRow, RunStateRow, SubmitRow
+from evopolicy_coordinator.core.contract.records import OutcomeRow, RunRow, RunStateRow, SubmitRow
 
 SETTINGS = RunSettings(env="toy/line", entry="tester", model="none", exp_id="t")
 

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from evopolicy_common.refusals import Refusal
-from evopolicy_coordinator.core.events import RequestId
-from evopolicy_coordinator.core.model import Run
-from evopolicy_coordinator.core.reasons import Reason, because
-from evopolicy_coordinator.core.state import State
-from evopolicy_coordinator.core.step import Step
+from evopolicy_coordinator.core.contract.events import RequestId
+from evopolicy_coordinator.core.contract.reasons import Reason, because
+from evopolicy_coordinator.core.tables.model import Run
+from evopolicy_coordinator.core.tables.state import State
+from evopolicy_coordinator.core.tables.step import Step
 
 
 def live(state: State, request: RequestId, name: str, step: Step) -> Run | None:

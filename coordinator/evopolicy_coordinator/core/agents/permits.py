@@ -17,14 +17,14 @@ import msgspec
 from evopolicy_common.messages import gateway
 from evopolicy_common.messages.run_settings import ELSEWHERE
 from evopolicy_common.refusals import Refusal
+from evopolicy_coordinator.core.contract.reasons import Reason
+from evopolicy_coordinator.core.contract.records import PermitRow, RunRow, RunStateRow
 from evopolicy_coordinator.core.isolation import conflicts, kernels
 from evopolicy_coordinator.core.isolation.kernels import all_related, put, related, take
 from evopolicy_coordinator.core.leasing import leases
-from evopolicy_coordinator.core.model import Ask, Family, Kernel, Run
-from evopolicy_coordinator.core.reasons import Reason
-from evopolicy_coordinator.core.records import PermitRow, RunRow, RunStateRow
-from evopolicy_coordinator.core.state import State
-from evopolicy_coordinator.core.step import Step
+from evopolicy_coordinator.core.tables.model import Ask, Family, Kernel, Run
+from evopolicy_coordinator.core.tables.state import State
+from evopolicy_coordinator.core.tables.step import Step
 
 CANCELLED_S = 30.0
 """An agent has this long to end after its run was cancelled."""

@@ -15,10 +15,11 @@ Rules that this module owns:
 
 from __future__ import annotations
 
+from evopolicy_coordinator.core.contract.records import train_group
 from evopolicy_coordinator.core.isolation import conflicts, kernels
 from evopolicy_coordinator.core.isolation.kernels import all_related
 from evopolicy_coordinator.core.leasing import leases
-from evopolicy_coordinator.core.model import (
+from evopolicy_coordinator.core.tables.model import (
     EARLY_VALIDATION,
     EVERYWHERE,
     TRAIN,
@@ -28,9 +29,8 @@ from evopolicy_coordinator.core.model import (
     LaneKey,
     Reversal,
 )
-from evopolicy_coordinator.core.records import train_group
-from evopolicy_coordinator.core.state import State
-from evopolicy_coordinator.core.step import AgentOverdue, Step
+from evopolicy_coordinator.core.tables.state import State
+from evopolicy_coordinator.core.tables.step import AgentOverdue, Step
 
 LOOK_S = 1.0
 """Interval between checks of waiting hidden jobs, and of train jobs that hidden ones may keep waiting."""

@@ -5,17 +5,16 @@ from __future__ import annotations
 from evopolicy_common.messages import gateway, operator
 from evopolicy_common.messages.run_settings import ELSEWHERE, HiddenIsolation
 from evopolicy_common.refusals import Refusal
-from evopolicy_coordinator.core import events
+from evopolicy_coordinator.core.agents import permits
 from evopolicy_coordinator.core.agents.open_runs import over
+from evopolicy_coordinator.core.contract import events
+from evopolicy_coordinator.core.contract.reasons import Reason, because
+from evopolicy_coordinator.core.contract.records import PermitRow, RunRow
 from evopolicy_coordinator.core.isolation import conflicts, kernels
-from evopolicy_coordinator.core.model import EVERYWHERE, Run
-from evopolicy_coordinator.core.reasons import Reason, because
-from evopolicy_coordinator.core.records import PermitRow, RunRow
-from evopolicy_coordinator.core.state import State
-from evopolicy_coordinator.core.step import Step
 from evopolicy_coordinator.core.structures.polls import Poll
-
-from . import permits
+from evopolicy_coordinator.core.tables.model import EVERYWHERE, Run
+from evopolicy_coordinator.core.tables.state import State
+from evopolicy_coordinator.core.tables.step import Step
 
 ASK_AGAIN_S = 10.0
 """A declined permit request is kept for this long, until the gateway repeats it."""

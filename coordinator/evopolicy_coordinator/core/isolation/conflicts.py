@@ -10,7 +10,11 @@ Rules that this module owns:
 
 from __future__ import annotations
 
-from evopolicy_coordinator.core.model import (
+from evopolicy_coordinator.core.contract.reasons import Reason, because
+from evopolicy_coordinator.core.contract.records import PermitRow
+from evopolicy_coordinator.core.isolation import kernels
+from evopolicy_coordinator.core.isolation.kernels import all_related, related
+from evopolicy_coordinator.core.tables.model import (
     EARLY_VALIDATION,
     HIDDEN,
     TRAIN,
@@ -21,12 +25,7 @@ from evopolicy_coordinator.core.model import (
     Lease,
     Worker,
 )
-from evopolicy_coordinator.core.reasons import Reason, because
-from evopolicy_coordinator.core.records import PermitRow
-from evopolicy_coordinator.core.state import State
-
-from . import kernels
-from .kernels import all_related, related
+from evopolicy_coordinator.core.tables.state import State
 
 NO_BOOT_ID = (
     "the worker does not tell its kernel's boot id, so an agent may be on the same one; install the coordinator's version of"

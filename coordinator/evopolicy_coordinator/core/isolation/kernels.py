@@ -10,9 +10,9 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import TypeVar
 
-from evopolicy_coordinator.core.model import Family, Kernel, Lane
-from evopolicy_coordinator.core.state import State
-from evopolicy_coordinator.core.step import Step
+from evopolicy_coordinator.core.tables.model import Family, Kernel, Lane
+from evopolicy_coordinator.core.tables.state import State
+from evopolicy_coordinator.core.tables.step import Step
 
 T = TypeVar("T")
 

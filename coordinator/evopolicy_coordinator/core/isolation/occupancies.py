@@ -14,13 +14,12 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from evopolicy_common.messages.worker import HeldLease
-from evopolicy_coordinator.core.model import Lease, Occupancy, Worker
-from evopolicy_coordinator.core.records import KernelRow
-from evopolicy_coordinator.core.state import State
-from evopolicy_coordinator.core.step import Step
-
-from . import kernels
-from .kernels import put, related, take
+from evopolicy_coordinator.core.contract.records import KernelRow
+from evopolicy_coordinator.core.isolation import kernels
+from evopolicy_coordinator.core.isolation.kernels import put, related, take
+from evopolicy_coordinator.core.tables.model import Lease, Occupancy, Worker
+from evopolicy_coordinator.core.tables.state import State
+from evopolicy_coordinator.core.tables.step import Step
 
 
 def leased(state: State, lease: Lease, worker: Worker, serial: int, step: Step) -> None:

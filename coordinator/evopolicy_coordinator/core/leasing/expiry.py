@@ -8,12 +8,11 @@ Rules that this module owns:
 
 from __future__ import annotations
 
-from evopolicy_coordinator.core.model import JobState, Worker
-from evopolicy_coordinator.core.state import State
-from evopolicy_coordinator.core.step import Step
-
-from . import fleet, leases
-from .retry import JobFailure
+from evopolicy_coordinator.core.leasing import fleet, leases
+from evopolicy_coordinator.core.leasing.retry import JobFailure
+from evopolicy_coordinator.core.tables.model import JobState, Worker
+from evopolicy_coordinator.core.tables.state import State
+from evopolicy_coordinator.core.tables.step import Step
 
 FORGET_S = 3600.0
 """A lost worker is listed for this long."""

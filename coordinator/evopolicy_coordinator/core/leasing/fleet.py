@@ -16,12 +16,11 @@ from typing import Literal
 
 from evopolicy_common.messages import worker as wire
 from evopolicy_common.messages.episode import Tier
-from evopolicy_coordinator.core.events import DescriptionAwaited, WorkerRegistered
-from evopolicy_coordinator.core.model import Flow, JobState, Kernel, OutOfService, Profile, Worker
-from evopolicy_coordinator.core.state import State
-from evopolicy_coordinator.core.step import Step
-
-from . import queue
+from evopolicy_coordinator.core.contract.events import DescriptionAwaited, WorkerRegistered
+from evopolicy_coordinator.core.leasing import queue
+from evopolicy_coordinator.core.tables.model import Flow, JobState, Kernel, OutOfService, Profile, Worker
+from evopolicy_coordinator.core.tables.state import State
+from evopolicy_coordinator.core.tables.step import Step
 
 BENCH_AFTER = 3
 """Consecutive failures after which a worker is benched."""

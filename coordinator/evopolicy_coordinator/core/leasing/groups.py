@@ -8,12 +8,11 @@ Rules that this module owns:
 
 from __future__ import annotations
 
-from evopolicy_coordinator.core.model import JobGroup, JobState, OutcomeDigest
-from evopolicy_coordinator.core.records import OutcomeHead
-from evopolicy_coordinator.core.state import State
-from evopolicy_coordinator.core.step import Step
-
-from . import fleet, leases, queue
+from evopolicy_coordinator.core.contract.records import OutcomeHead
+from evopolicy_coordinator.core.leasing import fleet, leases, queue
+from evopolicy_coordinator.core.tables.model import JobGroup, JobState, OutcomeDigest
+from evopolicy_coordinator.core.tables.state import State
+from evopolicy_coordinator.core.tables.step import Step
 
 
 def open_group(state: State, group: JobGroup, step: Step) -> None:

@@ -8,9 +8,8 @@ from __future__ import annotations
 
 from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_common.messages.episode import EpisodeSpec, Job
-from evopolicy_coordinator.core.model import JobState, Template
-
-from .seeds import policy_seed, reference_seed
+from evopolicy_coordinator.core.leasing.seeds import policy_seed, reference_seed
+from evopolicy_coordinator.core.tables.model import JobState, Template
 
 
 def _seed(template: Template, index: int) -> bytes:

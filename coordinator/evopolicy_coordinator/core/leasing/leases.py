@@ -20,13 +20,12 @@ from collections.abc import Iterable
 
 from evopolicy_common.messages import worker as wire
 from evopolicy_coordinator.core.isolation import conflicts, occupancies
-from evopolicy_coordinator.core.model import TRAIN, JobGroup, JobState, Lease, Worker
-from evopolicy_coordinator.core.state import State
-from evopolicy_coordinator.core.step import JobRetried, Step
-
-from . import fleet, queue
-from .jobs import build
-from .retry import JobFailure, decide
+from evopolicy_coordinator.core.leasing import fleet, queue
+from evopolicy_coordinator.core.leasing.jobs import build
+from evopolicy_coordinator.core.leasing.retry import JobFailure, decide
+from evopolicy_coordinator.core.tables.model import TRAIN, JobGroup, JobState, Lease, Worker
+from evopolicy_coordinator.core.tables.state import State
+from evopolicy_coordinator.core.tables.step import JobRetried, Step
 
 MISSING_BEATS = 3
 """A lease that its worker has not named for this many heartbeat intervals since the grant has never arrived."""

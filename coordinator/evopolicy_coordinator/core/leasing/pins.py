@@ -13,11 +13,10 @@ import msgspec
 
 from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_common.messages.episode import Tier
-from evopolicy_coordinator.core.model import Family, Flow, Profile, Run, Worker
-from evopolicy_coordinator.core.state import State
-from evopolicy_coordinator.core.step import FlowPinned, Step
-
-from . import fleet, queue
+from evopolicy_coordinator.core.leasing import fleet, queue
+from evopolicy_coordinator.core.tables.model import Family, Flow, Profile, Run, Worker
+from evopolicy_coordinator.core.tables.state import State
+from evopolicy_coordinator.core.tables.step import FlowPinned, Step
 
 
 def add_flow(

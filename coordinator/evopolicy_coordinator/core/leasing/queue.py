@@ -19,7 +19,7 @@ import heapq
 from collections.abc import Collection
 
 from evopolicy_coordinator.core.isolation import conflicts
-from evopolicy_coordinator.core.model import (
+from evopolicy_coordinator.core.tables.model import (
     HIDDEN,
     HIDDEN_FIRST,
     N_PRIORITIES,
@@ -32,8 +32,8 @@ from evopolicy_coordinator.core.model import (
     Worker,
     add,
 )
-from evopolicy_coordinator.core.state import State
-from evopolicy_coordinator.core.step import Step
+from evopolicy_coordinator.core.tables.state import State
+from evopolicy_coordinator.core.tables.step import Step
 
 LOOK_AGAIN_S = 1.0
 """A lane is checked again after this time when jobs wait although workers wait too (they avoid each other)."""

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from typing import Literal, NamedTuple
 
-from evopolicy_coordinator.core.settings import CoreSettings
+from evopolicy_coordinator.core.contract.settings import CoreSettings
 
 JobFailure = Literal["returned", "unlisted", "failed", "worker_lost", "overdue"]
 """returned: given back unfinished, without a failure. unlisted: its worker is alive but does not know the lease,

@@ -5,15 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from evopolicy_common.messages.audit import AuditFinding, AuditRecord
+from evopolicy_coordinator.core.contract.reasons import Reason, because
+from evopolicy_coordinator.core.contract.records import AuditRow
 from evopolicy_coordinator.core.isolation import conflicts
-from evopolicy_coordinator.core.model import Run, Worker
-from evopolicy_coordinator.core.reasons import Reason, because
-from evopolicy_coordinator.core.records import AuditRow
-from evopolicy_coordinator.core.state import State
-from evopolicy_coordinator.core.step import Step
-
-from .audits import dispute, settle, words
-from .templates import HIDDEN_SPLITS
+from evopolicy_coordinator.core.runs.audits import dispute, settle, words
+from evopolicy_coordinator.core.runs.templates import HIDDEN_SPLITS
+from evopolicy_coordinator.core.tables.model import Run, Worker
+from evopolicy_coordinator.core.tables.state import State
+from evopolicy_coordinator.core.tables.step import Step
 
 LOOK_AGAIN_S = 5.0
 """Interval at which a run that waits for its audits checks whether a worker can still play them."""

@@ -23,15 +23,14 @@ from typing import Any
 
 import msgspec
 
-from evopolicy_coordinator.core import events
-from evopolicy_coordinator.core.effects import CompareAudit, PrepareAudit
+from evopolicy_coordinator.core.contract import events
+from evopolicy_coordinator.core.contract.effects import CompareAudit, PrepareAudit
+from evopolicy_coordinator.core.contract.records import AuditRow, WorkerRow
 from evopolicy_coordinator.core.leasing import expiry, fleet, groups
-from evopolicy_coordinator.core.model import Run
-from evopolicy_coordinator.core.records import AuditRow, WorkerRow
-from evopolicy_coordinator.core.state import State
-from evopolicy_coordinator.core.step import AuditsMoved, EpisodesDone, Step
-
-from . import templates
+from evopolicy_coordinator.core.runs import templates
+from evopolicy_coordinator.core.tables.model import Run
+from evopolicy_coordinator.core.tables.state import State
+from evopolicy_coordinator.core.tables.step import AuditsMoved, EpisodesDone, Step
 
 NOT_REPEATABLE = "the environment is marked as not deterministic"
 NO_STEPS = "no step was played"

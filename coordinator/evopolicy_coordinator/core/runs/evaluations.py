@@ -11,17 +11,16 @@ import msgspec
 
 from evopolicy_common.messages import operator
 from evopolicy_common.refusals import Refusal
-from evopolicy_coordinator.core import events
-from evopolicy_coordinator.core.effects import ReadEvaluation
+from evopolicy_coordinator.core.contract import events
+from evopolicy_coordinator.core.contract.effects import ReadEvaluation
+from evopolicy_coordinator.core.contract.reasons import because
+from evopolicy_coordinator.core.contract.records import EvaluationRow, evaluation_group
 from evopolicy_coordinator.core.leasing import groups, pins
-from evopolicy_coordinator.core.model import Ended, Evaluation, JobGroup
-from evopolicy_coordinator.core.reasons import because
-from evopolicy_coordinator.core.records import EvaluationRow, evaluation_group
-from evopolicy_coordinator.core.state import State
-from evopolicy_coordinator.core.step import EpisodesDone, FlowPinned, Step
+from evopolicy_coordinator.core.runs import templates, waits
 from evopolicy_coordinator.core.structures.polls import Poll
-
-from . import templates, waits
+from evopolicy_coordinator.core.tables.model import Ended, Evaluation, JobGroup
+from evopolicy_coordinator.core.tables.state import State
+from evopolicy_coordinator.core.tables.step import EpisodesDone, FlowPinned, Step
 
 
 def request(state: State, event: events.EvaluationRequested, step: Step) -> None:

@@ -16,12 +16,10 @@ from __future__ import annotations
 
 from evopolicy_common.messages import gateway, operator
 from evopolicy_common.refusals import Refusal
-from evopolicy_coordinator.core import events
 from evopolicy_coordinator.core.agents import permits
-from evopolicy_coordinator.core.leasing import groups, queue
-from evopolicy_coordinator.core.model import HELDOUT, JobGroup, Run
-from evopolicy_coordinator.core.reasons import because
-from evopolicy_coordinator.core.records import (
+from evopolicy_coordinator.core.contract import events
+from evopolicy_coordinator.core.contract.reasons import because
+from evopolicy_coordinator.core.contract.records import (
     FinishedRow,
     SubmitRow,
     heldout_group,
@@ -29,10 +27,19 @@ from evopolicy_coordinator.core.records import (
     train_group,
     validation_group,
 )
-from evopolicy_coordinator.core.state import State
-from evopolicy_coordinator.core.step import AgentOverdue, AuditsMoved, EpisodesDone, Step, SubmitEnded
-
-from . import audit_end, evaluations, finished, journal, result_polls, runs, templates
+from evopolicy_coordinator.core.leasing import groups, queue
+from evopolicy_coordinator.core.runs import (
+    audit_end,
+    evaluations,
+    finished,
+    journal,
+    result_polls,
+    runs,
+    templates,
+)
+from evopolicy_coordinator.core.tables.model import HELDOUT, JobGroup, Run
+from evopolicy_coordinator.core.tables.state import State
+from evopolicy_coordinator.core.tables.step import AgentOverdue, AuditsMoved, EpisodesDone, Step, SubmitEnded
 
 # ---- hidden groups ----
 

@@ -7,10 +7,9 @@ from typing import Literal
 from evopolicy_common.messages import operator
 from evopolicy_common.records.aggregates import mean
 from evopolicy_common.refusals import Refusal
-from evopolicy_coordinator.core import events
-from evopolicy_coordinator.core.model import Run
-from evopolicy_coordinator.core.reasons import Reason, because
-from evopolicy_coordinator.core.records import (
+from evopolicy_coordinator.core.contract import events
+from evopolicy_coordinator.core.contract.reasons import Reason, because
+from evopolicy_coordinator.core.contract.records import (
     SubmitRow,
     heldout_group,
     random_group,
@@ -18,11 +17,11 @@ from evopolicy_coordinator.core.records import (
     train_group,
     validation_group,
 )
-from evopolicy_coordinator.core.state import State
-from evopolicy_coordinator.core.step import Step
+from evopolicy_coordinator.core.runs import audit_end, result_polls, waits
 from evopolicy_coordinator.core.structures.polls import Poll
-
-from . import audit_end, result_polls, waits
+from evopolicy_coordinator.core.tables.model import Run
+from evopolicy_coordinator.core.tables.state import State
+from evopolicy_coordinator.core.tables.step import Step
 
 
 def unspent(run: Run) -> int:

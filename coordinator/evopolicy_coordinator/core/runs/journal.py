@@ -17,11 +17,11 @@ from evopolicy_common.messages.journal import Committed
 from evopolicy_common.messages.operator import Done, RunFinished
 from evopolicy_common.records import journal
 from evopolicy_common.refusals import Refusal
-from evopolicy_coordinator.core import events
-from evopolicy_coordinator.core.reasons import Reason, because
-from evopolicy_coordinator.core.records import DocumentRow, JournalRow, RunRow
-from evopolicy_coordinator.core.state import State
-from evopolicy_coordinator.core.step import Step
+from evopolicy_coordinator.core.contract import events
+from evopolicy_coordinator.core.contract.reasons import Reason, because
+from evopolicy_coordinator.core.contract.records import DocumentRow, JournalRow, RunRow
+from evopolicy_coordinator.core.tables.state import State
+from evopolicy_coordinator.core.tables.step import Step
 
 
 def fault(state: State, row: RunRow) -> Reason | None:

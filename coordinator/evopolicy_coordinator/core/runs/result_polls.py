@@ -4,18 +4,17 @@ from __future__ import annotations
 
 from evopolicy_common.messages import gateway
 from evopolicy_common.refusals import Refusal
-from evopolicy_coordinator.core import events
-from evopolicy_coordinator.core.effects import ReadFinished, ReadResults
-from evopolicy_coordinator.core.events import RequestId
-from evopolicy_coordinator.core.model import JobGroup
-from evopolicy_coordinator.core.reasons import Reason, because
-from evopolicy_coordinator.core.records import train_group
-from evopolicy_coordinator.core.state import State
-from evopolicy_coordinator.core.step import Step
+from evopolicy_coordinator.core.contract import events
+from evopolicy_coordinator.core.contract.effects import ReadFinished, ReadResults
+from evopolicy_coordinator.core.contract.events import RequestId
+from evopolicy_coordinator.core.contract.reasons import Reason, because
+from evopolicy_coordinator.core.contract.records import train_group
+from evopolicy_coordinator.core.runs import waits
+from evopolicy_coordinator.core.runs.runs import held_s
 from evopolicy_coordinator.core.structures.polls import Poll
-
-from . import waits
-from .runs import held_s
+from evopolicy_coordinator.core.tables.model import JobGroup
+from evopolicy_coordinator.core.tables.state import State
+from evopolicy_coordinator.core.tables.step import Step
 
 
 def results(state: State, event: events.Requested[gateway.ResultsRequest], step: Step) -> None:

@@ -15,18 +15,17 @@ from evopolicy_common.messages import gateway, operator
 from evopolicy_common.messages.gateway import CANCELLED
 from evopolicy_common.messages.status import RetriedJobs
 from evopolicy_common.refusals import Refusal
-from evopolicy_coordinator.core import events
 from evopolicy_coordinator.core.agents import requests
 from evopolicy_coordinator.core.agents.open_runs import live
+from evopolicy_coordinator.core.contract import events
+from evopolicy_coordinator.core.contract.reasons import Reason, because
+from evopolicy_coordinator.core.contract.records import RunRow, RunStateRow, train_group
 from evopolicy_coordinator.core.leasing import pins
-from evopolicy_coordinator.core.model import Run
-from evopolicy_coordinator.core.reasons import Reason, because
-from evopolicy_coordinator.core.records import RunRow, RunStateRow, train_group
-from evopolicy_coordinator.core.state import State
-from evopolicy_coordinator.core.step import FlowPinned, JobRetried, ResultsDiffered, Step
+from evopolicy_coordinator.core.runs import journal, waits
 from evopolicy_coordinator.core.structures.ledger import Ledger
-
-from . import journal, waits
+from evopolicy_coordinator.core.tables.model import Run
+from evopolicy_coordinator.core.tables.state import State
+from evopolicy_coordinator.core.tables.step import FlowPinned, JobRetried, ResultsDiffered, Step
 
 
 def create(state: State, event: events.RunCreated, step: Step) -> None:

@@ -18,18 +18,17 @@ from evopolicy_common.messages import gateway
 from evopolicy_common.messages.episode import NO_POLICY, PolicyFailure
 from evopolicy_common.messages.gateway import SubmitStatus
 from evopolicy_common.refusals import Refusal
-from evopolicy_coordinator.core import events
 from evopolicy_coordinator.core.agents import requests
 from evopolicy_coordinator.core.agents.open_runs import live, over
+from evopolicy_coordinator.core.contract import events
+from evopolicy_coordinator.core.contract.reasons import because
+from evopolicy_coordinator.core.contract.records import SubmitRow
 from evopolicy_coordinator.core.leasing import groups
-from evopolicy_coordinator.core.model import JobGroup, Run
-from evopolicy_coordinator.core.reasons import because
-from evopolicy_coordinator.core.records import SubmitRow
-from evopolicy_coordinator.core.state import State
-from evopolicy_coordinator.core.step import EpisodesDone, Step, SubmitEnded
+from evopolicy_coordinator.core.runs import result_polls, templates
 from evopolicy_coordinator.core.structures.ledger import refusal
-
-from . import result_polls, templates
+from evopolicy_coordinator.core.tables.model import JobGroup, Run
+from evopolicy_coordinator.core.tables.state import State
+from evopolicy_coordinator.core.tables.step import EpisodesDone, Step, SubmitEnded
 
 
 def submit(state: State, event: events.Requested[gateway.Submit], step: Step) -> None:

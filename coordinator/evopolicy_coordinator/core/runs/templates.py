@@ -20,8 +20,18 @@ from evopolicy_common.messages.environment import Case, ObservationForm, PolicyS
 from evopolicy_common.messages.episode import BlobRef, Record, ResourceLimits, Tier
 from evopolicy_common.messages.gateway import VideoOption
 from evopolicy_common.messages.operator import PlayedAs
+from evopolicy_coordinator.core.contract.records import (
+    AuditRow,
+    EvaluationRow,
+    SubmitRow,
+    evaluation_group,
+    heldout_group,
+    random_group,
+    train_group,
+    validation_group,
+)
 from evopolicy_coordinator.core.leasing.seeds import occurrences
-from evopolicy_coordinator.core.model import (
+from evopolicy_coordinator.core.tables.model import (
     AUDIT,
     EARLY_VALIDATION,
     HELDOUT,
@@ -33,16 +43,6 @@ from evopolicy_coordinator.core.model import (
     JobGroup,
     Run,
     Template,
-)
-from evopolicy_coordinator.core.records import (
-    AuditRow,
-    EvaluationRow,
-    SubmitRow,
-    evaluation_group,
-    heldout_group,
-    random_group,
-    train_group,
-    validation_group,
 )
 
 RANDOM = -1

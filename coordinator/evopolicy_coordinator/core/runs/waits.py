@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+from evopolicy_coordinator.core.contract.reasons import Reason, because
 from evopolicy_coordinator.core.isolation import conflicts
-from evopolicy_coordinator.core.model import Flow, JobGroup
-from evopolicy_coordinator.core.reasons import Reason, because
-from evopolicy_coordinator.core.state import State
+from evopolicy_coordinator.core.tables.model import Flow, JobGroup
+from evopolicy_coordinator.core.tables.state import State
 
 _LACKING_SHOWN = 3
 

@@ -10,9 +10,8 @@ Rules that this module owns:
 from __future__ import annotations
 
 from evopolicy_common.refusals import Refusal
-from evopolicy_coordinator.core.reasons import Reason, because
-
-from .trace import InvariantError
+from evopolicy_coordinator.core.contract.reasons import Reason, because
+from evopolicy_coordinator.core.structures.trace import InvariantError
 
 
 class Ledger:

@@ -8,9 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from evopolicy_coordinator.core.events import RequestId
-
-from .timers import Timers
+from evopolicy_coordinator.core.contract.events import RequestId
+from evopolicy_coordinator.core.structures.timers import Timers
 
 PollKind = Literal["results", "evaluation", "run", "permit"]
 

@@ -17,16 +17,15 @@ from __future__ import annotations
 from evopolicy_common.messages import operator
 from evopolicy_common.messages import worker as wire
 from evopolicy_common.refusals import Refusal
-from evopolicy_coordinator.core import events
+from evopolicy_coordinator.core.contract import events
+from evopolicy_coordinator.core.contract.reasons import because
+from evopolicy_coordinator.core.contract.records import WorkerRow
 from evopolicy_coordinator.core.isolation import conflicts, kernels, occupancies
 from evopolicy_coordinator.core.leasing import fleet, leases, pins
-from evopolicy_coordinator.core.model import Profile, Worker
-from evopolicy_coordinator.core.reasons import because
-from evopolicy_coordinator.core.records import WorkerRow
-from evopolicy_coordinator.core.state import State
-from evopolicy_coordinator.core.step import ResultsPersisted, Step
-
-from . import scheduler
+from evopolicy_coordinator.core.tables.model import Profile, Worker
+from evopolicy_coordinator.core.tables.state import State
+from evopolicy_coordinator.core.tables.step import ResultsPersisted, Step
+from evopolicy_coordinator.core.workers import scheduler
 
 
 def registered(state: State, event: events.WorkerRegistered, step: Step) -> None:

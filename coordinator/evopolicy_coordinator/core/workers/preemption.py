@@ -11,7 +11,7 @@ from itertools import islice
 
 from evopolicy_coordinator.core.isolation import conflicts
 from evopolicy_coordinator.core.leasing import leases, queue
-from evopolicy_coordinator.core.model import (
+from evopolicy_coordinator.core.tables.model import (
     AUDIT,
     EARLY_VALIDATION,
     HELDOUT,
@@ -23,8 +23,8 @@ from evopolicy_coordinator.core.model import (
     Lane,
     Lease,
 )
-from evopolicy_coordinator.core.state import State
-from evopolicy_coordinator.core.step import Step
+from evopolicy_coordinator.core.tables.state import State
+from evopolicy_coordinator.core.tables.step import Step
 
 VICTIMS_MAX = 256
 """Most hidden leases checked for a lane in one step."""

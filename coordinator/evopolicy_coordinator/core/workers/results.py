@@ -22,12 +22,12 @@ from __future__ import annotations
 from evopolicy_common.messages.bounds import LARGEST
 from evopolicy_common.messages.episode import TIME_LIMITS, EpisodeOutcome
 from evopolicy_common.messages.worker import JobResult
+from evopolicy_coordinator.core.contract.records import BegunRow, OutcomeRow
 from evopolicy_coordinator.core.leasing import fleet, groups, leases
 from evopolicy_coordinator.core.leasing.retry import JobFailure
-from evopolicy_coordinator.core.model import JobState, Lease, Worker, outcome_digest
-from evopolicy_coordinator.core.records import BegunRow, OutcomeRow
-from evopolicy_coordinator.core.state import State
-from evopolicy_coordinator.core.step import EpisodesDone, ResultsDiffered, ResultsPersisted, Step
+from evopolicy_coordinator.core.tables.model import JobState, Lease, Worker, outcome_digest
+from evopolicy_coordinator.core.tables.state import State
+from evopolicy_coordinator.core.tables.step import EpisodesDone, ResultsDiffered, ResultsPersisted, Step
 
 MAX_OUTCOME_BYTES = 2 << 20
 """Largest sum of an outcome's texts, names and bytes. A worker uploads larger recordings as blobs. A page has at least one

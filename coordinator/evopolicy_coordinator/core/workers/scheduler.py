@@ -19,13 +19,12 @@ from itertools import islice
 
 from evopolicy_common.messages import worker as wire
 from evopolicy_coordinator.core.agents import permits, precedence
-from evopolicy_coordinator.core.events import Requested
+from evopolicy_coordinator.core.contract.events import Requested
 from evopolicy_coordinator.core.leasing import fleet, leases, queue
-from evopolicy_coordinator.core.model import TRAIN, Lane, LeasePoll, Worker
-from evopolicy_coordinator.core.state import State
-from evopolicy_coordinator.core.step import Step
-
-from . import preemption, suspects
+from evopolicy_coordinator.core.tables.model import TRAIN, Lane, LeasePoll, Worker
+from evopolicy_coordinator.core.tables.state import State
+from evopolicy_coordinator.core.tables.step import Step
+from evopolicy_coordinator.core.workers import preemption, suspects
 
 PREFETCH_BELOW_S = 1.0
 """Longer episodes are leased to free slots only: the time to fetch them is negligible beside their play time."""

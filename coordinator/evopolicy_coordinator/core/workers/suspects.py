@@ -11,11 +11,10 @@ from itertools import islice
 from evopolicy_common.messages import worker as wire
 from evopolicy_coordinator.core.isolation import conflicts
 from evopolicy_coordinator.core.leasing import fleet, leases, queue
-from evopolicy_coordinator.core.model import EARLY_VALIDATION, TRAIN, JobState, Worker
-from evopolicy_coordinator.core.state import State
-from evopolicy_coordinator.core.step import Step
-
-from . import preemption
+from evopolicy_coordinator.core.tables.model import EARLY_VALIDATION, TRAIN, JobState, Worker
+from evopolicy_coordinator.core.tables.state import State
+from evopolicy_coordinator.core.tables.step import Step
+from evopolicy_coordinator.core.workers import preemption
 
 SUSPECTS_MAX = 16
 """Most suspects checked in one step."""

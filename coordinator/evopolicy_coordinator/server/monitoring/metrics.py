@@ -16,9 +16,9 @@ from prometheus_client.registry import Collector
 
 from evopolicy_common.messages.status import StatusReply
 from evopolicy_common.messages.worker import Leases
-from evopolicy_coordinator.core.effects import Effect, Log, Persist, Reply
+from evopolicy_coordinator.core.contract.effects import Effect, Log, Persist, Reply
+from evopolicy_coordinator.core.contract.records import OutcomeRow, SubmitRow
 from evopolicy_coordinator.core.machine import Core
-from evopolicy_coordinator.core.records import OutcomeRow, SubmitRow
 from evopolicy_coordinator.storage.disk_use import sizes
 
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"

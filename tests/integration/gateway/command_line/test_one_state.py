@@ -11,7 +11,7 @@ from waiting import wait_until
 
 from evopolicy_common.local.cluster import WORKERS_ENDED
 from evopolicy_common.messages.environment import Split
-from evopolicy_coordinator.core.records import KernelRow
+from evopolicy_coordinator.core.contract.records import KernelRow
 from evopolicy_coordinator.splits import SPLITS, cases_hash, derive
 from evopolicy_coordinator.storage.store import Store
 

@@ -16,9 +16,9 @@ from evopolicy_common.messages import gateway, operator
 from evopolicy_common.messages.environment import Case
 from evopolicy_common.messages.episode import Job, ResourceLimits
 from evopolicy_common.messages.operator import EvaluationStarted, RunProgress
-from evopolicy_coordinator.core.effects import ReadEvaluation
+from evopolicy_coordinator.core.contract.effects import ReadEvaluation
+from evopolicy_coordinator.core.contract.records import EvaluationRow, RunRow, SubmitRow
 from evopolicy_coordinator.core.leasing.seeds import policy_seed
-from evopolicy_coordinator.core.records import EvaluationRow, RunRow, SubmitRow
 from evopolicy_coordinator.server.reason_texts import words
 
 

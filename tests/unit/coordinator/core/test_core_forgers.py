@@ -12,8 +12,8 @@ from rigs.audit_fleet import WAIT_S, Fleet, audit_state
 from evopolicy_common.errors import RefusedError
 from evopolicy_common.messages import operator
 from evopolicy_common.messages import worker as wire
-from evopolicy_coordinator.core import events
-from evopolicy_coordinator.core.records import OutcomeRow, WorkerRow
+from evopolicy_coordinator.core.contract import events
+from evopolicy_coordinator.core.contract.records import OutcomeRow, WorkerRow
 from evopolicy_coordinator.core.runs import audit_end
 
 

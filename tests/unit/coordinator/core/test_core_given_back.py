@@ -7,7 +7,7 @@ from rigs.core_rig import Rig, done, result, split_of
 
 from evopolicy_common.messages import worker as wire
 from evopolicy_common.messages.episode import BlobRef
-from evopolicy_coordinator.core.records import BegunRow
+from evopolicy_coordinator.core.contract.records import BegunRow
 
 HERE = "kernel-of-w1"
 BEGUN = BlobRef(digest="b" * 64, size=5000)

@@ -12,8 +12,8 @@ from evopolicy_common.messages.operator import Done
 from evopolicy_common.messages.worker import Refused
 from evopolicy_common.records import journal
 from evopolicy_common.records.journal import Ended, Opened, Opening, Result, Revealed
-from evopolicy_coordinator.core import events
-from evopolicy_coordinator.core.records import DocumentRow, JournalRow, RunRow
+from evopolicy_coordinator.core.contract import events
+from evopolicy_coordinator.core.contract.records import DocumentRow, JournalRow, RunRow
 
 
 def entries(rig: Rig) -> list[bytes]:

@@ -11,10 +11,10 @@ from rigs.core_rig import Rig, done, outcome_of, result
 from evopolicy_common.messages import operator
 from evopolicy_common.messages import worker as wire
 from evopolicy_common.messages.episode import PolicyFailure
-from evopolicy_coordinator.core import events
+from evopolicy_coordinator.core.contract import events
+from evopolicy_coordinator.core.contract.records import OutcomeRow, SubmitRow
 from evopolicy_coordinator.core.leasing.expiry import FORGET_S
 from evopolicy_coordinator.core.leasing.leases import lease_id
-from evopolicy_coordinator.core.records import OutcomeRow, SubmitRow
 
 GROUP = "r1/s0/train"
 

@@ -14,8 +14,8 @@ from evopolicy_common.messages import worker as wire
 from evopolicy_common.messages.run_settings import ELSEWHERE
 from evopolicy_common.refusals import Refusal
 from evopolicy_coordinator.core.agents import permits
+from evopolicy_coordinator.core.contract.records import PermitRow
 from evopolicy_coordinator.core.isolation import kernels
-from evopolicy_coordinator.core.records import PermitRow
 
 HERE = "kernel-of-w1"
 

@@ -12,8 +12,8 @@ from evopolicy_common.messages import gateway, operator
 from evopolicy_common.messages import worker as wire
 from evopolicy_common.messages.environment import Case
 from evopolicy_common.messages.episode import ResourceLimits
+from evopolicy_coordinator.core.contract.records import OutcomeRow
 from evopolicy_coordinator.core.isolation import kernels
-from evopolicy_coordinator.core.records import OutcomeRow
 
 HERE = "kernel-of-w1"
 WAIT_S = 60.0

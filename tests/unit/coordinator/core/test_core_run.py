@@ -7,8 +7,8 @@ from rigs.core_rig import Rig, split_of
 
 from evopolicy_common.messages import gateway, operator
 from evopolicy_common.messages.worker import Refused
-from evopolicy_coordinator.core.effects import ReadFinished, ReadResults
-from evopolicy_coordinator.core.records import SubmitRow, submit_done
+from evopolicy_coordinator.core.contract.effects import ReadFinished, ReadResults
+from evopolicy_coordinator.core.contract.records import SubmitRow, submit_done
 
 
 def test_a_run_plays_its_submits_validates_selects_and_is_scored() -> None:

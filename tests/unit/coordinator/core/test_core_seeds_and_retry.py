@@ -9,9 +9,9 @@ import hypothesis.strategies as st
 from hypothesis import given
 
 from evopolicy_common.messages.environment import Case
+from evopolicy_coordinator.core.contract.settings import CoreSettings
 from evopolicy_coordinator.core.leasing.retry import backoff_s, decide
 from evopolicy_coordinator.core.leasing.seeds import occurrences, policy_seed, reference_seed
-from evopolicy_coordinator.core.settings import CoreSettings
 
 SETTINGS = CoreSettings()
 

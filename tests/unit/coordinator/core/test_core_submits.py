@@ -13,8 +13,8 @@ from rigs.store_rows import blob
 from evopolicy_common.messages import gateway, operator
 from evopolicy_common.messages.episode import PolicyFailure, ResourceLimits
 from evopolicy_common.messages.worker import Refused
-from evopolicy_coordinator.core.effects import ReadResults
-from evopolicy_coordinator.core.records import OutcomeRow, SubmitRow, submit_done
+from evopolicy_coordinator.core.contract.effects import ReadResults
+from evopolicy_coordinator.core.contract.records import OutcomeRow, SubmitRow, submit_done
 
 
 def started(**settings: Any) -> tuple[Rig, str]:

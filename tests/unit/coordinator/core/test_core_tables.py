@@ -9,12 +9,12 @@ from typing import get_args
 import pytest
 
 import evopolicy_coordinator.core
-from evopolicy_coordinator.core import step
 from evopolicy_coordinator.core.machine import NEWS, POLLS, TIMERS
-from evopolicy_coordinator.core.model import GroupKind
 from evopolicy_coordinator.core.structures.polls import PollKind
 from evopolicy_coordinator.core.structures.trace import InvariantError
-from evopolicy_coordinator.core.transitions import AUDIT, JOB, RUN, SUBMIT, Table, check, goes_on
+from evopolicy_coordinator.core.tables import step
+from evopolicy_coordinator.core.tables.model import GroupKind
+from evopolicy_coordinator.core.tables.transitions import AUDIT, JOB, RUN, SUBMIT, Table, check, goes_on
 
 CORE = Path(evopolicy_coordinator.core.__file__).parent
 

@@ -16,8 +16,9 @@ from rigs.core_rig import Rig
 
 import evopolicy_coordinator.core
 from evopolicy_common.messages import worker as wire
-from evopolicy_coordinator.core import machine, step
-from evopolicy_coordinator.core.effects import Effect, Log, Persist, Refuse, Reply
+from evopolicy_coordinator.core import machine
+from evopolicy_coordinator.core.contract.effects import Effect, Log, Persist, Refuse, Reply
+from evopolicy_coordinator.core.tables import step
 
 FOLDER = Path(evopolicy_coordinator.core.__file__).parent / "transcripts"
 

@@ -17,9 +17,9 @@ from evopolicy_common.messages.episode import EpisodeOutcome
 from evopolicy_common.records.blobs import BlobStore
 from evopolicy_common.records.episodes.rendered import MAGIC
 from evopolicy_common.records.episodes.trajectory import Recorder, decode
-from evopolicy_coordinator.core.effects import CompareAudit, PrepareAudit
-from evopolicy_coordinator.core.events import AuditCompared, AuditPrepared
-from evopolicy_coordinator.core.records import AuditRow, OutcomeRow
+from evopolicy_coordinator.core.contract.effects import CompareAudit, PrepareAudit
+from evopolicy_coordinator.core.contract.events import AuditCompared, AuditPrepared
+from evopolicy_coordinator.core.contract.records import AuditRow, OutcomeRow
 from evopolicy_coordinator.server import auditing
 from evopolicy_coordinator.storage.disk_use import collect
 from evopolicy_coordinator.storage.store import Reader, Store

@@ -10,7 +10,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from rigs.core_rig import Rig, done
 
 from evopolicy_common.messages.status import StatusReply
-from evopolicy_coordinator.core.effects import Effect
+from evopolicy_coordinator.core.contract.effects import Effect
 from evopolicy_coordinator.server.monitoring.metrics import Meter
 
 DEPLOY = Path(__file__).parents[4] / "deploy"

@@ -14,8 +14,8 @@ import evopolicy_coordinator.core
 from evopolicy_common.messages import gateway
 from evopolicy_common.messages.worker import Refused
 from evopolicy_common.refusals import Refusal
-from evopolicy_coordinator.core.effects import Refuse, Reply
-from evopolicy_coordinator.core.reasons import Code, because
+from evopolicy_coordinator.core.contract.effects import Refuse, Reply
+from evopolicy_coordinator.core.contract.reasons import Code, because
 from evopolicy_coordinator.server.reason_texts import TEXTS, message, words
 
 CORE = Path(evopolicy_coordinator.core.__file__).parent

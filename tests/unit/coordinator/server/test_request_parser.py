@@ -23,7 +23,7 @@ from evopolicy_common.messages.status import StatusRequest
 from evopolicy_common.messages.worker import Message
 from evopolicy_common.records.blobs import BlobStore
 from evopolicy_common.wire import codec, keys
-from evopolicy_coordinator.core.records import RunRow
+from evopolicy_coordinator.core.contract.records import RunRow
 from evopolicy_coordinator.server import request_checks
 from evopolicy_coordinator.server.request_parser import RequestParser
 from evopolicy_coordinator.server.uploads import Uploads

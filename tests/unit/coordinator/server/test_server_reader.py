@@ -17,8 +17,8 @@ from evopolicy_common.messages.worker import BlobAck, BlobChunk, BlobGet, BlobPu
 from evopolicy_common.records.blobs import BlobStore
 from evopolicy_common.refusals import Refusal
 from evopolicy_common.wire import codec
-from evopolicy_coordinator.core import records
-from evopolicy_coordinator.core.effects import ReadEvaluation, ReadFinished, ReadResults
+from evopolicy_coordinator.core.contract import records
+from evopolicy_coordinator.core.contract.effects import ReadEvaluation, ReadFinished, ReadResults
 from evopolicy_coordinator.server import uploads as uploads_module
 from evopolicy_coordinator.server.reader import MAX_PAGE_BYTES, ServiceReader
 from evopolicy_coordinator.server.uploads import Uploads

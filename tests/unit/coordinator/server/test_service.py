@@ -24,8 +24,8 @@ from evopolicy_common.messages.status import StatusRequest
 from evopolicy_common.records.blobs import digest_of
 from evopolicy_common.wire import keys
 from evopolicy_coordinator.cli.status import abandoned
+from evopolicy_coordinator.core.contract.settings import CoreSettings
 from evopolicy_coordinator.core.machine import Core
-from evopolicy_coordinator.core.settings import CoreSettings
 from evopolicy_coordinator.server import core_host, process, service
 
 

@@ -13,8 +13,8 @@ from rigs.store_rows import blob, outcome_row, run_row, state_row, submit_row
 
 from evopolicy_common.errors import ConfigError, DamagedStoreError, StorageError
 from evopolicy_common.messages.episode import ResourceLimits
-from evopolicy_coordinator.core import records
-from evopolicy_coordinator.core.records import (
+from evopolicy_coordinator.core.contract import records
+from evopolicy_coordinator.core.contract.records import (
     DocumentRow,
     EvaluationRow,
     JournalRow,

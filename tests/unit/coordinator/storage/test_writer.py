@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from rigs.store_rows import run_row
 
 from evopolicy_common.errors import StorageError
-from evopolicy_coordinator.core.effects import Effect, Log, Persist
+from evopolicy_coordinator.core.contract.effects import Effect, Log, Persist
 from evopolicy_coordinator.storage.store import Store
 from evopolicy_coordinator.storage.writer import Outbox, Writer
 

@@ -7,9 +7,19 @@ from collections import deque
 from dataclasses import dataclass, field
 
 from evopolicy_common.messages.gateway import RunState
-
-from .families import Families
-from .model import (
+from evopolicy_coordinator.core.contract.records import (
+    BegunRow,
+    JournalRow,
+    KernelRow,
+    OutcomeHead,
+    PermitRow,
+)
+from evopolicy_coordinator.core.contract.settings import CoreSettings
+from evopolicy_coordinator.core.structures.polls import Polls
+from evopolicy_coordinator.core.structures.rate import Rate
+from evopolicy_coordinator.core.structures.timers import Timers
+from evopolicy_coordinator.core.structures.trace import Trace
+from evopolicy_coordinator.core.tables.model import (
     EVERYWHERE,
     RANKS,
     Ask,
@@ -29,12 +39,7 @@ from .model import (
     Run,
     Worker,
 )
-from .records import BegunRow, JournalRow, KernelRow, OutcomeHead, PermitRow
-from .settings import CoreSettings
-from .structures.polls import Polls
-from .structures.rate import Rate
-from .structures.timers import Timers
-from .structures.trace import Trace
+from evopolicy_coordinator.core.tables.related import Families
 
 ATTEMPTS_PER_INCARNATION = 1_000_000
 

@@ -26,11 +26,17 @@ from evopolicy_common.messages.gateway import VideoOption
 from evopolicy_common.messages.status import RetriedJobs
 from evopolicy_common.messages.worker import Fingerprint
 from evopolicy_common.records.aggregates import mean
-
-from .events import RequestId
-from .records import AuditRow, EvaluationRow, PermitRow, RunRow, RunStateRow, SubmitRow
-from .structures.ledger import Ledger
-from .transitions import JOB, Place, check
+from evopolicy_coordinator.core.contract.events import RequestId
+from evopolicy_coordinator.core.contract.records import (
+    AuditRow,
+    EvaluationRow,
+    PermitRow,
+    RunRow,
+    RunStateRow,
+    SubmitRow,
+)
+from evopolicy_coordinator.core.structures.ledger import Ledger
+from evopolicy_coordinator.core.tables.transitions import JOB, Place, check
 
 T = TypeVar("T")
 

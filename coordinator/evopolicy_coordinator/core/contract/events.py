@@ -19,7 +19,7 @@ import msgspec
 from evopolicy_common.messages.episode import BlobRef
 from evopolicy_common.messages.operator import CreateRun, Disclose, Evaluate, Rescore
 from evopolicy_common.messages.worker import Message, Register
-from evopolicy_coordinator.core.records import EvaluationRow, RunRow
+from evopolicy_coordinator.core.contract.records import EvaluationRow, RunRow
 
 RequestId = int | str
 M_co = TypeVar("M_co", bound=Message, covariant=True)

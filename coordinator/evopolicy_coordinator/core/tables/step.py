@@ -20,13 +20,12 @@ import msgspec
 from evopolicy_common.messages.episode import EpisodeOutcome
 from evopolicy_common.messages.worker import JobResult, Message
 from evopolicy_common.refusals import Refusal
-
-from . import transitions
-from .effects import Effect, Log, Persist, Refuse, Reply
-from .events import RequestId
-from .model import Flow, JobGroup, JobState, Lane, Profile, Run, Worker
-from .reasons import Reason
-from .records import AuditRow, Row, SubmitRow
+from evopolicy_coordinator.core.contract.effects import Effect, Log, Persist, Refuse, Reply
+from evopolicy_coordinator.core.contract.events import RequestId
+from evopolicy_coordinator.core.contract.reasons import Reason
+from evopolicy_coordinator.core.contract.records import AuditRow, Row, SubmitRow
+from evopolicy_coordinator.core.tables import transitions
+from evopolicy_coordinator.core.tables.model import Flow, JobGroup, JobState, Lane, Profile, Run, Worker
 
 # ---- news ----
 #

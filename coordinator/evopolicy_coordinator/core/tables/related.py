@@ -9,8 +9,7 @@ import json
 from collections.abc import Iterable
 
 from evopolicy_common.messages.environment import Case
-
-from .model import CaseKey, Family
+from evopolicy_coordinator.core.tables.model import CaseKey, Family
 
 
 class Families:

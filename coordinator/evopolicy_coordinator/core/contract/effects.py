@@ -17,10 +17,9 @@ import msgspec
 
 from evopolicy_common.messages.worker import Message
 from evopolicy_common.refusals import Refusal
-
-from .events import RequestId
-from .reasons import Reason
-from .records import Row
+from evopolicy_coordinator.core.contract.events import RequestId
+from evopolicy_coordinator.core.contract.reasons import Reason
+from evopolicy_coordinator.core.contract.records import Row
 
 
 class Persist(msgspec.Struct, frozen=True, kw_only=True):
