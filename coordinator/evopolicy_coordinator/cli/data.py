@@ -20,6 +20,7 @@ from evopolicy_common.console import table, terminal
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.environment import Split
 from evopolicy_common.messages.run_settings import MAX_HIDDEN
+from evopolicy_common.records import splits as split_files
 from evopolicy_common.terminal import say, say_json
 from evopolicy_coordinator import splits
 
@@ -90,9 +91,9 @@ def _plan(
             "heldout": heldout or suite.n_heldout,
         }
         for split, cases in splits.derive(secret, suite.name, env, counts).items():
-            stem = splits.FILE_STEMS[split]
-            content = splits.SplitFile(env=env, split=stem, cases=cases, secret=seed is None)
-            planned[root / splits.folder_name(env) / f"{stem}.json"] = (
+            stem = split_files.FILE_STEMS[split]
+            content = split_files.SplitFile(env=env, split=stem, cases=cases, secret=seed is None)
+            planned[root / split_files.folder_name(env) / f"{stem}.json"] = (
                 msgspec.json.format(msgspec.json.encode(content), indent=1) + b"\n"
             )
     return planned
@@ -131,7 +132,7 @@ def check(
     """Check that split files are well-formed and disjoint, and print their hashes."""
     if not folder.is_dir():
         _usage(f"{folder} is not a folder")
-    folders = splits.folders_below(folder)
+    folders = split_files.folders_below(folder)
     if not folders:
         _usage(f"no train.json, valid.json or heldout.json in {folder} or in its folders")
     reports = [_report(item.resolve()) for item in folders]
@@ -153,7 +154,7 @@ def _report(folder: Path) -> dict[str, Any]:
     return {
         "folder": str(folder),
         "env": loaded.env,
-        "cases": {split: len(loaded.cases(split)) for split in splits.SPLITS},
+        "cases": {split: len(loaded.cases(split)) for split in split_files.SPLITS},
         "sha256": loaded.hashes(),
         "secret": loaded.secret,
         "findings": findings,
@@ -167,8 +168,8 @@ def _print(reports: list[dict[str, Any]]) -> None:
         if report["env"] is None:
             shown.add_row(Path(report["folder"]).name, "", "", "", "", "", verdict)
             continue
-        counts = [str(report["cases"][split]) for split in splits.SPLITS]
-        hashes = " ".join(report["sha256"][split][:8] for split in splits.SPLITS)
+        counts = [str(report["cases"][split]) for split in split_files.SPLITS]
+        hashes = " ".join(report["sha256"][split][:8] for split in split_files.SPLITS)
         shown.add_row(report["env"], *counts, "yes" if report["secret"] else "no", hashes, verdict)
     console = terminal()
     console.print(shown)

@@ -30,13 +30,13 @@ from evopolicy_common.processes.scratch import scratch_folder
 from evopolicy_common.records.blobs import digest_of
 from evopolicy_common.records.episodes.rendered import decode
 from evopolicy_common.records.episodes.trajectory import Trajectory
+from evopolicy_common.records.splits import FILE_STEMS, SPLITS, SplitFile, cases_hash, folder_name
 from evopolicy_common.wire import credentials, transport
 from evopolicy_common.wire.operator_client import DESCRIPTION_S, OperatorClient
 from evopolicy_coordinator.publish import contents
 from evopolicy_coordinator.publish.contents import Group
 from evopolicy_coordinator.publish.findings import Checked, Files, PublishedRun
 from evopolicy_coordinator.publish.run_rules import recording_of
-from evopolicy_coordinator.splits import FILE_STEMS, SPLITS, SplitFile, cases_hash, folder_name
 from evopolicy_coordinator.verify import compare
 
 LAST_PLACES = 4

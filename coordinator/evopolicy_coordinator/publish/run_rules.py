@@ -18,6 +18,7 @@ from evopolicy_common.records.journal import Ended, Opened, Opening, Result, Rev
 from evopolicy_common.records.policies import bundles
 from evopolicy_common.records.policies.bundles import Bundle
 from evopolicy_common.records.run_record import PROTOCOL_VERSION, decode_run_record, inputs_digest
+from evopolicy_common.records.splits import FILE_STEMS, SPLITS, cases_hash, overlaps
 from evopolicy_common.records.summary import utc_text
 from evopolicy_coordinator.publish import contents, fields
 from evopolicy_coordinator.publish.contents import Group
@@ -30,7 +31,6 @@ from evopolicy_coordinator.publish.findings import (
     PublishedRun,
     decoded,
 )
-from evopolicy_coordinator.splits import FILE_STEMS, SPLITS, cases_hash, overlaps
 from evopolicy_coordinator.verify.compare import same
 from evopolicy_coordinator.verify.numbers import outcome_pairs
 

@@ -38,10 +38,10 @@ from evopolicy_common.records.rescores import (
 )
 from evopolicy_common.records.run_files import RUN_JSON, read_record
 from evopolicy_common.records.run_record import RunRecord
+from evopolicy_common.records.splits import FILE_STEMS, cases_hash, folder_of, read_split_file
 from evopolicy_common.refusals import WRONG_SETTINGS, Refusal
 from evopolicy_common.wire.operator_client import DESCRIPTION_S, OperatorClient
 from evopolicy_common.wire.transport import Link
-from evopolicy_coordinator.splits import FILE_STEMS, cases_hash, folder_of, read_split_file
 
 RANDOM = -1
 _WORKER_PAUSE_S = 0.3

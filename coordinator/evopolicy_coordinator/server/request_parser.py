@@ -31,6 +31,7 @@ from evopolicy_common.messages.run_settings import (
 from evopolicy_common.messages.worker import BlobGet, BlobPut, Message
 from evopolicy_common.records.blobs import BlobStore, is_digest
 from evopolicy_common.records.journal import SALT_BYTES
+from evopolicy_common.records.splits import SPLITS, overlaps
 from evopolicy_common.refusals import Refusal
 from evopolicy_common.wire import codec, keys
 from evopolicy_common.wire.credentials import Role
@@ -58,7 +59,7 @@ from evopolicy_coordinator.server.request_checks import (
     finite_wait,
 )
 from evopolicy_coordinator.server.uploads import Uploads
-from evopolicy_coordinator.splits import SPLITS, FurtherSplit, SplitSource, overlaps
+from evopolicy_coordinator.splits import FurtherSplit, SplitSource
 from evopolicy_coordinator.storage.state_folder import Identity
 from evopolicy_coordinator.storage.store import stored_blobs
 

@@ -20,7 +20,8 @@ from commands import evopolicy
 
 from evopolicy_common.messages.environment import Case
 from evopolicy_common.records.rescores import RescoreRecord, read_rescore
-from evopolicy_coordinator.splits import SplitFile, load_or_create_secret
+from evopolicy_common.records.splits import SplitFile
+from evopolicy_coordinator.splits import load_or_create_secret
 from evopolicy_coordinator.storage.store import Reader
 
 ENV = "toy/line"

@@ -14,15 +14,9 @@ from hypothesis import strategies as st
 
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.environment import Case
+from evopolicy_common.records.splits import SPLITS, cases_hash, folders_below, overlaps
 from evopolicy_coordinator import splits
-from evopolicy_coordinator.splits import (
-    SPLITS,
-    SplitSource,
-    derive,
-    folders_below,
-    load,
-    secret_of,
-)
+from evopolicy_coordinator.splits import SplitSource, derive, load, secret_of
 
 COUNTS = {"train": 64, "validation": 16, "heldout": 32}
 
@@ -60,7 +54,7 @@ def test_derived_splits_are_disjoint_and_of_the_length_asked_for(counts: dict[An
         patch.setattr(splits, "_SEED_LIMIT", space)
         drawn = derive(b"s" * 32, "suite", "env", counts)
     assert {split: len(cases) for split, cases in drawn.items()} == counts
-    assert splits.overlaps(drawn) == []
+    assert overlaps(drawn) == []
     assert all(0 <= case.seed < space for cases in drawn.values() for case in cases)
 
 
@@ -95,7 +89,7 @@ def test_run_with_hidden_cases_of_its_own_shares_none_but_all_train_cases(folder
 def test_hash_is_of_canonical_json_of_the_cases() -> None:
     cases = [Case(seed=3), Case(seed=4, options={"b": 1, "a": [0.5]})]
     text = '[{"seed":3},{"options":{"a":[0.5],"b":1},"seed":4}]'
-    assert splits.cases_hash(cases) == hashlib.sha256(text.encode()).hexdigest()
+    assert cases_hash(cases) == hashlib.sha256(text.encode()).hexdigest()
 
 
 def test_files_are_read_and_cut_to_what_is_asked_for(folder: Path) -> None:

@@ -11,8 +11,9 @@ from waiting import wait_until
 
 from evopolicy_common.local.cluster import WORKERS_ENDED
 from evopolicy_common.messages.environment import Split
+from evopolicy_common.records.splits import SPLITS, cases_hash
 from evopolicy_coordinator.core.contract.records import KernelRow
-from evopolicy_coordinator.splits import SPLITS, cases_hash, derive
+from evopolicy_coordinator.splits import derive
 from evopolicy_coordinator.storage.store import Store
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
