@@ -21,19 +21,14 @@ from evopolicy_coordinator.analysis.reading.comparability import (
     Mixture,
     mixtures,
 )
+from evopolicy_coordinator.analysis.reading.environments import learn_names, ordered_environments, suites_of
 from evopolicy_coordinator.analysis.reading.reader import load_runs
 from evopolicy_coordinator.analysis.reading.records import LeftOut, Run
 from evopolicy_coordinator.analysis.reading.rescored import rescored
 from evopolicy_coordinator.analysis.scoring.evolution import Evolution, evolutions
 from evopolicy_coordinator.analysis.scoring.normalised import Normalised, normalised
 from evopolicy_coordinator.analysis.scoring.ranking import Leaderboard, leaderboard
-from evopolicy_coordinator.analysis.scoring.scores import (
-    ScoreTable,
-    learn_names,
-    ordered_environments,
-    score_table,
-    suites_of,
-)
+from evopolicy_coordinator.analysis.scoring.scores import ScoreTable, score_table
 from evopolicy_coordinator.analysis.statistics.resampling import RESAMPLES
 from evopolicy_coordinator.analysis.statistics.suite import SuiteStatistics, suite_statistics
 

@@ -33,8 +33,8 @@ from evopolicy_coordinator.analysis.html.pages import (
     trace_page,
 )
 from evopolicy_coordinator.analysis.palette import Look, looks
+from evopolicy_coordinator.analysis.reading.environments import ordered_environments
 from evopolicy_coordinator.analysis.reading.records import Run, path_text
-from evopolicy_coordinator.analysis.scoring.scores import ordered_environments
 from evopolicy_coordinator.analysis.study import Study
 from evopolicy_coordinator.analysis.tables.latex import to_latex
 from evopolicy_coordinator.analysis.tables.report_tables import tables_of

@@ -30,7 +30,7 @@ from evopolicy_coordinator.analysis.html.site import (
     section,
 )
 from evopolicy_coordinator.analysis.palette import looks
-from evopolicy_coordinator.analysis.scoring.scores import suite_title, title_of
+from evopolicy_coordinator.analysis.reading.environments import suite_title, title_of
 from evopolicy_coordinator.analysis.study import Study, study_of
 from evopolicy_coordinator.analysis.tables.report_tables import tables_of
 from evopolicy_coordinator.analysis.write import slug, write_report

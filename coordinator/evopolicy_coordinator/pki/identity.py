@@ -7,16 +7,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from cryptography.exceptions import InvalidSignature
-from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
 
+from evopolicy_coordinator.publish.signatures import MANIFEST
 from evopolicy_coordinator.splits import load_or_create_secret
 
 SIGNING_KEY = "signing-key"
 """File of the state folder: 32 random bytes, mode 0600."""
-MANIFEST, HEAD = b"evopolicy manifest 1\0", b"evopolicy head 1\0"
-"""Prefixes of the signed bytes: a signature of one kind is not valid for the other."""
 
 
 def public_key(state: Path) -> str:
@@ -31,16 +29,6 @@ def sign(state: Path, digest: str, kind: bytes = MANIFEST) -> tuple[str, str]:
     """Signs a SHA-256 (hex). Returns the public key (64 hex digits) and the signature (128)."""
     key = _private(state)
     return _public(key), key.sign(kind + bytes.fromhex(digest)).hex()
-
-
-def signed_by(key: str, signature: str, digest: str, kind: bytes = MANIFEST) -> bool:
-    """Whether the owner of the public `key` signed the `digest`; False for anything malformed."""
-    try:
-        public = Ed25519PublicKey.from_public_bytes(bytes.fromhex(key))
-        public.verify(bytes.fromhex(signature), kind + bytes.fromhex(digest))
-    except (InvalidSignature, ValueError):
-        return False
-    return True
 
 
 def _private(state: Path) -> Ed25519PrivateKey:

@@ -17,11 +17,11 @@ from evopolicy_common.records import journal
 from evopolicy_common.records.canary import CANARY
 from evopolicy_common.records.journal import Ended, Opened
 from evopolicy_common.records.summary import utc_text
-from evopolicy_coordinator.pki.identity import HEAD, signed_by
 from evopolicy_coordinator.publish import contents, fields
 from evopolicy_coordinator.publish.contents import Countersignature, Manifest, Removed, Signature
 from evopolicy_coordinator.publish.findings import Checked, Files, History, decoded
 from evopolicy_coordinator.publish.run_rules import UPDATE, check_run, read_run, refuse_unknown
+from evopolicy_coordinator.publish.signatures import HEAD, signed_by
 
 
 def check(files: Files, identity: str = "", heads: Sequence[str | Countersignature] = ()) -> Checked:

@@ -11,7 +11,7 @@ from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from evopolicy_coordinator.analysis.html import visible
-from evopolicy_coordinator.analysis.scoring.scores import title_of
+from evopolicy_coordinator.analysis.reading.environments import title_of
 from evopolicy_coordinator.web.feeds import View
 
 STATES = {

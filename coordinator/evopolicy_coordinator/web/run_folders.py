@@ -27,8 +27,8 @@ from evopolicy_common.records.run_record import RunRecord
 from evopolicy_common.records.suite_folder import INDEX, PAUSED, Entry, Index
 from evopolicy_common.records.summary import Summary, decode_summary
 from evopolicy_common.regular_files import read_regular
+from evopolicy_coordinator.analysis.reading.environments import learn_names
 from evopolicy_coordinator.analysis.reading.reader import find_run_dirs
-from evopolicy_coordinator.analysis.scoring.scores import learn_names
 from evopolicy_coordinator.web.confined import Confined, NotThereError
 
 _MAX_SUMMARY_BYTES = 8 << 20

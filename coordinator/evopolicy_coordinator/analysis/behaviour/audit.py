@@ -12,8 +12,8 @@ from typing import Any, TypeVar
 import msgspec
 
 from evopolicy_coordinator.analysis.behaviour.edits import classify
+from evopolicy_coordinator.analysis.reading.environments import ordered_environments
 from evopolicy_coordinator.analysis.reading.records import Run
-from evopolicy_coordinator.analysis.scoring.scores import ordered_environments
 
 _Value = TypeVar("_Value")
 

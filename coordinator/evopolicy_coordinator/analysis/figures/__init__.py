@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from evopolicy_coordinator.analysis.figures import cost, edits, profiles, scores
 from evopolicy_coordinator.analysis.figures.style import Plot
 from evopolicy_coordinator.analysis.palette import looks
-from evopolicy_coordinator.analysis.scoring.scores import ordered_environments
+from evopolicy_coordinator.analysis.reading.environments import ordered_environments
 from evopolicy_coordinator.analysis.study import Study
 
 

@@ -14,8 +14,8 @@ from evopolicy_coordinator.analysis.behaviour.phases import events_of, phases
 from evopolicy_coordinator.analysis.behaviour.structure import BINS, DATA_ONLY, UNCHANGED
 from evopolicy_coordinator.analysis.figures.style import INK, MUTED, RC, Plot, new_figure
 from evopolicy_coordinator.analysis.palette import EDIT_COLOURS, Look
+from evopolicy_coordinator.analysis.reading.environments import title_of
 from evopolicy_coordinator.analysis.reading.records import rows
-from evopolicy_coordinator.analysis.scoring.scores import title_of
 from evopolicy_coordinator.analysis.study import Study, Timeline
 
 MAX_ROWS = 24

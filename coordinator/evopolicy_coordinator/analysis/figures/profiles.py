@@ -8,8 +8,8 @@ import matplotlib
 
 from evopolicy_coordinator.analysis.figures.style import RC, Plot, new_figure
 from evopolicy_coordinator.analysis.palette import Look
+from evopolicy_coordinator.analysis.reading.environments import suite_title
 from evopolicy_coordinator.analysis.reading.records import rows
-from evopolicy_coordinator.analysis.scoring.scores import suite_title
 from evopolicy_coordinator.analysis.statistics.aggregates import TAUS
 from evopolicy_coordinator.analysis.study import Suite
 

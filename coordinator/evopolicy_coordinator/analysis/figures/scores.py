@@ -12,10 +12,10 @@ from matplotlib.lines import Line2D
 from evopolicy_coordinator.analysis.behaviour.edits import demand_of
 from evopolicy_coordinator.analysis.figures.style import GRID, MUTED, RC, Plot, new_figure
 from evopolicy_coordinator.analysis.palette import REFERENCE, Look
+from evopolicy_coordinator.analysis.reading.environments import family_of, family_title, suite_title, title_of
 from evopolicy_coordinator.analysis.reading.records import rows
 from evopolicy_coordinator.analysis.scoring.evolution import Evolution, best_at
 from evopolicy_coordinator.analysis.scoring.normalised import DEMANDS
-from evopolicy_coordinator.analysis.scoring.scores import family_of, family_title, suite_title, title_of
 from evopolicy_coordinator.analysis.study import Study, Suite
 
 

@@ -15,9 +15,9 @@ from evopolicy_coordinator.analysis.behaviour.trace import Trace, TraceRow, diff
 from evopolicy_coordinator.analysis.html import visible
 from evopolicy_coordinator.analysis.html.small_timeline import small_timeline
 from evopolicy_coordinator.analysis.palette import Look
+from evopolicy_coordinator.analysis.reading.environments import suite_title, title_of
 from evopolicy_coordinator.analysis.reading.records import Run, Submit
 from evopolicy_coordinator.analysis.scan.signals import TITLES
-from evopolicy_coordinator.analysis.scoring.scores import suite_title, title_of
 from evopolicy_coordinator.analysis.simulators.look import Flag
 from evopolicy_coordinator.analysis.study import Study
 from evopolicy_coordinator.analysis.tables.run_tables import submits_text

@@ -21,8 +21,8 @@ from evopolicy_common.errors import EvopolicyError
 from evopolicy_common.messages.environment import Split
 from evopolicy_common.records.fingerprints import comparable
 from evopolicy_common.records.run_record import inputs_digest
+from evopolicy_coordinator.analysis.reading.environments import ordered_environments, suites_of
 from evopolicy_coordinator.analysis.reading.records import Run, path_text
-from evopolicy_coordinator.analysis.scoring.scores import ordered_environments, suites_of
 
 
 class Mixture(msgspec.Struct, frozen=True, kw_only=True):

@@ -13,8 +13,8 @@ from collections.abc import Iterable, Mapping, Sequence
 import msgspec
 
 from evopolicy_coordinator.analysis.behaviour.edits import classify
+from evopolicy_coordinator.analysis.reading.environments import ordered_environments
 from evopolicy_coordinator.analysis.reading.records import Run
-from evopolicy_coordinator.analysis.scoring.scores import ordered_environments
 
 
 class Step(msgspec.Struct, frozen=True, kw_only=True):

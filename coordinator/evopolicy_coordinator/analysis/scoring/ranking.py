@@ -15,7 +15,8 @@ from statistics import fmean
 
 import msgspec
 
-from evopolicy_coordinator.analysis.scoring.scores import ScoreTable, family_of
+from evopolicy_coordinator.analysis.reading.environments import family_of
+from evopolicy_coordinator.analysis.scoring.scores import ScoreTable
 
 
 class CellResult(msgspec.Struct, frozen=True, kw_only=True):

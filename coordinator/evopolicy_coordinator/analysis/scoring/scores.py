@@ -10,17 +10,13 @@ from __future__ import annotations
 import csv
 import io
 import math
-import re
 from collections.abc import Iterable, Sequence
-from functools import cache
 from statistics import fmean
 
 import msgspec
 
-from evopolicy_common import catalogue
 from evopolicy_common.errors import ConfigError
-from evopolicy_common.records.run_record import RunRecord
-from evopolicy_common.terminal import one_line
+from evopolicy_coordinator.analysis.reading.environments import ordered_environments
 from evopolicy_coordinator.analysis.reading.records import Run
 
 RANDOM_ENTRY = "Random policy"
@@ -81,84 +77,6 @@ class ScoreTable(msgspec.Struct, frozen=True, kw_only=True):
             harness={entry: harness for entry, harness in self.harness.items() if entry in left},
             reference=self.reference if self.reference in left else None,
         )
-
-
-def ordered_environments(envs: Iterable[str]) -> list[str]:
-    """Distinct environment ids in catalogue order, then unknown ones by name."""
-    order = {env: place for place, env in enumerate(catalogue.entries())}
-    return sorted(set(envs), key=lambda env: (order.get(env, len(order)), env))
-
-
-_names_in_runs: dict[str, set[tuple[str, str]]] = {}
-"""Titles and families that runs tell of environments which do not ship, by id."""
-_MAX_TITLE = 60
-_FAMILY = re.compile(r"[a-z0-9_]{1,40}")
-
-
-def learn_names(records: Iterable[RunRecord]) -> None:
-    """Takes from runs, for this process, the titles and families of environments that the catalogue lacks.
-
-    They are shown where all runs of an environment tell the same.
-    """
-    for record in records:
-        if record.env not in catalogue.entries() and (record.env_title or record.env_family):
-            names = _names_in_runs.setdefault(record.env, set())
-            if len(names) < 2:
-                names.add((record.env_title, record.env_family))
-
-
-def _name(env: str) -> tuple[str, str]:
-    """Title and family; empty where they are unknown."""
-    found = catalogue.entries().get(env)
-    if found is not None:
-        return found.title, found.family
-    names = _names_in_runs.get(env, set())
-    return next(iter(names)) if len(names) == 1 else ("", "")
-
-
-@cache
-def _shipped_titles() -> frozenset[str]:
-    return frozenset(each.title.casefold() for each in catalogue.entries().values())
-
-
-def title_of(env: str) -> str:
-    """Short name for tables; the id itself if neither the catalogue nor the runs that were read have one, or if these tell the
-    title of an environment that ships."""
-    title = " ".join(one_line(_name(env)[0])[:_MAX_TITLE].split())
-    foreign = env not in catalogue.entries()
-    return env if not title or (foreign and title.casefold() in _shipped_titles()) else title
-
-
-def family_of(env: str) -> str:
-    """Family key; `other` for an environment of which neither the catalogue nor the runs that were read tell one."""
-    family = _name(env)[1]
-    return family if _FAMILY.fullmatch(family) else "other"
-
-
-def family_title(family: str) -> str:
-    """Displayed title of a family."""
-    return catalogue.families().get(family, family.replace("_", " ").capitalize())
-
-
-def suites_of(environments: Iterable[str]) -> dict[str, list[str]]:
-    """Groups `environments` by suite name (the catalogue's first suite with each); unknown ones are in `other`."""
-    found: dict[str, list[str]] = {}
-    for env in ordered_environments(environments):
-        name = catalogue.suite_of(env).name if env in catalogue.entries() else "other"
-        found.setdefault(name, []).append(env)
-    return found
-
-
-def suite_title(suite: str) -> str:
-    """Displayed title of a suite."""
-    known = catalogue.suites().get(suite)
-    return known.title if known is not None else suite.capitalize()
-
-
-def suite_size(suite: str) -> int:
-    """Number of environments in the whole suite; 0 if it has no definition."""
-    known = catalogue.suites().get(suite)
-    return len(known.environments) if known is not None else 0
 
 
 def score_table(runs: Iterable[Run]) -> ScoreTable:

@@ -13,9 +13,9 @@ from statistics import fmean
 
 import msgspec
 
+from evopolicy_coordinator.analysis.reading.environments import family_of, ordered_environments
 from evopolicy_coordinator.analysis.reading.records import Run
 from evopolicy_coordinator.analysis.scoring.normalised import Scale
-from evopolicy_coordinator.analysis.scoring.scores import family_of, ordered_environments
 from evopolicy_coordinator.analysis.statistics.intervals import Estimate, of_runs
 
 SUCCESS_ABOVE = {"minigrid": 0.0, "gym/acrobot": -500.0, "gym/continuouscar": 0.0}

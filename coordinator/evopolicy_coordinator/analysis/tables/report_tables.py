@@ -9,14 +9,14 @@ import msgspec
 from evopolicy_common import catalogue
 from evopolicy_coordinator.analysis.behaviour import structure
 from evopolicy_coordinator.analysis.behaviour.edits import demand_of
-from evopolicy_coordinator.analysis.scoring.normalised import DEMANDS
-from evopolicy_coordinator.analysis.scoring.scores import (
+from evopolicy_coordinator.analysis.reading.environments import (
     family_of,
     family_title,
     suite_size,
     suite_title,
     title_of,
 )
+from evopolicy_coordinator.analysis.scoring.normalised import DEMANDS
 from evopolicy_coordinator.analysis.statistics.intervals import Estimate
 from evopolicy_coordinator.analysis.statistics.standings import RankEstimate
 from evopolicy_coordinator.analysis.study import Study, Suite

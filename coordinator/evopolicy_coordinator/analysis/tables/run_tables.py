@@ -9,14 +9,14 @@ from typing import Any
 from evopolicy_common import catalogue
 from evopolicy_coordinator.analysis.behaviour.edits import demand_of
 from evopolicy_coordinator.analysis.behaviour.trace import Trace, TraceRow
-from evopolicy_coordinator.analysis.reading.records import Run, path_text
-from evopolicy_coordinator.analysis.scan.signals import TITLES
-from evopolicy_coordinator.analysis.scoring.scores import (
+from evopolicy_coordinator.analysis.reading.environments import (
     family_of,
     family_title,
     ordered_environments,
     title_of,
 )
+from evopolicy_coordinator.analysis.reading.records import Run, path_text
+from evopolicy_coordinator.analysis.scan.signals import TITLES
 from evopolicy_coordinator.analysis.study import Study
 from evopolicy_coordinator.analysis.tables.table import Column, Table
 

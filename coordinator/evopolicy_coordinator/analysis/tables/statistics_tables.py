@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from evopolicy_coordinator.analysis.scoring.scores import suite_title, title_of
+from evopolicy_coordinator.analysis.reading.environments import suite_title, title_of
 from evopolicy_coordinator.analysis.statistics.aggregates import LEAST_RUNS, TAUS, Bounded
 from evopolicy_coordinator.analysis.statistics.distributions import ALPHA
 from evopolicy_coordinator.analysis.statistics.intervals import Estimate

@@ -13,7 +13,7 @@ from markupsafe import Markup
 
 from evopolicy_common.cli.conventions import bytes_text
 from evopolicy_common.messages.status import DiskUse, StatusReply, WorkerStatus
-from evopolicy_coordinator.analysis.scoring.scores import title_of
+from evopolicy_coordinator.analysis.reading.environments import title_of
 from evopolicy_coordinator.web.charts import Line, chart
 from evopolicy_coordinator.web.cluster import Cluster
 from evopolicy_coordinator.web.feeds import View

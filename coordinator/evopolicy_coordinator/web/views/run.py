@@ -11,7 +11,7 @@ from evopolicy_common.messages.status import RetriedJobs, StatusReply
 from evopolicy_common.records.summary import utc_text
 from evopolicy_coordinator.analysis.behaviour.trace import diff
 from evopolicy_coordinator.analysis.palette import looks
-from evopolicy_coordinator.analysis.scoring.scores import title_of
+from evopolicy_coordinator.analysis.reading.environments import title_of
 from evopolicy_coordinator.web.charts import Line, chart
 from evopolicy_coordinator.web.feeds import View
 from evopolicy_coordinator.web.rendering import duration, number, part, short, state_words

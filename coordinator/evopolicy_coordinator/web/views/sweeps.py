@@ -9,7 +9,7 @@ from typing import Any
 
 from evopolicy_common.cli.conventions import bytes_text
 from evopolicy_coordinator.analysis.palette import Look, looks
-from evopolicy_coordinator.analysis.scoring.scores import title_of
+from evopolicy_coordinator.analysis.reading.environments import title_of
 from evopolicy_coordinator.web.cluster import Cluster
 from evopolicy_coordinator.web.feeds import View
 from evopolicy_coordinator.web.rendering import STATES, duration, number, part, short, state_words
