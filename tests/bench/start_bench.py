@@ -56,9 +56,7 @@ WORKER = "import evopolicy_worker.cli"
 SIMULATOR = f"import evopolicy_worker.episodes.env_process, gymnasium; gymnasium.make({GYMNASIUM_ID!r})"
 TRIAL = (f"{FRONT}, evopolicy_gateway.cli.play", COORDINATOR, WORKER, SIMULATOR)
 LOCAL = (*TRIAL, "import evopolicy_gateway.cli.serve", "import evopolicy_gateway.agent_supervisor.supervisor")
-REPORT = (
-    "import evopolicy_gateway.cli.main, evopolicy_coordinator.cli.results.report, evopolicy_coordinator.analysis.write",
-)
+REPORT = ("import evopolicy_gateway.cli.main, evopolicy_results.cli.report, evopolicy_results.report",)
 
 
 class Cost(NamedTuple):

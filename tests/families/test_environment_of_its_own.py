@@ -21,7 +21,7 @@ from coordinator_harness import Coordinator
 from evopolicy_common.catalogue import installs
 from evopolicy_common.catalogue.installs import Made
 from evopolicy_common.records.run_record import decode_run_record
-from evopolicy_coordinator.analysis.statistics.intervals import over_cases
+from evopolicy_results.statistics.intervals import over_cases
 
 FAMILY, ENV = "mo_gymnasium", "gymnasium/deep-sea-treasure-v0"
 POLICY = Path(__file__).parent / "policies" / ENV.replace("/", "_")

@@ -17,8 +17,8 @@ from evopolicy_common.errors import ProtocolError
 from evopolicy_common.records import journal
 from evopolicy_common.records.aggregates import mean, std
 from evopolicy_coordinator.pki import identity
-from evopolicy_coordinator.publish import contents
-from evopolicy_coordinator.publish.archive import Archive, Writer
+from evopolicy_results.publish import contents
+from evopolicy_results.publish.archive import Archive, Writer
 
 ENV = "toy/line"
 AGENT = """

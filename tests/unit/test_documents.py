@@ -131,7 +131,7 @@ def test_the_architecture_names_every_folder_of_a_room_and_of_its_larger_parts()
     named = set(re.findall(r"`(\w+)/`", table))
     parts = [
         *ROOMS.values(),
-        "coordinator/evopolicy_coordinator/analysis/",
+        "coordinator/evopolicy_results/",
         "worker/evopolicy_worker/environments/",
     ]
     inside = {

@@ -9,9 +9,9 @@ from types import ModuleType
 import pytest
 
 from evopolicy_common import catalogue
-from evopolicy_coordinator.analysis.behaviour.topology import describe
-from evopolicy_coordinator.analysis.reading.sources import reachable_modules, source_digest
 from evopolicy_gateway.agents.replay import folder_for, policies_in
+from evopolicy_results.code.sources import reachable_modules, source_digest
+from evopolicy_results.code.topology import describe
 
 SCRIPT = Path(__file__).parents[2] / "examples/smoke-report/labelled_edits.py"
 

@@ -29,6 +29,7 @@ LARGE = {
     *("logging", "msgspec", "socket", "tempfile", "tomllib", "uvicorn", "zenoh", "zstandard"),
     *(
         "evopolicy_coordinator",
+        "evopolicy_results",
         "evopolicy_worker",
         "evopolicy_gateway.cli.play",
         "evopolicy_gateway.operator",

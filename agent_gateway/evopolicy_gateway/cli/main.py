@@ -30,6 +30,7 @@ class Place(NamedTuple):
 
 _PLAY = "evopolicy_gateway.cli.play:app"
 _COORDINATOR = "evopolicy_coordinator.cli"
+_RESULTS = "evopolicy_results.cli"
 
 GROUPS = {
     "Play": {
@@ -50,7 +51,7 @@ GROUPS = {
     },
     "Results": {
         "report": Place(
-            f"{_COORDINATOR}.results.report:app",
+            f"{_RESULTS}.report:app",
             "Write a report on finished runs: leaderboard, figures and diagnostics.",
         ),
         "diff": Place(
@@ -58,11 +59,11 @@ GROUPS = {
             "Compare two run directories, except for times, logs and other values that differ between equal runs.",
         ),
         "verify": Place(
-            f"{_COORDINATOR}.results.verify:app",
+            f"{_RESULTS}.verify:app",
             "Replay a run's recorded actions, and compare rewards, observations and returns bit for bit.",
         ),
         "rescore": Place(
-            f"{_COORDINATOR}.results.rescore:app",
+            f"{_RESULTS}.rescore:app",
             "Play checkpoints of finished runs on further hidden cases, for tighter intervals.",
         ),
         "export": Place(
@@ -70,12 +71,12 @@ GROUPS = {
             "Export runs to tables, experiment trackers, trajectory datasets and agents' logs.",
         ),
         "publish": Place(
-            f"{_COORDINATOR}.results.publish:app",
+            f"{_RESULTS}.publish:app",
             "Write finished runs into one signed file that anyone can check, and make their cases public.",
         ),
-        "check": Place(f"{_COORDINATOR}.results.publish:check_app", "Check published results."),
+        "check": Place(f"{_RESULTS}.publish:check_app", "Check published results."),
         "leaderboard": Place(
-            f"{_COORDINATOR}.results.leaderboard:app",
+            f"{_RESULTS}.leaderboard:app",
             "Write a leaderboard of several labs' published results as a static site.",
         ),
     },

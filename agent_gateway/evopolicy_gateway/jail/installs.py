@@ -20,7 +20,7 @@ from evopolicy_common.simulators import SIMULATORS
 SYSTEM = ("/usr", "/bin", "/sbin", "/lib", "/lib32", "/lib64", "/libx32")
 """Folders visible in every jail."""
 
-_HIDDEN = frozenset((*SIMULATORS, "evopolicy_worker", "evopolicy_coordinator"))
+_HIDDEN = frozenset((*SIMULATORS, "evopolicy_worker", "evopolicy_coordinator", "evopolicy_results"))
 """Packages that no agent may see, in any Python installation."""
 
 _INSTALLATION_MARKS = ("pyvenv.cfg", "lib", "libexec", "node_modules")

@@ -21,10 +21,10 @@ from evopolicy_common.terminal import say, say_json
 from evopolicy_common.wire.credentials import default_state_dir, no_state
 from evopolicy_coordinator import splits
 from evopolicy_coordinator.pki.identity import public_key, sign
-from evopolicy_coordinator.publish.contents import Countersignature, document, head_digest
-from evopolicy_coordinator.publish.signatures import HEAD
 from evopolicy_coordinator.storage.state_folder import StateFolder
 from evopolicy_coordinator.storage.store import Reader
+from evopolicy_results.publish.contents import Countersignature, document, head_digest
+from evopolicy_results.publish.signatures import HEAD
 
 _PAGE_BYTES = 1 << 20
 

@@ -10,8 +10,8 @@ from pathlib import Path
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
 
-from evopolicy_coordinator.publish.signatures import MANIFEST
 from evopolicy_coordinator.splits import load_or_create_secret
+from evopolicy_results.publish.signatures import MANIFEST
 
 SIGNING_KEY = "signing-key"
 """File of the state folder: 32 random bytes, mode 0600."""

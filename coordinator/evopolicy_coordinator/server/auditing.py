@@ -12,12 +12,12 @@ from __future__ import annotations
 from evopolicy_common.errors import ProtocolError, StorageError
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome
 from evopolicy_common.records.blobs import BlobStore
+from evopolicy_common.records.episodes import compare
 from evopolicy_common.records.episodes.rendered import decode
 from evopolicy_common.records.episodes.trajectory import Trajectory
 from evopolicy_coordinator.core.contract.effects import AuditEffect, CompareAudit, PrepareAudit
 from evopolicy_coordinator.core.contract.events import AuditCompared, AuditEvent, AuditPrepared
 from evopolicy_coordinator.storage.store import Reader
-from evopolicy_coordinator.verify import compare
 
 MAX_TEXT = 500
 _LOST = "its record is not in the store any more"

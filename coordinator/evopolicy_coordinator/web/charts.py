@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from html import escape
 
-from evopolicy_coordinator.analysis.palette import COLOURS, REFERENCE
+from evopolicy_results.studies.palette import COLOURS, REFERENCE
 
 _WIDTH, _LEFT, _RIGHT, _TOP, _BOTTOM = 760.0, 62.0, 14.0, 12.0, 30.0
 _DASHES = ("", "6 3", "2 3", "8 3 2 3")

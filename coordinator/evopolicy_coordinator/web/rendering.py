@@ -10,9 +10,9 @@ from typing import Any
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from evopolicy_coordinator.analysis.html import visible
-from evopolicy_coordinator.analysis.reading.environments import title_of
 from evopolicy_coordinator.web.feeds import View
+from evopolicy_results.html import visible
+from evopolicy_results.reading.environments import title_of
 
 STATES = {
     "pending": ("·", "waiting"),
@@ -40,7 +40,7 @@ _PRIORITIES = {
 def _environment() -> Environment:
     package = __package__ or ""
     environment = Environment(
-        loader=ChoiceLoader([PackageLoader(package), PackageLoader("evopolicy_coordinator.analysis.html")]),
+        loader=ChoiceLoader([PackageLoader(package), PackageLoader("evopolicy_results.html")]),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
@@ -58,7 +58,7 @@ def static_files() -> dict[str, tuple[bytes, str]]:
     """Static files of the pages, by name: bytes and content type."""
     types = {".css": "text/css; charset=utf-8", ".js": "text/javascript; charset=utf-8"}
     found: dict[str, tuple[bytes, str]] = {}
-    report = files("evopolicy_coordinator.analysis.html").joinpath("templates")
+    report = files("evopolicy_results.html").joinpath("templates")
     for folder, names in (
         (files(__package__ or "").joinpath("static"), ("web.css", "web.js", "idiomorph.min.js")),
         (report, ("report.css", "report.js")),

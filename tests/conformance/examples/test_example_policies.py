@@ -19,7 +19,7 @@ N_CASES = 2
 
 def paper_returns() -> dict[str, tuple[float, float]]:
     """Random's and the best agent's held-out mean by environment (Table 1 of the paper)."""
-    text = files("evopolicy_coordinator.analysis").joinpath("data/table1_heldout_returns.csv").read_text()
+    text = files("evopolicy_results").joinpath("data/table1_heldout_returns.csv").read_text()
     rows = list(csv.DictReader(text.splitlines()))
     return {
         env: (

@@ -13,10 +13,10 @@ from played import DATA, EARLIER, play
 from typer.testing import CliRunner
 
 from evopolicy_common.records.run_difference import differences
-from evopolicy_coordinator.analysis.reading.reader import read_run
-from evopolicy_coordinator.cli.results.report import app as report
+from evopolicy_results.cli.report import app as report
+from evopolicy_results.reading.reader import read_run
 
-VERIFY = "from evopolicy_common.cli.frame import run_app; from evopolicy_coordinator.cli.results.verify import app; run_app(app)"
+VERIFY = "from evopolicy_common.cli.frame import run_app; from evopolicy_results.cli.verify import app; run_app(app)"
 
 
 pytestmark = pytest.mark.timeout(600)

@@ -15,10 +15,10 @@ from typer.testing import CliRunner
 
 from evopolicy_common.errors import ConfigError, ProtocolError
 from evopolicy_common.records.run_record import decode_run_record
-from evopolicy_coordinator.analysis.reading.reader import read_or_explain, read_run
-from evopolicy_coordinator.analysis.reading.records import LeftOut
-from evopolicy_coordinator.cli.results.report import app
-from evopolicy_coordinator.verify.source import read_run as read_for_verify
+from evopolicy_results.cli.report import app
+from evopolicy_results.reading.reader import read_or_explain, read_run
+from evopolicy_results.reading.records import LeftOut
+from evopolicy_results.verify.source import read_run as read_for_verify
 
 
 def test_the_fixture_is_what_the_published_checker_passes(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import evopolicy_gateway.agents
-from evopolicy_coordinator.analysis.simulators.look import look
+from evopolicy_results.simulators.look import look
 
 HERE = Path(__file__).parent
 EXAMPLES = HERE.parents[2] / "examples" / "policies"

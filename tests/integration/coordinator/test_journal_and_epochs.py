@@ -24,8 +24,8 @@ from evopolicy_common.messages.operator import RunFinished
 from evopolicy_common.records import journal
 from evopolicy_common.wire.operator_client import OperatorClient
 from evopolicy_common.wire.transport import connect
-from evopolicy_coordinator.publish.signatures import signed_by
 from evopolicy_coordinator.storage.backup import back_up
+from evopolicy_results.publish.signatures import signed_by
 
 
 def command(*args: str) -> subprocess.CompletedProcess[str]:

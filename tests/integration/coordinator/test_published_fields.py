@@ -14,8 +14,8 @@ from publications import Forger, Held, Results, spelt
 
 from evopolicy_common.records.episodes.trajectory import Recorder, decode
 from evopolicy_common.records.run_record import RunRecord
-from evopolicy_coordinator.publish import contents, fields, rules
-from evopolicy_coordinator.publish.findings import Checked
+from evopolicy_results.publish import contents, fields, rules
+from evopolicy_results.publish.findings import Checked
 
 FILES = {
     "manifest.json": contents.MANIFEST,

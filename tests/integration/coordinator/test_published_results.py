@@ -25,9 +25,9 @@ from evopolicy_common.records import journal
 from evopolicy_common.records.episodes.trajectory import Recorder, decode
 from evopolicy_common.records.policies import bundles
 from evopolicy_common.records.policies.bundles import BundleFile
-from evopolicy_coordinator.publish import contents, rules, run_rules
-from evopolicy_coordinator.publish import replay as replays
-from evopolicy_coordinator.publish.findings import KINDS, Finding
+from evopolicy_results.publish import contents, rules, run_rules
+from evopolicy_results.publish import replay as replays
+from evopolicy_results.publish.findings import KINDS, Finding
 
 
 @pytest.fixture(scope="module")

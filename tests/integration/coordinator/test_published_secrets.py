@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from commands import evopolicy
 
-from evopolicy_coordinator.publish.archive import Archive
+from evopolicy_results.publish.archive import Archive
 
 KEY = "sk-" + "a1B2c3D4e5" * 3
 PLAIN = "hunter2 hunter2"

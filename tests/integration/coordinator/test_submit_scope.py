@@ -13,7 +13,9 @@ from typing import Any
 
 import pytest
 
-PROGRAM = "from evopolicy_common.cli.frame import run_app; from evopolicy_coordinator.cli.results.{0} import app; run_app(app)"
+PROGRAM = (
+    "from evopolicy_common.cli.frame import run_app; from evopolicy_results.cli.{0} import app; run_app(app)"
+)
 POLICY = """
 import time
 

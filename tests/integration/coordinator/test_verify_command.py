@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-VERIFY = "from evopolicy_common.cli.frame import run_app; from evopolicy_coordinator.cli.results.verify import app; run_app(app)"
+VERIFY = "from evopolicy_common.cli.frame import run_app; from evopolicy_results.cli.verify import app; run_app(app)"
 AGENT = """
 import json, os, urllib.request
 with open("system/policy.py", "w") as file:

@@ -21,14 +21,14 @@ from evopolicy_common.records.code_metrics import TREND, code_metrics
 from evopolicy_common.records.episodes.trajectory import Recorder, decode
 from evopolicy_common.records.policies import bundles
 from evopolicy_common.records.policies.bundles import BundleFile
-from evopolicy_coordinator.leaderboard.bundles import LabBundle, read_bundles
-from evopolicy_coordinator.leaderboard.compare import boards
 from evopolicy_coordinator.pki import identity
-from evopolicy_coordinator.publish import contents, rules
-from evopolicy_coordinator.publish.archive import Archive
-from evopolicy_coordinator.publish.findings import Checked
-from evopolicy_coordinator.publish.replay import replay
-from evopolicy_coordinator.publish.run_rules import return_of
+from evopolicy_results.leaderboard.bundles import LabBundle, read_bundles
+from evopolicy_results.leaderboard.compare import boards
+from evopolicy_results.publish import contents, rules
+from evopolicy_results.publish.archive import Archive
+from evopolicy_results.publish.findings import Checked
+from evopolicy_results.publish.replay import replay
+from evopolicy_results.publish.run_rules import return_of
 
 pytestmark = pytest.mark.timeout(900)
 PAGE = Path(__file__).parents[3] / "docs/how-to/publish.md"

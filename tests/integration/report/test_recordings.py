@@ -19,9 +19,9 @@ from typer.testing import CliRunner
 
 from evopolicy_common.records.run_difference import differences
 from evopolicy_common.records.run_record import RunRecord, decode_run_record
-from evopolicy_coordinator.analysis.behaviour.trace import trace
-from evopolicy_coordinator.analysis.reading.reader import load_runs
-from evopolicy_coordinator.cli.results.report import app
+from evopolicy_results.behaviour.trace import trace
+from evopolicy_results.cli.report import app
+from evopolicy_results.reading.reader import load_runs
 
 TIMEOUT_S = 600.0
 ENVIRONMENTS = ("toy/line", "gymnasium/FetchPickAndPlace-v4")

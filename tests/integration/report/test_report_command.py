@@ -17,9 +17,10 @@ from invented.run_dirs import write_run
 from invented.study import AGENTS, write_suite
 from typer.testing import CliRunner
 
-from evopolicy_coordinator.analysis import figures_of, rows, study, write_report
-from evopolicy_coordinator.analysis.scoring import paper
-from evopolicy_coordinator.cli.results.report import app
+from evopolicy_results.cli.report import app
+from evopolicy_results.notebook import figures_of, rows, write_report
+from evopolicy_results.scoring import paper
+from evopolicy_results.studies.study import study
 
 ENVIRONMENTS = ("gym/acrobot", "gym/racing", "toy/line")
 MP4 = bytes.fromhex("000000206674797069736f6d0000020069736f6d69736f32617663316d703431")

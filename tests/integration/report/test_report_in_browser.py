@@ -11,7 +11,7 @@ from browser import Page
 from invented.study import AGENTS, write_suite
 from typer.testing import CliRunner
 
-from evopolicy_coordinator.cli.results.report import app
+from evopolicy_results.cli.report import app
 
 COLUMN = """(() => {
   const table = document.getElementById(%r);

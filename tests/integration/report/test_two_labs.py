@@ -14,8 +14,8 @@ import pytest
 from browser import Page
 
 from evopolicy_common.records.run_record import decode_run_record
-from evopolicy_coordinator.publish import contents
-from evopolicy_coordinator.publish.archive import Archive, Writer
+from evopolicy_results.publish import contents
+from evopolicy_results.publish.archive import Archive, Writer
 
 pytestmark = pytest.mark.timeout(900)
 ROOT = Path(__file__).parents[3]

@@ -20,10 +20,10 @@ from evopolicy_common.wire import codec, keys, operator_client, requests, transp
 from evopolicy_common.wire.credentials import Credentials, Role
 from evopolicy_common.wire.requests import Requester
 from evopolicy_common.wire.transport import IncomingQuery, Link
-from evopolicy_coordinator.verify import run as verify_run
 from evopolicy_gateway.operator.operations import Operations
 from evopolicy_gateway.run import coordinator_client
 from evopolicy_gateway.run.coordinator_client import CoordinatorClient
+from evopolicy_results.verify import run as verify_run
 
 SOON_S = 0.2
 QUESTION = WaitRun(token="", run="r", wait_s=0.0)

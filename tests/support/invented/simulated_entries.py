@@ -11,14 +11,14 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from evopolicy_coordinator.analysis.scoring.normalised import Scale
-from evopolicy_coordinator.analysis.statistics.aggregates import aggregates
-from evopolicy_coordinator.analysis.statistics.intervals import difference, mean, of_runs
-from evopolicy_coordinator.analysis.statistics.pairs import pairs
-from evopolicy_coordinator.analysis.statistics.repeats import Spread, half_width, repeats_needed
-from evopolicy_coordinator.analysis.statistics.resampling import RESAMPLES
-from evopolicy_coordinator.analysis.statistics.samples import RunReturns, Sample
-from evopolicy_coordinator.analysis.statistics.standings import standings
+from evopolicy_results.scoring.normalised import Scale
+from evopolicy_results.statistics.aggregates import aggregates
+from evopolicy_results.statistics.intervals import difference, mean, of_runs
+from evopolicy_results.statistics.pairs import pairs
+from evopolicy_results.statistics.repeats import Spread, half_width, repeats_needed
+from evopolicy_results.statistics.resampling import RESAMPLES
+from evopolicy_results.statistics.samples import RunReturns, Sample
+from evopolicy_results.statistics.standings import standings
 
 Floats = NDArray[np.float64]
 Generator = np.random.Generator

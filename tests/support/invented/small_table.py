@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from evopolicy_coordinator.analysis.tables.table import Column, Table, best_marks
+from evopolicy_results.tables.table import Column, Table, best_marks
 
 ROWS = (
     {"who": "A & B_1", "x": 1.23456, "share": 0.5, "n": 3},

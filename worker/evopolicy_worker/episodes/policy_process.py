@@ -33,7 +33,14 @@ from evopolicy_worker.slots.endings import EndedFromOutsideError, Ending
 _DENIED = frozenset(
     {
         *SIMULATORS,
-        *("evopolicy_common", "evopolicy_worker", "evopolicy_coordinator", "evopolicy_gateway", "zenoh"),
+        *(
+            "evopolicy_common",
+            "evopolicy_worker",
+            "evopolicy_coordinator",
+            "evopolicy_results",
+            "evopolicy_gateway",
+        ),
+        "zenoh",
     }
 )
 """Modules that a policy may not import: simulators and our own code, which it does not see."""

@@ -13,13 +13,13 @@ from markupsafe import Markup
 
 from evopolicy_common.cli.conventions import bytes_text
 from evopolicy_common.messages.status import DiskUse, StatusReply, WorkerStatus
-from evopolicy_coordinator.analysis.reading.environments import title_of
 from evopolicy_coordinator.web.charts import Line, chart
 from evopolicy_coordinator.web.cluster import Cluster
 from evopolicy_coordinator.web.feeds import View
 from evopolicy_coordinator.web.rendering import duration, part, short
 from evopolicy_coordinator.web.run_folders import RunFacts, Runs
 from evopolicy_coordinator.web.tables import PAGE_ROWS, Words, ident, matches, paged
+from evopolicy_results.reading.environments import title_of
 
 _NOTICE_LINES = 5
 """Lines of a notice; tables have the rest."""

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from evopolicy_coordinator.cli.results.cluster import where_of
+from evopolicy_results.cli.cluster import where_of
 
 
 def _sweep(folder: Path, name: str) -> Path:
@@ -45,7 +45,7 @@ def test_another_users_folder_beside_the_runs_does_not_end_the_command() -> None
     program = """
 import os, sys
 from pathlib import Path
-from evopolicy_coordinator.cli.results.cluster import where_of
+from evopolicy_results.cli.cluster import where_of
 
 if os.getuid() == 0:
     os.setuid(65534)

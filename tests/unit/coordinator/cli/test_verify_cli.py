@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from evopolicy_coordinator.cli.results import verify
+from evopolicy_results.cli import verify
 
 
 def test_verify_ended_by_a_signal_says_so_in_a_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

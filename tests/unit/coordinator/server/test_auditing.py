@@ -15,6 +15,7 @@ from rigs.store_rows import blob, outcome_row, run_row, state_row
 
 from evopolicy_common.messages.episode import EpisodeOutcome
 from evopolicy_common.records.blobs import BlobStore
+from evopolicy_common.records.episodes import compare
 from evopolicy_common.records.episodes.rendered import MAGIC
 from evopolicy_common.records.episodes.trajectory import Recorder, decode
 from evopolicy_coordinator.core.contract.effects import CompareAudit, PrepareAudit
@@ -23,7 +24,6 @@ from evopolicy_coordinator.core.contract.records import AuditRow, OutcomeRow
 from evopolicy_coordinator.server import auditing
 from evopolicy_coordinator.storage.disk_use import collect
 from evopolicy_coordinator.storage.store import Reader, Store
-from evopolicy_coordinator.verify import compare
 
 GROUP = "r-1/s0/train"
 ACTIONS = [np.array([0.25], np.float32), [1, 2.5], {"a": float("nan")}, np.float64(-0.0), None, "left"]

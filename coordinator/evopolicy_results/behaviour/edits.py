@@ -1,0 +1,175 @@
+"""Edit types: the kind of change of each score-bearing submit, and its effect (paper, mechanism section, Table "edit
+types").
+
+A *transition* goes from one score-bearing submit (ok, with a validation mean) to the next. Its type follows from the
+source bundle's topology, which leaves out numeric constants (`topology`), in this order:
+
+- `retest`: the source bundle and all of `system/` are byte-identical to the previous ones.
+- `data`: the source bundle is byte-identical, and other files of `system/` changed (weights, tables, unreachable
+  modules). Those are outside the paper's boundary, so this is neither edit type. It is no retest either, as the
+  policy may act differently. If the checkpoints' digests are unknown, such submits count as retests.
+- `parametric`: bytes changed, and the topology equals that of the immediately previous submit.
+- `rollback`: the topology differs from the previous one, and an earlier score-bearing submit of this run had it.
+- `synthesis`: the topology is new to this run.
+
+The first score-bearing submit has no predecessor. Its type is `first`; it is no transition, counts in no rate, and is
+counted among the excluded. A transition is a *hit* when it strictly raises the best validation mean so far.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import msgspec
+
+from evopolicy_common import catalogue
+from evopolicy_results.reading.records import EditType, Run, Submit
+
+RATED: tuple[EditType, ...] = ("synthesis", "parametric")
+"""The edit types that have a hit rate; the others are candidate management."""
+
+
+class Transition(msgspec.Struct, frozen=True, kw_only=True):
+    """One score-bearing submit and its relation to the previous one."""
+
+    index: int
+    """Submit index."""
+    previous: int | None
+    """Index of the previous score-bearing submit; None for the first."""
+    consumed_before: int
+    consumed: int
+    edit: EditType
+    hit: bool
+    """Whether it raised the best validation mean so far; always true for the first."""
+    val_mean: float
+    best: float
+    """Best validation mean so far, including this submit."""
+    val_drop: bool
+    """Whether the validation mean is below that of the previous score-bearing submit."""
+    mean_return: float | None
+    mean_improved: bool | None
+    """Whether the visible mean rose; None for the first."""
+    changed_lines: int | None
+    """Edit size; None for the first, and after an ok submit without a score."""
+    back_to: int | None = None
+    """For a rollback: the latest earlier submit with that topology."""
+
+
+class EditRates(msgspec.Struct, frozen=True, kw_only=True):
+    """One row of the edit-type table: an entry's edits in one demand group, pooled over its runs."""
+
+    entry: str
+    demand: str
+    """`synthesis`, `tuning`, or `all` for every environment, including those that the paper places in neither group."""
+    n_synthesis: int = 0
+    hits_synthesis: int = 0
+    n_parametric: int = 0
+    hits_parametric: int = 0
+    n_rollback: int = 0
+    n_retest: int = 0
+    n_data: int = 0
+    """Submits that changed only files outside the source bundle."""
+    n_first: int = 0
+    n_not_ok: int = 0
+    """Accepted submits that are not ok."""
+    n_unscored: int = 0
+    """Ok submits without a validation mean or a readable policy."""
+
+    @property
+    def rate_synthesis(self) -> float | None:
+        """Share of syntheses that hit; None if there are none."""
+        return self.hits_synthesis / self.n_synthesis if self.n_synthesis else None
+
+    @property
+    def rate_parametric(self) -> float | None:
+        """Share of parametric edits that hit; None if there are none."""
+        return self.hits_parametric / self.n_parametric if self.n_parametric else None
+
+
+def classify(submits: Sequence[Submit]) -> list[Transition]:
+    """One record for every score-bearing submit of a run, in order; the first has edit type `first`."""
+    out: list[Transition] = []
+    seen: dict[str, int] = {}
+    previous: Submit | None = None
+    best = float("-inf")
+    skipped = False
+    for submit in submits:
+        if not submit.is_scored:
+            skipped = skipped or submit.status == "ok"
+            continue
+        assert submit.source is not None
+        assert submit.val_mean is not None
+        edit = _edit(previous, submit, seen)
+        hit = submit.val_mean > best
+        best = max(best, submit.val_mean)
+        out.append(
+            Transition(
+                index=submit.index,
+                previous=previous.index if previous is not None else None,
+                consumed_before=submit.consumed_before,
+                consumed=submit.consumed,
+                edit=edit,
+                hit=hit,
+                val_mean=submit.val_mean,
+                best=best,
+                val_drop=bool(out) and submit.val_mean < out[-1].val_mean,
+                mean_return=submit.mean_return,
+                mean_improved=_improved(previous, submit),
+                changed_lines=submit.changed_lines if previous is not None and not skipped else None,
+                back_to=seen.get(submit.source.topology) if edit == "rollback" else None,
+            )
+        )
+        seen[submit.source.topology] = submit.index
+        previous = submit
+        skipped = False
+    return out
+
+
+def _edit(previous: Submit | None, submit: Submit, seen: dict[str, int]) -> EditType:
+    assert submit.source is not None
+    if previous is None or previous.source is None:
+        return "first"
+    if submit.source.digest == previous.source.digest:
+        known = bool(submit.bundle_digest and previous.bundle_digest)
+        return "data" if known and submit.bundle_digest != previous.bundle_digest else "retest"
+    if submit.source.topology == previous.source.topology:
+        return "parametric"
+    return "rollback" if submit.source.topology in seen else "synthesis"
+
+
+def _improved(previous: Submit | None, submit: Submit) -> bool | None:
+    if previous is None or previous.mean_return is None or submit.mean_return is None:
+        return None
+    return submit.mean_return > previous.mean_return
+
+
+def edit_rates(runs: Iterable[Run]) -> list[EditRates]:
+    """Rows by entry (sorted) and demand group, with `all` last in each entry. Counts are pooled over runs."""
+    counts: dict[tuple[str, str], dict[str, int]] = {}
+    for run in runs:
+        transitions = classify(run.submits)
+        demand = demand_of(run.env)
+        for group in ([demand] if demand else []) + ["all"]:
+            row = counts.setdefault((run.entry, group), {})
+            for transition in transitions:
+                _count(row, f"n_{transition.edit}")
+                if transition.hit and transition.edit in RATED:
+                    _count(row, f"hits_{transition.edit}")
+            for submit in run.submits:
+                if submit.status != "ok":
+                    _count(row, "n_not_ok")
+                elif not submit.is_scored:
+                    _count(row, "n_unscored")
+    order = {"synthesis": 0, "tuning": 1, "all": 2}
+    keys = sorted(counts, key=lambda key: (key[0].casefold(), key[0], order[key[1]]))
+    return [EditRates(entry=entry, demand=group, **counts[entry, group]) for entry, group in keys]
+
+
+def _count(row: dict[str, int], key: str) -> None:
+    row[key] = row.get(key, 0) + 1
+
+
+def demand_of(env: str) -> str | None:
+    """The environment's demand group in the catalogue; None if it has none or is unknown."""
+    found = catalogue.entries().get(env)
+    return found.demand if found is not None else None

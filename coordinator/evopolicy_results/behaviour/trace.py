@@ -1,0 +1,153 @@
+"""Feedback use, submit by submit (paper, "feedback-utilization traces"): evidence read, change made, outcome seen.
+
+One `TraceRow` per submit: what the agent read and wrote since the previous submit (`agent_log`, if the log shows it),
+how the policy changed, and the result. Sources and images stay on disk until a page needs them.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping
+from pathlib import Path
+
+import msgspec
+
+from evopolicy_common.processes.left_files import left_files
+from evopolicy_common.records.policies.checkpoints import policy_folder
+from evopolicy_common.regular_files import read_regular
+from evopolicy_results.behaviour.edits import Transition, classify
+from evopolicy_results.code.line_diff import unified
+from evopolicy_results.code.sources import read_python_files
+from evopolicy_results.reading.agent_log import Evidence, LogReading, read_agent_log
+from evopolicy_results.reading.records import Run, Submit, checkpoint_folder
+
+IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".gif", ".webp"})
+MAX_IMAGE_BYTES = 4 << 20
+MAX_IMAGES = 40
+"""Maximum number of images on one run's page."""
+MAX_DIFF_LINES = 1500
+"""Maximum number of kept lines of one diff; the others are counted."""
+
+
+class TraceRow(msgspec.Struct, frozen=True, kw_only=True):
+    """One accepted submit."""
+
+    submit: Submit
+    transition: Transition | None
+    """None for a submit without a score."""
+    evidence: Evidence | None
+    """None if the log has no evidence of it."""
+    images: tuple[Path, ...]
+    """Images that the agent made before this submit."""
+    video: Path | None
+    """The first recorded episode of its feedback; None if the run recorded none."""
+
+
+class FileDiff(msgspec.Struct, frozen=True, kw_only=True):
+    """One file's unified diff, three lines of context."""
+
+    path: str
+    lines: tuple[str, ...]
+    """Without line ends; each begins with ` `, `+`, `-` or `@`."""
+    cut: int
+    """Number of lines left out at the end."""
+
+
+class Trace(msgspec.Struct, frozen=True, kw_only=True):
+    run: Run
+    rows: tuple[TraceRow, ...]
+    unplaced: tuple[str, ...]
+    """Messages of the agent that belong to no known submit."""
+
+
+def trace(run: Run) -> Trace:
+    """Reads the run's log and finds its images."""
+    log = run.record.artifacts.logs_agent
+    reading = read_agent_log(run.path / log, run.submits) if log else LogReading()
+    transitions = {t.index: t for t in classify(run.submits)}
+    images = _images(run, reading)
+    rows = [
+        TraceRow(
+            submit=submit,
+            transition=transitions.get(submit.index),
+            evidence=reading.by_submit.get(submit.index),
+            images=tuple(images.get(submit.index, ())),
+            video=_first_video(run, submit),
+        )
+        for submit in run.submits
+    ]
+    return Trace(run=run, rows=tuple(rows), unplaced=reading.unplaced)
+
+
+def _first_video(run: Run, submit: Submit) -> Path | None:
+    workspace = run.path / (run.record.artifacts.workspace or "workspace")
+    episodes = checkpoint_folder(workspace, "feedback", submit.index) / "episodes"
+    return next((path for path in sorted(episodes.glob("ep_*/video.mp4"))), None)
+
+
+def sources(run: Run, submit: Submit) -> dict[str, str]:
+    """Text of a checkpoint's source bundle by path, `policy.py` first; all its Python files if it has no bundle."""
+    system = policy_folder(run.checkpoint(submit.index))
+    try:
+        if submit.source is not None:
+            found = {path: read_regular(system / path) for path in submit.source.files}
+        else:
+            found = read_python_files(system)
+    except OSError:
+        return {}
+    ordered = sorted(found, key=lambda path: (path != "policy.py", path))
+    return {path: found[path].decode("utf-8", "replace") for path in ordered}
+
+
+def diff(before: Mapping[str, str], after: Mapping[str, str]) -> list[FileDiff]:
+    """Diffs of the files that differ, `policy.py` first."""
+    out: list[FileDiff] = []
+    for path in sorted({*before, *after}, key=lambda path: (path != "policy.py", path)):
+        old, new = before.get(path, ""), after.get(path, "")
+        if old == new:
+            continue
+        body = unified(old.splitlines(), new.splitlines())
+        out.append(
+            FileDiff(path=path, lines=tuple(body[:MAX_DIFF_LINES]), cut=max(0, len(body) - MAX_DIFF_LINES))
+        )
+    return out
+
+
+def _images(run: Run, reading: LogReading) -> dict[int, list[Path]]:
+    """Images by submit index: new in that checkpoint's `system/`, or in the final workspace and named in its part of
+    the log.
+
+    Workspace images that the log does not name are shown with the last submit.
+    """
+    if not run.submits:
+        return {}
+    found: dict[int, list[Path]] = {}
+    known: set[tuple[str, int]] = set()
+    total = 0
+    for submit in run.submits:
+        for path in _image_files(policy_folder(run.checkpoint(submit.index)), MAX_IMAGES):
+            key = (path.name, path.stat().st_size)
+            if key not in known and total < MAX_IMAGES:
+                known.add(key)
+                found.setdefault(submit.index, []).append(path)
+                total += 1
+    named = {
+        Path(name).name: index for index, evidence in reading.by_submit.items() for name in evidence.images
+    }
+    workspace = run.path / (run.record.artifacts.workspace or "workspace")
+    for path in _image_files(workspace, MAX_IMAGES, skip="feedback"):
+        key = (path.name, path.stat().st_size)
+        if key not in known and total < MAX_IMAGES:
+            known.add(key)
+            found.setdefault(named.get(path.name, run.submits[-1].index), []).append(path)
+            total += 1
+    return found
+
+
+def _image_files(folder: Path, limit: int, skip: str | None = None) -> list[Path]:
+    found = (
+        path
+        for path, size in left_files(folder, enter=lambda name: name != skip and not name.startswith("."))
+        if path.suffix.lower() in IMAGE_SUFFIXES and size <= MAX_IMAGE_BYTES
+    )
+    return list(itertools.islice(found, limit))

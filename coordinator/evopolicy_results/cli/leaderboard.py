@@ -1,0 +1,127 @@
+"""`evopolicy leaderboard FILES…`: a static site from published results of several labs.
+
+Exit codes: 0 written, 1 no file could be shown, 2 wrong usage.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import random
+import re
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from evopolicy_common.cli.conventions import fail, fail_on_our_errors
+from evopolicy_common.cli.frame import App
+from evopolicy_common.errors import ConfigError
+from evopolicy_common.processes.preflight import check_writable
+from evopolicy_common.processes.scratch import scratch_folder
+from evopolicy_common.terminal import one_line, say, say_json
+from evopolicy_results.publish.archive import Archive
+from evopolicy_results.publish.findings import Checked
+from evopolicy_results.publish.replay import replay as replayed
+from evopolicy_results.publish.replay import share_of
+
+NOTHING = 1
+
+app = App(name="leaderboard")
+
+
+@app.command(
+    name="leaderboard",
+    epilog="Example: evopolicy leaderboard lab-a.evp lab-b.evp --identity KEY=Lab-A --out site && xdg-open site/index.html",
+)
+def leaderboard(
+    files: Annotated[
+        list[Path], typer.Argument(metavar="FILES...", help="Published results.", show_default=False)
+    ],
+    out: Annotated[
+        Path, typer.Option(help="Folder to write; a new one, or an earlier site's.", show_default=False)
+    ],
+    identity: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="KEY[=NAME]",
+            help="Public key of a signer, from another source than the file, and the name of the lab; may be repeated.",
+            show_default=False,
+        ),
+    ] = None,
+    replay: Annotated[
+        str | None,
+        typer.Option(
+            metavar="SHARE",
+            help="Replay recorded actions of each file: `5%` of the episodes, drawn at random, or `all`.",
+            show_default=False,
+        ),
+    ] = None,
+    slots: Annotated[
+        int, typer.Option(min=1, max=1024, help="With --replay: episodes at the same time.")
+    ] = 2,
+    title: Annotated[str, typer.Option(help="Heading of the site.")] = "Leaderboard",
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print the listed and the rejected files as JSON.")
+    ] = False,
+) -> None:
+    """Write a leaderboard of several labs' published results as a static site.
+
+    Checks each file first. Files that fail are listed with the reason and not ranked. Results that cannot be compared get separate
+    tables.
+    """
+    labs: dict[str, str] = {}
+    for each in identity or ():
+        key, _, name = each.partition("=")
+        if not re.fullmatch(r"[0-9a-fA-F]{64}", key):
+            fail(
+                f"--identity {each!r}: 64 hexadecimal digits, as `evopolicy-coordinator identity` prints them, then =NAME"
+            )
+        labs[key.lower()] = name
+    share = None
+    if replay is not None:
+        try:
+            share = share_of(replay)
+        except ValueError:
+            fail(f"--replay {replay!r}: say a share such as 5%, or all")
+    for path in files:
+        if not path.is_file():
+            fail(f"{path}: there is no such file")
+    # Here, not above: they need jinja2 and matplotlib, and `evopolicy` loads this module to list its commands.
+    from evopolicy_results.leaderboard.bundles import read_bundles
+    from evopolicy_results.leaderboard.write import write_site
+
+    def play(archive: Archive, checked: Checked) -> None:
+        assert share is not None
+        drawn = random.SystemRandom().randrange(2**32)
+        asyncio.run(replayed(archive, checked, share, drawn, slots, lambda played, total: None))
+
+    with fail_on_our_errors(), scratch_folder("leaderboard") as folder:
+        check_writable(out, "--out")
+        try:
+            bundles = read_bundles(files, labs, Path(folder), None if share is None else play)
+        except OSError as error:
+            raise ConfigError(f"{error.filename}: {error.strerror}") from error
+        shown = [bundle for bundle in bundles if not bundle.refused]
+        index = write_site(bundles, out, title=title, tell=lambda text: say(one_line(text), err=True))
+        summary = {
+            "index": str(index),
+            "files": [
+                {
+                    "file": one.file,
+                    "signer": one.signer,
+                    "lab": one.lab,
+                    "runs": len(one.runs),
+                    "refused": one.refused,
+                }
+                for one in bundles
+            ],
+        }
+    if as_json:
+        say_json(summary)
+    else:
+        for one in bundles:
+            if one.refused:
+                say(one_line(f"not shown: {one.file}: {one.refused}"), err=True)
+        say(f"{len(shown)} of {len(bundles)} files: {index}")
+    if not shown:
+        raise typer.Exit(NOTHING)

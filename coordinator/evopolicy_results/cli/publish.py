@@ -1,0 +1,326 @@
+"""`evopolicy publish`, `evopolicy check`: results that others can check, and the check.
+
+Exit codes of `check`: 0 nothing contradicts, 1 something does, 2 wrong usage or no file of published results, 3 a replay that
+was asked for could not be done, or not of all parts of a run.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import functools
+import random
+import re
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+import typer
+
+from evopolicy_common.cli.conventions import (
+    Connect,
+    CredentialsFile,
+    end_on_sigterm,
+    fail,
+    fail_on_our_errors,
+)
+from evopolicy_common.cli.frame import App
+from evopolicy_common.console import table, terminal
+from evopolicy_common.errors import DECODE_ERRORS, ConfigError, ProtocolError
+from evopolicy_common.processes.packages import checked_names
+from evopolicy_common.regular_files import read_given
+from evopolicy_common.terminal import one_line, say, say_json
+from evopolicy_results.cli.cluster import Local, State, where_of
+from evopolicy_results.publish import replay as replays
+from evopolicy_results.publish import rules
+from evopolicy_results.publish.archive import Archive
+from evopolicy_results.publish.collect import Published, Publisher, find_runs, needles_of_this_machine
+from evopolicy_results.publish.contents import Countersignature, Listed
+from evopolicy_results.publish.findings import KINDS, Checked
+from evopolicy_results.publish.policies import play_policies
+from evopolicy_results.publish.scan import scan_published
+
+FAILED, NOT_REPLAYED = 1, 3
+_SHOWN = 20
+
+app = App(name="publish")
+check_app = App(name="check")
+
+
+@app.command(name="publish", epilog="Example: evopolicy publish runs/evolve --out evolve.evp --local")
+def publish(
+    runs: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="RUNS...", help="Finished runs' directories, or folders of them.", show_default=False
+        ),
+    ],
+    out: Annotated[Path, typer.Option(help="File to write, such as results.evp.")],
+    connect: Connect = None,
+    file: CredentialsFile = None,
+    local: Local = False,
+    state: State = None,
+    with_logs: Annotated[
+        bool,
+        typer.Option("--with-logs", help="Publish the agents' logs too, with the same removals."),
+    ] = False,
+    remove_findings: Annotated[
+        bool,
+        typer.Option("--remove-findings", help="Leave out policies and recordings that hold keys or tokens."),
+    ] = False,
+    accept_finding: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="FILE:LINE",
+            help="Publish this line as it is, though it looks like a secret; may be repeated.",
+            show_default=False,
+        ),
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print what was published as JSON.")] = False,
+) -> None:
+    """Write finished runs into one signed file that anyone can check, and make their cases public.
+
+    This cannot be undone: no new run plays cases of the same epoch (see `evopolicy-coordinator epoch`). Paths, host names, users,
+    variables and tokens are removed; removed.json in the file lists them. Keys in policies or recordings, and values that a run
+    passed to its agent, stop the command: see --remove-findings and --accept-finding.
+    """
+    where = where_of(connect, file, local, state, runs=runs)
+    if out.exists():
+        fail(f"--out {out} is there already; name a new file")
+    if not out.absolute().parent.is_dir():
+        fail(f"--out {out}: there is no folder {out.parent}")
+
+    async def work() -> Published:
+        end_on_sigterm()
+        found, left = find_runs(runs)
+        async with where.link("publish") as (link, _):
+            needles = needles_of_this_machine(link, *runs, *([state] if state else []))
+            publisher = Publisher(
+                link,
+                lambda text: say(one_line(text), err=True),
+                needles,
+                with_logs=with_logs,
+                remove_findings=remove_findings,
+                accepted=accept_finding or (),
+            )
+            return await publisher.publish(found, out, left)
+
+    with fail_on_our_errors():
+        done = asyncio.run(work())
+    if as_json:
+        say_json(done)
+        return
+    say(f"{done.path}: {done.runs} runs, {done.bytes:,} bytes, signed by {done.signer}")
+    say(f"journal head: {done.journal_head}")
+    for each in done.folders_left_out[:_SHOWN]:
+        say(one_line(f"left out: {each.what}: {each.why}"))
+    if len(done.folders_left_out) > _SHOWN:
+        say(f"… and {len(done.folders_left_out) - _SHOWN} more (--json tells all)")
+    say(f"completeness: {done.completeness}; {len(done.folders_left_out)} folders were left out")
+    _say_listing("left out, of the same entries:", done.left_out)
+    say(f"{len(done.removed)} things were removed; removed.json in the file lists them")
+    say(f"next: evopolicy check {done.path} --identity {done.signer}")
+
+
+@check_app.command(name="check", epilog="Example: evopolicy check results.evp --replay 5% --identity KEY")
+def check(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="Published results.", show_default=False)],
+    replay: Annotated[
+        str | None,
+        typer.Option(
+            metavar="SHARE",
+            help="Replay recorded actions: `5%` of the episodes, drawn at random, or `all`.",
+            show_default=False,
+        ),
+    ] = None,
+    policies: Annotated[
+        str | None,
+        typer.Option(
+            metavar="SHARE",
+            help="Also play policies that declare themselves deterministic, in the sandbox, and compare their actions: `5%` of the"
+            " episodes, or `all`.",
+            show_default=False,
+        ),
+    ] = None,
+    policy_package: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--policy-package",
+            metavar="NAME",
+            help="With --policies: package that policies may import besides numpy, where their run names it; may be repeated.",
+            show_default=False,
+        ),
+    ] = None,
+    identity: Annotated[
+        str | None,
+        typer.Option(
+            help="Public key of the expected signer, from another source than the file.",
+            show_default=False,
+        ),
+    ] = None,
+    head: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="HEAD",
+            help="Head of the journal that you noted earlier: 64 hexadecimal digits, or a file written by"
+            " `evopolicy-coordinator countersign`; may be repeated.",
+            show_default=False,
+        ),
+    ] = None,
+    seed: Annotated[
+        int | None, typer.Option(help="Seed of the draw; default: random.", show_default=False)
+    ] = None,
+    slots: Annotated[int, typer.Option(min=1, max=1024, help="Episodes at the same time.")] = 2,
+    as_json: Annotated[bool, typer.Option("--json", help="Print all findings as JSON.")] = False,
+) -> None:
+    """Check published results.
+
+    Checks signature, digests, commitments, journal, selection and scores; with --replay also the recorded episodes. Executes nothing
+    of the file, except policies in the sandbox with --policies. Exit codes: 0 no contradiction, 1 a contradiction, 2 wrong usage or
+    no such file, 3 a replay was not possible, or some episodes have no recording.
+    """
+    if identity is not None and not re.fullmatch(r"[0-9a-fA-F]{64}", identity):
+        fail(
+            f"--identity {identity!r}: 64 hexadecimal digits, as `evopolicy-coordinator identity` prints them"
+        )
+    share, policy_share = _share("--replay", replay), _share("--policies", policies)
+    if policy_package and policy_share is None:
+        fail("--policy-package goes with --policies")
+    noted = [_noted(each) for each in head or ()]
+    drawn = random.SystemRandom().randrange(2**32) if seed is None else seed
+    with fail_on_our_errors():
+        play_them = functools.partial(play_policies, packages=frozenset(checked_names(policy_package)))
+        try:
+            with Archive(file) as archive:
+                checked = rules.check(archive, identity or "", noted)
+                scan_published(archive, checked)
+                contradicts = checked.failed
+                if share is None:
+                    checked.add("replay", "open", "not asked for; --replay 5% plays recorded actions again")
+                elif not contradicts:
+                    asyncio.run(_play("replay", replays.replay, archive, checked, share, drawn, slots))
+                else:
+                    checked.add("replay", "open", "not played, as the file contradicts itself")
+                if policy_share is not None and not contradicts:
+                    asyncio.run(_play("policies", play_them, archive, checked, policy_share, drawn, slots))
+        except ProtocolError as error:
+            raise ConfigError(f"{file}: {error}") from error
+        except OSError as error:
+            raise ConfigError(f"{file}: {error.strerror or error}") from error
+    if as_json:
+        result = {
+            "file": str(file),
+            "ok": not checked.failed,
+            "signer": checked.signer,
+            "findings": checked.findings,
+            "claims": checked.claims,
+            "covered": checked.covered,
+            "listing": checked.listing,
+            "removed": checked.removed,
+        }
+        say_json(result)
+    else:
+        _print(checked)
+    replayed = share is None or not (
+        any(each.kind == "replay" and each.state == "open" for each in checked.findings)
+        or any(map(checked.unrecorded, checked.recorded))
+    )
+    raise typer.Exit(FAILED if checked.failed else 0 if replayed else NOT_REPLAYED)
+
+
+def _noted(text: str) -> str | Countersignature:
+    """A noted head. Ends the command for anything else."""
+    if re.fullmatch(r"[0-9a-fA-F]{64}", text):
+        return text.lower()
+    try:
+        return msgspec.json.decode(read_given(Path(text), "a file of that name", 4096), type=Countersignature)
+    except (ConfigError, *DECODE_ERRORS) as error:
+        fail(f"--head {text!r} is neither 64 hexadecimal digits nor a countersignature's file: {error}")
+
+
+def _share(option: str, text: str | None) -> float | None:
+    if text is None:
+        return None
+    try:
+        return replays.share_of(text)
+    except ValueError:
+        fail(f"{option} {text!r}: say a share such as 5%, or all")
+
+
+async def _play(
+    what: str,
+    play: Callable[..., Awaitable[None]],
+    archive: Archive,
+    checked: Checked,
+    share: float,
+    seed: int,
+    slots: int,
+) -> None:
+    end_on_sigterm()
+    console = terminal(stderr=True)
+    with console.status(what) as status:
+
+        def tell(played: int, total: int) -> None:
+            status.update(f"{what}: {played} of {total} episodes")
+
+        await play(archive, checked, share, seed, slots, tell)
+
+
+def _print(checked: Checked) -> None:
+    """One page: a line a kind; where something fails or cannot be shown, what and where."""
+    marks = {"ok": "ok    ", "open": "open  ", "failed": "FAILED"}
+    for kind, meaning in KINDS.items():
+        of_kind = [each for each in checked.findings if each.kind == kind]
+        if not of_kind:
+            continue
+        for state in ("failed", "open"):
+            lines: dict[str, list[str]] = {}
+            for each in of_kind:
+                if each.state == state:
+                    lines.setdefault(each.text, []).append(each.run)
+            for text, named in list(lines.items())[:_SHOWN]:
+                where = (
+                    "" if not named[0] else f" [{named[0]}]" if len(named) == 1 else f" [{len(named)} runs]"
+                )
+                say(one_line(f"{marks[state]} {kind}: {text}{where}"))
+            if len(lines) > _SHOWN:
+                say(f"{marks[state]} {kind}: … and {len(lines) - _SHOWN} more (--json tells all)")
+        if all(each.state == "ok" for each in of_kind):
+            n = len({each.run for each in of_kind if each.run})
+            say(one_line(f"{marks['ok']} {kind}: " + (f"{meaning} ({n} runs)" if n else of_kind[0].text)))
+    if checked.covered:
+        say(f"the replay covered {checked.coverage()} episodes")
+    _say_listing(
+        "left out, of the same entries:", [each for each in checked.listing if each.state != "published"]
+    )
+    shown = (
+        "something in this file contradicts itself or what you expect"
+        if checked.failed
+        else "nothing in this file contradicts itself"
+    )
+    without = sum(bool(checked.unrecorded(run)) for run in checked.recorded)
+    if without:
+        shown += f"; {without} of {len(checked.recorded)} runs have episodes without a recording, which no replay can confirm"
+    known = any(each.kind == "identity" and each.state == "ok" for each in checked.findings)
+    say(f"verdict: {shown}; " + ("the signer is the one that you named" if known else "self-signed"))
+
+
+def _say_listing(heading: str, listed: list[Listed] | tuple[Listed, ...]) -> None:
+    if not listed:
+        return
+    say(heading)
+    shown = table("run", "entry", "environment", "experiment", "repeat", "attempt", "state", "replaced by")
+    for each in listed[:_SHOWN]:
+        shown.add_row(
+            each.run,
+            each.entry,
+            each.env,
+            each.exp_id,
+            str(each.repeat),
+            str(each.attempt),
+            each.state,
+            each.replaced_by,
+        )
+    terminal().print(shown)
+    if len(listed) > _SHOWN:
+        say(f"… and {len(listed) - _SHOWN} more")

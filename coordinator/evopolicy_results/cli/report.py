@@ -1,0 +1,195 @@
+"""`evopolicy report`: run directories in, a folder with the report out.
+
+It reads hidden scores, so it comes with the coordinator's extra. Needs no coordinator, worker or simulator. Exit codes: 0
+written, 1 no complete run among what was given or a disk that refuses, 2 wrong usage, 3 the runs are no fair comparison.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+from evopolicy_common.cli.conventions import code_of, fail
+from evopolicy_common.cli.frame import App
+from evopolicy_common.console import terminal
+from evopolicy_common.errors import ConfigError
+from evopolicy_common.processes.preflight import check_writable
+from evopolicy_common.records.rescores import is_name
+from evopolicy_common.regular_files import read_given
+from evopolicy_common.terminal import say, say_json, say_lines
+from evopolicy_results.reading.comparability import REMEDIES, UNKNOWN_ISOLATION, MixedRunsError
+from evopolicy_results.reading.reader import load_runs
+from evopolicy_results.reading.rescored import rescored
+from evopolicy_results.scoring.scores import ScoreTable, read_score_csv
+from evopolicy_results.studies.study import Study, study_of
+
+if TYPE_CHECKING:
+    from evopolicy_results.report import Progress as Tell
+
+NOTHING, MIXED = 1, 3
+
+app = App(name="report")
+
+
+@app.command(
+    name="report",
+    epilog="Example: evopolicy report runs --out report && xdg-open report/index.html",
+)
+def report(
+    runs: Annotated[
+        list[Path],
+        typer.Argument(
+            help="Run directories, or folders that contain them. A CSV of held-out returns (entry,harness,<environment>,…) adds "
+            "entries without runs.",
+            show_default=False,
+        ),
+    ],
+    out: Annotated[
+        Path, typer.Option(help="Folder to write; a new one, or an earlier report's.", show_default=False)
+    ],
+    scores: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help="Use the held-out scores of this re-score of `evopolicy rescore`; the report labels them post hoc.",
+            show_default=False,
+        ),
+    ] = None,
+    title: Annotated[str | None, typer.Option(help="Heading of the report.", show_default=False)] = None,
+    allow_mixed: Annotated[
+        bool,
+        typer.Option(
+            "--allow-mixed",
+            help="Compare runs with different budgets, policy scopes, splits, fingerprints, jails or hidden isolation; the report "
+            "says so.",
+        ),
+    ] = False,
+    allow_unknown: Annotated[
+        bool,
+        typer.Option(
+            "--allow-unknown",
+            help="Compare runs without recorded hidden isolation, which are old, with newer ones; the report says so.",
+        ),
+    ] = False,
+    pages: Annotated[
+        bool,
+        typer.Option(
+            "--pages/--no-pages", help="Write a page for each run: feedback use, checkpoints, differences."
+        ),
+    ] = True,
+    jobs: Annotated[
+        int, typer.Option(min=0, help="Number of processes; 0: one for each core.", show_default=True)
+    ] = 0,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print the written files and the excluded runs as JSON.")
+    ] = False,
+) -> None:
+    """Write a report on finished runs: leaderboard, figures and diagnostics."""
+    # Here, not above: it needs jinja2 and matplotlib, and `evopolicy` loads this module to list its commands.
+    from evopolicy_results.report import write_report
+
+    try:
+        check_writable(out, "--out")
+        with _progress() as tell:
+            study = _study(runs, scores, allow_mixed, allow_unknown, jobs or os.cpu_count() or 1, tell)
+            if not study.suites:
+                index = None
+            else:
+                index = write_report(study, out, title=title, traces=pages, progress=tell)
+    except MixedRunsError as error:
+        options = sorted(
+            {
+                "--allow-unknown" if one.what == UNKNOWN_ISOLATION else "--allow-mixed"
+                for one in error.mixtures
+            }
+        )
+        same = dict.fromkeys(REMEDIES[one.what] for one in error.mixtures if one.what in REMEDIES)
+        advice = [f"Runs compare that were played with {'; '.join(same)}."] if same else []
+        say_lines([f"error: {error}".splitlines()[0], *str(error).splitlines()[1:], *advice], err=True)
+        say(
+            f"Give the folders of runs that agree, or {' '.join(options)} to compare them all the same.",
+            err=True,
+        )
+        raise SystemExit(MIXED) from error
+    except ConfigError as error:
+        fail(str(error), code_of(error))
+    if unknown := sum(
+        run.record.hidden_isolation == "unknown" and not run.is_published for run in study.runs
+    ):
+        say(
+            f"warning: {unknown} of {len(study.runs)} runs do not tell whether hidden episodes and agents shared a kernel;"
+            " they are from before it was recorded",
+            err=True,
+        )
+    if as_json:
+        left_out = [{"path": str(item.path), "reason": item.reason} for item in study.left_out]
+        found = {
+            "index": str(index) if index is not None else None,
+            "runs": len(study.runs),
+            "left_out": left_out,
+        }
+        say_json(found, indent=False)
+    else:
+        say_lines((f"left out: {item.path}: {item.reason}" for item in study.left_out), err=True)
+        if index is not None:
+            say(
+                f"{len(study.runs)} run{'s' * (len(study.runs) != 1)}, {len(study.left_out)} left out: {index}"
+            )
+    if index is None:
+        fail(
+            f"no finished run in {', '.join(map(str, runs))}; nothing written. Name run directories, such as"
+            " runs/evolve/gym_acrobot/first, or folders that contain them",
+            NOTHING,
+        )
+
+
+def _study(
+    paths: list[Path], rescore: str | None, allow_mixed: bool, allow_unknown: bool, jobs: int, tell: Tell
+) -> Study:
+    tables = [path for path in paths if path.suffix == ".csv" and path.is_file()]
+    if len(tables) > 1:
+        raise ConfigError(f"one CSV of held-out returns at most, not {len(tables)}")
+    loaded = load_runs(
+        [path for path in paths if path not in tables],
+        jobs=jobs,
+        progress=lambda done, total: tell("runs read", done, total),
+    )
+    if rescore and not is_name(rescore):
+        raise ConfigError(f"--scores {rescore!r} is no name of a re-score")
+    scores = _read_table(tables[0]) if tables else None
+    return study_of(
+        rescored(loaded.runs, rescore) if rescore else loaded.runs,
+        left_out=loaded.left_out,
+        allow_mixed=allow_mixed,
+        allow_unknown=allow_unknown,
+        scores=scores,
+    )
+
+
+def _read_table(path: Path) -> ScoreTable:
+    try:
+        return read_score_csv(read_given(path, str(path)).decode(), source=str(path))
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path} cannot be read: {error}") from error
+
+
+@contextmanager
+def _progress() -> Iterator[Tell]:
+    """A bar for each stage on standard error, when that is a terminal."""
+    console = terminal(stderr=True)
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=console, disable=not console.is_terminal, transient=True) as progress:
+        tasks = {}
+
+        def tell(what: str, done: int, total: int) -> None:
+            if what not in tasks:
+                tasks[what] = progress.add_task(what, total=total)
+            progress.update(tasks[what], completed=done, total=total)
+
+        yield tell

@@ -1,0 +1,177 @@
+"""`evopolicy rescore RUN…`: stored checkpoints on further hidden cases, written beside `run.json`.
+
+Exit codes: 0 every run is re-scored, 1 the cluster failed or refused, 2 wrong usage (also: no run can be re-scored), 3 some
+runs are re-scored and others cannot be, 130 Ctrl-C. The same command continues where an interrupted one stopped.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from evopolicy_common.cli.conventions import (
+    Connect,
+    CredentialsFile,
+    end_on_sigterm,
+    fail,
+    fail_on_our_errors,
+    run_to_end,
+)
+from evopolicy_common.cli.frame import App
+from evopolicy_common.console import Terminal, table, terminal
+from evopolicy_common.errors import ConfigError
+from evopolicy_common.processes.packages import packages_in
+from evopolicy_common.records.rescores import is_name
+from evopolicy_common.records.run_files import run_folders
+from evopolicy_common.terminal import number, one_line, say, say_json
+from evopolicy_results.cli.cluster import Local, Slots, State, Where, play, playing, where_of
+from evopolicy_results.rescore.play import Finished, Rescorer, Wanted, Written, read_finished
+
+PARTIAL = 3
+
+app = App(name="rescore")
+
+
+@app.command(
+    name="rescore",
+    epilog="Example: evopolicy rescore runs --cases 256 --local && evopolicy report runs --scores cases-256 --out report",
+)
+def rescore(
+    runs: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="RUNS...", help="Finished runs' directories, or folders of them.", show_default=False
+        ),
+    ],
+    cases: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            max=10_000,
+            help="Number of new hidden cases. The coordinator derives them from its secret.",
+            show_default=False,
+        ),
+    ] = None,
+    data: Annotated[
+        Path | None,
+        typer.Option(
+            help="Take the held-out cases of this folder of split files instead; with --cases, the first ones.",
+            show_default=False,
+        ),
+    ] = None,
+    all_checkpoints: Annotated[
+        bool,
+        typer.Option("--all-checkpoints", help="Play every eligible checkpoint, not only the selected one."),
+    ] = False,
+    name: Annotated[
+        str | None,
+        typer.Option(
+            help="Name of the re-score; runs have the same new cases under the same name. Default: cases-N, or the"
+            " data folder's name.",
+            show_default=False,
+        ),
+    ] = None,
+    connect: Connect = None,
+    file: CredentialsFile = None,
+    local: Local = False,
+    state: State = None,
+    slots: Slots = 2,
+    as_json: Annotated[bool, typer.Option("--json", help="Print what was written as JSON.")] = False,
+) -> None:
+    """Play checkpoints of finished runs on further hidden cases, for tighter intervals.
+
+    Writes rescore/NAME.json beside run.json, which stays as it is. A re-score is post hoc: it never changes which checkpoint was
+    selected. `evopolicy report --scores NAME` uses it. Repeat an interrupted command to continue it.
+    Exit codes: 0 all re-scored, 1 the cluster failed, 2 wrong usage or no run can be re-scored, 3 some runs cannot be re-scored.
+    """
+    if cases is None and data is None:
+        fail("name the new cases: --cases 256 for their number, or --data FOLDER for split files")
+    if data is not None and not data.is_dir():
+        fail(f"--data {data} is not a folder")
+    where = where_of(connect, file, local, state, runs=runs)
+    chosen = name or (f"cases-{cases}" if data is None else re.sub(r"[^A-Za-z0-9._-]+", "-", data.name))
+    if not is_name(chosen):
+        fail(f"--name {chosen!r}: letters, digits, '.', '_' and '-', at most 64, the first a letter or digit")
+    wanted = Wanted(name=chosen, n_cases=cases, data=data, every=all_checkpoints)
+    console = terminal(stderr=as_json)
+    with fail_on_our_errors():
+        found, empty = run_folders(runs)
+        if empty:
+            raise ConfigError(f"{empty[0]} holds no run directory")
+        finished, without, failed = read_finished(found)
+        for text in without:
+            say(f"left out: {one_line(text)}", err=True)
+        if not finished:
+            raise ConfigError(failed[0] if failed else "none of these runs has a checkpoint to re-score")
+        written: list[Written] = []
+        try:
+            run_to_end(_rescore(finished, wanted, where, slots, console, written, failed))
+            if not written:
+                raise ConfigError(failed[0])
+        finally:
+            for text in failed if written else failed[1:]:
+                say(f"not re-scored: {one_line(text)}", err=True)
+            if written:
+                _print(written, as_json, console)
+    if failed:
+        say(f"{len(written)} of {len(written) + len(failed)} runs are re-scored", err=True)
+        raise typer.Exit(PARTIAL)
+    if not as_json:
+        say(f"next: evopolicy report {' '.join(map(str, runs))} --scores {chosen} --out report")
+
+
+def _print(written: list[Written], as_json: bool, console: Terminal) -> None:
+    if as_json:
+        say_json(written)
+        return
+    shown = table(
+        "environment", "entry", "held-out mean", "re-scored mean", "episodes", right=("held-out mean",)
+    )
+    for one in written:
+        shown.add_row(one.env, one.entry, number(one.score), number(one.rescored), str(one.episodes))
+    console.print(shown)
+
+
+async def _rescore(
+    runs: list[Finished],
+    wanted: Wanted,
+    where: Where,
+    slots: int,
+    console: Terminal,
+    written: list[Written],
+    failed: list[str],
+) -> None:
+    """Adds to `written` what is re-scored, and to `failed` why other runs cannot be."""
+    end_on_sigterm()
+    packages = _packages(runs) if where.local else ()
+    async with where.link("rescore", packages=packages) as (link, cluster):
+        with playing(console, "rescore") as shown:
+            rescorer = Rescorer(link, wanted, shown.played, own_workers=cluster is not None)
+
+            async def work() -> None:
+                for run in runs:
+                    shown.update(title=f"{run.record.agent.entry} on {run.record.env}")
+                    try:
+                        written.append(await rescorer.rescore(run))
+                    except ConfigError as error:
+                        failed.append(f"{run.folder}: {error}")
+
+            envs = sorted({run.record.env for run in runs})
+            await play(cluster, envs, {run.record.sandbox_tier for run in runs}, slots, work)
+
+
+def _packages(runs: list[Finished]) -> tuple[str, ...]:
+    """Packages besides numpy that the runs' policies import. Raises ConfigError where they differ, since a cluster
+    offers one set of packages."""
+    found = {packages_in(run.record.versions.fingerprint): run.folder for run in runs}
+    if len(found) > 1:
+        listed = "; ".join(
+            f"{folder}: {', '.join(names) or 'none'}" for names, folder in sorted(found.items())
+        )
+        raise ConfigError(
+            f"policies of these runs import different packages ({listed}): re-score runs with the same packages at a time"
+        )
+    return next(iter(found))

@@ -1,0 +1,390 @@
+"""Topology of a policy source bundle (its AST without numeric constants), and its structural features.
+
+The topology is a hash that stays the same exactly when an edit preserves the policy's structure (paper, mechanism
+section: a *parametric* edit changes the bundle "while preserving that stripped topology"). It ignores everything that
+is not structure: the value and sign of numeric constants, digits in f-string format specifications, comments,
+formatting, docstrings, type hints, unused imports, the order of definitions and of top-level statements, the local
+module of a definition, and the bundle's own names. It keeps node types, operators, the order of statements inside
+functions, string and boolean constants, and every external name (`np.sin` against `np.cos`, `obs["image"]`).
+
+Every function, class and top-level statement becomes a unit, a list of tokens; `canonical` hashes all units into one
+digest.
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Callable, Mapping
+
+import msgspec
+
+from evopolicy_results.code.canonical import PROTOCOL_NAMES, Names, Scope, Unit, canonical, stable_hash
+from evopolicy_results.code.sources import Module, absolute_import
+
+_DIGITS = re.compile(r"\d+")
+
+
+class Features(msgspec.Struct, frozen=True, kw_only=True):
+    """Deterministic AST features of a source bundle: the columns of the paper's Table "Realized computational structure"."""
+
+    functions: int = 0
+    """`def` and `async def`, methods included; lambdas are not."""
+    branches: int = 0
+    """`if` and `elif`, conditional expressions, and `match` cases."""
+    loops: int = 0
+    """`for` and `while` statements; comprehensions are not."""
+    depth: int = 0
+    """Deepest nesting of `if`, loop, `with`, `try` and `match` blocks inside one function; `elif` does not nest."""
+    state: int = 0
+    """Persistent state: distinct attributes that methods assign on their instance, counted per class, and `global`s."""
+    nodes: int = 0
+    """AST nodes that the topology includes: a size independent of formatting."""
+    lines: int = 0
+    """Source lines, including blank lines and comments."""
+    modules: int = 0
+
+
+def describe(modules: Mapping[str, Module]) -> tuple[str, Features]:
+    """Topology (32 hex digits) and features of a bundle's reachable modules."""
+    walker = _Walker(set(modules))
+    opaque: list[str] = []
+    for module in modules.values():
+        if module.tree is not None:
+            try:
+                walker.module(module)
+                continue
+            except RecursionError:
+                pass
+        opaque.append(stable_hash([module.path, module.source.hex()]))
+    features = Features(
+        functions=walker.functions,
+        branches=walker.branches,
+        loops=walker.loops,
+        depth=walker.depth,
+        state=len(walker.state),
+        nodes=walker.nodes,
+        lines=sum(
+            module.source.count(b"\n") + (not module.source.endswith(b"\n")) for module in modules.values()
+        ),
+        modules=len(modules),
+    )
+    return stable_hash([canonical(walker.units, walker.names), *sorted(opaque)]), features
+
+
+class _Walker:
+    def __init__(self, local_modules: set[str]) -> None:
+        self.local_modules = local_modules
+        self.submodules = {name.rsplit(".", 1)[1] for name in local_modules if "." in name}
+        self.units: list[Unit] = []
+        self.names = Names()
+        self.state: set[tuple[str, str]] = set()
+        self.functions = self.branches = self.loops = self.depth = self.nodes = 0
+        self._class = ""
+        self._instance = ("", "")
+        """Class and first parameter of the visited method."""
+
+    def module(self, module: Module) -> None:
+        assert module.tree is not None
+        scope = Scope()
+        for node in module.imports:
+            self._bind_import(node, scope, module)
+        for statement in module.tree.body:
+            unit = self._statement_unit(statement, scope, self.names.top_defs)
+            if unit is not None:
+                self.units.append(unit)
+                if not unit.is_function:
+                    self.names.global_names |= unit.stored
+
+    def _bind_import(self, node: ast.Import | ast.ImportFrom, scope: Scope, module: Module) -> None:
+        if isinstance(node, ast.Import):
+            for alias in node.names:
+                bound = alias.asname or alias.name.split(".")[0]
+                if alias.name.split(".")[0] in self.local_modules:
+                    scope.modules.add(bound)
+                else:
+                    scope.external[bound] = alias.name if alias.asname else bound
+            return
+        base = absolute_import(node, module.name, module.path.endswith("__init__.py"))
+        local = node.level > 0 or base.split(".")[0] in self.local_modules
+        for alias in node.names:
+            bound = alias.asname or alias.name
+            if not local:
+                scope.external[bound] = f"{base}.{alias.name}"
+            elif (f"{base}.{alias.name}" if base else alias.name) in self.local_modules:
+                scope.modules.add(bound)
+            else:
+                scope.aliases[bound] = alias.name
+
+    def _statement_unit(self, node: ast.stmt, scope: Scope, defs: set[str]) -> Unit | None:
+        """A unit for a statement of a module's or class's body; None for statements that are not structure."""
+        if isinstance(node, _NO_STRUCTURE) or _is_docstring(node):
+            return None
+        if isinstance(node, _FUNCTIONS):
+            defs.add(node.name)
+            unit = Unit(scope, node.name, is_function=True)
+            self._function(node, unit, 0)
+            return unit
+        if isinstance(node, ast.ClassDef):
+            defs.add(node.name)
+            return self._class_unit(node, scope)
+        unit = Unit(scope, "", is_function=False)
+        self._statement(node, unit, 0)
+        return unit
+
+    def _class_unit(self, node: ast.ClassDef, scope: Scope) -> Unit:
+        unit = Unit(scope, node.name, is_function=False)
+        outer, self._class = self._class, f"{self._class}.{node.name}"
+        self._add(unit, "ClassDef", _own_name(node.name))
+        for part in (*node.decorator_list, *node.bases, *node.keywords):
+            self._node(part, unit, 0)
+        for statement in node.body:
+            child = self._class_field(statement, scope) or self._statement_unit(
+                statement, scope, self.names.method_defs
+            )
+            if child is not None:
+                unit.children.append(child)
+                if not child.is_function:
+                    self.names.attribute_names |= child.stored
+        self._class = outer
+        return unit
+
+    def _class_field(self, node: ast.stmt, scope: Scope) -> Unit | None:
+        """A unit for an annotated class variable, which is a field to dataclasses and differs from a plain
+        assignment."""
+        if not isinstance(node, ast.AnnAssign):
+            return None
+        unit = Unit(scope, "", is_function=False)
+        self._add(unit, "Field")
+        self._node(node.target, unit, 0)
+        if node.value is not None:
+            self._node(node.value, unit, 0)
+        return unit
+
+    def _function(self, node: ast.FunctionDef | ast.AsyncFunctionDef, unit: Unit, depth: int) -> None:
+        self.functions += 1
+        self._add(unit, type(node).__name__, _own_name(node.name))
+        for decorator in node.decorator_list:
+            self._node(decorator, unit, depth)
+        self._arguments(node.args, unit, depth)
+        outer = self._instance
+        if self._class:
+            positional = [*node.args.posonlyargs, *node.args.args]
+            self._instance = (self._class, positional[0].arg) if positional else ("", "")
+        self._body(node.body, unit, depth)
+        self._instance = outer
+
+    def _arguments(self, args: ast.arguments, unit: Unit, depth: int) -> None:
+        self._add(unit, "(")
+        for group in (args.posonlyargs, args.args, args.kwonlyargs):
+            for argument in group:
+                unit.stored.add(argument.arg)
+                self.names.parameters.add(argument.arg)
+                unit.tokens.append(("n", argument.arg))
+            self._add(unit, "/")
+        for extra in (args.vararg, args.kwarg):
+            if extra is not None:
+                unit.stored.add(extra.arg)
+                unit.tokens.append(("n", extra.arg))
+            self._add(unit, "/")
+        for default in (*args.defaults, *args.kw_defaults):
+            if default is None:
+                self._add(unit, "~")
+            else:
+                self._node(default, unit, depth)
+        self._add(unit, ")")
+
+    def _body(self, body: list[ast.stmt], unit: Unit, depth: int) -> None:
+        self._add(unit, "{")
+        for statement in body:
+            self._statement(statement, unit, depth)
+        self._add(unit, "}")
+
+    def _statement(self, node: ast.stmt, unit: Unit, depth: int) -> None:
+        if isinstance(node, _NO_STRUCTURE) or _is_docstring(node):
+            return
+        if isinstance(node, ast.AnnAssign):
+            if node.value is not None:
+                self._add(unit, "Assign")
+                self._node(node.target, unit, depth)
+                self._node(node.value, unit, depth)
+            return
+        if isinstance(node, _FUNCTIONS):
+            unit.stored.add(node.name)
+            unit.tokens.append(("n", node.name))
+            outer, self._class = self._class, ""
+            self._function(node, unit, 0)
+            self._class = outer
+            return
+        if isinstance(node, _DECLARATIONS):
+            if isinstance(node, ast.Global):
+                unit.globals.update(node.names)
+                self.names.global_names.update(node.names)
+                self.state.update(("", name) for name in node.names)
+            return
+        if isinstance(node, ast.Assign):
+            self._add(unit, "Assign")
+            for target in node.targets:
+                self._node(target, unit, depth)
+            self._node(node.value, unit, depth)
+            return
+        self._node(node, unit, depth)
+
+    def _node(self, node: ast.AST, unit: Unit, depth: int) -> None:
+        handler = _HANDLERS.get(type(node))
+        if handler is not None:
+            handler(self, node, unit, depth)
+            return
+        kind = type(node)
+        if kind in _NESTING:
+            depth = self._nest(depth)
+        if kind in _LOOPS:
+            self.loops += 1
+        elif kind in _CASES:
+            self.branches += 1
+        self._add(unit, kind.__name__)
+        self._fields(node, unit, depth)
+
+    def _if(self, node: ast.If, unit: Unit, depth: int) -> None:
+        self.branches += 1
+        inner = self._nest(depth)
+        self._add(unit, "If")
+        self._node(node.test, unit, depth)
+        self._body(node.body, unit, inner)
+        is_elif = len(node.orelse) == 1 and isinstance(node.orelse[0], ast.If)
+        self._body(node.orelse, unit, depth if is_elif else inner)
+
+    def _unary(self, node: ast.UnaryOp, unit: Unit, depth: int) -> None:
+        if isinstance(node.op, (ast.USub, ast.UAdd)) and _is_number(node.operand):
+            self._add(unit, "#")
+        else:
+            self._add(unit, "UnaryOp")
+            self._fields(node, unit, depth)
+
+    def _fields(self, node: ast.AST, unit: Unit, depth: int) -> None:
+        for name in node._fields:
+            value = getattr(node, name, None)
+            if name in _SKIPPED_FIELDS:
+                continue
+            if isinstance(value, list):
+                self._add(unit, "[")
+                for item in value:
+                    if isinstance(item, ast.stmt):
+                        self._statement(item, unit, depth)
+                    elif isinstance(item, ast.AST):
+                        self._node(item, unit, depth)
+                    else:
+                        self._identifier(item, unit)
+                self._add(unit, "]")
+            elif isinstance(value, ast.arguments):
+                self._arguments(value, unit, depth)
+            elif isinstance(value, ast.AST):
+                self._node(value, unit, depth)
+            elif name == "arg" and isinstance(value, str):
+                unit.tokens.append(("k", value))
+            else:
+                self._identifier(value, unit)
+
+    def _identifier(self, value: object, unit: Unit) -> None:
+        """A bare name in a node's field, bound by an `except … as` or a pattern."""
+        if isinstance(value, str):
+            unit.stored.add(value)
+            unit.tokens.append(("n", value))
+        else:
+            self._add(unit, repr(value))
+
+    def _name(self, node: ast.Name, unit: Unit, depth: int) -> None:
+        self.nodes += 1
+        if not isinstance(node.ctx, ast.Load):
+            unit.stored.add(node.id)
+        unit.tokens.append(("n", node.id))
+
+    def _attribute(self, node: ast.Attribute, unit: Unit, depth: int) -> None:
+        self.nodes += 1
+        if not isinstance(node.ctx, ast.Load):
+            self.names.attribute_names.add(node.attr)
+            if isinstance(node.ctx, ast.Store) and getattr(node.value, "id", None) == self._instance[1]:
+                self.state.add((self._instance[0], node.attr))
+        root: ast.expr = node
+        path: list[str] = []
+        while isinstance(root, ast.Attribute):
+            path.append(root.attr)
+            root = root.value
+        if isinstance(root, ast.Name) and root.id not in unit.stored:
+            if root.id in unit.module.external:
+                unit.tokens.append(".".join([unit.module.external[root.id], *reversed(path)]))
+                return
+            if root.id in unit.module.modules:
+                inside = list(reversed(path))
+                while len(inside) > 1 and inside[0] in self.submodules:
+                    inside.pop(0)
+                unit.tokens.append(("m", inside[0]))
+                unit.tokens.extend(("a", name) for name in inside[1:])
+                return
+        self._node(node.value, unit, depth)
+        unit.tokens.append(("a", node.attr))
+
+    def _constant(self, node: ast.Constant, unit: Unit, depth: int) -> None:
+        self._add(unit, "#" if _is_number(node) else repr(node.value))
+
+    def _f_string(self, node: ast.JoinedStr, unit: Unit, depth: int) -> None:
+        self._add(unit, "JoinedStr")
+        for part in node.values:
+            if isinstance(part, ast.FormattedValue):
+                self._add(unit, "FormattedValue", str(part.conversion))
+                self._node(part.value, unit, depth)
+                for piece in part.format_spec.values if isinstance(part.format_spec, ast.JoinedStr) else ():
+                    if isinstance(piece, ast.Constant):
+                        self._add(unit, _DIGITS.sub("#", str(piece.value)))
+                    elif isinstance(piece, ast.FormattedValue):
+                        self._node(piece.value, unit, depth)
+            else:
+                self._node(part, unit, depth)
+        self._add(unit, "end")
+
+    def _nest(self, depth: int) -> int:
+        self.depth = max(self.depth, depth + 1)
+        return depth + 1
+
+    def _add(self, unit: Unit, *tokens: str) -> None:
+        self.nodes += 1
+        unit.tokens.extend(tokens)
+
+
+_SKIPPED_FIELDS = frozenset({"ctx", "type_comment", "type_params", "annotation", "returns", "simple", "kind"})
+
+
+_HANDLERS: dict[type[ast.AST], Callable[..., None]] = {
+    ast.Name: _Walker._name,
+    ast.Constant: _Walker._constant,
+    ast.Attribute: _Walker._attribute,
+    ast.UnaryOp: _Walker._unary,
+    ast.JoinedStr: _Walker._f_string,
+    ast.If: _Walker._if,
+}
+_NO_STRUCTURE = (ast.Import, ast.ImportFrom, ast.Pass)
+_FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
+_DECLARATIONS = (ast.Global, ast.Nonlocal)
+_LOOPS = frozenset({ast.For, ast.AsyncFor, ast.While})
+_CASES = frozenset({ast.IfExp, ast.match_case})
+_NESTING = _LOOPS | {ast.With, ast.AsyncWith, ast.Try, ast.TryStar, ast.Match}
+
+
+def _own_name(name: str) -> str:
+    return name if name in PROTOCOL_NAMES or (name.startswith("__") and name.endswith("__")) else "·"
+
+
+def _is_docstring(node: ast.stmt) -> bool:
+    return (
+        isinstance(node, ast.Expr)
+        and isinstance(node.value, ast.Constant)
+        and isinstance(node.value.value, str)
+    )
+
+
+def _is_number(node: ast.expr) -> bool:
+    return (
+        isinstance(node, ast.Constant)
+        and isinstance(node.value, (int, float, complex))
+        and not isinstance(node.value, bool)
+    )

@@ -1,0 +1,507 @@
+"""The report's pages as text: their contents and wording. Markup is in `templates/`; `write` writes the files."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import cache
+from importlib.resources import files
+from typing import Any
+
+import msgspec
+from jinja2 import DictLoader, Environment, StrictUndefined
+from markupsafe import Markup
+
+from evopolicy_results.behaviour.trace import Trace, TraceRow, diff, sources
+from evopolicy_results.html import visible
+from evopolicy_results.html.small_timeline import small_timeline
+from evopolicy_results.reading.environments import suite_title, title_of
+from evopolicy_results.reading.records import Run, Submit
+from evopolicy_results.scan.signals import TITLES
+from evopolicy_results.simulators.look import Flag
+from evopolicy_results.studies.palette import Look
+from evopolicy_results.studies.study import Study
+from evopolicy_results.tables.run_tables import submits_text
+from evopolicy_results.tables.table import Column, Table, shown
+
+_FILTER_FROM = 9
+"""Number of rows from which a table has a filter."""
+_LONG = 60
+"""Number of characters from which a cell's text is broken into lines."""
+FORMS = (("CSV", "csv"), ("Markdown", "md"), ("LaTeX", "tex"))
+"""File forms of a table, with their suffixes."""
+
+
+class FigureView(msgspec.Struct, frozen=True, kw_only=True):
+    """A figure as the index page shows it; its SVG is inlined."""
+
+    name: str
+    title: str
+    caption: str
+    group: str
+    svg: str
+    width: float
+    """Maximum displayed width, rem."""
+    timeline: str = ""
+
+
+class PlayedEpisode(msgspec.Struct, frozen=True, kw_only=True):
+    """A recorded episode of one run, with the parts of it that were copied into the report."""
+
+    run: Run
+    split: str
+    episode: int
+    submit_index: int
+    episode_return: float | None
+    length: int | None
+    video: str | None
+    """Path of the copy, relative to the page; None when the recording is missing."""
+    strip: str | None
+
+
+_TEMPLATES = ("base", "macros", "index", "trace", "failed", "replays", "site", "site_bundle", "site_episodes")
+
+
+@cache
+def environment() -> Environment:
+    """The templates of all pages, with autoescaping."""
+    folder = files(__package__).joinpath("templates")
+    names = [f"{name}.html.j2" for name in _TEMPLATES]
+    loader = DictLoader({name: folder.joinpath(name).read_text(encoding="utf-8") for name in names})
+    made = Environment(
+        loader=loader,
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        finalize=visible,
+    )
+    for name in ("report.css", "report.js"):
+        made.globals[name.split(".")[1]] = Markup(folder.joinpath(name).read_text(encoding="utf-8"))
+    return made
+
+
+def index_page(
+    study: Study,
+    *,
+    title: str,
+    looks: Mapping[str, Look],
+    tables: Sequence[Table],
+    figures: Sequence[FigureView],
+    trace_links: Mapping[str, str],
+    replay_links: Mapping[str, str],
+) -> str:
+    """`index.html`: every section with content, and what was left out."""
+    views = {table.name: table_view(table) for table in tables}
+    suites = [suite.name for suite in study.suites]
+    named = {figure.name: figure for figure in figures}
+
+    def shown_figures(*names: str) -> list[FigureView]:
+        return [named[name] for name in names if name in named]
+
+    def shown_tables(*names: str) -> list[dict[str, Any]]:
+        return [views[name] for name in names if name in views]
+
+    timelines = [figure for figure in figures if figure.timeline]
+    sections: list[dict[str, Any]] = [
+        _section(
+            "leaderboard",
+            "Leaderboard",
+            figures=shown_figures(*(f"rank_scores_{s}" for s in suites)),
+            tables=[v for s in suites for v in shown_tables(f"leaderboard_{s}", f"incomplete_{s}", f"heldout_{s}")]
+            + [{**v, "folded": True} for s in suites for v in shown_tables(f"cells_{s}")],
+        ),
+        _section(
+            "statistics",
+            "Statistics",
+            title="How sure the scores are",
+            texts=["Intervals are at 95 %. Each table says over what: the cases of one run, or runs and cases. No verdict contradicts the interval "
+                   "beside it; the correction for many pairs can only withhold one."],
+            figures=shown_figures(*(f"profiles_{s}" for s in suites)),
+            tables=[v for s in suites for v in shown_tables(f"resolution_{s}", f"aggregates_{s}", f"improvement_{s}")]
+            + [{**v, "folded": True} for s in suites for v in shown_tables(f"pairs_{s}", f"generalisation_{s}")],
+        ),
+        _section(
+            "evolution",
+            "Score evolution",
+            figures=shown_figures(*(f"score_evolution_{s}" for s in suites)),
+            tables=shown_tables("evolution"),
+        ),
+        _section(
+            "demand",
+            "Task demand",
+            title="Performance by task demand",
+            texts=["Synthesis-dominant tasks need machinery (perception, memory, planning); tuning-dominant ones mostly need the "
+                   "right constants. A lens, not a taxonomy."],
+            figures=shown_figures(*(f"normalised_{s}" for s in suites)),
+            tables=shown_tables(*(f"normalised_{s}" for s in suites)),
+        ),
+        _section(
+            "edits", "Edits", title="What edits do",
+            figures=shown_figures("edit_hits", "edit_size"), tables=shown_tables("edit_types", "edit_sizes"),
+        ),
+        _section(
+            "timelines", "Timelines", title="Code-phase timelines", figures=timelines,
+            picker=[(figure.timeline, title_of(figure.timeline)) for figure in timelines],
+        ),
+        _section("structure", "Structure", title="Realised structure", figures=shown_figures("structure"),
+                 tables=shown_tables("structure")),
+        _section(
+            "cost", "Cost and audit", figures=shown_figures("tokens", "wall_time"),
+            tables=shown_tables("tokens", "audit", "signals", "simulator_flags"),
+        ),
+        _section(
+            "feedback", "Feedback use",
+            texts=["Each run has a page: what its agent read and said before every submit, what it changed, and what came of it, with "
+                   "all checkpoints and their differences."],
+            tables=shown_tables("runs") if trace_links else [],
+            links=[(f"All submits in one table ({label})", f"tables/feedback_use.{suffix}") for label, suffix in FORMS]
+            if trace_links
+            else [],
+        ),
+        _section(
+            "replays", "Replays",
+            texts=["Videos of the selected checkpoints' episodes, agents side by side."] if replay_links else
+            ["None of these runs has recorded episodes of its selected checkpoint."],
+            links=[(title_of(env), href) for env, href in replay_links.items()],
+        ),
+        _section("setup", "Setup", tables=shown_tables("agents", "environments", "not_told")),
+        _section(
+            "left-out", "Left out",
+            tables=shown_tables("left_out") if study.left_out else [],
+            texts=[] if study.left_out else ["Nothing: every run folder that was found is in this report."],
+        ),
+    ]  # fmt: skip
+    kept = [
+        s for s in sections if s["figures"] or s["tables"] or s["links"] or s["id"] in ("replays", "left-out")
+    ]
+    n_envs = len({env for suite in study.suites for env in suite.table.environments})
+    return environment().get_template("index.html.j2").render(
+        title=title,
+        lead="Agents evolve an executable policy under a budget of train episodes; the checkpoint that hidden validation selects is "
+        "scored on hidden held-out cases.",
+        facts=[
+            ("agents", len(study.entries)),
+            ("environments", n_envs),
+            ("runs", len(study.runs)),
+            ("submits", sum(len(run.submits) for run in study.runs)),
+            ("left out", len(study.left_out)),
+        ],
+        looks=looks,
+        notices=_notices(study),
+        sections=kept,
+        footer="Scores rank held-out means within each environment; everything below the leaderboard is a diagnostic and no part of "
+        "the score. Made by evopolicy report.",
+    )  # fmt: skip
+
+
+def _section(ident: str, nav: str, *, title: str = "", **parts: Any) -> dict[str, Any]:
+    empty: dict[str, Any] = {"figures": [], "tables": [], "texts": [], "links": [], "picker": []}
+    return {**empty, "id": ident, "nav": nav, "title": title or nav, **parts}
+
+
+_ISOLATION_NOTICES = {
+    "unknown": "do not tell whether hidden episodes and agents shared a kernel: they are from before it was recorded.",
+    "shared": "were played while hidden episodes and agents could share a kernel (--hidden-isolation off).",
+    "waived": "had agents whose place the operator vouched for (--agent-host elsewhere).",
+}
+
+
+def _notices(study: Study) -> list[dict[str, Any]]:
+    out: list[dict[str, Any]] = []
+    if study.post_hoc:
+        out.append({"title": study.post_hoc, "lines": []})
+    if study.mixtures:
+        out.append(
+            {
+                "title": "These runs are no fair comparison: they were mixed on purpose, and differ in",
+                "lines": [str(mixture) for mixture in study.mixtures],
+            }
+        )
+    public = sum(not signals.secret_splits for signals in study.audit)
+    if public:
+        out.append(
+            {
+                "title": f"{public} of {len(study.audit)} runs played public splits, of case files or a public seed: agents and "
+                "models may know the hidden cases.",
+                "lines": [],
+            }
+        )
+    if flagged := sum(bool(run.simulator_flags) for run in study.runs):
+        title = (
+            f"{flagged} of {len(study.runs)} runs have code that looks like a simulator, which their rules forbid: "
+            "a signal to read, never a verdict."
+        )
+        out.append({"title": title, "lines": []})
+    if noted := sum(bool(run.signals) for run in study.runs):
+        title = f"{noted} of {len(study.runs)} runs have signals in their log or code that deserve a look; none is a verdict."
+        out.append({"title": title, "lines": []})
+    if allowed := sum(run.simulation_allowed for run in study.runs):
+        title = f"{allowed} of {len(study.runs)} runs let their agent simulate, or are from before there was a rule against it."
+        out.append({"title": title, "lines": []})
+    unjailed = sum(signals.jail == "none" for signals in study.audit)
+    if unjailed:
+        out.append(
+            {"title": f"{unjailed} of {len(study.audit)} runs had no jail around their agent.", "lines": []}
+        )
+    for isolation, text in _ISOLATION_NOTICES.items():
+        if found := sum(signals.hidden_isolation == isolation for signals in study.audit):
+            out.append({"title": f"{found} of {len(study.audit)} runs {text}", "lines": []})
+    if own := sum(signals.hidden_cases == "per_run" for signals in study.audit):
+        title = (
+            f"{own} of {len(study.audit)} runs had hidden cases of their own: no two scores are on the same cases, "
+            "so differences between runs cannot be paired by case."
+        )
+        out.append({"title": title, "lines": []})
+    return out
+
+
+def table_view(table: Table) -> dict[str, Any]:
+    return {
+        "id": table.name.replace("_", "-") + "-table",
+        "title": table.title,
+        "caption": table.caption,
+        "files": [(label, f"tables/{table.name}.{suffix}") for label, suffix in FORMS],
+        "filter": len(table.rows) >= _FILTER_FROM,
+        "folded": False,
+        "columns": [
+            {
+                "title": column.title.replace(" /", "\u00a0/").replace("-", "\u2011"),
+                "numeric": column.kind != "text",
+                "note": column.note,
+            }
+            for column in table.columns
+        ],
+        "rows": [
+            [_cell(table, number, column, row.get(column.key)) for column in table.columns]
+            for number, row in enumerate(table.rows)
+        ],
+    }
+
+
+def _cell(table: Table, number: int, column: Column, value: Any) -> dict[str, Any]:
+    numeric = column.kind != "text"
+    mark = table.marks.get((number, column.key), 0)
+    classes = (["n"] if numeric else []) + [["first", "second"][mark - 1]] * bool(mark)
+    if value is None and not numeric:
+        classes.append("none")
+    if not numeric and len(str(value)) > _LONG:
+        classes.append("long")
+    return {
+        "text": shown(value, column),
+        "value": ("" if value is None else value) if numeric else None,
+        "cls": " ".join(classes),
+        "href": table.links.get(number) if column.key == "run" else None,
+        "entry": value if column.key == "entry" else None,
+    }
+
+
+def trace_page(
+    trace: Trace,
+    *,
+    look: Look | None,
+    image_links: Mapping[int, Sequence[tuple[str, str]]],
+    videos: Mapping[int, str],
+    beside: Sequence[tuple[str, Look | None, str]] = (),
+) -> str:
+    """One run's page. By submit index, `image_links` has (name, path relative to the page) of its copied images, and
+    `videos` the path of its copied feedback video. `beside` lists (agent, look, page) of other agents on the same
+    environment."""
+    run = trace.run
+    outcome = run.record.outcome
+    transitions = [row.transition for row in trace.rows if row.transition is not None]
+    checkpoints = _checkpoints(trace)
+    anchors = {view["label"]: view["anchor"] for view in checkpoints}
+    has_evidence = any(row.evidence is not None for row in trace.rows)
+    note = "" if has_evidence else "This run's log does not tell what was read or said before which submit."
+    facts = [
+        (
+            "held-out mean" if run.rescore is None else f"post hoc mean, {run.rescore.name}",
+            "–" if run.score is None else f"{run.score:.3f}",
+        ),
+        ("selected", "–" if outcome.best_submit_index is None else f"s{outcome.best_submit_index:03d}"),
+        ("submits", len(run.submits)),
+        ("episodes used", f"{run.submits[-1].consumed if run.submits else 0} of {run.budget}"),
+        ("rejected requests", "–" if run.is_published else len(run.record.rejected_submits)),
+    ]
+    svg = small_timeline(transitions, run.submits, run.budget, "t-") if transitions else ""
+    closed = outcome.closed_reason.replace("_", " ")
+    return environment().get_template("trace.html.j2").render(
+        title=f"{run.entry} on {title_of(run.env)}, {run.record.exp_id}",
+        entry=run.entry,
+        env_title=title_of(run.env),
+        lead=f"Run {run.record.exp_id}, repeat {run.record.repeat}, harness {run.harness}, policy scope "
+        f"{run.record.experiment_dimensions.policy_scope}" + (f", ended by: {closed}." if closed else "."),
+        look=look,
+        beside=beside,
+        facts=facts,
+        budget=run.budget,
+        timeline=Markup(svg),
+        log_note=note,
+        rows=[_trace_row(row, trace, anchors, image_links.get(row.submit.index, ()), videos.get(row.submit.index)) for row in trace.rows],
+        unplaced=trace.unplaced,
+        simulation_allowed=run.simulation_allowed,
+        flags=[_flag(flag) for flag in run.simulator_flags],
+        signals=[
+            {"title": TITLES[each.kind], "path": each.path, "line": each.line, "reason": each.reason, "quote": each.quote,
+             "submits": submits_text(each.submits)}
+            for each in run.signals
+        ],
+        checkpoints=checkpoints,
+    )  # fmt: skip
+
+
+def _flag(flag: Flag) -> dict[str, Any]:
+    return {
+        "kind": flag.kind,
+        "path": flag.path,
+        "lines": f"{flag.line}–{flag.end_line}",
+        "submits": submits_text(flag.submits),
+        "reasons": flag.reasons,
+        "quote": "\n".join(flag.quote),
+    }
+
+
+def failed_page(run: Run, reason: str) -> str:
+    """Replaces a run's page that could not be made."""
+    return (
+        environment()
+        .get_template("failed.html.j2")
+        .render(title=f"{run.entry} on {title_of(run.env)}, {run.record.exp_id}", reason=reason)
+    )
+
+
+def _trace_row(
+    row: TraceRow,
+    trace: Trace,
+    anchors: Mapping[str, str],
+    images: Sequence[tuple[str, str]],
+    video: str | None,
+) -> dict[str, Any]:
+    submit, transition, evidence = row.submit, row.transition, row.evidence
+    messages = list(evidence.messages) if evidence is not None else []
+    return {
+        "label": submit.label,
+        "anchor": anchors.get(submit.label),
+        "selected": submit.index == trace.run.record.outcome.best_submit_index,
+        "consumed_before": submit.consumed_before,
+        "consumed": submit.consumed,
+        "n_episodes": submit.n_episodes,
+        "read": list(evidence.read[:12]) + (["…"] if len(evidence.read) > 12 else [])
+        if evidence is not None
+        else [],
+        "quote": messages[-1] if messages else "",
+        "more": messages[:-1][-20:],
+        "images": [{"name": name, "href": href} for name, href in images],
+        "video": video,
+        "edit": transition.edit if transition is not None else "",
+        "change": _change(row),
+        "outcome": _outcome(submit, row, trace),
+        "hit": transition is not None and transition.hit,
+    }
+
+
+def _change(row: TraceRow) -> str:
+    submit, transition = row.submit, row.transition
+    if transition is not None and transition.edit == "rollback":
+        return f"to the topology of s{transition.back_to:03d}, {submit.changed_lines} lines changed"
+    if transition is not None and transition.edit == "retest":
+        return "same bytes"
+    if transition is not None and transition.edit == "data":
+        return "other files of system/ changed, not the source bundle"
+    if submit.changed_lines is None:
+        return ""
+    return f"{submit.changed_lines} lines changed"
+
+
+def _outcome(submit: Submit, row: TraceRow, trace: Trace) -> str:
+    if submit.status != "ok":
+        return f"{submit.status}: no working policy"
+    parts: list[str] = []
+    before = next((r.submit for r in trace.rows if r.transition and row.transition
+                   and r.submit.index == row.transition.previous), None)  # fmt: skip
+    if submit.mean_return is not None:
+        change = ""
+        if before is not None and before.mean_return is not None:
+            change = f" ({submit.mean_return - before.mean_return:+.3g})"
+        parts.append(f"visible mean {submit.mean_return:.4g}{change}")
+    if submit.val_mean is not None:
+        change = (
+            f" ({submit.val_mean - before.val_mean:+.3g})"
+            if before is not None and before.val_mean is not None
+            else ""
+        )
+        parts.append(f"validation mean {submit.val_mean:.4g}{change}")
+    if submit.n_failed_episodes:
+        parts.append(f"policy failed in {submit.n_failed_episodes} of {submit.n_episodes} episodes")
+    return "; ".join(parts)
+
+
+def _checkpoints(trace: Trace) -> list[dict[str, Any]]:
+    out: list[dict[str, Any]] = []
+    previous: dict[str, str] | None = None
+    seen: dict[str, str] = {}
+    for row in trace.rows:
+        text = sources(trace.run, row.submit)
+        if not text:
+            continue
+        key = repr(sorted(text.items()))
+        same_as = seen.setdefault(key, row.submit.label)
+        is_new = same_as == row.submit.label
+        files_view = (
+            [{"path": p, "text": t, "n_lines": len(t.splitlines())} for p, t in text.items()]
+            if is_new
+            else []
+        )
+        diffs = [] if previous is None else diff(previous, text)
+        out.append(
+            {
+                "label": row.submit.label,
+                "anchor": f"{row.submit.label}-source",
+                "edit": row.transition.edit if row.transition is not None else "",
+                "same_as": "" if is_new else same_as,
+                "diffs": [
+                    {"path": d.path, "cut": d.cut, "lines": [(_diff_class(line), line) for line in d.lines]}
+                    for d in diffs
+                ],
+                "files": files_view,
+            }
+        )
+        previous = text
+    return out
+
+
+def _diff_class(line: str) -> str:
+    return {"+": "ins", "-": "del", "@": "hunk"}.get(line[:1], "")
+
+
+def replays_page(env: str, episodes: Sequence[PlayedEpisode], looks: Mapping[str, Look]) -> str:
+    """One environment's recordings: one group per case, with one card per run."""
+    groups: dict[tuple[str, int], list[dict[str, Any]]] = {}
+    for played in sorted(
+        episodes, key=lambda p: (p.split, p.episode, p.run.entry.casefold(), p.run.record.repeat)
+    ):
+        facts = [f"s{played.submit_index:03d}"]
+        if played.episode_return is not None:
+            facts.append(f"return {played.episode_return:.4g}")
+        if played.length is not None:
+            facts.append(f"{played.length} steps")
+        groups.setdefault((played.split, played.episode), []).append(
+            {
+                "entry": played.run.entry,
+                "run": played.run.record.exp_id,
+                "video": played.video,
+                "strip": played.strip,
+                "text": ", ".join(facts),
+            }
+        )
+    return environment().get_template("replays.html.j2").render(
+        title=f"Replays: {title_of(env)}",
+        env_title=title_of(env),
+        looks=looks,
+        groups=[{"title": f"{'Held-out' if split == 'heldout' else split.capitalize()} case {n}", "cards": cards} for (split, n), cards in groups.items()],
+    )  # fmt: skip
+
+
+def default_title(study: Study) -> str:
+    """`Core16, Toy: policy evolution report`."""
+    return ", ".join(suite_title(suite.name) for suite in study.suites) + ": policy evolution report"

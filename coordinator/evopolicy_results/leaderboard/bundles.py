@@ -1,0 +1,301 @@
+"""Reads published results for a leaderboard: checks each file and unpacks its runs into run directories for the report.
+
+Rules that this module owns:
+- A file is untrusted. Its check comes first, and nothing is unpacked of a file that fails.
+- Entries of different signers are different entries, also under one name.
+- Differences of processors do not make labs incomparable (`cpu` of the fingerprint); they are shown instead.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import msgspec
+
+from evopolicy_common.errors import BundleError, ProtocolError
+from evopolicy_common.records.policies import bundles, checkpoints
+from evopolicy_common.records.policies.checkpoints import CheckpointMeta
+from evopolicy_common.records.run_record import Artifacts, encode_run_record
+from evopolicy_results.publish import contents, rules, run_rules
+from evopolicy_results.publish.archive import Archive
+from evopolicy_results.publish.findings import Checked, PublishedRun
+from evopolicy_results.publish.scan import scan_published
+from evopolicy_results.reading.reader import load_runs
+from evopolicy_results.reading.records import LeftOut, Run
+
+_MAX_NAME = 120
+_POINTS = 160
+
+Replay = Callable[[Archive, Checked], None]
+"""Replays recorded actions and adds the findings."""
+
+
+class Curve(msgspec.Struct, frozen=True, kw_only=True):
+    """A recorded held-out episode."""
+
+    index: int
+    episode_return: float
+    length: int
+    failure: str
+    sums: tuple[float, ...]
+    """Sum of the rewards so far at up to `_POINTS` steps; empty where the recording was withheld."""
+
+
+class LabRun(msgspec.Struct, frozen=True, kw_only=True):
+    """A published run and its run directory."""
+
+    run: Run
+    published: str
+    """The coordinator's id."""
+    episodes: tuple[Curve, ...]
+    """Held-out episodes of the selected checkpoint."""
+    unrecorded: bool = False
+    """Some of its episodes have no recording, so that no replay can contradict their returns."""
+
+
+class LabBundle(msgspec.Struct, kw_only=True):
+    """One file of published results."""
+
+    file: str
+    """Its name without folders."""
+    sha256: str
+    number: int = 0
+    """Position among the files of the site."""
+    lab: str = ""
+    """Name that the site's owner gives the signer; empty for none."""
+    checked: Checked = msgspec.field(default_factory=Checked)
+    runs: list[LabRun] = []
+    left_out: list[LeftOut] = []
+    """Runs of the file that a report leaves out, with the reason."""
+    refused: str = ""
+    """Why no run of it is shown; empty when they are."""
+    processors: list[str] = []
+
+    @property
+    def page(self) -> str:
+        """Its page, relative to the site's folder."""
+        return f"bundles/{self.number:03d}.html"
+
+    @property
+    def signer(self) -> str:
+        return self.checked.signer
+
+    @property
+    def known(self) -> bool:
+        """Whether the site's owner named the signer's key."""
+        return any(each.kind == "identity" and each.state == "ok" for each in self.checked.findings)
+
+    @property
+    def label(self) -> str:
+        """The signer as text: its name, or the first digits of its key."""
+        return self.lab or (f"key {self.signer[:8]}" if self.signer else "no signer")
+
+    def state_of(self, kind: str) -> str:
+        """`failed`, `open` or `ok`, the gravest of the kind's findings; empty when there are none."""
+        states = {each.state for each in self.checked.findings if each.kind == kind}
+        return next((state for state in ("failed", "open", "ok") if state in states), "")
+
+
+def read_bundles(
+    files: Sequence[Path], labs: dict[str, str], folder: Path, replay: Replay | None = None
+) -> list[LabBundle]:
+    """Checks all files and unpacks their runs below `folder`. `labs`: public key (hex) to the signer's name, empty for
+    none."""
+    found: list[LabBundle] = []
+    seen: dict[str, str] = {}
+    for number, path in enumerate(files):
+        bundle = LabBundle(file=path.name, sha256=_sha256(path), number=number)
+        found.append(bundle)
+        try:
+            with Archive(path) as archive:
+                _read(archive, bundle, labs, folder / f"{number:04d}", seen, replay)
+        except ProtocolError as error:
+            bundle.refused = str(error)
+    _tell_apart(found)
+    return found
+
+
+def _read(
+    archive: Archive,
+    bundle: LabBundle,
+    labs: dict[str, str],
+    folder: Path,
+    seen: dict[str, str],
+    replay: Replay | None,
+) -> None:
+    checked = rules.check(archive)
+    if checked.signer in labs:
+        # The whole check again costs more than to replace its one finding on the signer.
+        checked.findings = [each for each in checked.findings if each.kind != "identity"]
+        checked.add("identity", "ok", "signed by a key that the site's owner named")
+        bundle.lab = labs[checked.signer]
+    scan_published(archive, checked)
+    bundle.checked = checked
+    if replay is not None and not checked.failed:
+        replay(archive, checked)
+    if checked.failed:
+        bundle.refused = "; ".join(
+            dict.fromkeys(f"{each.kind}: {each.text}" for each in checked.findings if each.state == "failed")
+        )[:500]
+        return
+    again = [run.opening.run for run in checked.runs if f"{checked.signer} {run.opening.run}" in seen]
+    if again:
+        bundle.refused = f"run {again[0]} is also in {seen[f'{checked.signer} {again[0]}']}"
+        return
+    processors: dict[str, None] = {}
+    by_folder: dict[Path, PublishedRun] = {}
+    for run in checked.runs:
+        seen[f"{checked.signer} {run.opening.run}"] = bundle.file
+        processors[run.record.versions.fingerprint.get("cpu", "")] = None
+        place = folder / run.folder
+        _unpack(archive, run, place)
+        by_folder[place.resolve()] = run
+    bundle.processors = [each for each in processors if each]
+    loaded = load_runs([folder])
+    bundle.left_out = [
+        msgspec.structs.replace(each, path=each.path.relative_to(folder.resolve()))
+        if each.path.is_relative_to(folder.resolve())
+        else each
+        for each in loaded.left_out
+    ]
+    for loaded_run in loaded.runs:
+        source = by_folder[loaded_run.path]
+        bundle.runs.append(
+            LabRun(
+                run=loaded_run,
+                published=source.opening.run,
+                episodes=_curves(archive, source),
+                unrecorded=bool(checked.unrecorded(source.opening.run)),
+            )
+        )
+    if not bundle.runs:
+        bundle.refused = "none of its runs has a score"
+
+
+def _unpack(archive: Archive, run: PublishedRun, place: Path) -> None:
+    """Writes `run.json` and the checkpoints as a run directory."""
+    place.mkdir(parents=True)
+    record, result = run.record, run.result
+    versions = msgspec.structs.replace(
+        record.versions,
+        fingerprint={name: each for name, each in record.versions.fingerprint.items() if name != "cpu"},
+    )
+    kept = msgspec.structs.replace(
+        record,
+        exp_id=_short(record.exp_id),
+        agent=msgspec.structs.replace(
+            record.agent, entry=_short(record.agent.entry), harness=_short(record.agent.harness)
+        ),
+        versions=versions,
+        # They name files of a run directory; this folder contains only the files written here.
+        artifacts=Artifacts(),
+        replays=(),
+    )
+    (place / "run.json").write_bytes(encode_run_record(kept))
+    left = run.opening.budget
+    for submit in result.submits:
+        before, left = left, left - len(submit.env_instances)
+        name = f"{run.folder}/{contents.checkpoint_path(submit.submit_index)}"
+        bundle = None
+        if submit.bundle is not None and name in archive.names:
+            try:
+                bundle = bundles.load(archive.read(name, contents.MAX_DOCUMENT_BYTES * 2), submit.bundle)
+            except BundleError:
+                bundle = None
+        meta = CheckpointMeta(
+            submit_index=submit.submit_index,
+            submit_time="",
+            n_episodes_requested=len(submit.env_instances),
+            remaining_budget_before=before,
+            remaining_budget_after=left,
+            validation_status=submit.status,
+            mean_return=submit.mean_return,
+            val_mean=submit.val_mean,
+        )
+        folder = place / "checkpoints" / f"submit_{submit.submit_index:03d}"
+        checkpoints.write(folder, meta, bundle, checkpoints.measured(bundle))
+
+
+def _curves(archive: Archive, run: PublishedRun) -> tuple[Curve, ...]:
+    best = run.result.best_submit_index
+    group = next((each for each in run.groups if each.split == "heldout" and each.submit_index == best), None)
+    if group is None:
+        return ()
+    path = f"{run.folder}/actions/{group.name}"
+    recordings: list[bytes | None] = []
+    if path in archive.names:
+        recordings = contents.unpack_recordings(archive.read(path, contents.MAX_RECORDING_BYTES))
+    found = []
+    for episode in group.episodes:
+        data = recordings[episode.index] if episode.index < len(recordings) else None
+        found.append(
+            Curve(
+                index=episode.index,
+                episode_return=episode.episode_return,
+                length=episode.length,
+                failure=episode.failure,
+                sums=() if data is None else _sums(run_rules.recording_of(data).rewards.tolist()),
+            )
+        )
+    return tuple(found)
+
+
+def _sums(rewards: Sequence[float]) -> tuple[float, ...]:
+    total, sums = 0.0, [0.0]
+    for reward in rewards:
+        total += reward
+        sums.append(total)
+    step = max(1, -(-len(sums) // _POINTS))
+    return (*sums[:-1:step], sums[-1])
+
+
+def _tell_apart(found: Sequence[LabBundle]) -> None:
+    """Adds the signer to entries that several signers have, until none is shared: a signer may have chosen the name that
+    another's entry gets. Of a signer's runs with one name, the later ones get their ids."""
+    names = [bundle.label for bundle in found]
+    while shared := _shared(found):
+        for bundle, name in zip(found, names, strict=True):
+            for number, each in enumerate(bundle.runs):
+                if each.run.entry in shared:
+                    agent = msgspec.structs.replace(each.run.record.agent, entry=f"{each.run.entry} ({name})")
+                    record = msgspec.structs.replace(each.run.record, agent=agent)
+                    bundle.runs[number] = msgspec.structs.replace(
+                        each, run=msgspec.structs.replace(each.run, record=record)
+                    )
+        # Names and first digits may be equal; whole keys are not.
+        names = [bundle.signer for bundle in found]
+    # A report knows a run by its name, so two files of one signer may not have the same one.
+    seen: set[str] = set()
+    for bundle in found:
+        for number, each in enumerate(bundle.runs):
+            while each.run.name in seen:
+                record = msgspec.structs.replace(
+                    each.run.record, exp_id=f"{each.run.record.exp_id} ({each.published})"
+                )
+                each = bundle.runs[number] = msgspec.structs.replace(
+                    each, run=msgspec.structs.replace(each.run, record=record)
+                )
+            seen.add(each.run.name)
+
+
+def _shared(found: Sequence[LabBundle]) -> set[str]:
+    """Entries that several signers have."""
+    signers: dict[str, set[str]] = {}
+    for bundle in found:
+        for each in bundle.runs:
+            signers.setdefault(each.run.entry, set()).add(bundle.signer)
+    return {entry for entry, keys in signers.items() if len(keys) > 1}
+
+
+def _short(text: str) -> str:
+    """The text; a longer one is cut and gets a hash, so that different texts stay different."""
+    if len(text) <= _MAX_NAME:
+        return text
+    return f"{text[: _MAX_NAME - 10]}…{hashlib.sha256(text.encode()).hexdigest()[:8]}"
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -1,0 +1,145 @@
+"""Findings of a check of published results, and what it reads: the files, the journal's entries, one run's documents."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import Any, Literal, NamedTuple, Protocol, TypeVar
+
+import msgspec
+
+from evopolicy_common.errors import DECODE_ERRORS, ProtocolError
+from evopolicy_common.messages.environment import Split
+from evopolicy_common.records import journal
+from evopolicy_common.records.journal import Opening, Result
+from evopolicy_common.records.run_record import RunRecord
+from evopolicy_results.publish.contents import Group, Listed, Removed
+
+T = TypeVar("T")
+
+KINDS = {
+    "format": "the format is one that this version reads",
+    "signature": "the signature is of this manifest",
+    "identity": "the signer is the one that you named",
+    "digests": "every file has the digest that was signed",
+    "journal": "the journal's entries are complete and in order",
+    "commitment": "splits and settings are those that were fixed before the agent began",
+    "disclosure": "the journal says that the cases were made public",
+    "record": "run.json tells what was committed to and what came of it",
+    "result": "the result is the one that the journal fixed when the run ended",
+    "budget": "submits keep to budget and bounds",
+    "selection": "the selected checkpoint is the one with the best validation mean",
+    "scores": "scores follow from the returns of the episodes",
+    "recordings": "returns follow from the recorded rewards",
+    "checkpoints": "the policies are those that were submitted",
+    "signals": "nothing in checkpoints and logs asks for a look (no verdict)",
+    "logs": "agents' logs are what the agents wrote",
+    "completeness": "every run that was opened for the entries is here",
+    "order": "the journal could not be begun anew",
+    "policies": "the actions came from the policies",
+    "claims": "every field follows from another, or was fixed when the run was opened or ended",
+    "replay": "the environments give the recorded rewards for the recorded actions",
+}
+"""The checks, in the order of the output."""
+
+
+class Finding(msgspec.Struct, frozen=True, kw_only=True):
+    """One verdict."""
+
+    kind: str
+    state: Literal["ok", "failed", "open"]
+    text: str
+    run: str = ""
+    """The run it is of; empty for the whole."""
+
+
+class Files(Protocol):
+    """The files of published results."""
+
+    @property
+    def names(self) -> frozenset[str]: ...
+
+    def read(self, name: str, most: int) -> bytes:
+        """ProtocolError for a file that is not there, damaged, or larger than `most`."""
+
+
+class PublishedRun(msgspec.Struct, frozen=True, kw_only=True):
+    """A run whose documents could be read."""
+
+    folder: str
+    record: RunRecord
+    opening: Opening
+    salt: bytes
+    result: Result
+    groups: tuple[Group, ...]
+    opening_bytes: bytes
+    result_bytes: bytes
+    as_written: dict[str, Any]
+    """The content of `run.json`."""
+
+    def cases(self, split: Split) -> tuple[Any, ...]:
+        """The cases of a split."""
+        return {
+            "train": self.opening.train,
+            "validation": self.opening.validation,
+            "heldout": self.opening.heldout,
+        }[split]
+
+
+class Checked(msgspec.Struct, kw_only=True):
+    """The result of a check so far."""
+
+    signer: str = ""
+    """Public key, hexadecimal; empty without a valid signature."""
+    findings: list[Finding] = []
+    listing: tuple[Listed, ...] = ()
+    """Every run that was opened for the published entries."""
+    removed: tuple[Removed, ...] = ()
+    runs: list[PublishedRun] = []
+    claims: dict[str, list[str]] = {}
+    """Fields that nobody can check, by file (`fields`)."""
+    recorded: dict[str, dict[str, tuple[int, int]]] = {}
+    """By run and part (`contents.PARTS`): the episodes that have a recording, and all."""
+
+    @property
+    def failed(self) -> bool:
+        return any(each.state == "failed" for each in self.findings)
+
+    covered: dict[str, int] = {}
+    """By part, the episodes that a replay played."""
+
+    def coverage(self) -> str:
+        """The episodes that a replay played of all, by part, such as `2 of 5 train, 0 of 3 held-out`."""
+        total: dict[str, int] = {}
+        for parts in self.recorded.values():
+            for part, (_, of) in parts.items():
+                total[part] = total.get(part, 0) + of
+        return ", ".join(f"{self.covered.get(part, 0)} of {of} {part}" for part, of in total.items())
+
+    def unrecorded(self, run: str) -> list[str]:
+        """The parts of a run with episodes that have no recording, such as `0 of 6 held-out`."""
+        return [f"{n} of {of} {part}" for part, (n, of) in self.recorded.get(run, {}).items() if n < of]
+
+    def claim(self, file: str, fields: Iterable[str]) -> None:
+        if found := list(fields):
+            self.claims.setdefault(file, []).extend(found)
+
+    def add(self, kind: str, state: Literal["ok", "failed", "open"], text: str, run: str = "") -> None:
+        self.findings.append(Finding(kind=kind, state=state, text=text, run=run))
+
+
+class Fault(NamedTuple):
+    kind: str
+    text: str
+
+
+class History(NamedTuple):
+    entries: list[journal.Entry]
+    heads: list[str]
+
+
+def decoded(name: str, data: bytes, kind: Callable[..., T] | type[T]) -> T:
+    try:
+        found: T = msgspec.json.decode(data, type=kind)
+    except (*DECODE_ERRORS, ValueError) as error:
+        raise ProtocolError(f"{name} is damaged: {error}") from error
+    return found

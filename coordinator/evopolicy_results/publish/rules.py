@@ -1,0 +1,253 @@
+"""The checks of `evopolicy check` on published results, without playing episodes. Pure: files in, findings out.
+
+Rules that this module owns:
+- No part of a file is trusted because another part confirms it: everything is traced to the journal's entries, whose
+  chain of hashes is in the signed manifest. The signer is trusted only if the caller names the key.
+- A finding has a kind (`KINDS`). `failed`: the published data contradict each other or the signature. `open`: this
+  check cannot decide, and states the reason.
+- For any content of a file, the check ends with findings; only a file without published results is an error.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from evopolicy_common.errors import ProtocolError
+from evopolicy_common.records import journal
+from evopolicy_common.records.canary import CANARY
+from evopolicy_common.records.journal import Ended, Opened
+from evopolicy_common.records.summary import utc_text
+from evopolicy_results.publish import contents, fields
+from evopolicy_results.publish.contents import Countersignature, Manifest, Removed, Signature
+from evopolicy_results.publish.findings import Checked, Files, History, decoded
+from evopolicy_results.publish.run_rules import UPDATE, check_run, read_run, refuse_unknown
+from evopolicy_results.publish.signatures import HEAD, signed_by
+
+
+def check(files: Files, identity: str = "", heads: Sequence[str | Countersignature] = ()) -> Checked:
+    """All but the replay. `identity`: the public key (hex) that the signer must have; empty: any.
+
+    `heads`: of the journal, as they were noted elsewhere: hexadecimal digits, or another coordinator's countersignature.
+    """
+    checked = Checked()
+    manifest = _manifest(files, identity, checked)
+    if manifest is None:
+        return checked
+    _names(files, manifest, checked)
+    damaged = _digests(files, manifest, checked)
+    entries = _journal(files, manifest, checked)
+    _order(entries, heads, checked)
+    _removed(files, checked)
+    folders = sorted({"/".join(name.split("/")[:2]) for name in files.names if name.startswith("runs/")})
+    if len(folders) > contents.MAX_RUNS:
+        checked.add("format", "failed", f"{len(folders):,} runs; {contents.MAX_RUNS:,} are allowed")
+        return checked
+    if not folders:
+        checked.add("format", "failed", "there is no run in it")
+    seen: set[str] = set()
+    for folder in folders:
+        run = read_run(files, folder, checked)
+        if run is None:
+            continue
+        if run.opening.run in seen:
+            checked.add("digests", "failed", f"run {run.opening.run} occurs twice", run.opening.run)
+        seen.add(run.opening.run)
+        checked.runs.append(run)
+        check_run(files, run, entries, damaged, checked)
+    if any(name.startswith("runs/") and "/actions/" in name for name in files.names):
+        text = "only --replay compares the recorded actions, single rewards and ends with the environment"
+        checked.add("claims", "open", text)
+    checked.listing = contents.listing(entries.entries, seen)
+    _completeness(checked)
+    _claims(checked)
+    return checked
+
+
+def _manifest(files: Files, identity: str, checked: Checked) -> Manifest | None:
+    try:
+        data = files.read(contents.MANIFEST, contents.MAX_DOCUMENT_BYTES)
+        manifest = decoded(contents.MANIFEST, data, Manifest)
+        by = files.read(contents.SIGNATURE, 4096)
+        signature = decoded(contents.SIGNATURE, by, Signature)
+        if contents.document(signature) != by:
+            raise ProtocolError(f"{contents.SIGNATURE} is not written as the software writes it")
+    except ProtocolError as error:
+        checked.add("format", "failed", str(error))
+        return None
+    if (manifest.format, manifest.version) != (contents.FORMAT, contents.VERSION):
+        found = f"{manifest.format[:40]!r} version {manifest.version}"
+        checked.add(
+            "format", "failed", f"{found}; this program reads {contents.FORMAT!r} version {contents.VERSION}"
+        )
+        return None
+    if data != contents.document(manifest) or manifest.canary != CANARY:
+        checked.add(
+            "format",
+            "failed",
+            "the manifest is not written as the software writes it: a field is added or doubled, or another canary",
+        )
+        return None
+    checked.claim(contents.MANIFEST, ["software"])
+    checked.add("format", "ok", f"version {manifest.version}, made by evopolicy {manifest.software}")
+    if not signed_by(signature.key, signature.signature, contents.digest(data)):
+        checked.add("signature", "failed", f"not a signature of this manifest by {signature.key[:64]}")
+        return manifest
+    checked.signer = signature.key
+    checked.add("signature", "ok", f"signed by {signature.key}")
+    if not identity:
+        text = (
+            "self-signed: whoever made the file chose the key. Name the key that you expect with --identity"
+        )
+        checked.add("identity", "open", text)
+    elif signature.key == identity.lower():
+        checked.add("identity", "ok", "signed by the key that you named")
+    else:
+        checked.add("identity", "failed", f"another signer: {signature.key}, not {identity}")
+    return manifest
+
+
+def _names(files: Files, manifest: Manifest, checked: Checked) -> None:
+    """Files that publication does not write, and those of the manifest that it leaves to a run's digests."""
+    odd = sorted(name for name in files.names if fields.file_kind(name) is None)
+    top = (contents.JOURNAL, contents.REMOVED)
+    odd += [name for name in manifest.files if name not in top and not name.endswith(f"/{contents.DIGESTS}")]
+    for name in odd:
+        checked.add("format", "failed", f"{name[:120]} is no file of published results: {UPDATE}")
+
+
+def _digests(files: Files, manifest: Manifest, checked: Checked) -> set[str]:
+    """The names of files that are not what was signed."""
+    wanted = dict(manifest.files)
+    bad: list[str] = []
+    for name in [name for name in manifest.files if name.endswith(f"/{contents.DIGESTS}")]:
+        try:
+            data = files.read(name, contents.MAX_DOCUMENT_BYTES)
+            inner = decoded(name, data, dict[str, str])
+            fields.parsed(name, data)
+        except ProtocolError as error:
+            bad.append(str(error))
+            continue
+        folder = name.removesuffix(contents.DIGESTS)
+        wanted |= {f"{folder}{path}": digest for path, digest in inner.items()}
+    expected = wanted.keys() | {contents.MANIFEST, contents.SIGNATURE}
+    damaged: set[str] = set()
+    for name in sorted(wanted.keys() & files.names):
+        try:
+            found = contents.digest(files.read(name, contents.MAX_RECORDING_BYTES))
+        except ProtocolError as error:
+            bad.append(str(error))
+            damaged.add(name)
+            continue
+        if found != wanted[name]:
+            bad.append(f"{name} was changed")
+            damaged.add(name)
+    bad += [f"{name} is missing" for name in sorted(expected - files.names)]
+    bad += [f"{name} was added" for name in sorted(files.names - expected)]
+    for text in bad:
+        checked.add("digests", "failed", text)
+    if not bad:
+        checked.add("digests", "ok", f"{len(wanted):,} files")
+    return damaged
+
+
+def _journal(files: Files, manifest: Manifest, checked: Checked) -> History:
+    try:
+        lines = contents.journal_entries(files.read(contents.JOURNAL, contents.MAX_RECORDING_BYTES))
+        entries = [journal.read_entry(line) for line in lines]
+        for line in lines:
+            fields.parsed(contents.JOURNAL, line)
+    except ProtocolError as error:
+        checked.add("journal", "failed", f"{contents.JOURNAL}: {error}")
+        return History([], [])
+    heads = journal.heads(lines)
+    head = heads[-1] if heads else journal.EMPTY_HEAD
+    fault = _history_fault(entries)
+    if (len(lines), head) != (manifest.journal_entries, manifest.journal_head):
+        fault = f"its {len(lines)} entries come to the head {head}, which is not the signed one"
+    if fault:
+        checked.add("journal", "failed", fault)
+    else:
+        checked.add("journal", "ok", f"{len(lines)} entries, head {head}")
+    return History(entries, heads)
+
+
+def _order(history: History, noted: Sequence[str | Countersignature], checked: Checked) -> None:
+    """Whether the journal had the heads that were noted elsewhere."""
+    if not noted:
+        text = (
+            "the journal is its owner's, who could have deleted it and begun another: compare its head with one that was noted"
+            " elsewhere in time (--head)"
+        )
+        checked.add("order", "open", text)
+    for each in noted:
+        head, by = each, "that you gave"
+        if isinstance(each, Countersignature):
+            head, by = each.head, f"countersigned by {each.key} at {utc_text(each.at)} by its clock"
+            if not signed_by(each.key, each.signature, contents.head_digest(each.head, each.at), HEAD):
+                checked.add("order", "failed", f"not a countersignature by {each.key}")
+                continue
+            if each.key == checked.signer:
+                checked.add(
+                    "order", "open", "countersigned with the signer's own key, which shows nothing more"
+                )
+                continue
+        try:
+            number = history.heads.index(str(head))
+        except ValueError:
+            text = f"the journal never had the head {head}, {by}: it was changed, or begun anew"
+            checked.add("order", "failed", text)
+            continue
+        later = sum(isinstance(entry, Opened) for entry in history.entries[number + 1 :])
+        checked.add(
+            "order",
+            "ok",
+            f"the journal had entry {number} with the head {by}; {later} runs were opened after it",
+        )
+
+
+def _history_fault(entries: Sequence[journal.Entry]) -> str | None:
+    """A contradiction in the order of the entries; None if there is none."""
+    opened: dict[str, str] = {}
+    ended: set[str] = set()
+    revealed: set[str] = set()
+    at = 0.0
+    for number, entry in enumerate(entries):
+        if entry.at < at:
+            return f"entry {number} is older than the one before it"
+        at = entry.at
+        if isinstance(entry, Opened):
+            if entry.run in opened:
+                return f"run {entry.run} is opened twice"
+            opened[entry.run] = entry.epoch
+        elif isinstance(entry, Ended):
+            if entry.run not in opened or entry.run in ended:
+                return f"run {entry.run} ends without being open"
+            ended.add(entry.run)
+        else:
+            revealed.add(entry.epoch)
+            left = next((run for run, of in opened.items() if of == entry.epoch and run not in ended), None)
+            if left is not None:
+                return f"epoch {entry.epoch} is revealed while run {left} is open"
+    return None
+
+
+def _removed(files: Files, checked: Checked) -> None:
+    try:
+        data = files.read(contents.REMOVED, contents.MAX_DOCUMENT_BYTES)
+        checked.removed = decoded(contents.REMOVED, data, tuple[Removed, ...])
+        refuse_unknown(contents.REMOVED, fields.parsed(contents.REMOVED, data), {}, checked)
+    except ProtocolError as error:
+        checked.add("format", "failed", str(error))
+
+
+def _claims(checked: Checked) -> None:
+    for file, found in checked.claims.items():
+        kind = fields.file_kind(file) or file
+        run = next((run.opening.run for run in checked.runs if file.startswith(f"{run.folder}/")), "")
+        text = f"nobody can check, in {kind.removeprefix('runs/*/')}: {', '.join(found)}"
+        checked.add("claims", "open", text, run)
+
+
+def _completeness(checked: Checked) -> None:
+    is_whole = all(each.state == "published" for each in checked.listing)
+    checked.add("completeness", "ok" if is_whole else "open", contents.completeness(checked.listing))

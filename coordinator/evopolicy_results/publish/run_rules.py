@@ -1,0 +1,473 @@
+"""The rules of `evopolicy check` for one run: its documents against the journal, against each other, and against its recordings."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import zip_longest
+from typing import Any, TypeVar
+
+import msgspec
+
+from evopolicy_common import catalogue
+from evopolicy_common.errors import BundleError, ProtocolError
+from evopolicy_common.records import journal
+from evopolicy_common.records.aggregates import mean
+from evopolicy_common.records.code_metrics import TREND, code_metrics
+from evopolicy_common.records.episodes.compare import same
+from evopolicy_common.records.episodes.trajectory import Trajectory, decode
+from evopolicy_common.records.journal import Ended, Opened, Opening, Result, Revealed
+from evopolicy_common.records.policies import bundles
+from evopolicy_common.records.policies.bundles import Bundle
+from evopolicy_common.records.run_record import PROTOCOL_VERSION, decode_run_record, inputs_digest
+from evopolicy_common.records.splits import FILE_STEMS, SPLITS, cases_hash, overlaps
+from evopolicy_common.records.summary import utc_text
+from evopolicy_results.publish import contents, fields
+from evopolicy_results.publish.contents import Group
+from evopolicy_results.publish.findings import KINDS, Checked, Fault, Files, History, PublishedRun, decoded
+from evopolicy_results.verify.numbers import outcome_pairs
+
+T = TypeVar("T")
+
+_SHOWN = 8
+"""Unknown fields of a file that become findings."""
+_BY_SUBMIT = "code_metrics_by_submit"
+_PARSED = (
+    "classes",
+    "functions",
+    "imports",
+    "import_count",
+    "cyclomatic_total",
+    "cyclomatic_max",
+    "parse_errors",
+)
+"""Metrics of code that rest on Python's parser."""
+UPDATE = "it was added, or a later version of evopolicy wrote it (then update)"
+
+
+def refuse_unknown(name: str, value: Any, committed: dict[str, Any], checked: Checked, run: str = "") -> None:
+    """Refuses fields that the table of `fields` does not name, and notes those that are claims."""
+    unknown, claims = fields.unknown_and_claims(name, value, committed)
+    for field in unknown[:_SHOWN]:
+        checked.add(
+            "format", "failed", f"{name}: {field[:120]} is no field of published results: {UPDATE}", run
+        )
+    checked.claim(name, claims)
+
+
+def read_run(files: Files, folder: str, checked: Checked) -> PublishedRun | None:
+    data, content = {}, {}
+    try:
+        for name in (contents.OPENING, contents.RESULT, contents.EPISODES, contents.RUN, contents.SALT):
+            data[name] = files.read(f"{folder}/{name}", contents.MAX_DOCUMENT_BYTES)
+            if name != contents.SALT:
+                content[name] = fields.parsed(f"{folder}/{name}", data[name])
+        salt = data[contents.SALT].decode("ascii", "replace")
+        run = PublishedRun(
+            folder=folder,
+            record=decode_run_record(data[contents.RUN]),
+            opening=decoded(f"{folder}/{contents.OPENING}", data[contents.OPENING], Opening),
+            salt=bytes.fromhex(salt),
+            result=decoded(f"{folder}/{contents.RESULT}", data[contents.RESULT], Result),
+            groups=decoded(f"{folder}/{contents.EPISODES}", data[contents.EPISODES], tuple[Group, ...]),
+            opening_bytes=data[contents.OPENING],
+            result_bytes=data[contents.RESULT],
+            as_written=content[contents.RUN],
+        )
+        if salt != run.salt.hex():
+            raise ProtocolError("its salt is not written as the software writes it")
+    except (ProtocolError, ValueError) as error:
+        checked.add("format", "failed", f"{folder}: {error}", folder)
+        return None
+    for name in (contents.EPISODES, contents.RUN):
+        refuse_unknown(f"{folder}/{name}", content[name], run.result.record, checked, run.opening.run)
+    return run
+
+
+def check_run(files: Files, run: PublishedRun, history: History, damaged: set[str], checked: Checked) -> None:
+    name = run.opening.run
+    rules: tuple[tuple[str, Iterator[Fault]], ...] = (
+        ("commitment", _commitment(run, history)),
+        ("disclosure", _disclosure(run, history)),
+        ("result", _result(run, history)),
+        ("record", _record(run, history)),
+        ("budget", _budget(run)),
+        ("selection", _selection(run)),
+        ("scores", _scores(run)),
+    )
+    for kind, faults in rules:
+        found = list(faults)
+        for fault in found:
+            checked.add(fault.kind, "failed", fault.text, name)
+        if not found:
+            checked.add(kind, "ok", KINDS[kind], name)
+    _recordings(files, run, damaged, checked)
+    _checkpoints(files, run, damaged, checked)
+    if f"{run.folder}/{contents.LOG}" in files.names:
+        checked.add("logs", "open", "the log is its publisher's: nothing fixed it when the run ended", name)
+    text = "a recording shows what was played, not who decided it: actions could have been computed elsewhere"
+    checked.add("policies", "open", text, name)
+
+
+def _entry(history: History, kind: type[T], run: str) -> tuple[int, T] | None:
+    for number, entry in enumerate(history.entries):
+        if isinstance(entry, kind) and getattr(entry, "run", None) == run:
+            return number, entry
+    return None
+
+
+def _commitment(run: PublishedRun, history: History) -> Iterator[Fault]:
+    opening, settings = run.opening, run.opening.settings
+    found = _entry(history, Opened, opening.run)
+    if found is None:
+        yield Fault("journal", "the journal has no entry of this run")
+        return
+    number, entry = found
+    if len(run.salt) != journal.SALT_BYTES:
+        yield Fault("commitment", f"its salt has {len(run.salt)} bytes instead of {journal.SALT_BYTES}")
+    if journal.commitment(run.salt, run.opening_bytes) != entry.commitment:
+        yield Fault("commitment", "splits or settings are not those that were committed to")
+    declared = (entry.epoch, entry.entry, entry.model, entry.env, entry.exp_id, entry.repeat, entry.attempt)
+    ours = (opening.epoch, settings.entry, settings.model, settings.env, settings.exp_id)
+    if declared != (*ours, settings.repeat, settings.attempt):
+        yield Fault("commitment", "the journal opened it for another entry, environment, experiment or epoch")
+    place = run.record.committed
+    if place is None or (place.commitment, place.opened, place.opened_head, place.epoch) != (
+        entry.commitment,
+        number,
+        history.heads[number],
+        entry.epoch,
+    ):
+        yield Fault("record", "run.json tells another commitment or head of the journal than the journal has")
+    cases = {split: run.cases(split) for split in SPLITS}
+    if repeated := overlaps(cases):
+        yield Fault("commitment", f"its splits are not disjoint: {repeated[0]}")
+
+
+def _disclosure(run: PublishedRun, history: History) -> Iterator[Fault]:
+    epoch = run.opening.epoch
+    if not any(isinstance(entry, Revealed) and entry.epoch == epoch for entry in history.entries):
+        yield Fault(
+            "disclosure", f"epoch {epoch} was not revealed: its cases may still be played as secret ones"
+        )
+
+
+def _result(run: PublishedRun, history: History) -> Iterator[Fault]:
+    found = _entry(history, Ended, run.opening.run)
+    if found is None:
+        yield Fault("result", "the journal has no end of this run")
+        return
+    number, entry = found
+    if journal.digest(run.result_bytes) != entry.result or run.result.run != run.opening.run:
+        yield Fault("result", "result.json is not the result that the journal fixed when the run ended")
+    if run.result.status != entry.status:
+        yield Fault("result", f"it ended as {entry.status}, not as {run.result.status}")
+    place = run.record.committed
+    if place is None or (place.ended, place.ended_head) != (number, history.heads[number]):
+        yield Fault("record", "run.json tells another end of the run than the journal has")
+
+
+def _record(run: PublishedRun, history: History) -> Iterator[Fault]:
+    """`run.json`, compared with the committed documents."""
+    record, opening, result = run.record, run.opening, run.result
+    settings, dimensions = opening.settings, record.experiment_dimensions
+    # A run that ended before it had a workspace tells no counts.
+    staged = dimensions.n_train > 0 or bool(result.submits)
+    pairs: list[tuple[str, Any, Any]] = [
+        ("protocol_version", record.protocol_version, PROTOCOL_VERSION),
+        ("run", record.run, opening.run),
+        ("env", record.env, settings.env),
+        ("model", record.model, settings.model),
+        ("exp_id", record.exp_id, settings.exp_id),
+        ("repeat", record.repeat, settings.repeat),
+        ("attempt", record.attempt, settings.attempt),
+        ("agent.entry", record.agent.entry, settings.entry),
+        ("sandbox_tier", record.sandbox_tier, settings.sandbox_tier),
+        ("episode_budget", dimensions.episode_budget, opening.budget),
+        ("versions.data_secret", record.versions.data_secret, opening.cases_secret),
+    ]
+    for name in (
+        "policy_scope",
+        "observations",
+        "simulation",
+        "video",
+        "limits",
+        "finish",
+        "step_limit",
+        "profile",
+        "feedback",
+    ):
+        pairs.append((name, getattr(dimensions, name), getattr(settings, name)))
+    pairs.append(("hidden_cases", dimensions.hidden_cases, settings.hidden_cases))
+    for name, here, fixed in (
+        ("agents_md", dimensions.agents_md, settings.agents_md),
+        ("agent.prompts", record.agent.prompts, settings.prompts),
+    ):
+        pairs.append((name, here, f"sha256:{fixed}" if fixed else ""))
+    pairs.append(("agent.inputs", inputs_digest(record.agent.inputs), settings.inputs))
+    for name, told in (
+        ("n_train", len(opening.train)),
+        ("min_episodes_per_submit", opening.min_episodes_per_submit),
+        ("max_episodes_per_submit", opening.max_episodes_per_submit),
+    ):
+        pairs.append((name, getattr(dimensions, name), told if staged else 0))
+    suite = catalogue.suite_of(settings.env) if catalogue.is_shipped(settings.env) else catalogue.OTHER
+    for name, n, usual in (
+        ("n_validation", len(opening.validation), suite.n_validation),
+        ("n_heldout", len(opening.heldout), suite.n_heldout),
+    ):
+        # Where files determine the cases, `run.json` may tell the suite's number.
+        if getattr(dimensions, name) != usual or getattr(settings, name) is not None:
+            pairs.append((name, getattr(dimensions, name), n))
+    for path, fixed in result.record.items():
+        here = fields.value_at(run.as_written, path)
+        if not _alike(here, fixed):
+            pairs.append((path, here, fixed))
+    if not result.random_heldout_returns:
+        pairs.append(("outcome.random_reference", record.outcome.random_reference, None))
+    began, over = _entry(history, Opened, opening.run), _entry(history, Ended, opening.run)
+    if began is not None and over is not None:
+        start, end = began[1].at, over[1].at
+        pairs.append(("timing.start_time", record.timing.start_time, utc_text(start)))
+        pairs.append(("timing.end_time", record.timing.end_time, utc_text(end)))
+        pairs.append(("timing.wall_time_seconds", record.timing.wall_time_seconds, round(end - start, 3)))
+    for split in SPLITS:
+        ours = f"sha256:{cases_hash(run.cases(split))}"
+        pairs.append((f"the hash of the {FILE_STEMS[split]} cases", record.versions.cases_hash(split), ours))
+    for name, here, fixed in pairs:
+        if here != fixed:
+            yield Fault("record", f"run.json tells {name} {_short(here)}; committed to was {_short(fixed)}")
+    for name, here, fixed in outcome_pairs(record.outcome, result):
+        if here != fixed:
+            yield Fault(
+                "record", f"run.json tells {name} {_short(here)}; what came of the run is {_short(fixed)}"
+            )
+
+
+def _budget(run: PublishedRun) -> Iterator[Fault]:
+    opening, result = run.opening, run.result
+    indexes = [submit.submit_index for submit in result.submits]
+    if indexes != sorted(set(indexes)):
+        yield Fault("budget", "its submits are not in order")
+    used = 0
+    for submit in result.submits:
+        n = len(submit.env_instances)
+        used += n
+        if not opening.min_episodes_per_submit <= n <= opening.max_episodes_per_submit:
+            yield Fault(
+                "budget", f"submit {submit.submit_index} has {n} episodes, which the settings do not allow"
+            )
+        if any(not 0 <= case < len(opening.train) for case in submit.env_instances):
+            yield Fault("budget", f"submit {submit.submit_index} plays a case that is not one of train")
+    if used != result.budget_used or used > opening.budget:
+        yield Fault(
+            "budget",
+            f"its submits take {used} episodes, {result.budget_used} are told, {opening.budget} were granted",
+        )
+
+
+def _selection(run: PublishedRun) -> Iterator[Fault]:
+    result = run.result
+    eligible = [
+        submit
+        for submit in result.submits
+        if submit.status == "ok"
+        and submit.val_mean is not None
+        and submit.submit_index not in result.validation_ineligible
+    ]
+    best = max(eligible, key=lambda submit: (submit.val_mean, submit.submit_index), default=None)
+    wanted = None if best is None or result.status != "completed" else best.submit_index
+    if result.status == "completed" and result.best_submit_index != wanted:
+        yield Fault(
+            "selection",
+            f"submit {result.best_submit_index} is told, submit {wanted} has the best validation mean",
+        )
+
+
+def _scores(run: PublishedRun) -> Iterator[Fault]:
+    result, opening = run.result, run.opening
+    if len({group.name for group in run.groups}) != len(run.groups):
+        yield Fault("scores", "a list of episodes occurs twice")
+    wanted_names = [contents.group_name(split, index) for split, index, _ in contents.wanted_groups(result)]
+    if odd := [group.name for group in run.groups if group.name not in wanted_names]:
+        yield Fault("scores", f"the result has no episodes of {odd[0]}")
+    groups = {(group.split, group.submit_index): group for group in run.groups}
+    submits = {submit.submit_index: submit for submit in result.submits}
+    for split, index, n in contents.wanted_groups(result):
+        name = contents.group_name(split, index)
+        group = groups.get((split, index))
+        if group is None:
+            yield Fault("scores", f"the episodes of {name} are not there")
+            continue
+        wanted = len(opening.validation) if n < 0 else n
+        if [episode.index for episode in group.episodes] != list(range(wanted)):
+            yield Fault(
+                "scores", f"{name} has {len(group.episodes)} episodes, or out of order, instead of {wanted}"
+            )
+            continue
+        returns = tuple(episode.episode_return for episode in group.episodes)
+        if split == "heldout":
+            recorded = result.random_heldout_returns if index == contents.RANDOM else result.heldout_returns
+            if returns != recorded:
+                yield Fault("scores", f"the returns of {name} are not those of the result")
+        else:
+            submit = submits[index]
+            told = submit.mean_return if split == "train" else submit.val_mean
+            if returns and mean(returns) != told:
+                yield Fault("scores", f"the returns of {name} have the mean {mean(returns)!r}, not {told!r}")
+    for split in ("validation", "heldout"):
+        best = groups.get((split, -2 if result.best_submit_index is None else result.best_submit_index))
+        failed = 0 if best is None else sum(episode.failure != "" for episode in best.episodes)
+        if best is not None and failed != result.policy_failures.get(split, 0):
+            yield Fault(
+                "scores", f"{best.name} has {failed} failures of the policy, which the result does not tell"
+            )
+    if result.status == "completed":
+        n_heldout = len(result.heldout_returns)
+        if n_heldout != len(opening.heldout) or result.final_score != mean(result.heldout_returns):
+            yield Fault("scores", "the score is not the mean return of all held-out cases")
+
+
+def _recordings(files: Files, run: PublishedRun, damaged: set[str], checked: Checked) -> None:
+    name, fine = run.opening.run, True
+    recorded: dict[str, tuple[int, int]] = {}
+    lists = f"{run.folder}/actions/"
+    odd = {each for each in files.names if each.startswith(lists)} - {
+        lists + each.name for each in run.groups
+    }
+    for path in sorted(odd):
+        checked.add("recordings", "failed", f"{path} is of no list of episodes", name)
+        fine = False
+    for number, group in enumerate(run.groups):
+        path, there = f"{lists}{group.name}", 0
+        # The result has the returns of held-out episodes.
+        claimed = ["length"] if group.split == "heldout" else ["length", "episode_return"]
+        recordings: list[bytes | None] = []
+        if path in files.names and path not in damaged:
+            try:
+                recordings = contents.unpack_recordings(files.read(path, contents.MAX_RECORDING_BYTES))
+                if len(recordings) != len(group.episodes):
+                    raise ProtocolError(f"{len(recordings)} recordings")
+            except ProtocolError as error:
+                checked.add("recordings", "failed", f"{group.name}: {error}", name)
+                fine, recordings = False, []
+        for position, (episode, data) in enumerate(zip_longest(group.episodes, recordings)):
+            if data is None:
+                place = f"{number}.episodes.{position}"
+                checked.claim(f"{run.folder}/{contents.EPISODES}", (f"{place}.{field}" for field in claimed))
+                continue
+            there += 1
+            if fault := recording_fault(episode, data):
+                checked.add("recordings", "failed", f"{group.name}, episode {episode.index}: {fault}", name)
+                fine = False
+        before = recorded.get(group.part, (0, 0))
+        recorded[group.part] = before[0] + there, before[1] + len(group.episodes)
+    checked.recorded[name] = recorded
+    if missing := checked.unrecorded(name):
+        text = f"only {', '.join(missing)} episodes have a recording: the other returns rest on the publisher's word"
+        checked.add("recordings", "open", text, name)
+    elif fine:
+        checked.add("recordings", "ok", f"{sum(n for n, _ in recorded.values())} episodes", name)
+
+
+def recording_fault(episode: contents.Episode, data: bytes) -> str | None:
+    """The contradiction between a recording and the stated result of its episode; None if there is none."""
+    try:
+        recording = recording_of(data)
+    except ProtocolError as error:
+        return str(error)
+    total = return_of(recording)
+    if not same(total, episode.episode_return):
+        return f"its rewards come to {total!r}, told is {episode.episode_return!r}"
+    if recording.n != episode.length:
+        return f"it has {recording.n} steps, told are {episode.length}"
+    return None
+
+
+def recording_of(data: bytes) -> Trajectory:
+    """A published recording. Raises ProtocolError for other bytes, and for a recording of more than actions and
+    rewards."""
+    found = decode(data, contents.MAX_EPISODE_BYTES)
+    if found.record != "actions":
+        raise ProtocolError("it holds more than actions and rewards")
+    return found
+
+
+def return_of(recording: Trajectory) -> float:
+    """The sum of the rewards in the order of the steps, as an episode's return is made."""
+    total = 0.0
+    for reward in recording.rewards:
+        total += float(reward)
+    return total
+
+
+def _checkpoints(files: Files, run: PublishedRun, damaged: set[str], checked: Checked) -> None:
+    name, withheld, there, fine = run.opening.run, 0, 0, True
+    places = {contents.checkpoint_path(each.submit_index): each for each in run.result.submits if each.bundle}
+    policies: dict[int, Bundle] = {}
+    for path in sorted(files.names):
+        if path.startswith(f"{run.folder}/checkpoints/") and path[len(run.folder) + 1 :] not in places:
+            checked.add("checkpoints", "failed", f"{path} is the policy of no submit", name)
+            fine = False
+    for place, submit in places.items():
+        path = f"{run.folder}/{place}"
+        if path not in files.names or path in damaged:
+            withheld += 1
+            continue
+        try:
+            data = files.read(path, contents.MAX_DOCUMENT_BYTES * 2)
+            policies[submit.submit_index] = bundles.load(data, submit.bundle or "")
+            there += 1
+        except (BundleError, ProtocolError) as error:
+            text = f"submit {submit.submit_index}: another policy than the one that was submitted: {error}"
+            checked.add("checkpoints", "failed", text, name)
+            fine = False
+    if withheld:
+        checked.add("checkpoints", "open", f"{withheld} policies were withheld", name)
+    elif fine:
+        checked.add("checkpoints", "ok", f"{there} policies", name)
+    for fault in _metrics(run, policies, checked):
+        checked.add(fault.kind, "failed", fault.text, name)
+
+
+def _metrics(run: PublishedRun, policies: dict[int, Bundle], checked: Checked) -> Iterator[Fault]:
+    """The metrics of code in `run.json`, compared with the policies."""
+    told = run.record.outcome.auxiliary
+    by_submit = told.get(_BY_SUBMIT, {})
+    best = run.record.outcome.best_submit_index
+    try:
+        trend = {name: [each[name] for each in by_submit.values()] for name in TREND}
+        pairs: list[tuple[str, Any, Any]] = [
+            (_BY_SUBMIT, list(by_submit), [str(submit.submit_index) for submit in run.result.submits]),
+            ("code_metrics_best", told.get("code_metrics_best"), by_submit.get(str(best))),
+            ("code_metrics_trend", told.get("code_metrics_trend"), {"submits": list(map(int, by_submit)), **trend}),
+        ]  # fmt: skip
+        for index, here in by_submit.items():
+            where = f"outcome.auxiliary.{_BY_SUBMIT}.{index}"
+            if (policy := policies.get(int(index))) is None:
+                checked.claim(f"{run.folder}/{contents.RUN}", [f"{where}.**"])
+                continue
+            own = msgspec.to_builtins(code_metrics({file.path: file.data for file in policy.files}))
+            # Versions of Python differ in what they can parse.
+            parsed = () if own["parse_errors"] == tuple(here["parse_errors"]) else _PARSED
+            checked.claim(f"{run.folder}/{contents.RUN}", [f"{where}.{name}" for name in parsed])
+            pairs += [(where, here.get(name), value) for name, value in own.items() if name not in parsed]
+            pairs.append((where, sorted(here), sorted(own)))
+    except (AttributeError, KeyError, TypeError, ValueError):
+        yield Fault("record", "run.json tells metrics of code in another form than the software")
+        return
+    # Runs of early versions have none.
+    for name, here, fixed in (
+        pairs if told.keys() & {_BY_SUBMIT, "code_metrics_best", "code_metrics_trend"} else ()
+    ):
+        if not _alike(here, fixed):
+            yield Fault("record", f"run.json tells {name} {_short(here)}; the policies give {_short(fixed)}")
+
+
+def _alike(here: Any, fixed: Any) -> bool:
+    """Whether two values are the same JSON."""
+    return msgspec.json.encode(here, order="sorted") == msgspec.json.encode(fixed, order="sorted")
+
+
+def _short(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 80 else f"{text[:77]}…"

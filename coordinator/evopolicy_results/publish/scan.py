@@ -1,0 +1,60 @@
+"""The transcript scan of published results: places in checkpoints and logs that a person should look at. Adds findings that are never `failed`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from evopolicy_common.errors import BundleError, ProtocolError
+from evopolicy_common.records.policies import bundles
+from evopolicy_results.publish import contents
+from evopolicy_results.publish.findings import Checked, Files, PublishedRun
+from evopolicy_results.publish.run_rules import recording_of
+from evopolicy_results.scan.run import scan
+from evopolicy_results.scan.signals import TITLES, Signal
+
+_SHOWN = 8
+"""Signals of a run that become findings."""
+
+
+def scan_published(files: Files, checked: Checked) -> None:
+    """Adds a finding for each signal, or one `ok` for a run without signals."""
+    for run in checked.runs:
+        name = run.opening.run
+        try:
+            found = _signals(files, run)
+        except ProtocolError as error:
+            checked.add("signals", "open", f"not searched: {error}", name)
+            continue
+        for each in found[:_SHOWN]:
+            text = f"{TITLES[each.kind]}: {each.path}: {each.reason}: {each.quote}"
+            checked.add("signals", "open", text, name)
+        if len(found) > _SHOWN:
+            checked.add("signals", "open", f"{len(found) - _SHOWN} more signals", name)
+        if not found:
+            checked.add("signals", "ok", "no signal", name)
+
+
+def _signals(files: Files, run: PublishedRun) -> tuple[Signal, ...]:
+    log = f"{run.folder}/{contents.LOG}"
+    lines = files.read(log, contents.MAX_DOCUMENT_BYTES).splitlines() if log in files.names else ()
+
+    def trajectories(index: int) -> Iterator[list[object]]:
+        path = f"{run.folder}/actions/{contents.group_name('train', index)}"
+        if path in files.names:
+            for data in contents.unpack_recordings(files.read(path, contents.MAX_RECORDING_BYTES)):
+                if data is not None:
+                    yield list(recording_of(data).actions)
+
+    return scan(_checkpoints(files, run), lines, trajectories)
+
+
+def _checkpoints(files: Files, run: PublishedRun) -> Iterator[tuple[int, dict[str, bytes]]]:
+    for submit in run.result.submits:
+        path = f"{run.folder}/{contents.checkpoint_path(submit.submit_index)}"
+        if submit.bundle is None or path not in files.names:
+            continue
+        try:
+            bundle = bundles.load(files.read(path, contents.MAX_DOCUMENT_BYTES * 2), submit.bundle)
+        except BundleError:
+            continue  # reported by the check of checkpoints
+        yield submit.submit_index, {file.path: file.data for file in bundle.files}

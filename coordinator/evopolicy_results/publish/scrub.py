@@ -1,0 +1,177 @@
+"""Removes unpublishable data from records, and searches for it in all other files. Pure.
+
+A record keeps the fields that this module lists; all other fields are removed and named. If the search finds a term of
+this machine in a file that may be omitted (a policy, recorded actions), the whole file is omitted; otherwise nothing is
+published. A secret in any file stops the publication (`collect`).
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterable, Iterator, Mapping
+
+import msgspec
+
+from evopolicy_common.records import secrets
+from evopolicy_common.records.run_record import PUBLISHED_SETTINGS, Artifacts, RunRecord
+from evopolicy_common.records.secrets import Passed
+from evopolicy_results.publish.contents import Removed
+
+_MIN_NEEDLE = 4
+_SYSTEM_PATHS = (
+    "/usr",
+    "/bin",
+    "/sbin",
+    "/lib",
+    "/opt",
+    "/etc",
+    "/dev",
+    "/proc",
+    "/sys",
+    "/var",
+    "/run",
+    "/snap",
+)
+_PLAIN_VARIABLES = re.compile(
+    r"(LANG|LANGUAGE|LC_.*|TERM|COLORTERM|SHELL|TZ|PYTHON.*|PYTEST_.*|XDG_.*_TYPE|SHLVL|PAGER|EDITOR|LESS.*|LS_COLORS|DEBIAN_FRONTEND|OMP_.*|MKL_.*|CUDA_.*)"
+)
+_NOBODY = frozenset(
+    {"root", "user", "admin", "ubuntu", "debian", "runner", "nobody", "localhost", "evopolicy"}
+)
+"""Names that identify nobody."""
+_HOME = re.compile(rb"/(?:home|Users)/[A-Za-z0-9._-]+")
+
+
+class Needle(msgspec.Struct, frozen=True):
+    """A text that must not be found."""
+
+    text: bytes
+    what: str
+    """The kind of the match, without its text."""
+
+
+def record(full: RunRecord) -> tuple[RunRecord, list[Removed]]:
+    """The part of a `run.json` that is published, and what was left out."""
+    removed = []
+    settings = {name: each for name, each in full.agent.settings.items() if name in PUBLISHED_SETTINGS}
+    for name in sorted(full.agent.settings.keys() - settings.keys()):
+        removed.append(Removed(what=f"agent.settings.{name}", why="may name paths and commands of a machine"))
+    dropped = {
+        "audit": (full.audit is not None, "names workers; its counts are kept"),
+        "versions.fingerprint_overrides": (
+            bool(full.versions.fingerprint_overrides),
+            "an operator's own words",
+        ),
+        "outcome.error": (full.outcome.error is not None, "may name paths and hosts"),
+        "rejected_submits.message": (bool(full.rejected_submits), "free text"),
+        "artifacts": (full.artifacts != Artifacts(), "names folders"),
+        "replays": (bool(full.replays), "videos are not published"),
+    }
+    removed += [Removed(what=name, why=why) for name, (there, why) in dropped.items() if there]
+    audit = full.audit
+    kept = msgspec.structs.replace(
+        full,
+        agent=msgspec.structs.replace(full.agent, settings=settings),
+        outcome=msgspec.structs.replace(
+            full.outcome,
+            error=None if full.outcome.error is None else "left out",
+            policy_failures=tuple(
+                msgspec.structs.replace(each, message="") for each in full.outcome.policy_failures
+            ),
+        ),
+        rejected_submits=tuple(msgspec.structs.replace(each, message="") for each in full.rejected_submits),
+        artifacts=Artifacts(),
+        replays=(),
+        versions=msgspec.structs.replace(
+            full.versions,
+            fingerprint_overrides=tuple("left out" for _ in full.versions.fingerprint_overrides),
+        ),
+        audit=None if audit is None else audit.counts(),
+    )
+    return kept, removed
+
+
+def needles(
+    variables: Mapping[str, str], names: Mapping[str, str], paths: Iterable[str], secrets: Iterable[str]
+) -> tuple[Needle, ...]:
+    """The search terms: values of environment variables, names of users and hosts (each with its kind), folders,
+    secrets."""
+    found: dict[bytes, str] = {}
+
+    def add(text: str, what: str, least: int) -> None:
+        if len(text) >= least and text.casefold() not in _NOBODY:
+            found.setdefault(text.encode("utf-8", "surrogateescape"), what)
+            # As JSON spells it, in a log of JSON lines.
+            found.setdefault(json.dumps(text)[1:-1].encode("ascii"), what)
+
+    for secret in secrets:
+        add(secret, "a token or password of the cluster", _MIN_NEEDLE)
+    for path in paths:
+        if path.count("/") > 1 and not path.startswith(_SYSTEM_PATHS):
+            add(path, "a folder of the publishing machine", 6)
+    for name, what in names.items():
+        add(name, what, 3)
+    for name, value in variables.items():
+        if _PLAIN_VARIABLES.fullmatch(name):
+            continue
+        for part in value.split(":") if "/" in value else (value,):
+            if part.startswith("/") and (part.count("/") < 2 or part.startswith(_SYSTEM_PATHS)):
+                continue
+            add(part, f"the value of the environment variable {name}", 8)
+    return tuple(Needle(text, what) for text, what in sorted(found.items()))
+
+
+def search(data: bytes, needles: Iterable[Needle]) -> list[str]:
+    """The kinds of terms of this machine in `data`, without their texts; a name counts only if no letter or digit adjoins
+    it."""
+    found = ["a home folder"] if _HOME.search(data) else []
+    found += [needle.what for needle in needles if next(_places(data, needle.text), None) is not None]
+    return found
+
+
+def secret_lines(data: bytes, passed: Passed | None) -> dict[int, str]:
+    """The lines with a secret, counted from 1, each with the kind of its first one."""
+    lines: dict[int, str] = {}
+    line, counted = 1, 0
+    for at, what in sorted(secrets.found(data, passed)):
+        line, counted = line + data.count(b"\n", counted, at), at
+        lines.setdefault(line, what)
+    return lines
+
+
+REDACTED = b"[removed]"
+
+
+def redact(
+    data: bytes, needles: Iterable[Needle], passed: Passed | None = None
+) -> tuple[bytes, dict[str, int]]:
+    """`data` with everything replaced that the searches would find, and how often each kind was."""
+    counts: dict[str, int] = {}
+    if passed is not None:
+        data, counts[secrets.PASSED_VALUE] = secrets.replaced(data, passed.places(data), REDACTED)
+    for pattern, what in ((_HOME, "a home folder"), *secrets.looks(data)):
+        data, counts[what] = pattern.subn(REDACTED, data)
+    # The longest first: a folder's path may begin with another's.
+    for needle in sorted(needles, key=lambda needle: -len(needle.text)):
+        places = [(at, at + len(needle.text)) for at in _places(data, needle.text)]
+        data, n = secrets.replaced(data, places, REDACTED)
+        counts[needle.what] = counts.get(needle.what, 0) + n
+    return data, {what: n for what, n in counts.items() if n}
+
+
+_ESCAPES = (rb"\n", rb"\t", rb"\r", rb"\b", rb"\f")
+
+
+def _places(data: bytes, text: bytes) -> Iterator[int]:
+    """Positions of `text` in `data` without an adjoining letter or digit; they do not overlap."""
+    at = data.find(text)
+    while at >= 0:
+        end = at + len(text)
+        # A folder's path may follow any letter. In JSON, `\\n` before a name is a line's end, no letter.
+        before = data[max(0, at - 1) : at] if text[:1].isalnum() else b""
+        is_escape = data[max(0, at - 2) : at] in _ESCAPES
+        is_whole = (is_escape or not before.isalnum()) and not data[end : end + 1].isalnum()
+        if is_whole:
+            yield at
+        at = data.find(text, end if is_whole else at + 1)

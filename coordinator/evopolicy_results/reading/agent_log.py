@@ -1,0 +1,290 @@
+"""Reads from an agent's own log what preceded each submit: its messages, the feedback it read, the images it made.
+
+`logs/agent.jsonl` holds a harness's raw stream, one JSON value per line. Three forms are known: Claude Code's
+`stream-json` (assistant and user messages with content blocks), Codex's `exec --json` (`item.completed`), and the
+output of command agents: the turn protocol (`{"turn", "text", "stop"}`) and plain lines (`{"type": "stdout",
+"text"}`). Lines in any other form, and invalid JSON, are skipped.
+
+A submit's position in the stream is the first tool output with its answer (`submit_id`, or its summary), or the first
+plain line that begins with its name. If the log never shows answers but has timestamps, these decide. If it has
+neither, nothing is attributed: messages are listed separately rather than guessed into place.
+
+An agent may write anything into its log. So each rule here takes time linear in its length, and the amount of data
+that is kept is bounded.
+"""
+
+from __future__ import annotations
+
+import bisect
+import itertools
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from evopolicy_common.errors import DECODE_ERRORS
+from evopolicy_common.records.json_lines import objects
+from evopolicy_common.regular_files import open_regular
+from evopolicy_results.reading.records import Submit
+
+MAX_LOG_BYTES = 64 << 20
+"""Later bytes of a log are not read."""
+MAX_MESSAGE_CHARS = 6000
+MAX_EVENTS = 200_000
+"""Later events of a log are not read."""
+MAX_PATHS = 1000
+"""Maximum number of feedback paths, and of images, per submit."""
+_MAX_PATH_CHARS = 4096
+
+_FEEDBACK = re.compile(r"feedback/[\w./*?\[\]{},-]*")
+_PATH = re.compile(r"[\w./-]+")
+_IMAGE_SUFFIX = re.compile(r"(?<=.)\.(?:png|jpe?g|gif|webp)\b", re.IGNORECASE)
+_ANSWER = re.compile(r"submit_(?:id|index)[\\\"'\s:=]+(?:submit_)?0*(\d+)")
+_NAMED = re.compile(r"submit_0*(\d{1,9})\b")
+_WRAPPERS = ("event", "line", "payload", "data", "raw")
+_TIMES = ("timestamp", "at", "time", "ts")
+_MAX_STAMP_CHARS = 64
+
+
+class LogEvent(msgspec.Struct, frozen=True, kw_only=True):
+    """One event of the log, in the order of the stream."""
+
+    message: str = ""
+    """Text that the agent wrote, not a tool's."""
+    read: tuple[str, ...] = ()
+    """Paths under `feedback/` that a tool call names."""
+    images: tuple[str, ...] = ()
+    """Image files that a tool call names."""
+    answered: tuple[int, ...] = ()
+    """Indices of the submits that a tool's output answers."""
+    at: float | None = None
+    """Unix time, seconds; None when the line has no timestamp."""
+
+
+class Evidence(msgspec.Struct, frozen=True, kw_only=True):
+    """The log's events between the previous submit and this one."""
+
+    read: tuple[str, ...] = ()
+    """Feedback paths that the agent's tool calls name, in order, without repeats."""
+    messages: tuple[str, ...] = ()
+    """The agent's own messages; the last is the closest to the submit, and its attribution of the result if it gives
+    one."""
+    images: tuple[str, ...] = ()
+
+    @property
+    def attribution(self) -> str:
+        return self.messages[-1] if self.messages else ""
+
+
+class LogReading(msgspec.Struct, frozen=True, kw_only=True):
+    """The attributed events of a whole log."""
+
+    by_submit: dict[int, Evidence] = {}
+    unplaced: tuple[str, ...] = ()
+    """Messages from a log that shows no submits, or after the last submit."""
+
+
+def read_agent_log(path: Path, submits: Sequence[Submit]) -> LogReading:
+    """Reads a run's log; empty when it is missing. Never raises for damaged content."""
+    try:
+        events = (event for value in objects(_lines(path)) for event in _events_of(value))
+        kept = list(itertools.islice(events, MAX_EVENTS))
+    except OSError:
+        return LogReading()
+    return place(kept, submits)
+
+
+def place(events: Sequence[LogEvent], submits: Sequence[Submit]) -> LogReading:
+    """Assigns each event to the submit that it precedes."""
+    expected = [submit.index for submit in submits]
+    groups = _by_results(events, expected)
+    if groups is None:
+        groups = _by_times(events, submits)
+    if groups is None:
+        return LogReading(unplaced=tuple(event.message for event in events if event.message))
+    placed, rest = groups
+    by_submit = {index: _evidence(found) for index, found in placed.items()}
+    return LogReading(by_submit=by_submit, unplaced=tuple(event.message for event in rest if event.message))
+
+
+def _by_results(
+    events: Sequence[LogEvent], expected: list[int]
+) -> tuple[dict[int, list[LogEvent]], list[LogEvent]] | None:
+    placed: dict[int, list[LogEvent]] = {}
+    pending: list[LogEvent] = []
+    places = {index: place for place, index in enumerate(expected)}
+    first_waiting = 0
+    for event in events:
+        answered = next((index for index in event.answered if places.get(index, -1) >= first_waiting), None)
+        if answered is not None:
+            placed[answered] = pending
+            pending = []
+            first_waiting = places[answered] + 1
+        pending.append(event)
+    return (placed, pending) if placed else None
+
+
+def _by_times(
+    events: Sequence[LogEvent], submits: Sequence[Submit]
+) -> tuple[dict[int, list[LogEvent]], list[LogEvent]] | None:
+    starts = [
+        (started, submit.index) for submit in submits if (started := _instant(submit.started_at)) is not None
+    ]
+    if not starts or not any(event.at is not None for event in events):
+        return None
+    # An event goes to the first submit that starts late enough, so a submit listed after a later start gets none.
+    latest = list(itertools.accumulate((started for started, _ in starts), max))
+    placed: dict[int, list[LogEvent]] = {}
+    rest: list[LogEvent] = []
+    for event in events:
+        place = len(starts) if event.at is None else bisect.bisect_left(latest, event.at)
+        if place == len(starts):
+            rest.append(event)
+        else:
+            placed.setdefault(starts[place][1], []).append(event)
+    return placed, rest
+
+
+def _evidence(events: Iterable[LogEvent]) -> Evidence:
+    read: dict[str, None] = {}
+    images: dict[str, None] = {}
+    messages: list[str] = []
+    for event in events:
+        read.update(dict.fromkeys(event.read))
+        images.update(dict.fromkeys(event.images))
+        if event.message:
+            messages.append(event.message)
+    return Evidence(
+        read=tuple(itertools.islice(read, MAX_PATHS)),
+        messages=tuple(messages),
+        images=tuple(itertools.islice(images, MAX_PATHS)),
+    )
+
+
+def _lines(path: Path) -> Iterator[bytes]:
+    left = MAX_LOG_BYTES
+    with open_regular(path) as stream:
+        while left > 0:
+            line = stream.readline(left)
+            if not line:
+                return
+            left -= len(line)
+            yield line
+
+
+def _events_of(value: dict[str, Any]) -> Iterator[LogEvent]:
+    at = _stamp(value)
+    if "type" not in value and "turn" not in value and "message" not in value:
+        inner = next((value[key] for key in _WRAPPERS if key in value), None)
+        if isinstance(inner, str):
+            try:
+                inner = msgspec.json.decode(inner)
+            except DECODE_ERRORS:
+                return
+        if not isinstance(inner, dict):
+            return
+        value = inner
+        at = at if at is not None else _stamp(value)
+    kind = value.get("type")
+    if kind in ("assistant", "user"):
+        message = value.get("message")
+        content = message.get("content") if isinstance(message, dict) else None
+        if isinstance(content, str):
+            content = [{"type": "text", "text": content}]
+        for block in content if isinstance(content, list) else ():
+            if isinstance(block, dict):
+                yield from _claude_block(block, kind == "assistant", at)
+    elif kind == "item.completed" and isinstance(value.get("item"), dict):
+        yield from _codex_item(value["item"], at)
+    elif kind == "stdout" and isinstance(value.get("text"), str):
+        named = _NAMED.match(value["text"])
+        yield LogEvent(message=_clip(value["text"]), answered=(int(named.group(1)),) if named else (), at=at)
+    elif isinstance(value.get("turn"), int) and isinstance(value.get("text"), str):
+        yield LogEvent(message=_clip(value["text"]), at=at)
+
+
+def _claude_block(block: dict[str, Any], by_agent: bool, at: float | None) -> Iterator[LogEvent]:
+    kind = block.get("type")
+    if kind == "text" and by_agent and isinstance(block.get("text"), str) and block["text"].strip():
+        yield LogEvent(message=_clip(block["text"]), at=at)
+    elif kind == "tool_use":
+        yield _call(_strings(block.get("input")), at)
+    elif kind == "tool_result":
+        yield LogEvent(answered=_answered_submits(_strings(block.get("content"))), at=at)
+
+
+def _codex_item(item: dict[str, Any], at: float | None) -> Iterator[LogEvent]:
+    kind = item.get("type") or item.get("item_type")
+    if kind in ("agent_message", "assistant_message") and isinstance(item.get("text"), str):
+        yield LogEvent(message=_clip(item["text"]), at=at)
+    elif kind == "command_execution":
+        yield _call(_strings(item.get("command")), at)
+        yield LogEvent(answered=_answered_submits(_strings(item.get("aggregated_output"))), at=at)
+    elif kind in ("mcp_tool_call", "file_change"):
+        yield _call(_strings(item.get("arguments") or item.get("changes")), at)
+
+
+def _call(texts: Sequence[str], at: float | None) -> LogEvent:
+    read: dict[str, None] = {}
+    images: dict[str, None] = {}
+    for text in texts:
+        read.update(dict.fromkeys(path.rstrip("./,") for path in _FEEDBACK.findall(text) if _is_short(path)))
+        images.update(dict.fromkeys(filter(_is_short, _images(text))))
+    return LogEvent(read=tuple(read), images=tuple(images), at=at)
+
+
+def _images(text: str) -> Iterator[str]:
+    """Every run of path characters that holds an image suffix, cut after its last one."""
+    for run in _PATH.findall(text):
+        ends = [found.end() for found in _IMAGE_SUFFIX.finditer(run)]
+        if ends:
+            yield run[: ends[-1]]
+
+
+def _is_short(path: str) -> bool:
+    return len(path) <= _MAX_PATH_CHARS
+
+
+def _answered_submits(texts: Sequence[str]) -> tuple[int, ...]:
+    found: dict[int, None] = {}
+    for text in texts:
+        for match in _ANSWER.finditer(text):
+            if len(match.group(1)) <= 9:
+                found[int(match.group(1))] = None
+    return tuple(found)
+
+
+def _strings(value: Any, depth: int = 0) -> list[str]:
+    """Every string inside a JSON value, in order."""
+    if isinstance(value, str):
+        return [value]
+    if depth > 6:
+        return []
+    if isinstance(value, dict):
+        return [text for item in value.values() for text in _strings(item, depth + 1)]
+    if isinstance(value, list):
+        return [text for item in value for text in _strings(item, depth + 1)]
+    return []
+
+
+def _stamp(value: dict[str, Any]) -> float | None:
+    return next((at for key in _TIMES if (at := _instant(value.get(key))) is not None), None)
+
+
+def _instant(value: Any) -> float | None:
+    try:
+        if isinstance(value, int | float) and not isinstance(value, bool):
+            return float(value) / (1000.0 if value > 1e11 else 1.0)
+        if isinstance(value, str) and 0 < len(value) <= _MAX_STAMP_CHARS:
+            return datetime.fromisoformat(value).timestamp()
+    except (ValueError, OverflowError, OSError):
+        pass
+    return None
+
+
+def _clip(text: str) -> str:
+    text = text.strip()
+    return text if len(text) <= MAX_MESSAGE_CHARS else text[:MAX_MESSAGE_CHARS] + " …"

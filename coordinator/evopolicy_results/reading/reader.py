@@ -1,0 +1,298 @@
+"""Reads run directories as typed runs. A damaged or unfinished run is listed with its reason; it never causes a
+crash.
+
+A run is complete when its `run.json` is readable and has status `completed` or `no_ok_submit`. All other data come
+from the files that the agent saw (`summary.json`) and from the immutable checkpoints; only `run.json` has the hidden
+scores. Policies are parsed, never run. Runs of the published software are read too (`published`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections import OrderedDict
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from evopolicy_common.errors import ProtocolError
+from evopolicy_common.messages.bounds import check_plausible
+from evopolicy_common.records.policies.checkpoints import policy_folder, read_meta
+from evopolicy_common.records.run_files import RUN_JSON, check_places, run_folders, submit_folders
+from evopolicy_common.records.run_record import RunRecord, decode_run_record
+from evopolicy_common.records.summary import Summary, decode_summary
+from evopolicy_common.regular_files import read_regular
+from evopolicy_results.code.line_diff import n_changed
+from evopolicy_results.code.sources import reachable_modules, read_python_files, source_digest
+from evopolicy_results.code.topology import describe
+from evopolicy_results.reading import published
+from evopolicy_results.reading.parallel import in_processes
+from evopolicy_results.reading.published import PUBLISHED, PublishedSummary
+from evopolicy_results.reading.records import LeftOut, Run, Source, Submit, checkpoint_folder
+from evopolicy_results.scan.run import feedback_actions, log_lines, policy_files, scan
+from evopolicy_results.scan.signals import Signal
+from evopolicy_results.simulators.look import Flag, flags_of
+
+Files = Mapping[str, bytes]
+
+_MAX_REASON_CHARS = 1000
+_PARALLEL_FROM = 40
+"""Number of runs from which parallel reading outweighs the start of its processes."""
+
+
+class Loaded(msgspec.Struct, frozen=True, kw_only=True):
+    """The results of `load_runs`, both in order of path."""
+
+    runs: tuple[Run, ...]
+    left_out: tuple[LeftOut, ...]
+
+
+class UnreadableRunError(Exception):
+    """A folder is not a complete run; the message is the reason shown."""
+
+
+def find_run_dirs(paths: Iterable[Path]) -> tuple[list[Path], list[LeftOut]]:
+    """As `run_folders`; paths without a run directory are returned with the reason."""
+    found, without = run_folders(paths)
+    return found, [
+        LeftOut(
+            path=path,
+            reason="no run directory here"
+            if path.is_dir()
+            else "a file, not a run directory"
+            if path.exists()
+            else "no such folder",
+        )
+        for path in without
+    ]
+
+
+def load_runs(
+    paths: Iterable[Path], *, jobs: int = 1, progress: Callable[[int, int], None] | None = None
+) -> Loaded:
+    """Reads all complete runs at or under `paths`, and lists what is left out with the reason.
+
+    `jobs` processes read in parallel once there are enough runs; `progress` is called with (done, total). A run with
+    the entry, environment, experiment id and repeat of an earlier one is left out as its duplicate.
+    """
+    folders, left_out = find_run_dirs(paths)
+    runs: list[Run] = []
+    seen: dict[tuple[str, str, str, int], Path] = {}
+    for done, result in enumerate(_read_all(folders, jobs), start=1):
+        if progress is not None:
+            progress(done, len(folders))
+        if isinstance(result, LeftOut):
+            left_out.append(result)
+            continue
+        key = (result.entry, result.env, result.record.exp_id, result.record.repeat)
+        if key in seen:
+            left_out.append(LeftOut(path=result.path, reason=f"repeats the run in {seen[key]}"))
+            continue
+        seen[key] = result.path
+        runs.append(result)
+    return Loaded(runs=tuple(runs), left_out=tuple(left_out))
+
+
+def _read_all(folders: list[Path], jobs: int) -> Iterable[Run | LeftOut]:
+    if jobs <= 1 or len(folders) < _PARALLEL_FROM:
+        return map(read_or_explain, folders)
+    return in_processes(read_or_explain, folders, jobs, lambda folder, why: LeftOut(path=folder, reason=why))
+
+
+def read_or_explain(folder: Path) -> Run | LeftOut:
+    """The run in `folder`, or the reason why it is left out."""
+    try:
+        return read_run(folder)
+    except UnreadableRunError as error:
+        return LeftOut(path=folder, reason=str(error))
+    except Exception as error:
+        # The other runs are read regardless of an agent's leftovers.
+        return LeftOut(path=folder, reason=f"{type(error).__name__}: {error}"[:_MAX_REASON_CHARS])
+
+
+def read_run(folder: Path) -> Run:
+    """Reads the complete run in `folder`. Raises UnreadableRunError with the reason when there is none."""
+    record = _read_record(folder)
+    outcome = record.outcome
+    if outcome.status == "error":
+        raise UnreadableRunError(f"the run ended in an error: {outcome.error or 'no reason given'}")
+    if outcome.status == "cancelled":
+        raise UnreadableRunError(f"the run was {outcome.error or 'cancelled'}")
+    if outcome.agent_never_played:
+        raise UnreadableRunError(
+            "its agent failed before it used any budget; the run says nothing about the agent"
+        )
+    if outcome.status == "completed":
+        if outcome.final_score is None or not math.isfinite(outcome.final_score):
+            raise UnreadableRunError("run.json says completed, and has no final_score")
+        if outcome.best_submit_index is None:
+            raise UnreadableRunError("run.json says completed, and has no best_submit_index")
+    submits = _read_submits(folder, record)
+    selected = next((submit for submit in submits if submit.index == outcome.best_submit_index), None)
+    if outcome.status == "completed" and selected is None:
+        raise UnreadableRunError(f"the selected submit {outcome.best_submit_index} has no files")
+    run = Run(path=folder, record=record, submits=submits)
+    if not run.simulation_allowed:
+        run = msgspec.structs.replace(run, simulator_flags=_simulators(run))
+    run = msgspec.structs.replace(run, signals=_signals(run))
+    try:
+        check_plausible({"run.json": run.record, "submits": run.submits})
+    except ValueError as error:
+        raise UnreadableRunError(str(error)) from error
+    return run
+
+
+def _signals(run: Run) -> tuple[Signal, ...]:
+    artifacts = run.record.artifacts
+    feedback = run.path / (artifacts.workspace or "workspace") / "feedback"
+    checkpoints = (
+        (submit.index, policy_files(policy_folder(run.checkpoint(submit.index)))) for submit in run.submits
+    )
+    log = run.path / (artifacts.logs_agent or "logs/agent.jsonl")
+
+    def trajectories(index: int) -> Iterator[list[Any]]:
+        return feedback_actions(checkpoint_folder(feedback.parent, "feedback", index))
+
+    return scan(checkpoints, log_lines(log), trajectories)
+
+
+def _simulators(run: Run) -> tuple[Flag, ...]:
+    def files_of(submit: Submit) -> Files:
+        try:
+            return read_python_files(policy_folder(run.checkpoint(submit.index)))
+        except OSError:
+            return {}
+
+    artifacts = run.record.artifacts
+    log = run.path / artifacts.logs_agent if artifacts.logs_agent else None
+    workspace = run.path / (artifacts.workspace or "workspace")
+    return flags_of(((submit.index, files_of(submit)) for submit in run.submits), workspace, log, run.env)
+
+
+def _read_record(folder: Path) -> RunRecord:
+    try:
+        data = read_regular(folder / RUN_JSON)
+        value = published.decode(data)
+        record = (
+            published.read_record(folder, value) if published.is_published(value) else decode_run_record(data)
+        )
+        check_places(folder, record.artifacts)
+    except FileNotFoundError as error:
+        raise UnreadableRunError("unfinished: run.json is missing") from error
+    except OSError as error:
+        raise UnreadableRunError(f"run.json: {error.strerror}") from error
+    except ProtocolError as error:
+        raise UnreadableRunError(f"run.json: {error}") from error
+    return record
+
+
+def _read_submits(folder: Path, record: RunRecord) -> tuple[Submit, ...]:
+    feedback = folder / (record.artifacts.workspace or "workspace") / "feedback"
+    checkpoints = folder / (record.artifacts.checkpoints or "checkpoints")
+    indices = sorted({**submit_folders(feedback), **submit_folders(checkpoints)})
+    budget = record.experiment_dimensions.episode_budget
+    submits: list[Submit] = []
+    previous: Files | None = None
+    consumed = 0
+    for index in indices:
+        checkpoint = checkpoint_folder(folder, record.artifacts.checkpoints or "checkpoints", index)
+        shown = checkpoint_folder(feedback.parent, "feedback", index)
+        for place in (checkpoint, shown):
+            if place.is_symlink():
+                raise UnreadableRunError(
+                    f"{place.relative_to(folder)} is a link; put the folder itself in its place"
+                )
+        summary = _read_summary(shown, record)
+        try:
+            meta = read_meta(checkpoint, budget)
+        except ProtocolError as error:
+            raise UnreadableRunError(f"{checkpoint.relative_to(folder)}: {error}") from error
+        if summary is not None:
+            status: str = summary.status
+            n_episodes, mean = summary.n_episodes, summary.mean_return
+            left = summary.remaining_budget
+            after = budget - consumed - n_episodes if left is None else left
+        elif meta is not None:
+            status, n_episodes, mean = meta.validation_status, meta.n_episodes_requested, meta.mean_return
+            after = meta.remaining_budget_after
+        else:
+            raise UnreadableRunError(f"submit {index} has neither summary.json nor _meta.json")
+        before, consumed = consumed, budget - after
+        files, source = _read_source(checkpoint) if status == "ok" else (None, None)
+        changed = None if files is None or previous is None else count_changed_lines(previous, files)
+        previous = files if files is not None else previous
+        submits.append(
+            Submit(
+                index=index,
+                status=status,
+                n_episodes=n_episodes,
+                consumed_before=before,
+                consumed=consumed,
+                mean_return=mean,
+                std_return=summary.std_return if summary is not None else None,
+                val_mean=(record.outcome.val_scores or {}).get(str(index)),
+                n_failed_episodes=len(summary.errors or ()) if summary is not None else 0,
+                started_at=summary.submit_started_at if summary is not None else "",
+                completed_at=summary.submit_completed_at if summary is not None else "",
+                wall_s=summary.wall_time_seconds if summary is not None else 0.0,
+                bundle_digest=meta.bundle if meta is not None else "",
+                source=source,
+                changed_lines=changed,
+            )
+        )
+    return tuple(submits)
+
+
+def _read_summary(folder: Path, record: RunRecord) -> Summary | PublishedSummary | None:
+    path = folder / "summary.json"
+    if not path.is_file():
+        return None
+    try:
+        if record.record_version == PUBLISHED:
+            return published.read_summary(path)
+        return decode_summary(read_regular(path))
+    except ProtocolError as error:
+        raise UnreadableRunError(f"{folder.name}/summary.json: {error}") from error
+
+
+_described: OrderedDict[str, Source] = OrderedDict()
+_MAX_DESCRIBED = 4096
+
+
+def _read_source(checkpoint: Path) -> tuple[Files | None, Source | None]:
+    if not checkpoint.is_dir():
+        return None, None
+    return describe_files(read_python_files(policy_folder(checkpoint)))
+
+
+def describe_files(files: Files) -> tuple[Files, Source | None]:
+    """Returns the reachable source files of a bundle's Python files, and their description; None without a
+    `policy.py`.
+
+    Caches recent bundles: retests and policies shared by several runs are parsed once.
+    """
+    modules = reachable_modules(files)
+    reached = {module.path: module.source for module in modules.values()}
+    if not modules:
+        return reached, None
+    digest = source_digest(modules)
+    known = _described.get(digest)
+    if known is None:
+        topology, features = describe(modules)
+        known = _described[digest] = Source(
+            digest=digest, topology=topology, features=features, files=tuple(sorted(reached))
+        )
+        if len(_described) > _MAX_DESCRIBED:
+            _described.popitem(last=False)
+    return reached, known
+
+
+def count_changed_lines(before: Files, after: Files) -> int:
+    """Lines removed plus lines added between two source bundles, file by file; a renamed file counts twice."""
+    changed = 0
+    for path in sorted({*before, *after}):
+        old, new = before.get(path, b""), after.get(path, b"")
+        if old != new:
+            changed += n_changed(old.splitlines(), new.splitlines())
+    return changed

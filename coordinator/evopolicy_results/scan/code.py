@@ -1,0 +1,179 @@
+"""Signals in a checkpoint's Python files: network and simulator imports, and tables keyed by observation hashes or cases.
+
+A table keyed by observations or cases is memory of single episodes. Two forms are found:
+- a lookup (`table[key]`, `.get(key)`) whose key is a hash or the bytes of a value (`hash`, `hashlib`, `crc32`, `tobytes`);
+- a lookup in a literal of sequences by `episode_index`, directly or through a variable or attribute that holds it.
+Digests of at least `_HEX` hexadecimal digits as keys of a literal count too.
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Iterator, Mapping
+from functools import lru_cache
+
+import msgspec
+
+from evopolicy_common.records.code_metrics import parse
+from evopolicy_common.simulators import SIMULATORS
+from evopolicy_results.code.sources import MAX_FILE_BYTES
+from evopolicy_results.scan.signals import Kind, Signal, signal
+
+_NETWORK = frozenset(
+    {
+        "socket",
+        "urllib",
+        "http",
+        "requests",
+        "httpx",
+        "aiohttp",
+        "ftplib",
+        "smtplib",
+        "websocket",
+        "websockets",
+        "paramiko",
+    }
+)
+_HASHES = frozenset({"hash", "crc32", "adler32", "md5", "sha1", "sha256", "sha512", "blake2b", "blake2s"})
+_DIGESTS = frozenset({"hexdigest", "digest", "tobytes"})
+_HEX = re.compile(r"[0-9a-fA-F]{16,}")
+_FEWEST_KEYS = 4
+_FEWEST_STEPS = 8
+"""Number of values in a sequence from which it counts as the actions of an episode."""
+
+
+def code_signals(index: int, files: Mapping[str, bytes]) -> Iterator[Signal]:
+    """Signals of one checkpoint (files by path)."""
+    for path, source in files.items():
+        if path.endswith(".py") and len(source) <= MAX_FILE_BYTES:
+            for one in _of_file(path, source):
+                yield msgspec.structs.replace(one, submits=(index,))
+
+
+@lru_cache(maxsize=128)
+def _of_file(path: str, source: bytes) -> tuple[Signal, ...]:
+    """Cached: most files of a run's checkpoints are equal."""
+    tree = parse(source)
+    if tree is None:
+        return ()
+    try:
+        return tuple(_module(tree, f"system/{path}", source.decode("utf-8", "replace").splitlines()))
+    except RecursionError:
+        return ()
+
+
+def _module(tree: ast.Module, path: str, lines: list[str]) -> Iterator[Signal]:
+    def at(kind: Kind, node: ast.AST, reason: str) -> Signal:
+        line = getattr(node, "lineno", 0)
+        quote = lines[line - 1].strip() if 0 < line <= len(lines) else ""
+        return signal(kind, path, line, reason, quote)
+
+    literals = _episode_literals(tree)
+    hashed, numbers = _tainted(tree)
+    for node in ast.walk(tree):
+        for name in _imports(node):
+            if name in _NETWORK:
+                yield at("network", node, f"imports {name}")
+            elif name in SIMULATORS:
+                yield at("simulator", node, f"imports {name}")
+        if isinstance(node, ast.Dict):
+            digests = sum(isinstance(key, ast.Constant) and _is_digest(key.value) for key in node.keys)
+            if digests >= _FEWEST_KEYS:
+                yield at("table", node, f"a table with {digests} keys that look like digests")
+        key = _lookup(node)
+        if key is None:
+            continue
+        table, value = key
+        if _is_hash(value, hashed):
+            yield at("table", node, "a lookup by a hash or the bytes of a value")
+        elif _name(table) in literals and _is_number(value, numbers):
+            yield at("table", node, "a lookup by episode in a literal of sequences")
+
+
+def _imports(node: ast.AST) -> Iterator[str]:
+    if isinstance(node, ast.Import):
+        for alias in node.names:
+            yield alias.name.partition(".")[0]
+    elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
+        yield node.module.partition(".")[0]
+
+
+def _is_digest(value: object) -> bool:
+    if isinstance(value, bytes):
+        return len(value) >= 16
+    return isinstance(value, str) and _HEX.fullmatch(value) is not None
+
+
+def _lookup(node: ast.AST) -> tuple[ast.expr, ast.expr] | None:
+    """The table and the key of a lookup that reads: `table[key]`, `table.get(key)`, `key in table` is none."""
+    if isinstance(node, ast.Subscript) and isinstance(node.ctx, ast.Load):
+        return node.value, node.slice
+    if (
+        isinstance(node, ast.Call)
+        and isinstance(node.func, ast.Attribute)
+        and node.func.attr == "get"
+        and node.args
+    ):
+        return node.func.value, node.args[0]
+    return None
+
+
+def _name(node: ast.expr) -> str:
+    """`x` for a variable `x` and for an attribute `….x`; empty for anything else."""
+    if isinstance(node, ast.Name):
+        return node.id
+    return node.attr if isinstance(node, ast.Attribute) else ""
+
+
+def _is_hash(node: ast.expr, hashed: frozenset[str]) -> bool:
+    if isinstance(node, ast.Call):
+        name = _name(node.func)
+        if name in _DIGESTS and isinstance(node.func, ast.Attribute):
+            return True
+        return name in _HASHES and bool(node.args)
+    return _name(node) in hashed
+
+
+def _is_number(node: ast.expr, numbers: frozenset[str]) -> bool:
+    if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Mod):
+        node = node.left
+    return _name(node) in numbers
+
+
+def _tainted(tree: ast.Module) -> tuple[frozenset[str], frozenset[str]]:
+    """Names and attributes that hold a hash of something, and those that hold the episode's index."""
+    hashed: set[str] = set()
+    numbers = {"episode_index"}
+    for _ in range(3):
+        for node in ast.walk(tree):
+            if not isinstance(node, ast.Assign) or len(node.targets) != 1:
+                continue
+            name = _name(node.targets[0])
+            if name and _is_hash(node.value, frozenset(hashed)):
+                hashed.add(name)
+            elif name and _is_number(node.value, frozenset(numbers)):
+                numbers.add(name)
+    return frozenset(hashed), frozenset(numbers)
+
+
+def _episode_literals(tree: ast.Module) -> frozenset[str]:
+    """Names of literals that hold several sequences, each long enough to be an episode's actions."""
+    found: set[str] = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Assign) and len(node.targets) == 1:
+            value = node.value
+            members = (
+                value.values
+                if isinstance(value, ast.Dict)
+                else value.elts
+                if isinstance(value, ast.List | ast.Tuple)
+                else []
+            )
+            long = sum(
+                isinstance(member, ast.List | ast.Tuple) and len(member.elts) >= _FEWEST_STEPS
+                for member in members
+            )
+            if long >= 2 and (name := _name(node.targets[0])):
+                found.add(name)
+    return frozenset(found)

@@ -1,0 +1,192 @@
+"""Signals of policies that copy recorded train actions: a run of numbers in a checkpoint that an earlier trajectory has.
+
+A window of consecutive actions is compared as a whole, and only if it varies. Numbers that an earlier checkpoint already held
+are not copied from a trajectory: an open-loop policy's own plan comes back in its feedback.
+"""
+
+from __future__ import annotations
+
+import ast
+import itertools
+import json
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any
+
+import numpy as np
+
+from evopolicy_common.records.code_metrics import parse
+from evopolicy_common.records.episodes.npz import read_arrays
+from evopolicy_results.scan.signals import Files, Signal, Trajectories, signal
+
+_WINDOW = 24
+"""Consecutive numbers that must agree."""
+_FEWEST_VALUES, _FEWEST_CHANGES = 3, 8
+"""Different numbers, and changes from one to the next, that a window must have: constant and periodic plans have few."""
+_MAX_FILE, _MAX_UNPACKED = 4 << 20, 64 << 20
+_MAX_NUMBERS = 400_000
+"""Of a run's checkpoints, and of its trajectories."""
+
+Window = tuple[float, ...]
+
+
+def copied_actions(checkpoints: Sequence[tuple[int, Files]], trajectories: Trajectories) -> Iterator[Signal]:
+    """A signal for each file of a checkpoint that newly holds actions of an earlier submit's train episodes.
+
+    Trajectories are read only if a later checkpoint holds long runs of numbers that it did not hold before.
+    """
+    new = list(_fresh(checkpoints))
+    last = max((place for place, (_, fresh) in enumerate(new) if fresh), default=0)
+    recorded: dict[Window, int] = {}
+    reported: set[str] = set()
+    for place, (index, fresh) in enumerate(new[: last + 1]):
+        for path, windows in fresh.items():
+            copied = next((window for window in windows if window in recorded), None)
+            if copied is not None and path not in reported:
+                reported.add(path)
+                quote = ", ".join(f"{value:g}" for value in copied)
+                reason = (
+                    f"{_WINDOW} consecutive numbers or more are recorded actions of submit {recorded[copied]}"
+                )
+                yield signal("copy", f"system/{path}", 0, reason, quote, (index,))
+        if place < last:
+            for actions in trajectories(index):
+                for window in _windows([_flat(actions)]):
+                    recorded.setdefault(window, index)
+                if len(recorded) > _MAX_NUMBERS:
+                    return
+
+
+def _fresh(checkpoints: Sequence[tuple[int, Files]]) -> Iterator[tuple[int, dict[str, list[Window]]]]:
+    """The windows of each checkpoint's files that no earlier checkpoint held, until `_MAX_NUMBERS` numbers were read."""
+    left = _MAX_NUMBERS
+    own: set[Window] = set()
+    known: set[tuple[str, bytes]] = set()
+    for index, files in checkpoints:
+        fresh: dict[str, list[Window]] = {}
+        # Most files of a run's checkpoints are equal.
+        for path, data in [each for each in files.items() if each not in known]:
+            known.add((path, data))
+            for numbers in _sequences(path, data):
+                left -= len(numbers)
+                if left < 0:
+                    return
+                found = [each for each in _windows([numbers]) if each not in own]
+                if found:
+                    fresh.setdefault(path, []).extend(found)
+        own.update(window for found in fresh.values() for window in found)
+        yield index, fresh
+
+
+def _windows(sequences: Iterable[Sequence[float]]) -> Iterator[Window]:
+    for numbers in sequences:
+        for start in range(len(numbers) - _WINDOW + 1):
+            window = tuple(numbers[start : start + _WINDOW])
+            changes = sum(one != other for one, other in itertools.pairwise(window))
+            if changes >= _FEWEST_CHANGES and len(set(window)) >= _FEWEST_VALUES and not _is_regular(window):
+                yield window
+
+
+def _is_regular(window: Sequence[float]) -> bool:
+    """Whether it repeats with a short period, or has one step: tables of such numbers are everywhere."""
+    if any(
+        all(one == other for one, other in zip(window, window[period:], strict=False))
+        for period in range(1, 9)
+    ):
+        return True
+    steps = {round(other - one, 9) for one, other in itertools.pairwise(window)}
+    return len(steps) == 1
+
+
+def _flat(actions: Sequence[Any]) -> list[float]:
+    found: list[float] = []
+    for action in actions:
+        try:
+            found += [_rounded(value) for value in np.asarray(action, dtype=np.float64).reshape(-1)]
+        except (TypeError, ValueError, OverflowError):
+            return []
+        if len(found) > _MAX_NUMBERS:
+            break
+    return found
+
+
+def _rounded(value: float) -> float:
+    """float32 actions come back as other decimals than the policy's literal had."""
+    try:
+        return float(f"{value:.5g}")
+    except OverflowError:  # an integer that no float can hold
+        return math.inf if value > 0 else -math.inf
+
+
+def _sequences(path: str, data: bytes) -> Iterator[list[float]]:
+    """Runs of numbers in a file: literals of Python, arrays of JSON and numpy, columns of text."""
+    if len(data) > _MAX_FILE:
+        return
+    if path.endswith(".py"):
+        tree = parse(data)
+        for node in ast.walk(tree) if tree is not None else ():
+            if isinstance(node, ast.List | ast.Tuple) and len(node.elts) * 8 >= _WINDOW:
+                numbers = _numbers(node)
+                if len(numbers) >= _WINDOW:
+                    yield numbers
+    elif path.endswith(".json"):
+        try:
+            yield from _arrays(json.loads(data))
+        except (ValueError, RecursionError):
+            return
+    elif path.endswith((".npy", ".npz")):
+        try:
+            arrays = read_arrays(data, _MAX_UNPACKED)
+        except ValueError:
+            return
+        for array in arrays.values():
+            if array.dtype.kind in "fiu" and array.size <= _MAX_NUMBERS:
+                yield [_rounded(value) for value in array.astype(np.float64).reshape(-1)]
+    elif path.endswith((".csv", ".txt")):
+        numbers = []
+        for word in data.decode("utf-8", "replace").replace(",", " ").split():
+            try:
+                numbers.append(_rounded(float(word)))
+            except ValueError:
+                continue
+        if _WINDOW <= len(numbers) <= _MAX_NUMBERS:
+            yield numbers
+
+
+def _numbers(node: ast.expr) -> list[float]:
+    found: list[float] = []
+    queue: list[ast.expr] = [node]
+    while queue:
+        one = queue.pop()
+        if isinstance(one, ast.List | ast.Tuple):
+            queue += reversed(one.elts)
+        elif isinstance(one, ast.UnaryOp) and isinstance(one.op, ast.USub):
+            inner = one.operand
+            if isinstance(inner, ast.Constant) and isinstance(inner.value, int | float):
+                found.append(_rounded(-inner.value))
+        elif isinstance(one, ast.Constant) and isinstance(one.value, int | float):
+            found.append(_rounded(one.value))
+        if len(found) > _MAX_NUMBERS:
+            break
+    return found
+
+
+def _arrays(value: Any) -> Iterator[list[float]]:
+    """The numbers of each outermost list of a JSON value, in order."""
+    queue = [value]
+    while queue:
+        one = queue.pop()
+        if isinstance(one, dict):
+            queue += one.values()
+        elif isinstance(one, list):
+            numbers: list[float] = []
+            inner: list[Any] = list(reversed(one))
+            while inner and len(numbers) <= _MAX_NUMBERS:
+                each = inner.pop()
+                if isinstance(each, list):
+                    inner += reversed(each)
+                elif isinstance(each, dict):
+                    queue.append(each)
+                elif isinstance(each, int | float) and not isinstance(each, bool):
+                    numbers.append(_rounded(each))
+            yield numbers

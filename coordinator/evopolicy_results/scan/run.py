@@ -1,0 +1,116 @@
+"""All signals of one run: from a run directory, or from published results."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from evopolicy_common.errors import DECODE_ERRORS
+from evopolicy_common.processes.left_files import left_files
+from evopolicy_common.regular_files import open_regular, read_regular
+from evopolicy_results.scan.code import code_signals
+from evopolicy_results.scan.copies import copied_actions
+from evopolicy_results.scan.log import log_signals
+from evopolicy_results.scan.signals import MAX_SIGNALS, TITLES, Files, Signal, Trajectories
+
+_MAX_FILES, _MAX_FILE_BYTES, _MAX_LOG_BYTES = 200, 4 << 20, 64 << 20
+_MAX_RUN_BYTES = 256 << 20
+"""Different files of a run's checkpoints that are searched."""
+_SEARCHED = (".py", ".json", ".npy", ".npz", ".csv", ".txt")
+_MAX_ROWS = 20_000
+"""Rows of a submit's trajectories that are read."""
+
+
+def scan(
+    checkpoints: Iterable[tuple[int, Files]],
+    log: Iterable[bytes],
+    trajectories: Trajectories,
+) -> tuple[Signal, ...]:
+    """All signals of a run: `checkpoints` in order (submit index, files by path), the lines of its log, and the train
+    actions of each submit. At most `MAX_SIGNALS`; equal evidence counts once."""
+    found: dict[tuple[str, str, str], Signal] = {}
+    kept = _kept(checkpoints)
+    for index, files in kept:
+        for one in code_signals(index, files):
+            key = (one.kind, one.path, one.quote)
+            known = found.setdefault(key, one)
+            if known is not one:
+                found[key] = msgspec.structs.replace(known, submits=(*known.submits, index))
+    for one in (*copied_actions(kept, trajectories), *log_signals(log)):
+        found.setdefault((one.kind, one.path.partition(":")[0], one.quote), one)
+    order = {kind: place for place, kind in enumerate(TITLES)}
+    return tuple(sorted(found.values(), key=lambda one: (order[one.kind], one.path, one.line))[:MAX_SIGNALS])
+
+
+def _kept(checkpoints: Iterable[tuple[int, Files]]) -> list[tuple[int, Files]]:
+    """The files that are searched, each content once in memory, as a run may have thousands of checkpoints."""
+    contents: dict[bytes, bytes] = {}
+    left = _MAX_RUN_BYTES
+    kept: list[tuple[int, Files]] = []
+    for index, files in checkpoints:
+        searched: dict[str, bytes] = {}
+        for path, data in files.items():
+            if not path.endswith(_SEARCHED) or (data not in contents and len(data) > left):
+                continue
+            if data not in contents:
+                left -= len(data)
+            searched[path] = contents.setdefault(data, data)
+        kept.append((index, searched))
+    return kept
+
+
+def policy_files(folder: Path) -> dict[str, bytes]:
+    """The files of a checkpoint's policy by path, without large ones; empty when they cannot be read."""
+    found: dict[str, bytes] = {}
+    for path, size in left_files(folder, enter=lambda name: name != "__pycache__"):
+        searched = path.suffix in _SEARCHED and path.name not in ("_meta.json", "metrics.json")
+        if searched and size <= _MAX_FILE_BYTES:
+            try:
+                found[path.relative_to(folder).as_posix()] = read_regular(path, _MAX_FILE_BYTES)
+            except OSError:
+                continue
+            if len(found) >= _MAX_FILES:
+                break
+    return found
+
+
+def log_lines(path: Path | None) -> Iterator[bytes]:
+    """The lines of an agent's log; none for a missing or huge file, or for anything but a regular file."""
+    try:
+        if path is None or path.stat().st_size > _MAX_LOG_BYTES:
+            return
+        with open_regular(path) as lines:
+            yield from lines
+    except OSError:
+        return
+
+
+class _Row(msgspec.Struct):
+    action: Any = None
+
+
+_rows = msgspec.json.Decoder(_Row)
+
+
+def feedback_actions(submit: Path) -> Iterator[list[Any]]:
+    """The actions of each train episode in a submit's feedback folder."""
+    left = _MAX_ROWS
+    for path in sorted(submit.glob("episodes/*/trajectory.jsonl")):
+        actions = []
+        try:
+            if path.stat().st_size > _MAX_LOG_BYTES:
+                continue
+            with open_regular(path) as lines:
+                for line in lines:
+                    actions.append(_rows.decode(line).action)
+                    left -= 1
+                    if left <= 0:
+                        break
+        except (OSError, *DECODE_ERRORS):
+            continue
+        yield actions
+        if left <= 0:
+            return

@@ -1,0 +1,260 @@
+"""Interquartile mean, performance profiles and probability of improvement over normalised scores (Agarwal et al.
+2021).
+
+The scores of single runs are normalised to the random-to-best scale of their environment, not clipped. A run without
+an ok submit counts as below every number. Intervals are percentiles of a stratified bootstrap that resamples runs and
+their common cases within each environment, and the scale with them, as it is estimated from the same runs. If an entry
+has one run per cell, only cases are resampled, which gives the spread of these checkpoints' scores. Resamples of few
+runs vary too little, by the factor (n − 1)/n. For the IQM and the scale they are therefore stretched about their mean;
+profiles and probabilities have no interval if a cell has two or more runs but fewer than `LEAST_RUNS`.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+
+import msgspec
+import numpy as np
+
+from evopolicy_results.scoring.normalised import Scale
+from evopolicy_results.statistics.distributions import ALPHA
+from evopolicy_results.statistics.intervals import no_spread
+from evopolicy_results.statistics.resampling import RESAMPLES, weights
+from evopolicy_results.statistics.samples import Floats, Sample, matched
+
+LEAST_RUNS = 5
+NO_SCALE = "no scale: agents do not clearly beat random"
+
+TAUS = tuple(round(0.05 * i, 2) for i in range(21))
+"""Normalised scores at which a profile is evaluated."""
+
+
+class Bounded(msgspec.Struct, frozen=True, kw_only=True):
+    """A number and its 95 % interval; no bounds where nothing can be resampled or a bound is not finite."""
+
+    value: float
+    low: float | None = None
+    high: float | None = None
+    reason: str = ""
+    """Why an interval that could be resampled has no bounds."""
+
+
+class Aggregate(msgspec.Struct, frozen=True, kw_only=True):
+    """One entry over the environments that have a scale."""
+
+    entry: str
+    iqm: Bounded | None
+    """Mean of the middle half of all its runs' normalised scores; None if that half has a run without an ok submit."""
+    profile: tuple[Bounded, ...]
+    """Share of its runs with a normalised score above each of `TAUS`."""
+    n_runs: int
+    n_environments: int
+    over: str
+    """Resampled units: `runs and cases`, `runs` if their cases are not known, `cases` of single runs, or `nothing`."""
+
+
+class Improvement(msgspec.Struct, frozen=True, kw_only=True):
+    """Probability that a run of the first entry beats one of the second; mean over the environments that both have
+    played."""
+
+    first: str
+    second: str
+    probability: Bounded
+    n_environments: int
+
+
+def iqm(scores: Floats) -> Floats:
+    """Interquartile mean along the last axis: without the lowest and highest ⌊n/4⌋ of n values."""
+    n = scores.shape[-1]
+    cut = n // 4
+    middle = np.sort(scores, axis=-1)[..., cut : n - cut]
+    with np.errstate(invalid="ignore"):  # the mean of both infinities
+        found: Floats = np.asarray(middle.mean(axis=-1), dtype=np.float64)
+    return found
+
+
+def profile(scores: Floats, taus: Sequence[float] = TAUS) -> Floats:
+    """Share of `scores` (last axis) above each of `taus`, which become the last axis."""
+    return np.stack([(scores > tau).mean(axis=-1) for tau in taus], axis=-1)
+
+
+def probability_of_improvement(first: Floats, second: Floats) -> Floats:
+    """P(X > Y) + P(X = Y)/2 for scores of runs along the last axes: Mann and Whitney's U over the number of pairs."""
+    above = (first[..., :, None] > second[..., None, :]).mean(axis=(-2, -1))
+    equal = (first[..., :, None] == second[..., None, :]).mean(axis=(-2, -1))
+    found: Floats = above + 0.5 * equal
+    return found
+
+
+class _Draws(msgspec.Struct, frozen=True, kw_only=True):
+    """Resampled returns of one entry on one environment, (resamples, runs)."""
+
+    plain: Floats
+    stretched: Floats
+    """Stretched to the variance of that many runs."""
+    over: str
+
+
+class _Cell(msgspec.Struct, frozen=True, kw_only=True):
+    """Normalised scores of one entry on one environment, and resamples of them, (resamples, runs)."""
+
+    scores: Floats
+    stretched: Floats | None
+    """None if nothing can be resampled."""
+    counted: Floats | None
+    """Not stretched; None too if resampled from too few runs."""
+    returns: Floats | None
+    """`counted` before it was normalised: only the order matters for a probability of improvement."""
+    n_runs: int
+    over: str
+
+
+def aggregates(
+    samples: Mapping[tuple[str, str], Sample],
+    agents: Sequence[str],
+    scales: Mapping[str, Scale],
+    *,
+    resamples: int = RESAMPLES,
+) -> tuple[list[Aggregate], list[Improvement]]:
+    """Aggregates of all agents, and improvements of each pair; environments without a scale are left out."""
+    cells: dict[tuple[str, str], _Cell] = {}
+    for place, (env, scale) in enumerate(scales.items()):
+        here = [sample for (_, e), sample in samples.items() if e == env]
+        draws = {
+            sample.entry: _draws(sample, (place, number), resamples) for number, sample in enumerate(here)
+        }
+        low, width = _drawn_scale(here, draws, scale)
+        for sample in here:
+            if sample.entry in agents:
+                cells[sample.entry, env] = _cell(sample, draws[sample.entry], scale, low, width)
+    by_entry = {
+        agent: {env: cells[agent, env] for env in scales if (agent, env) in cells} for agent in agents
+    }
+    found = [_aggregate(agent, list(own.values())) for agent, own in by_entry.items() if own]
+    against = [
+        _improvement(one, other, [(by_entry[one][env], by_entry[other][env]) for env in common])
+        for one, other in itertools.combinations(agents, 2)
+        if (common := [env for env in by_entry[one] if env in by_entry[other]])
+    ]
+    return found, against
+
+
+def _draws(sample: Sample, seed: tuple[int, int], resamples: int) -> _Draws | None:
+    """Resamples of runs about the mean of resampled cases; None if there is nothing to draw."""
+    known = [-np.inf if run.score is None else run.score for run in sample.runs]
+    scores = np.array(known, dtype=np.float64)
+    n = len(scores)
+    common = matched([sample])
+    shift = np.zeros((resamples, 1))
+    if common is not None and (n_cases := common.returns[0].shape[1]) > 1:
+        # All entries share the draws of cases, as they share the cases.
+        by_case = common.returns[0].mean(axis=0)
+        shift = (weights(n_cases, n_cases, resamples, seed[0]) @ (by_case - by_case.mean()) / n_cases)[
+            :, None
+        ]
+    elif n == 1 and np.isfinite(scores[0]):
+        return None
+    if n == 1:
+        return _Draws(plain=scores + shift, stretched=scores + shift, over="cases")
+    over = "runs" if common is None else "runs and cases"
+    plain = scores[np.random.default_rng([21, *seed]).integers(0, n, (resamples, n))] + shift
+    if not np.isfinite(scores).all():
+        return _Draws(plain=plain, stretched=plain, over=over)
+    middle = scores.mean() + shift
+    stretched = middle + np.sqrt(n / (n - 1)) * (plain - middle)
+    return _Draws(plain=plain, stretched=stretched, over=over)
+
+
+def _drawn_scale(
+    here: Sequence[Sample], draws: Mapping[str, _Draws | None], scale: Scale
+) -> tuple[Floats, Floats]:
+    """Resampled low end and width of a scale, (resamples, 1). The best agent stays the observed one, and an end that
+    cannot be resampled stays fixed. A width that is not above 0 becomes 0."""
+    ends = {False: np.array([[scale.best]]), True: np.array([[scale.random]])}
+    for sample in here:
+        known, end = sample.scores, scale.random if sample.is_fixed else scale.best
+        drawn = draws[sample.entry]
+        if drawn is not None and known is not None and np.isclose(np.mean(known), end, rtol=1e-12, atol=0.0):
+            ends[sample.is_fixed] = drawn.stretched.mean(axis=1, keepdims=True)
+    return ends[True], np.maximum(0.0, ends[False] - ends[True])
+
+
+def _cell(sample: Sample, draws: _Draws | None, scale: Scale, low: Floats, width: Floats) -> _Cell:
+    known = [-np.inf if run.score is None else run.score for run in sample.runs]
+    scores = (np.array(known, dtype=np.float64) - scale.random) / (scale.best - scale.random)
+
+    def normalised(drawn: Floats) -> Floats:
+        # Without a width, a resample's scores are infinite: the interval of an aggregate that rests on them has no bounds.
+        with np.errstate(divide="ignore", invalid="ignore"):
+            found: Floats = np.nan_to_num((drawn - low) / width, nan=0.0, posinf=np.inf, neginf=-np.inf)
+        return found
+
+    n = len(scores)
+    returns = None if draws is None or 1 < n < LEAST_RUNS else draws.plain
+    return _Cell(
+        scores=scores,
+        stretched=None if draws is None else normalised(draws.stretched),
+        counted=None if returns is None else normalised(returns),
+        returns=returns,
+        n_runs=n,
+        over="" if draws is None else draws.over,
+    )
+
+
+def _aggregate(entry: str, cells: Sequence[_Cell]) -> Aggregate:
+    scores = np.concatenate([cell.scores for cell in cells])
+    drawn, counted = (
+        _together([cell.stretched for cell in cells]),
+        _together([cell.counted for cell in cells]),
+    )
+    middle = float(iqm(scores))
+    shares = profile(scores)
+    drawn_shares = None if counted is None else profile(counted)
+    return Aggregate(
+        entry=entry,
+        iqm=_bounded(middle, None if drawn is None else iqm(drawn), len(scores))
+        if np.isfinite(middle)
+        else None,
+        profile=tuple(
+            _bounded(float(share), None if drawn_shares is None else drawn_shares[:, i], len(scores))
+            for i, share in enumerate(shares)
+        ),
+        n_runs=len(scores),
+        n_environments=len(cells),
+        over="nothing" if drawn is None else " or ".join(sorted({cell.over for cell in cells})),
+    )
+
+
+def _together(drawn: Sequence[Floats | None]) -> Floats | None:
+    parts = [one for one in drawn if one is not None]
+    return np.concatenate(parts, axis=1) if len(parts) == len(drawn) else None
+
+
+def _improvement(first: str, second: str, cells: Sequence[tuple[_Cell, _Cell]]) -> Improvement:
+    value = float(np.mean([probability_of_improvement(one.scores, other.scores) for one, other in cells]))
+    drawn = [
+        probability_of_improvement(one.returns, other.returns)
+        for one, other in cells
+        if one.returns is not None and other.returns is not None
+    ]
+    n_runs = sum(one.n_runs + other.n_runs for one, other in cells)
+    return Improvement(
+        first=first,
+        second=second,
+        probability=_bounded(value, np.mean(drawn, axis=0) if len(drawn) == len(cells) else None, n_runs),
+        n_environments=len(cells),
+    )
+
+
+def _bounded(value: float, drawn: Floats | None, n: int) -> Bounded:
+    if drawn is None:
+        return Bounded(value=value)
+    # As an order statistic, a bound is not the mean of a finite and an infinite number.
+    drawn = np.where(np.isnan(drawn), -np.inf, drawn)
+    low, high = np.quantile(drawn, [ALPHA / 2.0, 1.0 - ALPHA / 2.0], method="nearest")
+    if not np.isfinite([low, high]).all():
+        return Bounded(value=value, reason=NO_SCALE)
+    if low == high:
+        return Bounded(value=value, reason=no_spread(n))
+    return Bounded(value=value, low=float(low), high=float(high))

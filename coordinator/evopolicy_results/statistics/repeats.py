@@ -1,0 +1,80 @@
+"""The number of runs that a given gap between two agents would need."""
+
+from __future__ import annotations
+
+import math
+
+import msgspec
+
+from evopolicy_results.statistics.distributions import ALPHA, t_quantile, t_two_sided
+from evopolicy_results.statistics.intervals import components
+from evopolicy_results.statistics.samples import Floats
+
+MAX_REPEATS = 1000
+
+
+class Spread(msgspec.Struct, frozen=True, kw_only=True):
+    """Variances of a difference between two agents on one environment, mean over both, or over all pairs."""
+
+    run: float
+    """Variance between runs of one agent, of their held-out means."""
+    case: float
+    """Variance of the difference that more runs do not reduce: agents differ by case, and these cases are a sample.
+    An estimate, which may be below 0."""
+    n_cases: int
+
+
+class Repeats(msgspec.Struct, frozen=True, kw_only=True):
+    """Number of runs per agent that resolve a gap."""
+
+    gap: float
+    n: int | None
+    """None if no number up to `MAX_REPEATS` does: the gap needs more cases."""
+
+
+def spread_of(*returns: Floats) -> Spread:
+    """Variances of two agents, from matrices runs × the same cases. A matrix of one row is one fixed policy."""
+    parts = [components(matrix) for matrix in returns]
+    gaps = components((returns[0].mean(axis=0) - returns[1].mean(axis=0))[None, :])
+    return Spread(
+        run=sum(part.runs * part.n_runs for part in parts) / 2.0,
+        case=gaps.cases - sum(part.residual for part in parts),
+        n_cases=gaps.n_cases,
+    )
+
+
+def half_width(spread: Spread, n: int) -> float:
+    """Half width of the 95 % interval of a difference between two agents of n ≥ 2 runs each."""
+    error, df = _error(spread, n)
+    return t_quantile(1.0 - ALPHA / 2.0, df) * error if error > 0.0 else 0.0
+
+
+def repeats_needed(spread: Spread, gap: float, *, level: float = ALPHA) -> Repeats:
+    """The fewest runs per agent, from 2, whose interval of a difference, at 1 − `level`, is no wider than ± `gap`. A true
+    gap of that size is then distinguished from 0 in half of all experiments. Raises ValueError for a gap that is not
+    above 0."""
+    if not gap > 0.0:
+        raise ValueError(f"a gap of {gap} cannot be resolved; give one above 0")
+    if not _resolves(spread, MAX_REPEATS, gap, level):
+        return Repeats(gap=gap, n=None)
+    low, high = 1, MAX_REPEATS
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (low, middle) if _resolves(spread, middle, gap, level) else (middle, high)
+    return Repeats(gap=gap, n=high)
+
+
+def _resolves(spread: Spread, n: int, gap: float, level: float) -> bool:
+    error, df = _error(spread, n)
+    return error <= 0.0 or t_two_sided(gap / error, df) <= level
+
+
+def _error(spread: Spread, n: int) -> tuple[float, float]:
+    """Standard error of a difference, and its degrees of freedom."""
+    by_run, by_case = 2.0 * spread.run / n, max(0.0, spread.case)
+    total = by_run + by_case
+    if total <= 0.0:
+        return 0.0, math.inf
+    below = (by_run / total) ** 2 / (2.0 * (n - 1))
+    below += (by_case / total) ** 2 / (spread.n_cases - 1) if spread.n_cases > 1 else 0.0
+    return math.sqrt(total), round(1.0 / below, 3) if below > 0.0 else math.inf

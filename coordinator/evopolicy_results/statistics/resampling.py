@@ -1,0 +1,59 @@
+"""Seeded resampling as weights: row b of a matrix holds how often resample b draws each unit."""
+
+from __future__ import annotations
+
+import itertools
+from functools import lru_cache
+
+import numpy as np
+
+from evopolicy_results.statistics.samples import Floats
+
+RESAMPLES = 2000
+EXACT_UP_TO = 1 << 13
+"""Up to this number, all patterns of labels are used; above, a random sample of them."""
+
+
+@lru_cache(maxsize=8)
+def weights(n: int, n_drawn: int, resamples: int, seed: int) -> Floats:
+    """(resamples, n): multinomial counts of `n_drawn` draws with replacement from `n`; rows sum to `n_drawn`.
+    Read-only."""
+    drawn = np.random.default_rng([seed, n, n_drawn]).multinomial(n_drawn, np.full(n, 1.0 / n), resamples)
+    found: Floats = drawn.astype(np.float64)
+    found.setflags(write=False)
+    return found
+
+
+@lru_cache(maxsize=8)
+def t_weights(n: int, draws: int, seed: int) -> Floats:
+    """(draws, n) weights w such that `mean + w @ (values − mean)` is distributed as Student's t with n − 1 degrees of
+    freedom about the mean of n values, with its standard error as scale. Values of several variables get a common
+    multivariate t. Zeros for n = 1. Read-only."""
+    if n == 1:
+        return np.zeros((draws, 1))
+    generator = np.random.default_rng([13, seed, n])
+    found: Floats = generator.normal(size=(draws, n))
+    found /= np.sqrt(n * generator.chisquare(n - 1, size=(draws, 1)))
+    found.setflags(write=False)
+    return found
+
+
+@lru_cache(maxsize=4)
+def label_patterns(n_first: int, n_second: int, n_random: int) -> tuple[Floats, bool]:
+    """(patterns, n_first + n_second) with 1 for the first group and 0 for the second, and whether the patterns are
+    complete. Read-only."""
+    n = n_first + n_second
+    n_all = 1
+    for i in range(n_first):
+        n_all = n_all * (n - i) // (i + 1)
+    if n_all <= EXACT_UP_TO:
+        found = np.zeros((n_all, n))
+        for row, chosen in zip(found, itertools.combinations(range(n), n_first), strict=True):
+            row[list(chosen)] = 1.0
+        exact = True
+    else:
+        order = np.random.default_rng([12, n_first, n_second]).random((n_random, n)).argsort(axis=1)
+        found = (order < n_first).astype(np.float64)
+        exact = False
+    found.setflags(write=False)
+    return found, exact

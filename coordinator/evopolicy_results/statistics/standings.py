@@ -1,0 +1,214 @@
+"""Intervals of rank scores and ranks, and tie groups, by drawing the whole suite again.
+
+A rank score depends only on the order of noisy means. Its interval is for the entry's average score over repetitions
+of the experiment with as many new runs and cases, on the same environments against the same entries. Each draw moves
+the entries' means by Student's t noise of their runs and of their cases (the same cases for all entries, as they are
+shared), ranks all entries again, and averages. Resampled runs would vary too little: three runs have few resamples. Two
+entries are distinguished if the drawn differences of their scores are significant at 5 % after Holm's correction over
+all pairs. An entry's rank then lies between 1 + (better distinguished entries) and N − (worse distinguished entries),
+as in Mogstad et al. (2024).
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import string
+from collections.abc import Mapping, Sequence
+
+import msgspec
+import numpy as np
+
+from evopolicy_results.statistics.distributions import ALPHA, holm
+from evopolicy_results.statistics.pairs import Pair
+from evopolicy_results.statistics.resampling import RESAMPLES, t_weights
+from evopolicy_results.statistics.samples import Floats, Sample, matched
+
+MAX_GROUPS = 200
+"""Above this number of tie groups the letters are omitted: they would not be informative."""
+
+
+class RankEstimate(msgspec.Struct, frozen=True, kw_only=True):
+    """The uncertainty of one row of a leaderboard."""
+
+    entry: str
+    score_low: float
+    score_high: float
+    """95 % interval of the rank score."""
+    rank_low: int
+    rank_high: int
+    """Best and worst rank consistent with the comparisons, at 95 % for all pairs together."""
+    ties: str
+    """Letters of its tie groups: entries that share a letter cannot be distinguished."""
+
+
+class Standings(msgspec.Struct, frozen=True, kw_only=True):
+    """Rank estimates of a suite; entries with a cell without spread are left out."""
+
+    rows: tuple[RankEstimate, ...]
+    gap: float | None
+    """Half width of the 95 % interval of a difference of two agents' rank scores, median over pairs."""
+    over: str
+    """`cases`, `runs and cases`, or both if cells differ."""
+
+    def of(self, entry: str) -> RankEstimate | None:
+        """The row of `entry`; None if it has none."""
+        return next((row for row in self.rows if row.entry == entry), None)
+
+
+def standings(
+    samples: Mapping[tuple[str, str], Sample],
+    scores: Mapping[str, float | None],
+    environments: Sequence[str],
+    *,
+    found: Sequence[Pair] = (),
+    resamples: int = RESAMPLES,
+) -> Standings:
+    """Rank estimates of the entries of `scores` (entry to its observed rank score), best first. All have a sample on each
+    environment.
+
+    On a single environment two entries are distinguished only if `found` tells them apart as well.
+    """
+    entries = sorted(scores, key=lambda entry: (-_or_least(scores[entry]), entry.casefold(), entry))
+    n_pairs = len(entries) * (len(entries) - 1) // 2
+    resamples = max(resamples, math.ceil(4 * n_pairs / ALPHA))
+    if len(entries) < 2:
+        return Standings(rows=(), gap=None, over="")
+    drawn, spread = _drawn_scores(samples, entries, environments, resamples)
+    sure = [i for i, entry in enumerate(entries) if entry in spread and scores[entry] is not None]
+    if len(sure) < 2:
+        return Standings(rows=(), gap=None, over="")
+    apart = _distinguished(drawn, sure)
+    if len(environments) == 1:
+        told = {frozenset((pair.first, pair.second)) for pair in found if pair.verdict in ("first", "second")}
+        failed = {entry for entry in entries if _known_failure(samples[entry, environments[0]])}
+        apart = {
+            (a, b)
+            for a, b in apart
+            if (both := frozenset((entries[sure[a]], entries[sure[b]]))) in told or both & failed
+        }
+    letters = dict(zip(sure, _letters(len(sure), apart), strict=True))
+    rows: list[RankEstimate] = []
+    for place, i in enumerate(sure):
+        low, high = np.quantile(drawn[i], [ALPHA / 2.0, 1.0 - ALPHA / 2.0])
+        rows.append(
+            RankEstimate(
+                entry=entries[i],
+                score_low=float(low),
+                score_high=float(high),
+                rank_low=1 + sum(worse == place for _, worse in apart),
+                rank_high=len(entries) - sum(better == place for better, _ in apart),
+                ties=letters[i],
+            )
+        )
+    agents = [i for i in sure if not _is_fixed(samples, entries[i])]
+    halves = [
+        float(np.diff(np.quantile(drawn[i] - drawn[j], [ALPHA / 2.0, 1.0 - ALPHA / 2.0]))[0]) / 2.0
+        for i, j in itertools.combinations(agents, 2)
+    ]
+    kinds = {len(sample.runs) > 1 for sample in samples.values() if not sample.is_fixed}
+    over = " or ".join(text for many, text in ((False, "cases"), (True, "runs and cases")) if many in kinds)
+    return Standings(rows=tuple(rows), gap=float(np.median(halves)) if halves else None, over=over)
+
+
+def _or_least(score: float | None) -> float:
+    return -math.inf if score is None else score
+
+
+def _is_fixed(samples: Mapping[tuple[str, str], Sample], entry: str) -> bool:
+    return any(sample.is_fixed for (name, _), sample in samples.items() if name == entry)
+
+
+def _drawn_scores(
+    samples: Mapping[tuple[str, str], Sample],
+    entries: Sequence[str],
+    environments: Sequence[str],
+    resamples: int,
+) -> tuple[Floats, set[str]]:
+    """(entries, resamples) rank scores, and the entries that vary on every environment."""
+    total = np.zeros((len(entries), resamples))
+    spread = set(entries)
+    for number, env in enumerate(environments):
+        here = [samples[entry, env] for entry in entries]
+        drawn = [_drawn_mean(sample, i, number, resamples) for i, sample in enumerate(here)]
+        spread -= {
+            sample.entry
+            for sample, found in zip(here, drawn, strict=True)
+            if found is None and not _known_failure(sample)
+        }
+        means = np.stack(
+            [
+                _fixed_mean(sample, resamples) if found is None else found
+                for sample, found in zip(here, drawn, strict=True)
+            ]
+        )
+        above = np.zeros_like(means)
+        for row in means:
+            above += row > means
+        total += 1.0 - above / (len(here) - 1)
+    return total / len(environments), spread
+
+
+def _known_failure(sample: Sample) -> bool:
+    """Whether the sample has a run without an ok submit: it has the worst rank in every resample."""
+    return sample.scores is None
+
+
+def _fixed_mean(sample: Sample, resamples: int) -> Floats:
+    value = -math.inf if sample.scores is None else float(np.mean(sample.scores))
+    return np.full(resamples, value)
+
+
+def _drawn_mean(sample: Sample, entry: int, env: int, resamples: int) -> Floats | None:
+    """Resampled means; None if the sample shows no spread, or has no mean."""
+    if sample.scores is None:
+        return None
+    common = matched([sample])
+    seed = 1000 + 97 * entry + 10_007 * env
+    scores, returns = np.array(sample.scores), np.zeros((1, 1))
+    if common is not None:
+        returns = common.returns[0]
+        scores = returns.mean(axis=1)
+    if len(scores) < 2 and returns.shape[1] < 2:
+        return None
+    by_case = returns.mean(axis=0)
+    drawn: Floats = scores.mean() + t_weights(len(scores), resamples, seed) @ (scores - scores.mean())
+    # By `env` alone: all entries play the same cases.
+    drawn += t_weights(len(by_case), resamples, env) @ (by_case - by_case.mean())
+    return drawn
+
+
+def _distinguished(drawn: Floats, sure: Sequence[int]) -> set[tuple[int, int]]:
+    """Distinguished pairs of places in `sure`, the better one first."""
+    places = list(itertools.combinations(range(len(sure)), 2))
+    tails: list[tuple[float, bool]] = []
+    for a, b in places:
+        gap = drawn[sure[a]] - drawn[sure[b]]
+        n_below, n_above = int((gap <= 1e-12).sum()), int((gap >= -1e-12).sum())
+        tails.append((min(1.0, 2.0 * (min(n_below, n_above) + 1) / (len(gap) + 1)), n_below <= n_above))
+    found: set[tuple[int, int]] = set()
+    for (a, b), (_, a_better), p in zip(places, tails, holm([p for p, _ in tails]), strict=True):
+        if p is not None and p <= ALPHA:
+            found.add((a, b) if a_better else (b, a))
+    return found
+
+
+def _letters(n: int, apart: set[tuple[int, int]]) -> list[str]:
+    """Letters of n entries; two share one exactly if they are not distinguished (Piepho 2004, insert and absorb)."""
+    groups: list[frozenset[int]] = [frozenset(range(n))]
+    for a, b in sorted(apart):
+        split = [
+            part for group in groups for part in ((group - {a}, group - {b}) if {a, b} <= group else (group,))
+        ]
+        distinct = list(dict.fromkeys(split))
+        groups = [group for group in distinct if not any(group < other for other in distinct)]
+        if len(groups) > MAX_GROUPS:
+            return ["…"] * n
+    groups.sort(key=sorted)
+    names = [_letter(i) for i in range(len(groups))]
+    return ["".join(name for name, group in zip(names, groups, strict=True) if i in group) for i in range(n)]
+
+
+def _letter(i: int) -> str:
+    more, last = divmod(i, 26)
+    return string.ascii_lowercase[last] + (str(more) if more else "")

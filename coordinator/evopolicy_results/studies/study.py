@@ -1,0 +1,201 @@
+"""All results of a report on a set of runs, as one typed record: the notebook's entry point."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import msgspec
+
+from evopolicy_results.behaviour.audit import AuditSignals, TokenUse, audit_signals, token_use
+from evopolicy_results.behaviour.edits import EditRates, Transition, classify, edit_rates
+from evopolicy_results.behaviour.structure import EditSizeBin, StructureMean, edit_size_bins, structure_means
+from evopolicy_results.reading.comparability import UNKNOWN_ISOLATION, MixedRunsError, Mixture, mixtures
+from evopolicy_results.reading.environments import learn_names, ordered_environments, suites_of
+from evopolicy_results.reading.reader import load_runs
+from evopolicy_results.reading.records import LeftOut, Run
+from evopolicy_results.reading.rescored import rescored
+from evopolicy_results.scoring.evolution import Evolution, evolutions
+from evopolicy_results.scoring.normalised import Normalised, normalised
+from evopolicy_results.scoring.ranking import Leaderboard, leaderboard
+from evopolicy_results.scoring.scores import ScoreTable, score_table
+from evopolicy_results.statistics.resampling import RESAMPLES
+from evopolicy_results.statistics.suite import SuiteStatistics, suite_statistics
+
+
+class Suite(msgspec.Struct, frozen=True, kw_only=True):
+    """The scores of one suite's environments."""
+
+    name: str
+    table: ScoreTable
+    board: Leaderboard
+    normalised: Normalised
+    statistics: SuiteStatistics
+
+
+class Timeline(msgspec.Struct, frozen=True, kw_only=True):
+    """One run's score-bearing submits with their edit types, for its code-phase timeline."""
+
+    run: str
+    entry: str
+    env: str
+    repeat: int
+    budget: int
+    transitions: tuple[Transition, ...]
+
+
+class Study(msgspec.Struct, frozen=True, kw_only=True):
+    """All metrics of a set of runs. `records.rows` turns each list of records into rows for a data frame."""
+
+    runs: tuple[Run, ...]
+    left_out: tuple[LeftOut, ...]
+    mixtures: tuple[Mixture, ...]
+    """Differences between runs in settings that a comparison holds fixed; empty unless mixing was allowed."""
+    suites: tuple[Suite, ...]
+    evolutions: tuple[Evolution, ...]
+    edit_rates: tuple[EditRates, ...]
+    timelines: tuple[Timeline, ...]
+    structure: tuple[StructureMean, ...]
+    edit_sizes: tuple[EditSizeBin, ...]
+    tokens: tuple[TokenUse, ...]
+    audit: tuple[AuditSignals, ...]
+
+    @property
+    def entries(self) -> list[str]:
+        """All agents by name, without the random reference."""
+        found = {entry for suite in self.suites for entry in suite.table.agents}
+        return sorted(found, key=lambda entry: (entry.casefold(), entry))
+
+    @property
+    def post_hoc(self) -> str:
+        """The name of the re-score that the held-out scores come from; empty for the runs' own scores."""
+        found = next((run.rescore for run in self.runs if run.rescore is not None), None)
+        if found is None:
+            return ""
+        return (
+            f"Held-out scores are those of the re-score {found.name}: {found.n_cases} further hidden cases, played post hoc, after"
+            " the runs had ended. The selected checkpoints are those of the runs."
+        )
+
+    @property
+    def reference(self) -> str | None:
+        """The entry of the uniform-random reference; None when it is missing."""
+        return next(
+            (suite.table.reference for suite in self.suites if suite.table.reference is not None), None
+        )
+
+
+def study_of(
+    runs: Sequence[Run],
+    *,
+    left_out: Iterable[LeftOut] = (),
+    allow_mixed: bool = False,
+    allow_unknown: bool = False,
+    scores: ScoreTable | None = None,
+    resamples: int = RESAMPLES,
+) -> Study:
+    """Computes every metric. Raises MixedRunsError when the runs are not one comparison and `allow_mixed` is false.
+
+    `allow_unknown` allows runs without a record of their hidden isolation beside runs with one; `allow_mixed` alone
+    does not.
+
+    `scores` adds a table of scores without run directories (such as the paper's). It has no submits, so it appears
+    only in the leaderboard and normalised performance. Its entries must differ from those of the runs.
+    """
+    learn_names(run.record for run in runs)
+    mixed = mixtures(runs)
+    table = score_table(runs)
+    if scores is not None:
+        table, more = _merged(table, scores)
+        mixed += more
+    refused = [one for one in mixed if not (allow_unknown if one.what == UNKNOWN_ISOLATION else allow_mixed)]
+    if refused:
+        raise MixedRunsError(refused)
+    ordered = _in_order(runs)
+    return Study(
+        runs=tuple(ordered),
+        left_out=tuple(left_out),
+        mixtures=tuple(mixed),
+        suites=tuple(
+            _suite(name, table.restricted(envs), ordered, resamples)
+            for name, envs in suites_of(table.environments).items()
+        ),
+        evolutions=tuple(evolutions(ordered, _reference_of(table))),
+        edit_rates=tuple(edit_rates(ordered)),
+        timelines=tuple(
+            Timeline(
+                run=run.name,
+                entry=run.entry,
+                env=run.env,
+                repeat=run.record.repeat,
+                budget=run.budget,
+                transitions=tuple(classify(run.submits)),
+            )
+            for run in ordered
+        ),
+        structure=tuple(structure_means(ordered)),
+        edit_sizes=tuple(edit_size_bins(ordered)),
+        tokens=tuple(token_use(ordered)),
+        audit=tuple(audit_signals(ordered)),
+    )
+
+
+def study(
+    paths: Iterable[Path | str],
+    *,
+    allow_mixed: bool = False,
+    allow_unknown: bool = False,
+    jobs: int = 1,
+    rescore: str = "",
+) -> Study:
+    """Reads the runs at or under `paths` and computes every metric; see `study_of`. `rescore`: name of a re-score whose
+    results replace the runs' held-out results."""
+    loaded = load_runs([Path(path) for path in paths], jobs=jobs)
+    runs = rescored(loaded.runs, rescore) if rescore else loaded.runs
+    return study_of(runs, left_out=loaded.left_out, allow_mixed=allow_mixed, allow_unknown=allow_unknown)
+
+
+def _suite(name: str, table: ScoreTable, runs: Sequence[Run], resamples: int) -> Suite:
+    board = leaderboard(table)
+    return Suite(
+        name=name,
+        table=table,
+        board=board,
+        normalised=normalised(table),
+        statistics=suite_statistics(runs, table, board, resamples=resamples),
+    )
+
+
+def _in_order(runs: Sequence[Run]) -> list[Run]:
+    place = {env: i for i, env in enumerate(ordered_environments(run.env for run in runs))}
+    return sorted(runs, key=lambda run: (place[run.env], run.entry.casefold(), run.record.repeat, run.name))
+
+
+def _reference_of(table: ScoreTable) -> dict[str, float]:
+    return {
+        env: cell.mean
+        for (entry, env), cell in table.cells.items()
+        if entry == table.reference and cell.mean is not None
+    }
+
+
+def _merged(table: ScoreTable, scores: ScoreTable) -> tuple[ScoreTable, list[Mixture]]:
+    """Merges both tables, and returns the mixtures of environments on which both have scores."""
+    twice = set(table.agents) & set(scores.agents)
+    if twice:
+        raise MixedRunsError(
+            [Mixture(what="entry from runs and from a CSV", where=n, values={}) for n in sorted(twice)]
+        )
+    cells = {**scores.cells, **table.cells}
+    harness = {**scores.harness, **table.harness}
+    if table.reference is not None and scores.reference is not None and table.reference != scores.reference:
+        for env in scores.environments:
+            cells.pop((scores.reference, env), None)
+        del harness[scores.reference]
+    reference = table.reference or scores.reference
+    shared = set(table.environments) & set(scores.environments)
+    found = [
+        Mixture(what="scores from runs and from a CSV", where=env, values={"runs": 1, "CSV": 1})
+        for env in ordered_environments(shared)
+    ]
+    return ScoreTable(cells=cells, harness=harness, reference=reference), found

@@ -1,0 +1,454 @@
+"""The report's tables, made from a `Study`: the paper's, and further diagnostics."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+
+from evopolicy_common import catalogue
+from evopolicy_results.behaviour import structure
+from evopolicy_results.behaviour.edits import demand_of
+from evopolicy_results.reading.environments import family_of, family_title, suite_size, suite_title, title_of
+from evopolicy_results.scoring.normalised import DEMANDS
+from evopolicy_results.statistics.intervals import Estimate
+from evopolicy_results.statistics.standings import RankEstimate
+from evopolicy_results.studies.study import Study, Suite
+from evopolicy_results.tables.run_tables import (
+    ENTRY,
+    ENV,
+    HARNESS,
+    RUN,
+    LinkOf,
+    no_link,
+    one_or_all,
+    tables_of_runs,
+)
+from evopolicy_results.tables.statistics_tables import (
+    CHECKPOINTS,
+    has_single_runs,
+    interval_text,
+    span,
+    statistics_tables,
+)
+from evopolicy_results.tables.table import Column, Table, best_marks
+
+_DEMAND = Column("demand", "Demand")
+
+
+def tables_of(study: Study, link_of: LinkOf = no_link) -> list[Table]:
+    """Every table of the report in order. Tables without rows are omitted, except for `left_out`."""
+    found: list[Table] = []
+    for suite in study.suites:
+        scored = [_aggregate(suite, study), _incomplete(suite), _heldout(suite), _cells(suite)]
+        scored += [*statistics_tables(suite), _normalised(suite)]
+        found += [_labelled(table, study.post_hoc) for table in scored]
+    found += [
+        _evolution(study, link_of),
+        _edit_types(study),
+        _structure(study),
+        _edit_sizes(study),
+        _tokens(study),
+        *tables_of_runs(study, link_of),
+    ]
+    return [table for table in found if table.rows or table.name == "left_out"]
+
+
+def _labelled(table: Table, post_hoc: str) -> Table:
+    return msgspec.structs.replace(table, caption=f"{table.caption} {post_hoc}") if post_hoc else table
+
+
+def _aggregate(suite: Suite, study: Study) -> Table:
+    families = list(dict.fromkeys(family_of(env) for env in suite.board.environments))
+    families = families if len(families) > 1 else []
+    budgets = _budgets(suite, study)
+    whole = suite_size(suite.name) or len(suite.board.environments)
+    rows: list[dict[str, Any]] = [
+        {
+            "entry": row.entry,
+            "harness": row.harness,
+            **{_key(family): row.families.get(family) for family in families},
+            "score": row.score,
+            **_sure(suite.statistics.standings.of(row.entry)),
+            "rank": row.rank,
+            "budget": None if row.is_reference else budgets.get(row.entry),
+            "wins": row.wins,
+            "top2": row.top2,
+            "environments": f"{row.n_environments} of {whole}",
+            "runs": None if row.is_reference else row.n_runs,
+        }
+        for row in suite.board.standings
+    ]
+    columns = [ENTRY, HARNESS]
+    columns += [Column(_key(family), family_title(family), "number") for family in families]
+    columns.append(Column("score", suite_title(suite.name), "number"))
+    standings = suite.statistics.standings
+    if standings.rows:
+        columns.append(Column("score_interval", "95 % interval"))
+        columns.append(Column("rank_interval", "Rank interval"))
+        columns.append(
+            Column("ties", "Tie group", note="Entries that share a letter do not differ significantly.")
+        )
+    if budgets:
+        columns.append(Column("budget", "Budget", "integer", note="Train episodes of a run."))
+    columns += [
+        Column("wins", "Wins", "integer", note="Environments on which it ranks first."),
+        Column("top2", "Top-2", "integer", note="Environments on which it ranks first or second."),
+        Column("environments", "Environments"),
+        Column("runs", "Runs", "integer"),
+    ]
+    budget = " Budget: train episodes of a run." if budgets else ""
+    caption = (
+        "Rank scores: within each environment entries are ranked by held-out mean return, ties sharing the better rank, and "
+        "s = 1 − (rank − 1)/(N − 1); families and the suite are means over their environments." + budget
+    )
+    if standings.rows:
+        caption += (
+            f" 95 % interval: of the rank score that a repetition with new {standings.over} would give on average. Tie group: "
+            "entries that share a letter do not differ significantly (all pairs together at 5 %, Holm); the rank interval "
+            "is what these comparisons leave."
+        )
+        if has_single_runs(suite):
+            caption += f" {CHECKPOINTS}"
+    return Table(
+        name=f"leaderboard_{suite.name}",
+        title=f"{suite_title(suite.name)} leaderboard",
+        caption=caption,
+        columns=tuple(columns),
+        rows=tuple(rows),
+        marks=best_marks(rows, [*map(_key, families), "score"]),
+    )
+
+
+def _incomplete(suite: Suite) -> Table:
+    n = len(suite.board.environments)
+    return Table(
+        name=f"incomplete_{suite.name}",
+        title=f"{suite_title(suite.name)} incomplete entries",
+        caption="Entries that have not played every environment of this report are not ranked and have no mean over environments: "
+        "it would not be comparable. Their returns are in the tables of single environments and of differences.",
+        columns=(
+            ENTRY,
+            HARNESS,
+            Column("environments", "Environments"),
+            Column("missing", "Not played"),
+            Column("runs", "Runs", "integer"),
+        ),
+        rows=tuple(
+            {
+                "entry": one.entry,
+                "harness": one.harness,
+                "environments": f"{one.n_environments} of {n}",
+                "missing": ", ".join(map(title_of, one.missing)),
+                "runs": None if one.is_reference else one.n_runs,
+            }
+            for one in suite.board.incomplete
+        ),
+    )
+
+
+def _key(family: str) -> str:
+    """A column's key. Families that do not ship could have the name of another column."""
+    return family if family in catalogue.families() else f"family_{family}"
+
+
+def _sure(row: RankEstimate | None) -> dict[str, Any]:
+    if row is None:
+        return {}
+    return {
+        "score_interval": span(row.score_low, row.score_high, 3)
+        if row.score_low < row.score_high
+        else "no spread: the same in each draw",
+        "rank_interval": f"{row.rank_low} to {row.rank_high}",
+        "ties": row.ties,
+    }
+
+
+def _budgets(suite: Suite, study: Study) -> dict[str, Any]:
+    """By entry, the train episode budget of its runs."""
+    found: dict[str, set[int]] = {}
+    for run in study.runs:
+        if run.env in suite.board.environments:
+            found.setdefault(run.entry, set()).add(run.budget)
+    return {entry: one_or_all(sorted(budgets)) for entry, budgets in found.items()}
+
+
+def _heldout(suite: Suite) -> Table:
+    rows: list[dict[str, Any]] = []
+    marks: dict[tuple[int, str], int] = {}
+    entries = [row.entry for row in suite.board.standings] + [row.entry for row in suite.board.incomplete]
+    for i, entry in enumerate(entries):
+        row: dict[str, Any] = {"entry": entry, "harness": suite.table.harness[entry]}
+        for env in suite.board.environments:
+            cell = suite.board.cells.get((entry, env))
+            if cell is not None:
+                row[env] = cell.mean
+                if cell.mean is not None and cell.rank in (1, 2) and len(suite.board.standings) > 1:
+                    marks[i, env] = cell.rank
+        rows.append(row)
+    columns = [Column(env, title_of(env), "number") for env in suite.board.environments]
+    return Table(
+        name=f"heldout_{suite.name}",
+        title=f"{suite_title(suite.name)} held-out returns",
+        caption="Mean return of the validation-selected policy on the held-out cases, in each environment's own units: compare "
+        "within a column only. Best and second-best are marked. The random reference plays the same cases. A dash is a cell "
+        "that was not run, or a run with no ok submit. Incomplete entries come last, without marks.",
+        columns=(ENTRY, HARNESS, *columns),
+        rows=tuple(rows),
+        marks=marks,
+    )
+
+
+def _cells(suite: Suite) -> Table:
+    rows = [
+        {
+            "env": title_of(env),
+            "family": family_title(family_of(env)),
+            "entry": cell.entry,
+            "mean": cell.mean,
+            "interval": interval_text(suite.statistics.means.get((cell.entry, env))),
+            "over": _over(suite.statistics.means.get((cell.entry, env))),
+            "runs": cell.n_runs,
+            "rank": cell.rank,
+            "score": cell.score,
+        }
+        for env in suite.board.environments
+        for cell in sorted(
+            (c for (_, e), c in suite.board.cells.items() if e == env),
+            key=lambda c: (c.rank is None, c.rank or 0, c.entry.casefold()),
+        )
+    ]
+    return Table(
+        name=f"cells_{suite.name}",
+        title=f"{suite_title(suite.name)} cells",
+        caption="Every entry on every environment: mean over its runs, 95 % interval of the mean over what the column Over names, rank "
+        "and rank score (of entries that played every environment). Entries share their cases, so two of these intervals may overlap where the difference is sure: compare by the "
+        "table of differences.",
+        columns=(
+            ENV,
+            Column("family", "Family"),
+            ENTRY,
+            Column("mean", "Held-out mean", "number"),
+            Column("interval", "95 % interval"),
+            Column("over", "Over", note="What a repetition would draw anew: cases, runs, or runs and cases."),
+            Column("runs", "Runs", "integer"),
+            Column("rank", "Rank", "integer"),
+            Column("score", "Rank score", "number"),
+        ),
+        rows=tuple(rows),
+    )
+
+
+def _over(mean: Estimate | None) -> str | None:
+    return None if mean is None or mean.low is None else mean.over
+
+
+def _normalised(suite: Suite) -> Table:
+    agents = suite.table.agents
+    cells = suite.normalised.cells
+    groups = {(group.entry, group.demand): group for group in suite.normalised.groups}
+    rows: list[dict[str, Any]] = []
+    bold: dict[tuple[int, str], int] = {}
+    for demand in (*DEMANDS, None):
+        envs = [env for env in suite.table.environments if demand_of(env) == demand]
+        for env in envs:
+            values = {a: cells[a, env].value for a in agents if (a, env) in cells}
+            rows.append({"demand": demand or "neither", "env": title_of(env), **values})
+        if envs and demand is not None:
+            means = {a: groups[a, demand].value for a in agents}
+            bold |= {(len(rows), a): 1 for a in agents}
+            rows.append({"demand": demand, "env": f"{demand.capitalize()} mean", **means})
+    return Table(
+        name=f"normalised_{suite.name}",
+        title=f"{suite_title(suite.name)} normalised performance",
+        caption="Held-out return on the random-to-best scale, clipped to 0 … 1, by dominant task demand: 0 is the random reference "
+        "on the same cases, 1 the best agent on that environment. Bold: means of a group's environments. A dash: no agent beats random, no "
+        "reference, or no score; for a mean, no score on one of the group's environments.",
+        columns=(
+            ENV,
+            _DEMAND,
+            *(Column(agent, agent, "number", digits=2) for agent in agents),
+        ),
+        rows=tuple(rows),
+        marks=bold,
+    )
+
+
+def _evolution(study: Study, link_of: LinkOf) -> Table:
+    rows = [
+        {
+            "env": title_of(found.env),
+            "entry": found.entry,
+            "run": found.run.rsplit(" / ", 1)[-1],
+            "submits": len(found.steps),
+            "best": found.steps[-1].best if found.steps else None,
+            "improvements": found.n_improvements,
+            "area": found.area,
+            "to_50": found.to_50,
+            "to_80": found.to_80,
+        }
+        for found in study.evolutions
+    ]
+    return Table(
+        name="evolution",
+        title="Score evolution",
+        caption="Best validation mean so far over the budget. Scale of each environment: 0 is the random reference, 1 the best "
+        "validation mean of any run. Area: mean of the curve over the budget. To 50 % and 80 %: train episodes consumed when the "
+        "curve first gets there. Validation is hidden from agents during the run.",
+        columns=(
+            ENV,
+            ENTRY,
+            RUN,
+            Column("submits", "Scored submits", "integer"),
+            Column("best", "Best validation mean", "number"),
+            Column("improvements", "Improvements", "integer", note="Rises after the first score."),
+            Column("area", "Area", "number", digits=2),
+            Column("to_50", "To 50 % (episodes)", "integer"),
+            Column("to_80", "To 80 % (episodes)", "integer"),
+        ),
+        rows=tuple(rows),
+        links={i: link for i, found in enumerate(study.evolutions) if (link := link_of(found.run))},
+    )
+
+
+def _edit_types(study: Study) -> Table:
+    harness = {run.entry: run.harness for run in study.runs}
+    rows = [
+        {
+            "entry": row.entry,
+            "harness": harness[row.entry],
+            "demand": row.demand,
+            "n_synthesis": row.n_synthesis,
+            "hit_synthesis": row.rate_synthesis,
+            "n_parametric": row.n_parametric,
+            "hit_parametric": row.rate_parametric,
+            "n_rollback": row.n_rollback,
+            "n_retest": row.n_retest,
+            "n_data": row.n_data,
+            "n_first": row.n_first,
+            "n_not_ok": row.n_not_ok,
+            "n_unscored": row.n_unscored,
+        }
+        for row in study.edit_rates
+    ]
+
+    def count(key: str, title: str, note: str) -> Column:
+        return Column(key, title, "integer", note=note)
+
+    return Table(
+        name="edit_types",
+        title="Edit types",
+        caption="Each score-bearing submit against the one before it. Synthesis: a numeric-constant-stripped AST topology that is new "
+        "to the run. Parametric: bytes changed, topology kept. A hit raises the validation best so far. The other columns are "
+        "excluded from both rates: rollbacks to an earlier topology, byte-identical retests, submits that changed data files only, the first score-bearing submit (it "
+        "follows none), submits that are not ok, and ok ones without a validation score.",
+        columns=(
+            ENTRY,
+            HARNESS,
+            _DEMAND,
+            count("n_synthesis", "Synthesis n", "New topology."),
+            Column("hit_synthesis", "Synthesis hit", "percent"),
+            count("n_parametric", "Parametric n", "Same topology, other bytes."),
+            Column("hit_parametric", "Parametric hit", "percent"),
+            count("n_rollback", "Rollback", "Back to an earlier topology."),
+            count("n_retest", "Retest", "Byte-identical."),
+            count("n_data", "Data only", "Files outside the source bundle changed, such as weights."),
+            count("n_first", "First", "First score-bearing submit of a run."),
+            count("n_not_ok", "Not ok", "Accepted submits without a working policy."),
+            count("n_unscored", "Unscored", "Ok, without a validation mean."),
+        ),
+        rows=tuple(rows),
+    )
+
+
+def _structure(study: Study) -> Table:
+    keys = (*structure.FEATURES, "nodes", "lines")
+    titles = ("Funcs", "Branches", "Loops", "Depth", "State", "AST nodes", "Lines")
+    rows = [
+        {
+            "demand": row.demand,
+            "entry": row.entry,
+            "harness": row.harness,
+            **{key: getattr(row, key) for key in keys},
+            "runs": row.n_runs,
+        }
+        for row in study.structure
+    ]
+    return Table(
+        name="structure",
+        title="Realised structure",
+        caption="AST features of the validation-selected policies (policy.py and the local modules it reaches), mean over "
+        "environments of a demand group. State counts attributes that methods assign on their instance.",
+        columns=(
+            _DEMAND,
+            ENTRY,
+            HARNESS,
+            *(Column(k, t, "number", digits=1) for k, t in zip(keys, titles, strict=True)),
+            Column("runs", "Runs", "integer"),
+        ),
+        rows=tuple(rows),
+    )
+
+
+def _edit_sizes(study: Study) -> Table:
+    rows = [
+        {
+            "entry": row.entry,
+            "lines": row.label,
+            "n": row.n,
+            "p_visible": row.p_visible,
+            "p_validation": row.p_validation,
+        }
+        for row in study.edit_sizes
+        if row.n
+    ]
+    return Table(
+        name="edit_sizes",
+        title="Edit size and improvement",
+        caption="Transitions between adjacent score-bearing submits by lines added and removed in the source bundle. Visible: the "
+        "train mean rose (a retest may play other cases). Validation: the validation best rose, which an unchanged policy cannot. Data "
+        "only: files outside the source bundle changed, such as weights.",
+        columns=(
+            ENTRY,
+            Column("lines", "Changed lines"),
+            Column("n", "Transitions", "integer"),
+            Column("p_visible", "Visible mean improved", "percent"),
+            Column("p_validation", "Validation best improved", "percent"),
+        ),
+        rows=tuple(rows),
+    )
+
+
+def _tokens(study: Study) -> Table:
+    rows = [
+        {
+            "env": title_of(row.env),
+            "entry": row.entry,
+            "input": row.input_noncached,
+            "cache": row.cache,
+            "output": row.output,
+            "cost": row.cost,
+            "runs": row.n_runs,
+        }
+        for row in study.tokens
+    ]
+
+    def millions(key: str, title: str, note: str) -> Column:
+        return Column(key, title, "number", digits=2, below=True, note=note)
+
+    return Table(
+        name="tokens",
+        title="Tokens and cost",
+        caption="Mean of a run, in millions of tokens. In: input that no cache served. Cache: cache read and creation. Out: output with "
+        "reasoning. Diagnostic only, no part of a score. A dash: the agent does not tell.",
+        columns=(
+            ENV,
+            ENTRY,
+            millions("input", "In (M)", "Non-cached input."),
+            millions("cache", "Cache (M)", "Cache read plus cache creation."),
+            millions("output", "Out (M)", "Output, reasoning included."),
+            Column("cost", "Cost (US$)", "number", digits=2),
+            Column("runs", "Runs that tell", "integer"),
+        ),
+        rows=tuple(rows) if any(row.n_runs for row in study.tokens) else (),
+    )

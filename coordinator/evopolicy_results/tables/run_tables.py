@@ -1,0 +1,478 @@
+"""The report's tables about the runs: setups of agents and environments, the runs, their audit signals, their submits
+with the preceding feedback, and the omitted runs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import Any
+
+from evopolicy_common import catalogue
+from evopolicy_results.behaviour.edits import demand_of
+from evopolicy_results.behaviour.trace import Trace, TraceRow
+from evopolicy_results.reading.environments import family_of, family_title, ordered_environments, title_of
+from evopolicy_results.reading.records import Run, path_text
+from evopolicy_results.scan.signals import TITLES
+from evopolicy_results.studies.study import Study
+from evopolicy_results.tables.table import Column, Table
+
+ENTRY = Column("entry", "Agent")
+HARNESS = Column("harness", "Harness")
+ENV = Column("env", "Environment")
+RUN = Column("run", "Run")
+
+_COUNTERS = frozenset({"reprompted", "paused_s", "requests_failed", "resumed"})
+"""Counters of a run's course that a harness stores among its settings; they are not settings."""
+_MAX_QUOTE = 240
+
+LinkOf = Callable[[str], str]
+"""Returns the page about a run by its name, or the empty string."""
+
+
+def no_link(run: str) -> str:
+    return ""
+
+
+def tables_of_runs(study: Study, link_of: LinkOf) -> list[Table]:
+    return [
+        _runs(study, link_of),
+        _audit(study, link_of),
+        _signals(study, link_of),
+        _simulators(study, link_of),
+        _agents(study),
+        _environments(study),
+        _missing(study),
+        _left_out(study),
+    ]
+
+
+def one_or_all(values: Iterable[Any]) -> Any:
+    """The common value of all, or `A or B` if different runs were mixed."""
+    found = list(dict.fromkeys(values))
+    return found[0] if len(found) == 1 else " or ".join(str(value) for value in found)
+
+
+def _short(run: str) -> str:
+    """The experiment in a run's name: agent and environment have columns of their own."""
+    return run.rsplit(" / ", 1)[-1]
+
+
+def _runs(study: Study, link_of: LinkOf) -> Table:
+    rows = tuple(
+        {
+            "env": title_of(run.env),
+            "entry": run.entry,
+            "run": _short(run.name),
+            "submits": len(run.submits),
+            "score": run.score,
+            "journal": _journal(run),
+        }
+        for run in study.runs
+    )
+    return Table(
+        name="runs",
+        title="Runs",
+        caption="Open a run for its feedback use, timeline, checkpoints and differences.",
+        columns=(
+            ENV,
+            ENTRY,
+            RUN,
+            Column("submits", "Submits", "integer"),
+            Column("score", "Held-out mean", "number"),
+            Column(
+                "journal",
+                "Journal",
+                note="Entry with the run's result, and the journal's head there: whoever noted heads sees a journal that was rewritten.",
+            ),
+        ),
+        rows=rows,
+        links={i: link for i, run in enumerate(study.runs) if (link := link_of(run.name))},
+    )
+
+
+def _journal(run: Run) -> str | None:
+    """Position of the run's result in the coordinator's journal; None for runs from before the journal existed."""
+    place = run.record.committed
+    return None if place is None or place.ended is None else f"{place.ended} {place.ended_head[:16]}"
+
+
+def _agents(study: Study) -> Table:
+    """One row per setup of an entry: several rows show that its runs differ."""
+    counts: dict[tuple[str, ...], int] = {}
+    for run in study.runs:
+        agent = run.record.agent
+        setup = (
+            run.entry,
+            run.harness,
+            agent.cli_version or "",
+            agent.model_string or "",
+            _settings(run),
+            run.record.jail,
+            run.record.hidden_isolation,
+        )
+        counts[setup] = counts.get(setup, 0) + 1
+    keys = ("entry", "harness", "cli_version", "model", "settings", "jail", "hidden_isolation")
+    rows = [
+        {**{key: value or None for key, value in zip(keys, setup, strict=True)}, "runs": n}
+        for setup, n in sorted(counts.items(), key=lambda item: (item[0][0].casefold(), item[0]))
+    ]
+    return Table(
+        name="agents",
+        title="Agents",
+        caption="How each agent was set up, as its run directories tell; an agent with several rows was not the same in all of its runs.",
+        columns=(
+            ENTRY,
+            HARNESS,
+            Column("cli_version", "Version", note="Of the harness's program."),
+            Column("model", "Model string"),
+            Column("settings", "Settings"),
+            Column("jail", "Jail"),
+            Column(
+                "hidden_isolation",
+                "Hidden isolation",
+                note="exclusive: hidden episodes and agents never shared a kernel.",
+            ),
+            Column("runs", "Runs", "integer"),
+        ),
+        rows=tuple(rows),
+    )
+
+
+def _settings(run: Run) -> str:
+    """The plain settings on one line; lists and paths of the original machine are only in run.json."""
+    settings = run.record.agent.settings
+    plain = {
+        key: value
+        for key, value in settings.items()
+        if isinstance(value, str | int | float)
+        and key not in _COUNTERS
+        and not str(value).startswith(("/", "~"))
+    }
+    words = {True: "yes", False: "no"}
+    return ", ".join(
+        f"{key} {words[value] if isinstance(value, bool) else f'{value:g}' if isinstance(value, float) else value}"
+        for key, value in plain.items()
+    )
+
+
+def _environments(study: Study) -> Table:
+    by_env: dict[str, list[Run]] = {}
+    for run in study.runs:
+        by_env.setdefault(run.env, []).append(run)
+
+    def common(runs: list[Run], value_of: Callable[[Run], Any]) -> Any:
+        return one_or_all(value_of(run) for run in runs)
+
+    rows: list[dict[str, Any]] = []
+    for env in ordered_environments(by_env):
+        runs, known = by_env[env], catalogue.entries().get(env)
+        rows.append(
+            {
+                "env": title_of(env),
+                "family": family_title(family_of(env)),
+                "id": env,
+                "version": common(runs, lambda run: run.record.versions.env),
+                "spaces": f"{known.observation}/{known.action}" if known is not None else None,
+                "demand": demand_of(env),
+                "steps": known.max_episode_steps if known is not None else None,
+                "budget": common(runs, lambda run: run.budget),
+                "submit": common(runs, lambda run: run.submit_size),
+                "validation": common(runs, lambda run: run.record.experiment_dimensions.n_validation or None),
+                "heldout": common(runs, lambda run: run.record.experiment_dimensions.n_heldout or None),
+                "scope": common(runs, lambda run: run.record.experiment_dimensions.policy_scope),
+            }
+        )
+    return Table(
+        name="environments",
+        title="Environments",
+        caption="What was played: cases of a run's hidden splits, and the train episodes that it could spend.",
+        columns=(
+            ENV,
+            Column("family", "Family"),
+            Column("id", "Suite id"),
+            Column("spaces", "Obs./action"),
+            Column("demand", "Demand"),
+            Column("steps", "Longest episode (steps)", "integer"),
+            Column("budget", "Budget", "integer", note="Train episodes of a run."),
+            Column("submit", "Episodes a submit", note="Fewest to most."),
+            Column("validation", "Validation cases", "integer"),
+            Column("heldout", "Held-out cases", "integer"),
+            Column("scope", "Policy scope", note="How long one policy object lives."),
+            Column("version", "Version"),
+        ),
+        rows=tuple(rows),
+    )
+
+
+def submits_of(trace: Trace) -> list[dict[str, Any]]:
+    """A run's rows of the table of feedback use."""
+    run = trace.run
+    return [
+        {
+            "env": title_of(run.env),
+            "entry": run.entry,
+            "run": _short(run.name),
+            **_submit(row),
+            "selected": "yes" if row.submit.index == run.record.outcome.best_submit_index else None,
+        }
+        for row in trace.rows
+    ]
+
+
+def _submit(row: TraceRow) -> dict[str, Any]:
+    submit, transition, evidence = row.submit, row.transition, row.evidence
+    quote = " ".join(evidence.attribution.split()) if evidence is not None else ""
+    return {
+        "submit": submit.label,
+        "before": submit.consumed_before,
+        "after": submit.consumed,
+        "read": ", ".join(evidence.read) or None if evidence is not None else None,
+        "said": quote if len(quote) <= _MAX_QUOTE else quote[: _MAX_QUOTE - 1] + "…",
+        "status": submit.status,
+        "edit": transition.edit if transition is not None else None,
+        "changed_lines": submit.changed_lines,
+        "visible": submit.mean_return,
+        "validation": submit.val_mean,
+        "best": ("yes" if transition.hit else "no") if transition is not None else None,
+    }
+
+
+def feedback_use(rows: Iterable[dict[str, Any]]) -> Table:
+    """Every submit of every run (`submits_of`). Too long for a page; each run has a page of its own."""
+    return Table(
+        name="feedback_use",
+        title="Feedback use",
+        caption="One row a submit: what the agent had read and said since the submit before, how the policy changed, and what came of "
+        "it. Budget: train episodes consumed before and after. Validation is hidden from agents.",
+        columns=(
+            ENV,
+            ENTRY,
+            RUN,
+            Column("submit", "Submit"),
+            Column("before", "Budget before", "integer"),
+            Column("after", "Budget after", "integer"),
+            Column("read", "Evidence read"),
+            Column("said", "The agent's own words"),
+            Column("status", "Status"),
+            Column("edit", "Edit"),
+            Column("changed_lines", "Changed lines", "integer"),
+            Column("visible", "Visible mean", "number"),
+            Column("validation", "Validation mean", "number"),
+            Column("best", "New validation best"),
+            Column("selected", "Selected"),
+        ),
+        rows=tuple(rows),
+    )
+
+
+def _audit(study: Study, link_of: LinkOf) -> Table:
+    rows: list[dict[str, Any]] = []
+    for found in study.audit:
+        row = {key: getattr(found, key) for key in found.__struct_fields__}
+        selected = found.selected_index
+        row |= {
+            "env": title_of(found.env),
+            "run": _short(found.run),
+            "selected": None if selected is None else f"s{selected:03d}",
+            "splits": "secret" if found.secret_splits else "public",
+        }
+        rows.append(row)
+
+    def seconds(key: str, title: str) -> Column:
+        return Column(key, f"{title} (s)", "number", digits=0)
+
+    return Table(
+        name="audit",
+        title="Audit signals",
+        caption="One row a run. Invalid submits: accepted ones that are not ok, of all accepted. Repaired actions: share of the train "
+        "steps whose action was outside the action space; a dash for runs of earlier versions. Score drops: score-bearing submits "
+        "whose validation mean is below the one before. Growth: AST nodes of the selected policy over those of the first. "
+        "Wall time by phase, in seconds; phases may overlap.",
+        columns=(
+            ENV,
+            ENTRY,
+            RUN,
+            Column("accepted", "Accepted", "integer"),
+            Column("rejected", "Rejected", "integer"),
+            Column("invalid_rate", "Invalid submits", "percent"),
+            Column(
+                "repaired_rate",
+                "Repaired actions",
+                "number",
+                digits=4,
+                below=True,
+                note="Share of the train steps whose action was outside the action space.",
+            ),
+            Column("budget_used", "Budget used", "integer"),
+            Column("episodes_per_submit", "Episodes / submit", "number", digits=1),
+            Column("failed_episodes", "Failed episodes", "integer"),
+            Column("score_drops", "Score drops", "integer"),
+            Column("selected", "Selected"),
+            Column("complexity_growth", "Growth (×)", "number", digits=2),
+            Column("turns", "Turns", "integer"),
+            Column("retries", "Retries", "integer"),
+            Column(
+                "splits", "Splits", note="`public`: of case files or a public seed that anybody may know."
+            ),
+            Column("simulation", "Simulation", note="Whether the run's rules let the agent simulate."),
+            Column(
+                "simulator_flags",
+                "Simulator flags",
+                "integer",
+                note="Places in its code that look like a simulator: a signal to read, never a verdict.",
+            ),
+            Column(
+                "signals",
+                "Signals",
+                "integer",
+                note="Places in its log and code that deserve a look: no verdict.",
+            ),
+            seconds("wall_s", "Wall"),
+            seconds("agent_s", "Agent"),
+            seconds("queue_s", "Queue"),
+            seconds("rollout_s", "Rollout"),
+            seconds("feedback_s", "Feedback"),
+            seconds("finalise_s", "Finalise"),
+        ),
+        rows=tuple(rows),
+        links={i: link for i, found in enumerate(study.audit) if (link := link_of(found.run))},
+    )
+
+
+def _simulators(study: Study, link_of: LinkOf) -> Table:
+    found = [(run, flag) for run in study.runs for flag in run.simulator_flags]
+    return Table(
+        name="simulator_flags",
+        title="Code that looks like a simulator",
+        caption="A signal to read, never a verdict: places where a state is made from the state before again and again, something decides "
+        "in between, and something of it is summed up or compared. Runs whose rules allow simulation are not looked through. "
+        "Submits: whose checkpoints have the lines; none for other files of the workspace, and for code in the agent's log.",
+        columns=(
+            ENV,
+            ENTRY,
+            RUN,
+            Column("file", "File"),
+            Column("lines", "Lines"),
+            Column("submits", "Submits"),
+            Column("kind", "Kind"),
+            Column("reasons", "Why"),
+            Column("quote", "Code"),
+        ),
+        rows=tuple(
+            {
+                "env": title_of(run.env),
+                "entry": run.entry,
+                "run": _short(run.name),
+                "file": flag.path,
+                "lines": f"{flag.line}–{flag.end_line}",
+                "submits": submits_text(flag.submits) or None,
+                "kind": flag.kind,
+                "reasons": "; ".join(flag.reasons),
+                "quote": " ⏎ ".join(line.strip() for line in flag.quote)[:_MAX_QUOTE],
+            }
+            for run, flag in found
+        ),
+        links={i: link for i, (run, _) in enumerate(found) if (link := link_of(run.name))},
+    )
+
+
+def _signals(study: Study, link_of: LinkOf) -> Table:
+    found = [(run, each) for run in study.runs for each in run.signals]
+    return Table(
+        name="signals",
+        title="What deserves a look",
+        caption="Signals to read, never verdicts: commands that reach for the network, for files outside the workspace or for a simulator, "
+        "policies with tables keyed by hashes of observations or by case, and policies that hold recorded train actions. Honest agents can "
+        "raise a signal, and an agent can hide from the search.",
+        columns=(
+            ENV,
+            ENTRY,
+            RUN,
+            Column("signal", "Signal"),
+            Column("file", "File"),
+            Column("submits", "Submits"),
+            Column("reason", "Why"),
+            Column("quote", "Evidence"),
+        ),
+        rows=tuple(
+            {
+                "env": title_of(run.env),
+                "entry": run.entry,
+                "run": _short(run.name),
+                "signal": TITLES[each.kind],
+                "file": f"{each.path}:{each.line}" if each.line and each.submits else each.path,
+                "submits": submits_text(each.submits) or None,
+                "reason": each.reason,
+                "quote": each.quote[:_MAX_QUOTE],
+            }
+            for run, each in found
+        ),
+        links={i: link for i, (run, _) in enumerate(found) if (link := link_of(run.name))},
+    )
+
+
+def submits_text(indices: Iterable[int]) -> str:
+    """Submit labels such as `s000–s003, s007`: neighbours as a range."""
+    spans: list[list[int]] = []
+    for index in sorted(indices):
+        if spans and index == spans[-1][1] + 1:
+            spans[-1][1] = index
+        else:
+            spans.append([index, index])
+    return ", ".join(f"s{a:03d}" if a == b else f"s{a:03d}–s{b:03d}" for a, b in spans)
+
+
+def _no_reference(run: Run) -> bool:
+    return run.record.outcome.random_reference is None
+
+
+def _no_validation(run: Run) -> bool:
+    return not run.record.outcome.val_scores
+
+
+_MISSING: tuple[tuple[str, str, Callable[[Run], bool]], ...] = (
+    ("Normalised performance", "the random reference on the held-out cases", _no_reference),
+    (
+        "Score evolution",
+        "the random reference: the scale begins at the lowest first score instead",
+        _no_reference,
+    ),
+    ("Score evolution", "validation means, so no curve", _no_validation),
+    ("Edit types, edit size", "validation means, so no hits", _no_validation),
+    (
+        "Realised structure",
+        "the selected policy's source",
+        lambda run: run.selected is None or run.selected.source is None,
+    ),
+    ("Tokens and cost", "tokens and cost", lambda run: run.record.agent.tokens is None),
+    ("Audit signals", "refused requests, turns, retries, the phases of the wall time", lambda run: True),
+    ("Agents", "harness, version, settings, jail, hidden isolation", lambda run: True),
+    ("Environments", "the bounds of a submit, the number of validation cases", lambda run: True),
+)
+"""Table, the information that it lacks for runs of the published software, and a test for affected runs."""
+
+
+def _missing(study: Study) -> Table:
+    """The information missing from the published software's run directories, by table."""
+    runs = [run for run in study.runs if run.is_published]
+    counts = [(table, what, sum(map(lacks, runs))) for table, what, lacks in _MISSING]
+    return Table(
+        name="not_told",
+        title="Missing values",
+        caption="Values that run directories of the published software lack, by table. They are left empty.",
+        columns=(
+            Column("table", "Table"),
+            Column("what", "Missing value"),
+            Column("runs", "Runs", "integer"),
+        ),
+        rows=tuple({"table": table, "what": what, "runs": n} for table, what, n in counts if n),
+    )
+
+
+def _left_out(study: Study) -> Table:
+    return Table(
+        name="left_out",
+        title="Left out",
+        caption="Folders that are no complete run, and why. They are in no table and no figure.",
+        columns=(Column("path", "Folder"), Column("reason", "Reason")),
+        rows=tuple({"path": path_text(item.path), "reason": item.reason} for item in study.left_out),
+    )

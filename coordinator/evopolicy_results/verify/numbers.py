@@ -1,0 +1,250 @@
+"""Checks the numbers of a run directory without playing an episode: against each other, and against the coordinator's result.
+
+Rules that this module owns:
+- A number that follows from others in the directory must be what follows, bit for bit: means, spreads, the selection, the
+  budget.
+- If the coordinator still has the run, its result decides the rest: which submits there were, of which policies, and all scores.
+- Every difference names the file and both values. Missing fields of earlier versions are no difference.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+from evopolicy_common.errors import BundleError, ProtocolError
+from evopolicy_common.messages.gateway import CANCELLED
+from evopolicy_common.records.aggregates import mean, std
+from evopolicy_common.records.journal import Result, SubmitResult
+from evopolicy_common.records.policies.checkpoints import bundle_of
+from evopolicy_common.records.rescores import FOLDER, RescoreRecord, read_rescore, rescore_names
+from evopolicy_common.records.run_record import Outcome
+from evopolicy_common.records.summary import Summary
+from evopolicy_results.verify.source import RunUnderTest, SubmitFiles
+
+Told = Iterable[tuple[str, Any, Any]]
+"""Names of numbers, each with its value and what it has to be."""
+
+_MAX_CHARS = 80
+_STORED = "the coordinator has"
+
+
+def differences(run: RunUnderTest, result: Result | None) -> Iterator[tuple[str, str]]:
+    """Pairs of a file and what differs in it. `result`: the coordinator's; None when it does not have the run."""
+    stored = {submit.submit_index: submit for submit in result.submits} if result is not None else {}
+    spent = 0
+    for position, submit in enumerate(run.submits):
+        name = f"submit {submit.index}"
+        if submit.index != position:
+            yield name, f"it is the submit after number {position - 1}: files of a submit are missing"
+        spent += submit.n_episodes
+        yield from _unlike(f"{name}, summary.json", _summary(run, submit, spent))
+        yield from _unlike(f"{name}, _meta.json", _meta(run, submit))
+        known = stored.get(submit.index)
+        if known is not None:
+            yield from _unlike(f"{name}, summary.json", _stored(submit, known), _STORED)
+        if (fault := _checkpoint(submit, known)) is not None:
+            yield name, fault
+    for played in run.train:
+        expected = {folder.name for folder in played.folders}
+        there = {folder.name for folder in played.folders[0].parent.glob("ep_*")} if played.folders else set()
+        for folder in sorted(there - expected):
+            yield f"submit {played.submit_index}", f"{folder[:_MAX_CHARS]} is none of its episodes"
+    yield from _unlike("run.json", _outcome(run, spent))
+    if result is not None:
+        here = [submit.index for submit in run.submits if submit.status != CANCELLED]
+        yield from _unlike("run.json", [("submits", here, sorted(stored))], _STORED)
+        yield from _unlike("run.json", outcome_pairs(run.record.outcome, result), _STORED)
+    for name in rescore_names(run.root):
+        file = f"{FOLDER}/{name}.json"
+        try:
+            if (record := read_rescore(run.root, name)) is not None:
+                yield from _unlike(file, _rescore(run, name, record))
+        except ProtocolError as error:
+            yield file, str(error)
+
+
+def outcome_pairs(outcome: Outcome, result: Result) -> Iterator[tuple[str, Any, Any]]:
+    """The numbers of `run.json` that a result determines, with what it has."""
+    completed = result.status == "completed"
+    given_up = outcome.status == "error" and result.status == "cancelled"
+    heldout, reference = result.heldout_returns, outcome.random_reference
+    val_scores = {
+        str(each.submit_index): each.val_mean for each in result.submits if each.val_mean is not None
+    }
+    score = result.final_score if completed else 0.0 if result.status == "no_ok_submit" else None
+    yield "status", outcome.status, outcome.status if given_up else result.status
+    yield "final_score", outcome.final_score, score
+    yield "best_submit_index", outcome.best_submit_index, result.best_submit_index if completed else None
+    yield "heldout_returns", outcome.heldout_returns, heldout if completed else ()
+    yield "heldout_successes", outcome.heldout_successes, result.heldout_successes if completed else ()
+    yield "heldout_mean_return", outcome.heldout_mean_return, result.final_score if completed else None
+    yield "heldout_std_return", outcome.heldout_std_return, std(heldout) if completed and heldout else None
+    yield "val_scores", outcome.val_scores, val_scores if completed else None
+    yield "budget_used", outcome.budget_used, result.budget_used
+    yield "quarantined_submits", outcome.quarantined_submits, result.validation_ineligible
+    for name in ("policy_failures", "infrastructure_retries", "nondeterministic_results"):
+        if name in outcome.auxiliary:
+            yield f"auxiliary.{name}", outcome.auxiliary[name], getattr(result, name)
+    random = result.random_heldout_returns
+    yield "random returns", () if reference is None else reference.returns, random
+    if reference is not None and random:
+        yield "mean of random actions", reference.mean_return, mean(random)
+        yield "standard deviation of random actions", reference.std_return, std(random)
+
+
+def _outcome(run: RunUnderTest, spent: int) -> Told:
+    """`run.json` against itself and the submits."""
+    outcome, dimensions = run.record.outcome, run.record.experiment_dimensions
+    heldout, reference = outcome.heldout_returns, outcome.random_reference
+    yield "budget_used", outcome.budget_used, spent
+    if spent > dimensions.episode_budget:
+        yield "episode_budget", dimensions.episode_budget, f"{spent} or more"
+    if reference is not None and reference.returns:
+        yield "mean of random actions", reference.mean_return, mean(reference.returns)
+        yield "standard deviation of random actions", reference.std_return, std(reference.returns)
+        yield "number of random returns", len(reference.returns), dimensions.n_heldout
+    if outcome.status != "completed":
+        yield "heldout_returns", heldout, ()
+        yield "best_submit_index", outcome.best_submit_index, None
+        yield "final_score", outcome.final_score or None, None
+        return
+    yield "number of heldout_returns", len(heldout), dimensions.n_heldout
+    if heldout:
+        for name in ("final_score", "heldout_mean_return"):
+            yield name, getattr(outcome, name), mean(heldout)
+        yield "heldout_std_return", outcome.heldout_std_return, std(heldout)
+    scores = outcome.val_scores or {}
+    quarantined = set(map(str, outcome.quarantined_submits))
+    played = {str(submit.index) for submit in run.submits if submit.status == "ok"}
+    yield "submits of val_scores", sorted(scores), sorted((played - quarantined) | (played & scores.keys()))
+    eligible = [(mean_, int(name)) for name, mean_ in scores.items() if name in played - quarantined]
+    yield "best_submit_index", outcome.best_submit_index, max(eligible)[1] if eligible else None
+
+
+def _summary(run: RunUnderTest, submit: SubmitFiles, spent: int) -> Told:
+    """A submit's summary against itself and the budget. `spent`: episodes up to its end."""
+    summary = submit.summary
+    if summary is None:
+        return
+    yield "submit_index", summary.submit_index, submit.index
+    yield "env", summary.env, run.record.env
+    if summary.status == CANCELLED:
+        return
+    yield (
+        "remaining_budget",
+        summary.remaining_budget,
+        run.record.experiment_dimensions.episode_budget - spent,
+    )
+    if summary.env_instances is not None:
+        yield "n_episodes", summary.n_episodes, len(summary.env_instances)
+    if summary.status == "ok":
+        for name in ("env_instances", "first_global_episode"):
+            if getattr(summary, name) is None:
+                yield name, None, "a value"
+        yield from _aggregates(summary)
+
+
+def _aggregates(summary: Summary) -> Told:
+    n, returns, lengths = summary.n_episodes, summary.returns or (), summary.episode_lengths or ()
+    yield "number of returns", len(returns), n
+    yield "number of episode_lengths", len(lengths), n
+    if len(returns) == len(lengths) == n > 0:
+        yield "mean_return", summary.mean_return, mean(returns)
+        yield "std_return", summary.std_return, std(returns)
+        yield "min_return", summary.min_return, min(returns)
+        yield "max_return", summary.max_return, max(returns)
+        yield "mean_episode_length", summary.mean_episode_length, mean(lengths)
+    failed = summary.errors or ()
+    if summary.policy_failures is not None:
+        yield "policy_failures", summary.policy_failures, len(failed)
+    for name in ("errors", "timeouts"):
+        places = getattr(summary, name) or ()
+        yield name, places, tuple(place for place in places if 0 <= place < n and place in failed)
+    parts = summary.reward_components_per_episode
+    if parts is not None:
+        yield "number of reward_components_per_episode", len(parts), n
+        names = dict.fromkeys(name for each in parts for name in each)
+        means = {name: mean([each.get(name, 0.0) for each in parts]) for name in names}
+        yield "reward_components_mean", summary.reward_components_mean, means
+    if summary.successes is not None:
+        yield "number of successes", len(summary.successes), n
+
+
+def _meta(run: RunUnderTest, submit: SubmitFiles) -> Told:
+    """A checkpoint's metadata against the summary and `run.json`."""
+    meta, summary = submit.meta, submit.summary
+    if meta is None:
+        return
+    yield "submit_index", meta.submit_index, submit.index
+    scores = run.record.outcome.val_scores or {}
+    if run.record.outcome.status == "completed":
+        yield "val_mean", meta.val_mean, scores.get(str(submit.index))
+    if summary is not None and summary.status != CANCELLED:
+        yield "validation_status", meta.validation_status, summary.status
+        yield "mean_return", meta.mean_return, summary.mean_return
+        yield "n_episodes_requested", meta.n_episodes_requested, summary.n_episodes
+        yield "remaining_budget_after", meta.remaining_budget_after, summary.remaining_budget
+        before = summary.remaining_budget + summary.n_episodes
+        yield "remaining_budget_before", meta.remaining_budget_before, before
+
+
+def _rescore(run: RunUnderTest, name: str, record: RescoreRecord) -> Told:
+    """A re-score against the run. Nothing in the directory determines its returns."""
+    yield "name", record.name, name
+    yield "run", record.run, run.record.run
+    yield "env", record.env, run.record.env
+    yield "selected", record.selected, run.record.outcome.best_submit_index
+    known = {submit.index for submit in run.submits if submit.status == "ok"}
+    there = sorted(each.submit_index for each in record.checkpoints)
+    yield "submits of checkpoints", there, sorted(known.intersection(there))
+    for each in record.checkpoints:
+        what = f"of submit {each.submit_index}"
+        yield f"number of lengths {what}", len(each.lengths), record.n_cases
+        if each.successes:
+            yield f"number of successes {what}", len(each.successes), record.n_cases
+        places = sorted(map(int, each.failures))
+        yield f"failures {what}", places, [place for place in places if place < record.n_cases]
+
+
+def _stored(submit: SubmitFiles, known: SubmitResult) -> Told:
+    """A submit against the coordinator's result."""
+    summary = submit.summary
+    if summary is None or summary.status == CANCELLED:
+        return
+    yield "status", summary.status, known.status
+    yield "mean_return", summary.mean_return, known.mean_return
+    if summary.env_instances is not None:
+        yield "env_instances", summary.env_instances, known.env_instances
+
+
+def _checkpoint(submit: SubmitFiles, known: SubmitResult | None) -> str | None:
+    """Whether the checkpoint's files are those that were submitted; without the coordinator, that its metadata names."""
+    named = "" if submit.meta is None else submit.meta.bundle
+    submitted = None if known is None else known.bundle
+    wanted = submitted or named
+    if not wanted:
+        return None
+    try:
+        found = bundle_of(submit.checkpoint).digest
+    except BundleError as error:
+        return f"its checkpoint cannot be read: {error}"
+    if found != wanted:
+        names = "that _meta.json names" if submitted is None else "that was submitted"
+        return f"its checkpoint does not hold the policy {names}"
+    return (
+        None if named in ("", wanted) else "_meta.json names another policy than the one that was submitted"
+    )
+
+
+def _unlike(
+    file: str, told: Told, source: str = "what follows from the rest is"
+) -> Iterator[tuple[str, str]]:
+    for name, here, wanted in told:
+        if here != wanted:
+            yield file, f"{name} is {_short(here)}; {source} {_short(wanted)}"
+
+
+def _short(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= _MAX_CHARS else f"{text[: _MAX_CHARS - 1]}…"

@@ -1,0 +1,426 @@
+"""Replays a finished run's episodes and reports every difference.
+
+Rules that this module owns:
+- The exact check replays recorded actions in the environment, without a policy. The actions are the coordinator's
+  stored ones if it still has them, otherwise those of the feedback files. The results must equal, bit for bit, the
+  stored record, the feedback files, and the returns in `summary.json` and `run.json`.
+- All other numbers of the directory are checked without playing (`numbers`), whatever the sample.
+- The advisory check: the checkpoint's policy plays the same cases again. A policy may read clocks, so this proves
+  nothing.
+- The cases must be the run's: split hashes are compared before any episode is played.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import uuid
+from collections.abc import AsyncIterator, Callable, Iterator, Sequence
+from typing import Any
+
+import msgspec
+
+from evopolicy_common.errors import BundleError, ConfigError
+from evopolicy_common.messages.environment import Split
+from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome, Record, ResourceLimits, Tier
+from evopolicy_common.messages.gateway import CANCELLED
+from evopolicy_common.messages.operator import (
+    DescribeEnvironment,
+    EnvironmentState,
+    Evaluate,
+    PlayedAs,
+)
+from evopolicy_common.records.blobs import digest_of
+from evopolicy_common.records.episodes import compare as verify_compare
+from evopolicy_common.records.episodes.rendered import decode
+from evopolicy_common.records.episodes.trajectory import Trajectory
+from evopolicy_common.records.fingerprints import comparable
+from evopolicy_common.records.journal import Result
+from evopolicy_common.records.policies.checkpoints import bundle_of
+from evopolicy_common.records.rescores import FOLDER, rescore_names
+from evopolicy_common.records.summary import Summary
+from evopolicy_common.wire.operator_client import TIMEOUT_S, OperatorClient
+from evopolicy_common.wire.transport import Link
+from evopolicy_results.verify import numbers as verify_numbers
+from evopolicy_results.verify.source import RANDOM, Played, RunUnderTest
+
+_SPLITS: tuple[Split, ...] = ("train", "validation", "heldout")
+
+Tell = Callable[[int, str], None]
+"""Called with the number of finished episodes and what the cluster waits for (empty: nothing)."""
+
+
+class Finding(msgspec.Struct, frozen=True, kw_only=True):
+    """One episode, or one list of episodes, that differs from the run's record."""
+
+    episode: str
+    difference: str
+
+
+class Report(msgspec.Struct, kw_only=True):
+    """The result of a verification; updated while it runs."""
+
+    run_directory: str
+    env: str
+    identical: bool = True
+    episodes: int = 0
+    """Replayed from their recorded actions."""
+    from_files: int = 0
+    """Of these, episodes whose actions came from feedback files, as the coordinator no longer stores them."""
+    differences: list[Finding] = []
+    not_checked: list[Finding] = []
+    unchecked_episodes: int = 0
+    """Of these, episodes whose actions nobody has any more."""
+    policy_episodes: int = 0
+    """Played again by the checkpoint's policy."""
+    policy_differences: list[Finding] = []
+    """Advisory."""
+    fingerprint_differences: list[str] = []
+    notes: list[str] = []
+
+    def differs(self, episode: str, difference: str) -> None:
+        self.identical = False
+        self.differences.append(Finding(episode=episode, difference=difference))
+
+
+class _Recording(msgspec.Struct, kw_only=True):
+    """The data of one episode before its replay."""
+
+    index: int
+    actions: bytes
+    """Trajectory bytes with the actions to replay."""
+    outcome: EpisodeOutcome | None
+    """As stored by the coordinator."""
+    stored: bytes | None
+    """Its packed trajectory, unpacked only for the comparison: a submit's trajectories together may be gigabytes."""
+    files: bool
+    """Whether there are feedback files to compare with."""
+
+
+class Verifier:
+    """One verification on one cluster."""
+
+    def __init__(self, link: Link, run: RunUnderTest, tell: Tell, tier: Tier | None = None) -> None:
+        self._ask = OperatorClient(link)
+        self._run = run
+        self._tell = tell
+        self._tier: Tier = tier or run.record.sandbox_tier
+        self._limits = run.record.experiment_dimensions.limits or ResourceLimits()
+        self._knows_run = False
+        self._came = 0
+        self._kept: dict[int, _Recording] = {}
+        """Recordings of the list that was replayed last, by index."""
+        self.report = Report(run_directory=str(run.root), env=run.record.env)
+
+    async def check_cases(self) -> bool:
+        """Whether the coordinator still has the run. Raises ConfigError when the coordinator's cases are not the
+        run's."""
+        state = await self._describe()
+        record, versions = self._run.record, self._run.record.versions
+        if record.experiment_dimensions.hidden_cases == "per_run" and not state.knows_run:
+            raise ConfigError(
+                f"run {record.run} had hidden cases of its own, and this cluster's coordinator does not have that run: they are in"
+                " the state folder of the coordinator that made it; use that one, with --state, or a backup of it"
+            )
+        for split in _SPLITS:
+            ours = versions.cases_hash(split).removeprefix("sha256:")
+            theirs = state.split_hashes.get(split, "")
+            if not ours:
+                text = "run.json has no hash of them: they may be others"
+                self.report.not_checked.append(Finding(episode=f"{split} cases", difference=text))
+            elif ours != theirs:
+                raise ConfigError(
+                    f"this cluster's {split} cases of {self._run.record.env} are not the run's (SHA-256 {theirs[:12]}…"
+                    f" here, {ours[:12]}… in run.json): use the coordinator that made the run, its --state, or its --data"
+                )
+        self._knows_run = state.knows_run
+        self._check_numbers(state.result)
+        if not versions.env_deterministic:
+            self.report.notes.append(
+                "this environment is marked as not deterministic: differences are to be expected"
+            )
+        return self._knows_run
+
+    def _check_numbers(self, data: bytes) -> None:
+        result = msgspec.json.decode(data, type=Result) if data else None
+        for name, difference in verify_numbers.differences(self._run, result):
+            self.report.differs(name, difference)
+        for submit in self._run.submits:
+            for name, content in (("summary.json", submit.summary), ("_meta.json", submit.meta)):
+                if content is None and submit.status != CANCELLED:
+                    finding = Finding(episode=f"submit {submit.index}", difference=f"it has no {name}")
+                    self.report.not_checked.append(finding)
+        for name in rescore_names(self._run.root):
+            text = (
+                "its returns are not played again: say `evopolicy rescore` with"
+                f" --name {name} for a copy of the run directory without this file, and compare"
+            )
+            self.report.not_checked.append(Finding(episode=f"{FOLDER}/{name}.json", difference=text))
+
+    async def replay(self, played: Played, indexes: Sequence[int]) -> None:
+        """Makes the exact check of these episodes of a list."""
+        recordings = await self._recordings(played, indexes)
+        if not recordings:
+            return
+        refs = []
+        for recording in recordings:
+            digest = digest_of(recording.actions)
+            await self._ask.upload(digest, recording.actions)
+            refs.append(BlobRef(digest=digest, size=len(recording.actions)))
+        record: Record = "full" if played.split == "train" else "actions"
+        by_index = dict(enumerate(recordings))
+        returns: dict[int, float] = {}
+        message = self._evaluate(played, [one.index for one in recordings], record, replays=tuple(refs))
+        async for outcome in self._outcomes(message):
+            recording = by_index.pop(outcome.index)
+            returns[recording.index] = outcome.episode_return
+            await self._compare(played, recording, outcome)
+        for recording in by_index.values():
+            self.report.differs(played.name(recording.index), "could not be played again")
+        if played.mean_differs(returns):
+            self.report.differs(
+                f"submit {played.submit_index}, {played.split}", f"run.json tells a mean of {played.mean!r}"
+            )
+
+    async def play_policy(self, played: Played, indexes: Sequence[int]) -> None:
+        """Makes the advisory check of these train episodes with their checkpoint's policy. Call it right after their
+        `replay`."""
+        dimensions = self._run.record.experiment_dimensions
+        name = f"submit {played.submit_index}"
+        if dimensions.policy_scope == "submit" and len(indexes) < len(played.env_instances):
+            self.report.not_checked.append(
+                Finding(
+                    episode=name,
+                    difference="its one policy plays whole submits, of which this sample is a part",
+                )
+            )
+            return
+        assert played.checkpoint is not None
+        try:
+            bundle = bundle_of(played.checkpoint)
+        except BundleError as error:
+            if not played.digest:
+                self.report.differs(name, f"its checkpoint cannot be read: {error}")
+            return  # otherwise a difference that the check of numbers has found
+        if bundle.digest != played.digest:
+            return  # a difference that the check of numbers has found
+        await self._ask.upload(bundle.digest, bundle.packed)
+        message = self._evaluate(played, indexes, "full", bundle=bundle.digest)
+        async for outcome in self._outcomes(message):
+            recording = self._kept.get(indexes[outcome.index])
+            if recording is None:
+                continue
+            self.report.policy_episodes += 1
+            difference = await self._policy_difference(played, recording, outcome)
+            if difference is not None:
+                self.report.policy_differences.append(
+                    Finding(episode=played.name(recording.index), difference=difference)
+                )
+
+    async def check_fingerprint(self) -> None:
+        """Compares the library versions of the connected workers with the run's. Call it after workers have played
+        episodes."""
+        known = self._run.record.versions.fingerprint
+        found: dict[str, None] = {}
+        for fingerprint in (await self._describe()).fingerprints if known else ():
+            then, here = comparable([known, fingerprint.flat()])
+            for name in sorted(then.keys() | here.keys()):
+                ours, theirs = then.get(name, "none"), here.get(name, "none")
+                if ours != theirs:
+                    found[f"{name}: {ours} in the run, {theirs} on the workers"] = None
+        self.report.fingerprint_differences = list(found)
+
+    # Recordings.
+
+    async def _recordings(self, played: Played, indexes: Sequence[int]) -> list[_Recording]:
+        known = await self._stored(played) if self._knows_run else {}
+        found = []
+        for index in indexes:
+            name = played.name(index)
+            outcome = known.get(index)
+            rows = self._rows(played, index)
+            stored: bytes | None = None
+            if outcome is not None and outcome.trajectory is not None:
+                stored = await self._ask.fetch(outcome.trajectory)
+                actions = verify_compare.recorded_actions(decode(stored))
+            elif rows is not None:
+                try:
+                    actions = verify_compare.action_log(verify_compare.actions_of(rows))
+                except Exception as error:
+                    # JSON of any shape and size: an agent without a jail could have written it.
+                    self.report.differs(
+                        name, f"its actions cannot be played: {type(error).__name__}: {error}"
+                    )
+                    continue
+                self.report.from_files += 1
+            else:
+                if not played.folders:
+                    self.report.unchecked_episodes += 1
+                    self.report.not_checked.append(
+                        Finding(episode=name, difference="the coordinator has no record of it any more")
+                    )
+                continue
+            found.append(
+                _Recording(
+                    index=index, actions=actions, outcome=outcome, stored=stored, files=rows is not None
+                )
+            )
+        self._kept = {recording.index: recording for recording in found}
+        return found
+
+    def _rows(self, played: Played, index: int) -> verify_compare.Rows | None:
+        if not played.folders:
+            return None
+        try:
+            rows = verify_compare.read_rows(played.folders[index])
+        except (OSError, ValueError) as error:
+            self.report.differs(played.name(index), f"trajectory.jsonl cannot be read: {error}")
+            return None
+        if not rows:
+            self.report.differs(played.name(index), "trajectory.jsonl has no step")
+            return None
+        return rows
+
+    async def _stored(self, played: Played) -> dict[int, EpisodeOutcome]:
+        """Outcomes that the coordinator stored, by index."""
+        found = self._ask.recorded(
+            self._run.record.run, played.split, played.submit_index, timeout_s=TIMEOUT_S
+        )
+        return {outcome.index: outcome async for outcome in found}
+
+    # Comparison.
+
+    async def _compare(self, played: Played, recording: _Recording, outcome: EpisodeOutcome) -> None:
+        self.report.episodes += 1
+        index, name = recording.index, played.name(recording.index)
+        assert outcome.trajectory is not None
+        replayed = decode(await self._ask.fetch(outcome.trajectory))
+        for what, difference in (
+            ("the stored record", _stored_difference(recording, replayed, outcome)),
+            ("the feedback files", self._files_difference(played, recording, replayed)),
+        ):
+            if difference is not None:
+                self.report.differs(name, f"{what}: {difference}")
+        if played.returns is not None and not verify_compare.same(
+            played.returns[index], outcome.episode_return
+        ):
+            self.report.differs(
+                name, f"return {played.returns[index]!r} is told, {outcome.episode_return!r} came"
+            )
+        if played.lengths is not None and played.lengths[index] != outcome.length:
+            self.report.differs(name, f"{played.lengths[index]} steps are told, {outcome.length} came")
+        for what, told, came in _summarised(played.summary, index, outcome, recording.outcome):
+            if told != came:
+                self.report.differs(name, f"{what} {told!r} is told, {came!r} came")
+
+    def _files_difference(self, played: Played, recording: _Recording, replayed: Trajectory) -> str | None:
+        if not recording.files:
+            return None
+        known = recording.stored is not None
+        return _of_files(
+            played, recording.index, decode(recording.stored) if recording.stored else replayed, actions=known
+        )
+
+    async def _policy_difference(
+        self, played: Played, recording: _Recording, outcome: EpisodeOutcome
+    ) -> str | None:
+        if outcome.failure is not None and outcome.length == 0:
+            return f"{outcome.failure.category}: {outcome.failure.message}"
+        assert outcome.trajectory is not None
+        again = decode(await self._ask.fetch(outcome.trajectory))
+        if recording.stored is not None:
+            return verify_compare.first_difference(decode(recording.stored), again)
+        return _of_files(played, recording.index, again, actions=True)
+
+    # Requests to the cluster.
+
+    async def _describe(self) -> EnvironmentState:
+        record = self._run.record
+        dimensions = record.experiment_dimensions
+        message = DescribeEnvironment(
+            token="",
+            env=record.env,
+            run=record.run,
+            n_validation=dimensions.n_validation,
+            n_heldout=dimensions.n_heldout,
+        )
+        return await self._ask.describe(message)
+
+    def _evaluate(
+        self,
+        played: Played,
+        indexes: Sequence[int],
+        record: Record,
+        *,
+        bundle: str | None = None,
+        replays: tuple[BlobRef, ...] = (),
+    ) -> Evaluate:
+        dimensions = self._run.record.experiment_dimensions
+        return Evaluate(
+            token="",
+            key=uuid.uuid4().hex,
+            env=self._run.record.env,
+            bundle=bundle,
+            split=played.split,
+            cases=tuple(played.env_instances[index] for index in indexes),
+            record=record,
+            sandbox_tier=self._tier,
+            limits=self._limits,
+            replays=replays,
+            step_limit=dimensions.step_limit,
+            as_in=PlayedAs(
+                run=self._run.record.run,
+                submit_index=played.submit_index,
+                env_instances=played.env_instances,
+                indexes=tuple(indexes),
+                modulo=played.modulo,
+                remaining_budget_after=played.remaining_budget_after,
+                policy_scope=dimensions.policy_scope,
+                # Random actions had no policy that could receive lists, and are recorded as arrays.
+                observations="arrays" if played.submit_index == RANDOM else dimensions.observations,
+            ),
+        )
+
+    async def _outcomes(self, message: Evaluate) -> AsyncIterator[EpisodeOutcome]:
+        """Yields outcomes as they arrive."""
+        async with contextlib.aclosing(self._ask.evaluate(message)) as outcomes:
+            async for outcome, _, waits_for in outcomes:
+                self._came += outcome is not None
+                self._tell(self._came, waits_for)
+                if outcome is not None:
+                    yield outcome
+
+
+def _summarised(
+    summary: Summary | None, index: int, again: EpisodeOutcome, stored: EpisodeOutcome | None
+) -> Iterator[tuple[str, Any, Any]]:
+    """What a submit's summary tells of one episode besides return and length, and what came."""
+    if summary is None:
+        return
+    parts, solved = summary.reward_components_per_episode, summary.successes
+    if parts is not None and index < len(parts):
+        yield "reward components", parts[index], again.reward_components
+    if stored is not None:
+        # A replay has no policy that could fail.
+        yield "policy failed", index in (summary.errors or ()), stored.failure is not None
+        if solved is not None and index < len(solved):
+            yield "success", solved[index], stored.success
+
+
+def _of_files(played: Played, index: int, episode: Trajectory, *, actions: bool) -> str | None:
+    """Describes the first difference of an episode's feedback files from `episode`."""
+    folder = played.folders[index]
+    try:
+        rows = verify_compare.read_rows(folder)
+        return verify_compare.files_difference(
+            folder, rows, episode, actions=actions, pictures=played.pictures
+        )
+    except Exception as error:
+        # An agent without a jail could have written the files: damaged archives, arrays of any size.
+        return f"cannot be read: {type(error).__name__}: {error}"
+
+
+def _stored_difference(recording: _Recording, replayed: Trajectory, outcome: EpisodeOutcome) -> str | None:
+    then = recording.outcome
+    if recording.stored is None or then is None:
+        return None
+    return verify_compare.episode_difference(then, decode(recording.stored), outcome, replayed)

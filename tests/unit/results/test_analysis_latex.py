@@ -1,0 +1,127 @@
+"""Tables in LaTeX: what is escaped, and that no table is wider or longer than its page.
+
+Where pdfLaTeX is installed, what is written is also compiled.
+"""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+import unicodedata
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from invented.small_table import TABLE
+
+from evopolicy_results.tables.latex import latex_text, to_latex
+from evopolicy_results.tables.table import Column, Table
+
+WORDS = "what the agent said of its submit, in some more words than go into a line of a page"
+
+
+def table(n_text: int, n_numbers: int, n_rows: int, text: str = WORDS) -> Table:
+    texts = tuple(Column(f"t{i}", f"Text {i}") for i in range(n_text))
+    numbers = tuple(Column(f"x{i}", f"Number {i}", "number") for i in range(n_numbers))
+    row = {**{c.key: text for c in texts}, **{c.key: 1.5 for c in numbers}}
+    columns = (Column("who", "Agent"), *texts, *numbers)
+    rows = tuple({"who": f"agent {i}", **row} for i in range(n_rows))
+    return Table(name="w", title="W", caption="", columns=columns, rows=rows)
+
+
+def test_what_means_something_to_latex_is_escaped_and_the_best_are_marked() -> None:
+    text = to_latex(TABLE)
+    assert "A \\& B\\_1 & \\textbf{1.23} & 50 \\% & \\textbf{3} \\\\" in text
+    assert "C\\textbar{}D & -- & 13 \\% & 0 \\\\" in text
+    assert "E & \\underline{0.00} & -- & \\textbf{3} \\\\" in text
+    assert "\\begin{tabular}{lrrr}" in text
+    assert "\\caption{50 \\% of it.}" in text
+
+
+def test_a_negative_number_has_a_true_minus() -> None:
+    below = Table(name="n", title="N", caption="", columns=TABLE.columns, rows=({"who": "-1", "x": -1.5},))
+    assert "\n-1 & $-$1.50 & -- & -- \\\\\n" in to_latex(below)
+
+
+@pytest.mark.parametrize(
+    ("text", "latex"),
+    [
+        ("0 … 1, −2 ≤ x", r"0 \ldots{} 1, $-$2 $\le$ x"),
+        ("--model a---b", "-{}-model a-{}-{}-b"),
+        ("é ﬁ 中\x00", "é fi ??"),
+        (" two\n lines ", "two lines"),
+        ("\\input{/etc/passwd}", r"\textbackslash{}input\{/etc/passwd\}"),
+    ],
+)
+def test_text_is_what_pdflatex_can_set(text: str, latex: str) -> None:
+    assert latex_text(text) == latex
+
+
+@given(st.text(st.characters(codec="utf-8")))
+def test_no_text_holds_a_command_of_its_own_or_an_unknown_letter(text: str) -> None:
+    found = latex_text(text)
+    assert all(c.isascii() or (unicodedata.category(c) in ("Lu", "Ll") and ord(c) < 256) for c in found)
+    assert "\n" not in found
+    bare = re.sub(r"\\[&%$#_{}]", "", found)
+    assert bare.count("{") == bare.count("}")
+    assert bare.count("$") % 2 == 0
+    assert not set("%#&~") & set(bare)
+
+
+def test_a_table_too_wide_is_in_panels_that_each_name_their_rows() -> None:
+    text = to_latex(table(0, 24, 2))
+    assert text.count("\\begin{tabular}") == text.count("\\end{tabular}") > 1
+    assert text.count("\nagent 1 & ") == text.count("\\begin{tabular}")
+    assert text.count(" & 1.500") == 48
+    assert text.count("\\begin{table}") == text.count("\\label") == 1
+
+
+def test_long_texts_are_broken_into_lines_and_numbers_never() -> None:
+    text = to_latex(table(2, 3, 2))
+    spec = next(line for line in text.splitlines() if line.startswith("\\begin{tabular}"))
+    assert len(re.findall(r"p\{\d+pt\}", spec)) == 2
+    assert spec.endswith("rrr}")
+    assert sum(int(points) for points in re.findall(r"p\{(\d+)pt\}", spec)) < 375
+
+
+def test_a_long_name_may_be_broken_where_it_has_joints() -> None:
+    text = to_latex(table(4, 6, 2, "gymnasium/MiniGrid-ObstructedMaze-1Q-v1"))
+    assert "gymnasium/\\allowbreak{}MiniGrid-\\allowbreak{}ObstructedMaze-" in text
+
+
+def test_a_table_too_long_goes_on_over_pages_under_its_heading() -> None:
+    text = to_latex(table(0, 3, 80))
+    assert "\\begin{longtable}{lrrr}" in text
+    assert "\\begin{table}" not in text
+    assert text.count("\\begin{longtable}") == text.count("\\caption") == text.count("\\label") == 1
+    assert text.splitlines()[0] == "% needs \\usepackage{array,booktabs,longtable}"
+    assert text.count("Number") == 6
+
+
+@pytest.mark.skipif(
+    shutil.which("pdflatex") is None, reason="needs pdflatex: apt-get install texlive-latex-extra"
+)
+def test_what_is_written_compiles_and_fits_the_page(tmp_path: Path) -> None:
+    names = []
+    strange = f"{WORDS} \\input{{x}} _^~#$%& … − × 中 --x gymnasium/MiniGrid-ObstructedMaze-1Q-v1"
+    for i, one in enumerate([TABLE, table(0, 24, 2), table(2, 3, 2), table(3, 30, 60, strange)]):
+        (tmp_path / f"{i}.tex").write_text(to_latex(one))
+        names.append(f"\\input{{{i}.tex}}")
+    page = "\\documentclass{article}\\textwidth=397pt\\usepackage{array,booktabs,longtable}"
+    (tmp_path / "all.tex").write_text(page + "\\begin{document}" + "\n".join(names) + "\\end{document}\n")
+    for _ in range(2):
+        done = subprocess.run(
+            ["pdflatex", "-interaction=nonstopmode", "all.tex"],
+            cwd=tmp_path,
+            capture_output=True,
+            text=True,
+            timeout=60,
+            check=False,
+        )
+        assert done.returncode == 0, done.stdout[-3000:]
+    assert "Float too large" not in done.stdout
+    # The words of a heading are as wide as they are.
+    over = [float(points) for points in re.findall(r"Overfull \\hbox \(([\d.]+)pt", done.stdout)]
+    assert all(points < 10 for points in over), done.stdout

@@ -1,0 +1,249 @@
+"""The topology on a corpus of labelled edits, and the features on sources counted by hand."""
+
+from __future__ import annotations
+
+import pytest
+
+from evopolicy_results.code.sources import reachable_modules, source_digest
+from evopolicy_results.code.topology import Features, describe
+
+BASE = '''
+import math
+import numpy as np
+
+GAIN = 0.5
+
+
+def wrap(angle):
+    return (angle + math.pi) % (2.0 * math.pi) - math.pi
+
+
+def follow(target, here):
+    delta = target - here
+    if delta > 1.0:
+        return np.sin(delta)
+    return wrap(delta)
+
+
+class Policy:
+    """Follows the target."""
+
+    def __init__(self, obs_space, action_space, env_meta):
+        self.kp = 1.5
+        self.last = 0.0
+
+    def reset(self, episode_index):
+        self.last = 0.0
+
+    def act(self, obs):
+        error = follow(obs["target"], obs["here"])
+        self.last = 0.9 * self.last + 0.1 * error
+        print(f"error {error:.2f}")
+        return [GAIN * self.kp * self.last, -1.0]
+'''
+
+HEAD, _, TAIL = BASE.partition("class Policy:")
+MOVED = {
+    "policy.py": (
+        "import helpers\nfrom constants import GAIN\n\n\nclass Policy:"
+        + TAIL.replace("follow(obs", "helpers.follow(obs")
+    ),
+    "helpers.py": HEAD.replace("GAIN = 0.5\n", ""),
+    "constants.py": "GAIN = 0.5\n",
+}
+
+
+def swap(old: str, new: str, source: str = BASE) -> dict[str, bytes]:
+    assert old in source
+    return {"policy.py": source.replace(old, new).encode()}
+
+
+def describe_files(files: dict[str, bytes]) -> tuple[str, str, Features]:
+    modules = reachable_modules(files)
+    topology, features = describe(modules)
+    return source_digest(modules), topology, features
+
+
+BYTES_ONLY = {
+    "a constant": swap("1.5", "2.75"),
+    "a constant's sign": swap("-1.0", "1.0"),
+    "an int for a float": swap("1.5", "2"),
+    "a comment": swap("self.kp = 1.5", "self.kp = 1.5  # found by hand"),
+    "blank lines and quotes": swap('obs["target"], obs["here"]', "\n    obs['target'],\n    obs['here'],\n"),
+    "a docstring": swap("Follows the target.", "Follows the target with a filter."),
+    "a docstring removed": swap('    """Follows the target."""\n', ""),
+    "a local variable renamed": swap("delta", "gap"),
+    "an attribute renamed": swap("kp", "proportional"),
+    "a function renamed": swap("wrap", "principal_angle"),
+    "a global renamed": swap("GAIN", "STRENGTH"),
+    "a parameter renamed": swap("here", "place", BASE.replace('["here"]', '["h"]')),
+    "type hints": swap("def wrap(angle):", "def wrap(angle: float) -> float:"),
+    "a hint on a variable": swap("        error = ", "        error: float = "),
+    "functions reordered": {
+        "policy.py": BASE.replace(
+            BASE[BASE.index("def wrap") : BASE.index("def follow")],
+            "",
+        )
+        .replace("class Policy:", BASE[BASE.index("def wrap") : BASE.index("def follow")] + "class Policy:")
+        .encode()
+    },
+    "methods reordered": {
+        "policy.py": (
+            BASE.replace("    def reset(self, episode_index):\n        self.last = 0.0\n\n", "")
+            + "\n    def reset(self, episode_index):\n        self.last = 0.0\n"
+        ).encode()
+    },
+    "code moved to helper modules": {name: text.encode() for name, text in MOVED.items()},
+    "digits of a format specification": swap(":.2f", ":.4f"),
+    "another import style": {
+        "policy.py": BASE.replace("import math\n", "from math import pi\n").replace("math.pi", "pi").encode()
+    },
+    "an unused import": swap("import math\n", "import math\nimport random\n"),
+}
+
+STRUCTURE = {
+    "a new branch": swap("        print(f", "        if error > 2:\n            error = 2\n        print(f"),
+    "a loop": swap(
+        "        print(f", "        for _ in range(3):\n            error *= 0.5\n        print(f"
+    ),
+    "new state": swap(
+        "self.last = 0.0\n\n    def reset", "self.last = 0.0\n        self.n = 0\n\n    def reset"
+    ),
+    "another library function": swap("np.sin", "np.tanh"),
+    "another operator": swap("target - here", "target + here"),
+    "another comparison": swap("delta > 1.0", "delta >= 1.0"),
+    "another helper called": swap("return wrap(delta)", "return follow(delta, delta)"),
+    "another observation": swap('obs["here"]', 'obs["there"]'),
+    "a flag flipped": swap("self.last = 0.0\n\n    def act", "self.last = False\n\n    def act"),
+    "statements swapped inside a function": swap(
+        "        self.kp = 1.5\n        self.last = 0.0\n", "        self.last = 0.0\n        self.kp = 1.5\n"
+    ),
+    "another attribute read": swap("GAIN * self.kp * self.last", "GAIN * self.last * self.kp"),
+    "an f-string for a print of parts": swap('print(f"error {error:.2f}")', 'print("error", error)'),
+    "a new helper module in use": {
+        "policy.py": swap("return wrap(delta)", "return limit(wrap(delta))")["policy.py"].replace(
+            b"import math\n", b"import math\nfrom limits import limit\n", 1
+        ),
+        "limits.py": b"def limit(x):\n    return max(-1.0, min(1.0, x))\n",
+    },
+    "a longer table": swap("self.kp * self.last, -1.0]", "self.kp * self.last, -1.0, 0.0]"),
+    "a decorator": swap("def wrap", "@staticmethod\ndef wrap"),
+    "a keyword of a library": swap("np.sin(delta)", "np.sin(delta, where=True)"),
+}
+
+
+@pytest.mark.parametrize("edit", sorted(BYTES_ONLY))
+def test_edit_that_is_no_structure_keeps_the_topology(edit: str) -> None:
+    before = BASE.replace('["here"]', '["h"]') if edit == "a parameter renamed" else BASE
+    digest, topology, _ = describe_files({"policy.py": before.encode()})
+    new_digest, new_topology, _ = describe_files(BYTES_ONLY[edit])
+    assert new_digest != digest
+    assert new_topology == topology
+
+
+@pytest.mark.parametrize("edit", sorted(STRUCTURE))
+def test_edit_of_structure_changes_the_topology(edit: str) -> None:
+    _, topology, _ = describe_files({"policy.py": BASE.encode()})
+    _, new_topology, _ = describe_files(STRUCTURE[edit])
+    assert new_topology != topology
+
+
+def test_dead_module_is_not_part_of_the_bundle() -> None:
+    alone = describe_files({"policy.py": BASE.encode()})
+    beside = describe_files(
+        {"policy.py": BASE.encode(), "scratch.py": b"x = [1, 2]\n", "notes/a.py": b"y = 1\n"}
+    )
+    assert alone == beside
+
+
+def test_imports_are_followed_into_packages_and_functions() -> None:
+    modules = reachable_modules(
+        {
+            "policy.py": b"from control import pid\n\ndef late():\n    import maps.grid as g\n    return g\n",
+            "control/__init__.py": b"",
+            "control/pid.py": b"from . import base\nfrom ..outside import nothing\n",
+            "control/base.py": b"import importlib\nimportlib.import_module('plugin')\n",
+            "maps/grid.py": b"import policy\n",
+            "plugin.py": b"",
+            "unused.py": b"",
+        }
+    )
+    assert list(modules) == ["control", "control.base", "control.pid", "maps.grid", "plugin", "policy"]
+
+
+def test_swapping_a_file_between_equal_bodies_of_two_helpers_keeps_the_topology() -> None:
+    one = {
+        "policy.py": b"import a, b\nX = a.f(1) + b.g(2)\n",
+        "a.py": b"def f(x):\n    return x\n",
+        "b.py": b"def g(x):\n    return -x\n",
+    }
+    two = {
+        "policy.py": b"import a, b\nX = b.f(1) + a.g(2)\n",
+        "b.py": b"def f(x):\n    return x\n",
+        "a.py": b"def g(x):\n    return -x\n",
+    }
+    assert describe_files(one)[1] == describe_files(two)[1]
+
+
+def test_source_that_does_not_parse_is_opaque_and_no_crash() -> None:
+    broken = describe_files({"policy.py": b"def act(:\n"})
+    other = describe_files({"policy.py": b"def act(:\n  1\n"})
+    assert broken[1] != other[1]
+    assert broken[2].functions == 0
+    assert describe_files({"policy.py": b"x = 1\0"})[2].nodes == 0
+    assert describe_files({"policy.py": ("x = " + "(" * 400 + "1" + ")" * 400).encode()})[1]
+
+
+def test_no_policy_gives_an_empty_bundle() -> None:
+    assert reachable_modules({"other.py": b""}) == {}
+
+
+def test_features_are_counted_as_documented() -> None:
+    source = b"""
+TABLE = [1 if x else 2 for x in (0, 1)]
+
+
+def plan(grid):
+    global CALLS
+    CALLS = 1
+    for row in grid:
+        while row:
+            if row > 3:
+                pass
+            elif row > 2:
+                with open("x") as f:
+                    f.read()
+            else:
+                row -= 1
+    return lambda x: x
+
+
+class Policy:
+    def __init__(self, a, b, c):
+        self.x, self.y = 0, 1
+        self.cells = {}
+
+    def reset(self, i):
+        self.x = 0
+
+    async def act(self, obs):
+        match obs:
+            case 0:
+                self.cells[0] = 1
+            case _:
+                pass
+        return 0
+
+
+class Map:
+    def __init__(this):
+        this.x = 1
+"""
+    _, _, features = describe_files({"policy.py": source})
+    assert features.functions == 5
+    assert features.branches == 5  # one conditional expression, if, elif, two cases
+    assert features.loops == 2
+    assert features.depth == 4  # for, while, elif, with
+    assert features.state == 5  # Policy: x, y, cells; Map: x; global CALLS
+    assert features.modules == 1
+    assert features.lines == source.count(b"\n")

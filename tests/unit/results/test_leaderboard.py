@@ -1,0 +1,109 @@
+"""Entries of several signers stay apart whatever they call themselves, and a published run names no file of this machine."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import msgspec
+import pytest
+from invented.policies import Version, policy
+from invented.run_dirs import write_run
+
+from evopolicy_common.errors import ConfigError
+from evopolicy_common.records.run_record import Artifacts, decode_run_record
+from evopolicy_results.leaderboard import write
+from evopolicy_results.leaderboard.bundles import LabBundle, LabRun, _tell_apart, _unpack
+from evopolicy_results.publish.findings import Checked, PublishedRun
+from evopolicy_results.reading.reader import read_run
+
+VERSIONS = [Version(policy(gain=1.0), (-200.0, -100.0), -180.0)]
+A, B = "ab" * 32, "ab" * 4 + "cd" * 28
+"""Keys with the same first digits."""
+
+
+def bundle(root: Path, signer: str, lab: str, *entries: str) -> LabBundle:
+    runs = [
+        LabRun(
+            run=read_run(write_run(root / f"{signer}-{n}", VERSIONS, entry=entry)),
+            published=f"{root.name}-{n}",
+            episodes=(),
+        )
+        for n, entry in enumerate(entries)
+    ]
+    return LabBundle(file="x.evp", sha256="", lab=lab, checked=Checked(signer=signer), runs=runs)
+
+
+def entries(found: LabBundle) -> list[str]:
+    return [each.run.entry for each in found.runs]
+
+
+def test_entries_of_several_signers_get_their_names(tmp_path: Path) -> None:
+    found = [bundle(tmp_path, A, "Lab-A", "evolve", "own"), bundle(tmp_path, B, "Lab-B", "evolve")]
+    _tell_apart(found)
+    assert [entries(each) for each in found] == [["evolve (Lab-A)", "own"], ["evolve (Lab-B)"]]
+
+
+def test_no_signer_gets_into_the_entry_of_another(tmp_path: Path) -> None:
+    for n, (lab_a, lab_b, theirs) in enumerate(
+        [
+            ("Lab-A", "", ("evolve", "evolve (Lab-A)")),  # the name that the other's entry gets
+            ("", "", ("evolve",)),  # keys with the same first digits
+            ("Lab", "Lab", ("evolve",)),
+        ]
+    ):
+        root = tmp_path / str(n)
+        found = [bundle(root, A, lab_a, "evolve"), bundle(root, B, lab_b, *theirs)]
+        _tell_apart(found)
+        ours, others = map(entries, found)
+        assert not set(ours) & set(others)
+        assert len(set(others)) == len(theirs)
+
+
+def test_runs_of_one_name_in_two_files_of_a_signer_have_pages_of_their_own(tmp_path: Path) -> None:
+    found = [bundle(tmp_path / name, A, "Lab-A", "evolve") for name in ("first", "second", "third")]
+    _tell_apart(found)
+    names = [bundle.runs[0].run.name for bundle in found]
+    assert len(set(names)) == 3
+    assert [name.rpartition(" (")[2] for name in names[1:]] == ["second-0)", "third-0)"]
+
+
+def test_an_unpacked_run_names_no_files_of_this_machine(tmp_path: Path) -> None:
+    record = decode_run_record((write_run(tmp_path / "run", VERSIONS) / "run.json").read_bytes())
+    hostile = msgspec.structs.replace(
+        record, artifacts=Artifacts(workspace="/home", logs_agent="/etc/passwd", checkpoints="../..")
+    )
+    nothing: Any = SimpleNamespace(budget=0, submits=(), names=frozenset())
+    run = PublishedRun(
+        folder="runs/0000", record=hostile, opening=nothing, salt=b"", result=nothing, groups=(), opening_bytes=b"",
+        result_bytes=b"", as_written={},
+    )  # fmt: skip
+    _unpack(nothing, run, tmp_path / "there")
+    assert decode_run_record((tmp_path / "there" / "run.json").read_bytes()).artifacts == Artifacts()
+
+
+def test_an_earlier_site_stays_until_the_new_one_is_whole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "site"
+    first, second = (LabBundle(file=f"{n}.evp", sha256="", number=n, refused="torn") for n in (0, 1))
+    index = write.write_site([first], out, title="First")
+    with monkeypatch.context() as patched:
+        patched.setattr(write, "front_page", lambda **_: 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            write.write_site([first, second], out, title="Second")
+    assert "First" in index.read_text()
+    assert [each.name for each in tmp_path.iterdir()] == ["site"]
+    # A command that was killed leaves its unfinished folder, and can be repeated.
+    (tmp_path / ".site.partial" / "bundles").mkdir(parents=True)
+    write.write_site([first, second], out, title="Second")
+    assert "Second" in index.read_text()
+    assert sorted(each.name for each in out.rglob("*")) == ["000.html", "001.html", "bundles", "index.html"]
+
+
+def test_a_page_that_is_no_leaderboard_is_not_replaced(tmp_path: Path) -> None:
+    (tmp_path / "index.html").write_text("mine")
+    with pytest.raises(ConfigError, match=r"no index\.html of a leaderboard"):
+        write.write_site([], tmp_path, title="Board")
+    assert (tmp_path / "index.html").read_text() == "mine"
