@@ -20,7 +20,7 @@ from evopolicy_common.logs import structlog
 from evopolicy_common.records.suite_folder import PAUSED
 from evopolicy_common.records.summary import utc_text
 from evopolicy_common.wire.operator_client import OperatorClient
-from evopolicy_coordinator.web.run_folders import Sweep, key_of
+from evopolicy_coordinator.web.content.run_folders import Sweep, key_of
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
 

@@ -31,14 +31,15 @@ from evopolicy_common.messages.status import StatusReply
 from evopolicy_common.wire.credentials import Credentials
 from evopolicy_common.wire.http import bound, serving
 from evopolicy_coordinator.server.monitoring.metrics import CONTENT_TYPE, StatusCollector
-from evopolicy_coordinator.web import acting, rendering
+from evopolicy_coordinator.web import acting
 from evopolicy_coordinator.web.access import Access, Guard
-from evopolicy_coordinator.web.cluster import Cluster
-from evopolicy_coordinator.web.confined import Confined, NotThereError
-from evopolicy_coordinator.web.feeds import Feeds, View
-from evopolicy_coordinator.web.run_detail import IMAGES, Detail
-from evopolicy_coordinator.web.run_folders import Reader, RunFacts, Runs
-from evopolicy_coordinator.web.tables import Words
+from evopolicy_coordinator.web.content import rendering
+from evopolicy_coordinator.web.content.cluster import Cluster
+from evopolicy_coordinator.web.content.confined import Confined, NotThereError
+from evopolicy_coordinator.web.content.feeds import Feeds, View
+from evopolicy_coordinator.web.content.run_detail import IMAGES, Detail
+from evopolicy_coordinator.web.content.run_folders import Reader, RunFacts, Runs
+from evopolicy_coordinator.web.content.tables import Words
 from evopolicy_coordinator.web.views.cluster import cluster_view
 from evopolicy_coordinator.web.views.run import episode_values, run_view, submit_values
 from evopolicy_coordinator.web.views.sweeps import sweeps_view

@@ -16,7 +16,7 @@ from invented.policies import Version, policy
 from invented.run_dirs import write_run
 
 from evopolicy_common.terminal import harmless
-from evopolicy_coordinator.web.rendering import _environment as live_environment
+from evopolicy_coordinator.web.content.rendering import _environment as live_environment
 from evopolicy_results.html.pages import environment
 from evopolicy_results.report import write_report
 from evopolicy_results.studies.study import study

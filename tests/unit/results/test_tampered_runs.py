@@ -32,9 +32,9 @@ from evopolicy_common.records.run_difference import differences
 from evopolicy_common.records.run_files import submit_folders
 from evopolicy_common.records.run_record import encode_run_record
 from evopolicy_common.regular_files import read_regular
-from evopolicy_coordinator.web.confined import NotThereError
-from evopolicy_coordinator.web.run_detail import Detail
-from evopolicy_coordinator.web.run_folders import Reader
+from evopolicy_coordinator.web.content.confined import NotThereError
+from evopolicy_coordinator.web.content.run_detail import Detail
+from evopolicy_coordinator.web.content.run_folders import Reader
 from evopolicy_gateway.harbor import scores
 from evopolicy_gateway.run.layout import RunFolder
 from evopolicy_results.publish.collect import find_runs

@@ -9,12 +9,12 @@ from markupsafe import Markup
 
 from evopolicy_common.messages.status import RetriedJobs, StatusReply
 from evopolicy_common.records.summary import utc_text
-from evopolicy_coordinator.web.charts import Line, chart
-from evopolicy_coordinator.web.feeds import View
-from evopolicy_coordinator.web.rendering import duration, number, part, short, state_words
-from evopolicy_coordinator.web.run_detail import MAX_WORDS, CodeFile, Detail, Happened, Played, Series
-from evopolicy_coordinator.web.run_folders import Reader, RunFacts, Runs, SubmitFacts
-from evopolicy_coordinator.web.tables import Words, ident
+from evopolicy_coordinator.web.content.charts import Line, chart
+from evopolicy_coordinator.web.content.feeds import View
+from evopolicy_coordinator.web.content.rendering import duration, number, part, short, state_words
+from evopolicy_coordinator.web.content.run_detail import MAX_WORDS, CodeFile, Detail, Happened, Played, Series
+from evopolicy_coordinator.web.content.run_folders import Reader, RunFacts, Runs, SubmitFacts
+from evopolicy_coordinator.web.content.tables import Words, ident
 from evopolicy_results.behaviour.trace import diff
 from evopolicy_results.reading.environments import title_of
 from evopolicy_results.studies.palette import looks

@@ -6,7 +6,7 @@ import asyncio
 import json
 from typing import Any
 
-from evopolicy_coordinator.web.feeds import LEAST_PAUSE_S, Feed, Feeds, View
+from evopolicy_coordinator.web.content.feeds import LEAST_PAUSE_S, Feed, Feeds, View
 
 
 def view(rows: dict[str, str], **parts: str) -> View:

@@ -9,7 +9,7 @@ import msgspec
 from invented.web_site import finished_run, open_run, open_status
 
 from evopolicy_common.records.suite_folder import INDEX, Entry, Index
-from evopolicy_coordinator.web.run_folders import Reader
+from evopolicy_coordinator.web.content.run_folders import Reader
 
 
 def test_a_sweep_shows_its_runs_on_all_hosts_once(tmp_path: Path) -> None:

@@ -13,8 +13,8 @@ from evopolicy_common.messages.status import (
     RetriedJobs,
     WorkerStatus,
 )
-from evopolicy_coordinator.web.cluster import _RETRIES_OF_A_RUN
-from evopolicy_coordinator.web.run_folders import key_of
+from evopolicy_coordinator.web.content.cluster import _RETRIES_OF_A_RUN
+from evopolicy_coordinator.web.content.run_folders import key_of
 
 LOST = RetriedJobs(at=1_767_312_000.0, worker="w-attic", failure="worker_lost", jobs=3)
 FAILED = RetriedJobs(at=1_767_312_060.0, worker="w-cellar", failure="failed")

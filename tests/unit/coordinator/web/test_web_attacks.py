@@ -34,7 +34,7 @@ from evopolicy_coordinator.pki import certs
 from evopolicy_coordinator.web import app
 from evopolicy_coordinator.web.access import POLICY, kept_tokens
 from evopolicy_coordinator.web.app import Address, listen, serve
-from evopolicy_coordinator.web.run_folders import key_of
+from evopolicy_coordinator.web.content.run_folders import key_of
 
 SCORE, RANDOM = "4242", "-4322"
 MARKUP = '<script>alert(1)</script><img src=x onerror="alert(2)">'

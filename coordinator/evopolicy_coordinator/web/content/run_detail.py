@@ -23,7 +23,7 @@ from evopolicy_common.records.episodes.npz import read_arrays
 from evopolicy_common.records.json_lines import objects
 from evopolicy_common.records.policies import bundles
 from evopolicy_common.records.policies.checkpoints import METADATA
-from evopolicy_coordinator.web.confined import Confined, NotThereError
+from evopolicy_coordinator.web.content.confined import Confined, NotThereError
 
 MAX_TEXT = 256 << 10
 """Characters of one file, or of one text, that are shown."""

@@ -8,7 +8,7 @@ from urllib.parse import urlencode
 
 import msgspec
 
-from evopolicy_coordinator.web.run_folders import key_of
+from evopolicy_coordinator.web.content.run_folders import key_of
 
 PAGE_ROWS = 50
 """Rows of a table on one page."""

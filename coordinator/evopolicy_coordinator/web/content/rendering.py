@@ -10,7 +10,7 @@ from typing import Any
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from evopolicy_coordinator.web.feeds import View
+from evopolicy_coordinator.web.content.feeds import View
 from evopolicy_results.html import visible
 from evopolicy_results.reading.environments import title_of
 

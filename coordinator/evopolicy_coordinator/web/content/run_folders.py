@@ -27,7 +27,7 @@ from evopolicy_common.records.run_record import RunRecord
 from evopolicy_common.records.suite_folder import INDEX, PAUSED, Entry, Index
 from evopolicy_common.records.summary import Summary, decode_summary
 from evopolicy_common.regular_files import read_regular
-from evopolicy_coordinator.web.confined import Confined, NotThereError
+from evopolicy_coordinator.web.content.confined import Confined, NotThereError
 from evopolicy_results.reading.environments import learn_names
 from evopolicy_results.reading.reader import find_run_dirs
 
