@@ -27,7 +27,7 @@ import numpy as np
 from evopolicy_common.catalogue import entry, suites
 from evopolicy_common.messages.environment import Case
 from evopolicy_results.scoring.paper import heldout_returns
-from evopolicy_worker.environments.base import Environment
+from evopolicy_worker.environments.interface.base import Environment
 from evopolicy_worker.environments.registry import make
 
 POLICIES = Path(__file__).resolve().parent / "policies"

@@ -69,7 +69,8 @@ def make(gymnasium_id: str) -> Any:
 def make_of(env_id: str) -> Any:
     """The environment of an id of the catalogue. Outside Core16 its family makes it, which knows its arguments."""
     from evopolicy_common import catalogue
-    from evopolicy_worker.environments import registry, settings
+    from evopolicy_worker.environments import registry
+    from evopolicy_worker.environments.interface import settings
 
     entry = catalogue.entry(env_id)
     if env_id in catalogue.suites()["core16"].environments:

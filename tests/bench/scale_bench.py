@@ -48,7 +48,7 @@ from evopolicy_coordinator.core.contract.records import train_group
 from evopolicy_coordinator.storage.store import Reader
 from evopolicy_gateway.run.layout import OpenedRun, RunFolder, save
 from evopolicy_worker import environments
-from evopolicy_worker.slots import slot_messages
+from evopolicy_worker.slot_protocol import slot_messages
 from evopolicy_worker.supervisor import Options, Supervisor
 
 POLICY = '''"""Actions that differ from step to step, and are the same in every run."""

@@ -30,7 +30,7 @@ from evopolicy_common import catalogue
 from evopolicy_common.messages.environment import Case
 from evopolicy_common.records.episodes.trajectory import Recorder
 from evopolicy_worker import environments
-from evopolicy_worker.environments import settings
+from evopolicy_worker.environments.interface import settings
 from evopolicy_worker.slots.slot import Slot
 
 (SEED,) = seeds(1)

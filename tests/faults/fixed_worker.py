@@ -6,7 +6,7 @@ from __future__ import annotations
 import msgspec
 
 from evopolicy_worker import cli
-from evopolicy_worker.fingerprint import fingerprint
+from evopolicy_worker.environments.interface.fingerprint import fingerprint
 
 if __name__ == "__main__":
     fixed = msgspec.structs.replace(fingerprint(), code_version="faults")

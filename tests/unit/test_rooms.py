@@ -170,7 +170,7 @@ OWN_STDOUT = {
     "evopolicy_gateway/jail/entry.py": "inside the jail, with the standard library alone",
     "evopolicy_gateway/cli/serve.py": "URLs of its own, for a shell to read",
     "evopolicy_common/processes/parent_death.py": "becomes another program, with the standard library alone",
-    "evopolicy_worker/environments/calls.py": "speaks with the process that started it",
+    "evopolicy_worker/environments/interface/calls.py": "speaks with the process that started it",
     "evopolicy_worker/sandbox/inside": "inside the sandbox, with the standard library alone",
     "evopolicy_common/terminal.py": "is the one place",
     "evopolicy_common/console.py": "is the one place for tables and live views",

@@ -26,9 +26,9 @@ from evopolicy_common.processes.scratch import scratch_folder
 from evopolicy_common.regular_files import read_given
 from evopolicy_common.terminal import say
 from evopolicy_worker import environments
-from evopolicy_worker.environments.actions import compile_actions
 from evopolicy_worker.environments.checks.conformance import SEEDS, Played
-from evopolicy_worker.environments.settings import use_browser
+from evopolicy_worker.environments.interface.actions import compile_actions
+from evopolicy_worker.environments.interface.settings import use_browser
 from evopolicy_worker.sandbox import available_tiers
 from evopolicy_worker.slots.slot import Slot
 

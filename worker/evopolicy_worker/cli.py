@@ -34,9 +34,9 @@ from evopolicy_common.terminal import say, say_json
 from evopolicy_common.wire import credentials, keys, transport
 from evopolicy_common.wire.ready import read_ready
 from evopolicy_worker import check_env, descriptions, environments, setup
-from evopolicy_worker.environments.calls import USUAL, Limits
-from evopolicy_worker.environments.settings import use_browser
-from evopolicy_worker.fingerprint import fingerprint
+from evopolicy_worker.environments.interface.calls import USUAL, Limits
+from evopolicy_worker.environments.interface.fingerprint import fingerprint
+from evopolicy_worker.environments.interface.settings import use_browser
 from evopolicy_worker.sandbox import SANDBOXED, available_tiers, why_not
 from evopolicy_worker.sandbox.doctor import best_tier, examine
 from evopolicy_worker.slots.cores import Cores

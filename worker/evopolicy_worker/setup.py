@@ -38,7 +38,7 @@ from evopolicy_common.processes.preflight import check_writable
 from evopolicy_common.terminal import one_line, say
 from evopolicy_worker.environments.browser import chromium
 from evopolicy_worker.environments.checks.conformance import Played
-from evopolicy_worker.environments.settings import BROWSER, use_browser
+from evopolicy_worker.environments.interface.settings import BROWSER, use_browser
 
 DISTRIBUTION = "evopolicy"
 _PIP = ("-m", "pip", "--disable-pip-version-check", "--no-input")

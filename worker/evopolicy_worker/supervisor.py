@@ -55,9 +55,9 @@ from evopolicy_common.wire import codec, keys
 from evopolicy_common.wire.requests import Requester
 from evopolicy_common.wire.transport import Link
 from evopolicy_worker.bundle_cache import BundleCache
-from evopolicy_worker.episodes.begun import HandedBack
 from evopolicy_worker.heartbeat import HeartbeatThread, HeldLeases
 from evopolicy_worker.outbox import Outbox
+from evopolicy_worker.slot_protocol.begun import HandedBack
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
 

@@ -16,7 +16,7 @@ from evopolicy_common.catalogue import entries
 from evopolicy_common.messages.environment import Case
 from evopolicy_worker.environments import Environment, make
 from evopolicy_worker.environments.accelerations import ACCELERATIONS, table
-from evopolicy_worker.environments.gymnasium_adapter import GymnasiumEnvironment
+from evopolicy_worker.environments.interface.gymnasium_adapter import GymnasiumEnvironment
 
 IDS = accelerated_ids()
 STEPS = {"gym/racing": 60, "gymnasium/parking-v0": 50, "gymnasium/roundabout-v0": 11}

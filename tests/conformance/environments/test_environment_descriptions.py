@@ -16,7 +16,7 @@ from evopolicy_common.catalogue import entries, entry, installs
 from evopolicy_common.messages.environment import Case, EnvironmentDescription, SpaceSchema
 from evopolicy_common.records.episodes.rendered import Renderer, decode
 from evopolicy_worker.environments import Environment, offered
-from evopolicy_worker.environments.spaces import bounds
+from evopolicy_worker.environments.interface.spaces import bounds
 
 Warm = Callable[[str], Environment]
 

@@ -26,7 +26,7 @@ from evopolicy_common.records.blobs import BlobStore
 from evopolicy_common.records.episodes.trajectory import decode
 from evopolicy_common.wire.transport import connect
 from evopolicy_coordinator.core.contract.records import BegunRow, OutcomeRow, validation_group
-from evopolicy_worker.episodes import begun
+from evopolicy_worker.slot_protocol import begun
 from evopolicy_worker.slots.slot import Slot
 from evopolicy_worker.supervisor import Options, Supervisor
 

@@ -37,7 +37,7 @@ from evopolicy_common.wire.requests import Requester
 from evopolicy_common.wire.transport import connect
 from evopolicy_coordinator.cli.status import status_app, workers_app
 from evopolicy_worker import outbox, supervisor
-from evopolicy_worker.episodes.begun import HandedBack
+from evopolicy_worker.slot_protocol.begun import HandedBack
 from evopolicy_worker.supervisor import Options, Probe, Supervisor
 
 pytestmark = pytest.mark.slow

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from evopolicy_worker.environments.actions import ActionCodec, compile_actions
-from evopolicy_worker.environments.base import Environment, Frame, Observation, Step
+from evopolicy_worker.environments.interface.actions import ActionCodec, compile_actions
+from evopolicy_worker.environments.interface.base import Environment, Frame, Observation, Step
+from evopolicy_worker.environments.interface.settings import process_environment
 from evopolicy_worker.environments.registry import (
     check_played,
     define,
@@ -15,7 +16,6 @@ from evopolicy_worker.environments.registry import (
     missing,
     offered,
 )
-from evopolicy_worker.environments.settings import process_environment
 
 __all__ = [
     "ActionCodec",

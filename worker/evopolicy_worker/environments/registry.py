@@ -18,11 +18,15 @@ from evopolicy_common import catalogue
 from evopolicy_common.catalogue import Entry, installs
 from evopolicy_common.errors import ConfigError, WorkerError
 from evopolicy_common.messages.environment import Case, EnvironmentDescription
-from evopolicy_worker.environments import settings
-from evopolicy_worker.environments.adapters import versions
-from evopolicy_worker.environments.base import Environment
 from evopolicy_worker.environments.families import foreign
-from evopolicy_worker.environments.gymnasium_adapter import GymnasiumEnvironment, GymnasiumFamily, quiet
+from evopolicy_worker.environments.interface import settings
+from evopolicy_worker.environments.interface.adapters import versions
+from evopolicy_worker.environments.interface.base import Environment
+from evopolicy_worker.environments.interface.gymnasium_adapter import (
+    GymnasiumEnvironment,
+    GymnasiumFamily,
+    quiet,
+)
 
 _TIMED_STEPS, _TIMED_S = 16, 0.25
 """How long a description measures what a step costs."""

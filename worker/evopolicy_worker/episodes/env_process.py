@@ -26,15 +26,15 @@ from evopolicy_common.errors import (
     WorkerError,
 )
 from evopolicy_worker import environments
-from evopolicy_worker.environments import calls
+from evopolicy_worker.environments.interface import calls
 from evopolicy_worker.episodes.loop import Player, fault_of
 from evopolicy_worker.episodes.monitor import Monitor
 from evopolicy_worker.episodes.policy_process import BundleFiles
 from evopolicy_worker.episodes.progress import CancelledJobError, Progress
 from evopolicy_worker.sandbox import env_jail, jail
 from evopolicy_worker.sandbox.zygote import Zygote
-from evopolicy_worker.slots import slot_messages as messages
-from evopolicy_worker.slots.child_pipes import take_pipes
+from evopolicy_worker.slot_protocol import slot_messages as messages
+from evopolicy_worker.slot_protocol.child_pipes import take_pipes
 
 _PROGRESS_S = 0.25
 ALIVE_S = 5.0

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from evopolicy_common.errors import DECODE_ERRORS, WorkerError
 from evopolicy_common.messages.environment import SpaceSchema
-from evopolicy_worker.environments.actions import MAX_ITEMS
+from evopolicy_worker.environments.interface.actions import MAX_ITEMS
 
 INIT, LOAD, RESET, ACT, FLUSH, END, COMPILE = 1, 2, 3, 4, 5, 6, 7
 OK, INT, FLOAT, ARRAY, FLOATS, GENERIC, FAILED, FAULT = 0, 1, 2, 3, 4, 5, 6, 7

@@ -57,20 +57,20 @@ from evopolicy_common.records.episodes.trajectory import Recorder, decode
 from evopolicy_common.wire import codec
 from evopolicy_worker import environments
 from evopolicy_worker.environments import Environment
-from evopolicy_worker.environments.calls import described, note
-from evopolicy_worker.environments.trial import solved
+from evopolicy_worker.environments.interface.calls import described, note
+from evopolicy_worker.environments.interface.trial import solved
 from evopolicy_worker.episodes import float_environment
-from evopolicy_worker.episodes.begun import Begun, Returned, is_kept, unpack
 from evopolicy_worker.episodes.monitor import Monitor
 from evopolicy_worker.episodes.policies import JobPolicies, Policies
 from evopolicy_worker.episodes.policy_process import BundleFiles, Ended, PolicyFailedError, PolicyProcess
 from evopolicy_worker.episodes.progress import CancelledJobError, Progress
+from evopolicy_worker.episodes.recording import VideoRecorder
 from evopolicy_worker.sandbox.jail import Jail
 from evopolicy_worker.sandbox.zygote import Zygote
-from evopolicy_worker.slots import endings
-from evopolicy_worker.slots import slot_messages as messages
-from evopolicy_worker.slots.endings import EndedFromOutsideError, Ending
-from evopolicy_worker.slots.recording import VideoRecorder
+from evopolicy_worker.slot_protocol import endings
+from evopolicy_worker.slot_protocol import slot_messages as messages
+from evopolicy_worker.slot_protocol.begun import Begun, Returned, is_kept, unpack
+from evopolicy_worker.slot_protocol.endings import EndedFromOutsideError, Ending
 
 MAX_FAULT = 4000
 """Characters of an error that are reported."""

@@ -27,8 +27,8 @@ from evopolicy_worker.episodes.monitor import STOPPED_S, Monitor, Verdict, Watch
 from evopolicy_worker.sandbox import zygote as zygotes
 from evopolicy_worker.sandbox.jail import Jail
 from evopolicy_worker.sandbox.zygote import Child, Exit, Zygote, wait_dead
-from evopolicy_worker.slots import endings
-from evopolicy_worker.slots.endings import EndedFromOutsideError, Ending
+from evopolicy_worker.slot_protocol import endings
+from evopolicy_worker.slot_protocol.endings import EndedFromOutsideError, Ending
 
 _DENIED = frozenset(
     {

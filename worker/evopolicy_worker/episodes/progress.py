@@ -5,9 +5,9 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 
-from evopolicy_worker.episodes.begun import Begun
 from evopolicy_worker.episodes.policy_process import PolicyProcess
-from evopolicy_worker.slots import slot_messages as messages
+from evopolicy_worker.slot_protocol import slot_messages as messages
+from evopolicy_worker.slot_protocol.begun import Begun
 
 
 class CancelledJobError(Exception):

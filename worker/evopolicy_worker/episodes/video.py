@@ -26,8 +26,8 @@ from evopolicy_common.messages.environment import Case
 from evopolicy_common.records.episodes.trajectory import decode
 from evopolicy_worker import environments
 from evopolicy_worker.environments import Environment, Frame
-from evopolicy_worker.slots.child_pipes import take_pipes
-from evopolicy_worker.slots.slot_messages import LENGTH
+from evopolicy_worker.slot_protocol.child_pipes import take_pipes
+from evopolicy_worker.slot_protocol.slot_messages import LENGTH
 
 CRF = 28
 """x264's constant rate factor: 200 frames of 600 × 400 come to some 66 KiB."""

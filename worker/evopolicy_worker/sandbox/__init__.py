@@ -15,7 +15,7 @@ from evopolicy_common.messages.episode import Tier
 from evopolicy_common.processes.scratch import scratch_folder
 from evopolicy_worker.sandbox import env_jail, jail
 from evopolicy_worker.sandbox.zygote import START_TIMEOUT_S
-from evopolicy_worker.slots import slot_messages as messages
+from evopolicy_worker.slot_protocol import slot_messages as messages
 
 SANDBOXED: tuple[Tier, ...] = ("bwrap", "landlock")
 """Tiers that confine policies, strongest first."""

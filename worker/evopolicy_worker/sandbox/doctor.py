@@ -15,7 +15,7 @@ import msgspec
 
 from evopolicy_common.messages.episode import Tier
 from evopolicy_common.processes import distribution, host
-from evopolicy_worker.fingerprint import fingerprint
+from evopolicy_worker.environments.interface.fingerprint import fingerprint
 from evopolicy_worker.sandbox import jail, seccomp, why_not
 
 Verdict = Literal["ok", "missing", "note"]

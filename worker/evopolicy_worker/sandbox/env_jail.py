@@ -25,14 +25,14 @@ from functools import cache
 from pathlib import Path
 
 import evopolicy_common
-import evopolicy_worker
 from evopolicy_common.catalogue import Entry
 from evopolicy_common.errors import SandboxError
 from evopolicy_common.messages.episode import Tier
 from evopolicy_common.processes.scratch import remove_tree
 from evopolicy_common.seccomp.numbers import SECCOMP
-from evopolicy_worker.environments import calls, defined, process_environment
-from evopolicy_worker.environments.settings import BROWSER
+from evopolicy_worker.environments import defined, process_environment
+from evopolicy_worker.environments.interface import calls
+from evopolicy_worker.environments.interface.settings import BROWSER
 from evopolicy_worker.sandbox import jail, seccomp, user_code
 from evopolicy_worker.sandbox.inside import zygote as inside
 
@@ -297,8 +297,8 @@ def _holds_home(path: str) -> bool:
 
 
 def _our_folders() -> list[str]:
-    packages = (evopolicy_common, evopolicy_worker)
-    return [os.path.realpath(os.path.dirname(package.__path__[0])) for package in packages]
+    ours = str(Path(__file__).parents[2])
+    return [os.path.realpath(folder) for folder in (os.path.dirname(evopolicy_common.__path__[0]), ours)]
 
 
 def _below(path: str, folder: str) -> bool:

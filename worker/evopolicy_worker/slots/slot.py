@@ -34,15 +34,14 @@ from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_common.messages.episode import EpisodeOutcome, Job, PolicyFailure, Tier
 from evopolicy_common.processes import proc
 from evopolicy_common.processes.scratch import remove_tree
-from evopolicy_worker.environments.calls import NOTE, USUAL, Limits, hung
+from evopolicy_worker.environments.interface.calls import NOTE, USUAL, Limits, hung
 from evopolicy_worker.environments.registry import remembers
-from evopolicy_worker.episodes import begun
-from evopolicy_worker.episodes.begun import HandedBack, PackedBegun
 from evopolicy_worker.episodes.monitor import is_stopped
 from evopolicy_worker.sandbox import env_jail, jail
-from evopolicy_worker.slots import endings
-from evopolicy_worker.slots import slot_messages as messages
-from evopolicy_worker.slots.endings import Ending, How
+from evopolicy_worker.slot_protocol import begun, endings
+from evopolicy_worker.slot_protocol import slot_messages as messages
+from evopolicy_worker.slot_protocol.begun import HandedBack, PackedBegun
+from evopolicy_worker.slot_protocol.endings import Ending, How
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
 

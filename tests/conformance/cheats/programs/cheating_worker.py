@@ -22,7 +22,7 @@ from evopolicy_common.records.episodes.rendered import ROWS, Renderer, decode
 from evopolicy_common.records.episodes.trajectory import Recorder
 from evopolicy_common.wire import codec
 from evopolicy_worker import cli
-from evopolicy_worker.fingerprint import fingerprint
+from evopolicy_worker.environments.interface.fingerprint import fingerprint
 from evopolicy_worker.slots.slot import Slot
 
 BONUS = 3.0

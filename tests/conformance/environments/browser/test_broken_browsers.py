@@ -17,7 +17,7 @@ from evopolicy_common.errors import WorkerError
 from evopolicy_worker.environments import make, missing
 from evopolicy_worker.environments.browser import chromium, page
 from evopolicy_worker.environments.checks import conformance
-from evopolicy_worker.environments.settings import BROWSER
+from evopolicy_worker.environments.interface.settings import BROWSER
 
 ENV = "miniwob/click-test-v1"
 BROKEN = {

@@ -16,13 +16,13 @@ from evopolicy_common import catalogue
 from evopolicy_common.errors import WorkerError
 from evopolicy_common.messages.environment import Case
 from evopolicy_worker.environments import Environment, make, missing
-from evopolicy_worker.environments.base import Step
 from evopolicy_worker.environments.browser import chromium
 from evopolicy_worker.environments.browser import page as page_module
 from evopolicy_worker.environments.browser.miniwob_env import ACTIONS, KEYS, MiniWoBEnv
 from evopolicy_worker.environments.browser.page import shared
 from evopolicy_worker.environments.checks import conformance, episodes
-from evopolicy_worker.environments.settings import BROWSER
+from evopolicy_worker.environments.interface.base import Step
+from evopolicy_worker.environments.interface.settings import BROWSER
 
 SAMPLE = (
     "miniwob/click-test-v1",

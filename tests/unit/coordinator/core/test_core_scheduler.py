@@ -18,7 +18,7 @@ from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_coordinator.core.runs.waits import waits_for_workers
 from evopolicy_coordinator.core.workers import scheduler
 from evopolicy_coordinator.server.reason_texts import words
-from evopolicy_worker.fingerprint import PACKAGES
+from evopolicy_worker.environments.interface.fingerprint import PACKAGES
 
 
 def validating(rig: Rig, session: str, n: int = 1) -> None:

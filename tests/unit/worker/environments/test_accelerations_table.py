@@ -14,7 +14,7 @@ from evopolicy_common.messages.environment import Case
 from evopolicy_worker.environments import make, process_environment
 from evopolicy_worker.environments.accelerations import ACCELERATIONS, PROVED, table, usable
 from evopolicy_worker.environments.accelerations.minigrid_view import _row
-from evopolicy_worker.environments.gymnasium_adapter import GymnasiumEnvironment
+from evopolicy_worker.environments.interface.gymnasium_adapter import GymnasiumEnvironment
 
 MAZE = "gymnasium/MiniGrid-FourRooms-v0"
 

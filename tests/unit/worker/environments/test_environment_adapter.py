@@ -14,9 +14,10 @@ from evopolicy_common import catalogue
 from evopolicy_common.catalogue import Entry
 from evopolicy_common.errors import ConfigError, WorkerError
 from evopolicy_common.messages.environment import Case
-from evopolicy_worker.environments import adapters, describe, gymnasium_adapter, make, registry
+from evopolicy_worker.environments import describe, make, registry
 from evopolicy_worker.environments.families import box2d
-from evopolicy_worker.environments.gymnasium_adapter import GymnasiumEnvironment, GymnasiumFamily
+from evopolicy_worker.environments.interface import adapters, gymnasium_adapter
+from evopolicy_worker.environments.interface.gymnasium_adapter import GymnasiumEnvironment, GymnasiumFamily
 
 
 class Counter(gymnasium.Env[Any, Any]):

@@ -10,7 +10,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from evopolicy_worker.environments.info import plain_info
+from evopolicy_worker.environments.interface.info import plain_info
 
 
 def test_scalars_of_numpy_become_plain() -> None:

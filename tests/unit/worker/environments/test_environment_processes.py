@@ -8,7 +8,8 @@ import sys
 
 import pytest
 
-from evopolicy_worker.environments import process_environment, settings
+from evopolicy_worker.environments import process_environment
+from evopolicy_worker.environments.interface import settings
 
 
 def run(program: str, **extra: str) -> str:

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from evopolicy_worker.environments.observations import compile_observation
-from evopolicy_worker.environments.spaces import bounds, obs_storage, parts, to_schema
+from evopolicy_worker.environments.interface.observations import compile_observation
+from evopolicy_worker.environments.interface.spaces import bounds, obs_storage, parts, to_schema
 
 
 def test_each_kind_of_space_has_its_form() -> None:

@@ -20,10 +20,10 @@ from evopolicy_gateway.agents import uniform
 from evopolicy_gateway.agents.evolve.evolved.spaces import ActionHead, Features
 from evopolicy_gateway.workspace.initial_policy import constant_action
 from evopolicy_worker.environments import Environment, compile_actions, define, describe, make, registry
-from evopolicy_worker.environments.gymnasium_adapter import GymnasiumFamily
-from evopolicy_worker.environments.opaque import Opaque
-from evopolicy_worker.environments.spaces import outside
-from evopolicy_worker.environments.trial import solved
+from evopolicy_worker.environments.interface.gymnasium_adapter import GymnasiumFamily
+from evopolicy_worker.environments.interface.opaque import Opaque
+from evopolicy_worker.environments.interface.spaces import outside
+from evopolicy_worker.environments.interface.trial import solved
 from evopolicy_worker.episodes.frames import compile_writer
 from evopolicy_worker.sandbox.inside import player
 

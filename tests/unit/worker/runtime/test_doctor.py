@@ -8,7 +8,7 @@ import pytest
 
 from evopolicy_common.processes import distribution, host
 from evopolicy_worker.environments.browser import chromium
-from evopolicy_worker.environments.settings import BROWSER
+from evopolicy_worker.environments.interface.settings import BROWSER
 from evopolicy_worker.sandbox import doctor, jail, machine, why_not
 
 

@@ -12,10 +12,10 @@ from waiting import wait_until
 
 from evopolicy_common.catalogue import Entry
 from evopolicy_common.errors import SlotDiedError, WorkerError
-from evopolicy_worker.environments import calls
 from evopolicy_worker.environments.browser.page import Page
-from evopolicy_worker.environments.calls import USUAL, Call, Guard, Limits, hung
 from evopolicy_worker.environments.families.foreign import ForeignFamily
+from evopolicy_worker.environments.interface import calls
+from evopolicy_worker.environments.interface.calls import USUAL, Call, Guard, Limits, hung
 from evopolicy_worker.slots import slot as slot_module
 from evopolicy_worker.slots.slot import Slot
 

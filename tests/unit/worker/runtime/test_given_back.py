@@ -13,7 +13,7 @@ from slots import HONEST, QUICK, STUCK, Slots, make_job, rows
 
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome, Job
 from evopolicy_common.records.blobs import digest_of
-from evopolicy_worker.episodes import begun
+from evopolicy_worker.slot_protocol import begun
 from evopolicy_worker.slots.slot import Slot
 
 PATIENT = msgspec.structs.replace(QUICK, act_wall_s=30.0, episode_wall_s=60.0)

@@ -22,8 +22,8 @@ from evopolicy_common.messages.worker import JobResult, ReportResults
 from evopolicy_common.records.episodes.trajectory import Recorder
 from evopolicy_common.wire import codec
 from evopolicy_worker import environments
-from evopolicy_worker.environments.actions import compile_actions
 from evopolicy_worker.environments.families.toy import Line
+from evopolicy_worker.environments.interface.actions import compile_actions
 from evopolicy_worker.episodes import frames
 from evopolicy_worker.episodes.loop import Player
 from evopolicy_worker.episodes.monitor import Monitor
@@ -31,7 +31,7 @@ from evopolicy_worker.episodes.policy_process import BundleFiles, PolicyProcess
 from evopolicy_worker.episodes.progress import Progress
 from evopolicy_worker.sandbox import jail
 from evopolicy_worker.sandbox.zygote import Zygote
-from evopolicy_worker.slots import slot_messages as messages
+from evopolicy_worker.slot_protocol import slot_messages as messages
 from evopolicy_worker.slots.slot import bundle_files
 
 SPACES: list[dict[str, Any]] = [

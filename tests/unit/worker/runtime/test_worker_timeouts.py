@@ -17,12 +17,12 @@ from slots import HONEST, QUICK, Slots, make_job
 
 from evopolicy_common.errors import SandboxError, SlotDiedError, WorkerError
 from evopolicy_worker import environments
-from evopolicy_worker.episodes import policy_process
+from evopolicy_worker.episodes import policy_process, recording
 from evopolicy_worker.episodes.monitor import Monitor
 from evopolicy_worker.episodes.policy_process import BundleFiles, PolicyProcess
 from evopolicy_worker.sandbox import doctor, jail, zygote
 from evopolicy_worker.sandbox.zygote import Child, Zygote
-from evopolicy_worker.slots import recording, slot
+from evopolicy_worker.slots import slot
 
 SOON_S = 0.2
 

@@ -12,8 +12,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from evopolicy_worker.slots import endings
-from evopolicy_worker.slots.endings import FAULTS, TABLE, Ending, First, How
+from evopolicy_worker.slot_protocol import endings
+from evopolicy_worker.slot_protocol.endings import FAULTS, TABLE, Ending, First, How
 
 EXAMPLES: dict[str, tuple[Ending, str | None]] = {
     "a policy's process before the bundle's code": (Ending("policy", "SIGKILL", began=False), None),

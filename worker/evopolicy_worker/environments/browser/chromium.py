@@ -30,7 +30,7 @@ from typing import Any
 from evopolicy_common.errors import WorkerError
 from evopolicy_common.processes import distribution, proc
 from evopolicy_worker.environments.browser.devtools import DevTools
-from evopolicy_worker.environments.settings import BROWSER
+from evopolicy_worker.environments.interface.settings import BROWSER
 
 _PROGRAMS = (
     "/usr/lib/chromium/chromium",

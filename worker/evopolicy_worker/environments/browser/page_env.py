@@ -23,10 +23,10 @@ import gymnasium
 import numpy as np
 
 from evopolicy_common.errors import ConfigError
-from evopolicy_worker.environments.base import Frame
 from evopolicy_worker.environments.browser import miniwob_pages
 from evopolicy_worker.environments.browser.devtools import BrowserLostError
 from evopolicy_worker.environments.browser.page import Address, Page, shared
+from evopolicy_worker.environments.interface.base import Frame
 
 STEP_MS = 200
 """Of the episode's clock that pass at each step."""

@@ -32,10 +32,11 @@ from evopolicy_common.processes import proc
 from evopolicy_common.processes.parent_death import end_with_parent
 from evopolicy_common.processes.scratch import remove_tree
 from evopolicy_common.records.episodes.rendered import Renderer, decode
-from evopolicy_worker.environments import registry, spaces
-from evopolicy_worker.environments.base import Environment, Step
+from evopolicy_worker.environments import registry
 from evopolicy_worker.environments.checks.episodes import digest, digest_of, rollout
-from evopolicy_worker.environments.gymnasium_adapter import GymnasiumEnvironment
+from evopolicy_worker.environments.interface import spaces
+from evopolicy_worker.environments.interface.base import Environment, Step
+from evopolicy_worker.environments.interface.gymnasium_adapter import GymnasiumEnvironment
 
 SEEDS = (20_011_117, 20_011_229)
 """Large, so that an occurrence in an observation or info is recognisable as a leak."""

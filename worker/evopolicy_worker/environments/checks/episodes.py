@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from evopolicy_common.messages.environment import Case
-from evopolicy_worker.environments.base import Environment, Step
+from evopolicy_worker.environments.interface.base import Environment, Step
 
 
 def rollout(

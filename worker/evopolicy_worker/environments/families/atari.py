@@ -8,8 +8,8 @@ from functools import cache
 from typing import TYPE_CHECKING, Any
 
 from evopolicy_common.catalogue import Entry
-from evopolicy_worker.environments.gymnasium_adapter import GymnasiumFamily
-from evopolicy_worker.environments.info import plain_info
+from evopolicy_worker.environments.interface.gymnasium_adapter import GymnasiumFamily
+from evopolicy_worker.environments.interface.info import plain_info
 from evopolicy_worker.environments.tasks import template
 
 if TYPE_CHECKING:

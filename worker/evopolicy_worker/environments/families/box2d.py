@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from evopolicy_common.catalogue import Entry
-from evopolicy_worker.environments.gymnasium_adapter import GymnasiumFamily
+from evopolicy_worker.environments.interface.gymnasium_adapter import GymnasiumFamily
 
 
 class Box2DFamily(GymnasiumFamily):

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from evopolicy_worker.environments.actions import ActionCodec
 from evopolicy_worker.environments.families.miniwob import MiniWoBFamily
+from evopolicy_worker.environments.interface.actions import ActionCodec
 
 if TYPE_CHECKING:
     from evopolicy_worker.environments.browser.page_env import PageEnv

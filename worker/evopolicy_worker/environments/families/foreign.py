@@ -15,9 +15,9 @@ from pathlib import Path
 from typing import Any
 
 from evopolicy_common.catalogue import Entry
-from evopolicy_worker.environments.adapters import versions
 from evopolicy_worker.environments.families import miniwob
-from evopolicy_worker.environments.gymnasium_adapter import GymnasiumFamily
+from evopolicy_worker.environments.interface.adapters import versions
+from evopolicy_worker.environments.interface.gymnasium_adapter import GymnasiumFamily
 
 _OF_GYMNASIUM = ("mujoco", "box2d", "pygame-ce", "ale-py")
 """Distributions of Gymnasium's own environments, besides Gymnasium."""

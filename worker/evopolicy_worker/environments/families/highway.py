@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from evopolicy_common.catalogue import Entry
-from evopolicy_worker.environments.gymnasium_adapter import GymnasiumFamily
-from evopolicy_worker.environments.info import plain_info
+from evopolicy_worker.environments.interface.gymnasium_adapter import GymnasiumFamily
+from evopolicy_worker.environments.interface.info import plain_info
 
 
 class HighwayFamily(GymnasiumFamily):

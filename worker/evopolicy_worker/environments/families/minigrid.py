@@ -6,7 +6,7 @@ import string
 from typing import TYPE_CHECKING, Any
 
 from evopolicy_common.catalogue import Entry
-from evopolicy_worker.environments.gymnasium_adapter import GymnasiumFamily
+from evopolicy_worker.environments.interface.gymnasium_adapter import GymnasiumFamily
 
 if TYPE_CHECKING:
     import gymnasium

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from evopolicy_common.catalogue import Entry
-from evopolicy_worker.environments.actions import ActionCodec
-from evopolicy_worker.environments.adapters import versions
 from evopolicy_worker.environments.browser import chromium, miniwob_pages
 from evopolicy_worker.environments.browser.page import shared
-from evopolicy_worker.environments.gymnasium_adapter import GymnasiumFamily
+from evopolicy_worker.environments.interface.actions import ActionCodec
+from evopolicy_worker.environments.interface.adapters import versions
+from evopolicy_worker.environments.interface.gymnasium_adapter import GymnasiumFamily
 
 if TYPE_CHECKING:
     import gymnasium

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from evopolicy_common.catalogue import Entry
 from evopolicy_common.errors import WorkerError
 from evopolicy_common.processes import distribution
-from evopolicy_worker.environments.gymnasium_adapter import GymnasiumFamily
+from evopolicy_worker.environments.interface.gymnasium_adapter import GymnasiumFamily
 from evopolicy_worker.environments.tasks import template
 
 if TYPE_CHECKING:

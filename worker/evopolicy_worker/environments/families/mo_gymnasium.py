@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from evopolicy_common.catalogue import Entry
-from evopolicy_worker.environments import rewards
 from evopolicy_worker.environments.families.mujoco import MujocoFamily
+from evopolicy_worker.environments.interface import rewards
 from evopolicy_worker.environments.tasks import template
 
 if TYPE_CHECKING:

@@ -15,9 +15,9 @@ import numpy as np
 
 from evopolicy_common.catalogue import Entry
 from evopolicy_common.messages.environment import Case, EnvironmentDescription, SpaceSchema
-from evopolicy_worker.environments.actions import compile_actions
-from evopolicy_worker.environments.adapters import adapter, versions
-from evopolicy_worker.environments.base import Environment, Frame, Observation, Step
+from evopolicy_worker.environments.interface.actions import compile_actions
+from evopolicy_worker.environments.interface.adapters import adapter, versions
+from evopolicy_worker.environments.interface.base import Environment, Frame, Observation, Step
 from evopolicy_worker.environments.tasks import written
 
 

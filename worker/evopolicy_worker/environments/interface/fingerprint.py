@@ -9,9 +9,8 @@ from pathlib import Path
 import numpy as np
 
 import evopolicy_common
-import evopolicy_worker
 from evopolicy_common.messages.worker import Fingerprint
-from evopolicy_worker.environments.adapters import versions
+from evopolicy_worker.environments.interface.adapters import versions
 
 PACKAGES = (
     "numpy",
@@ -41,8 +40,7 @@ def fingerprint() -> Fingerprint:
 def _source_digest() -> str:
     """SHA-256 over the worker's and the common package's own sources."""
     digest = hashlib.sha256()
-    for package in (evopolicy_common, evopolicy_worker):
-        root = Path(package.__path__[0])
+    for root in (Path(evopolicy_common.__path__[0]), Path(__file__).parents[2]):
         for path in sorted(path for path in root.rglob("*") if path.suffix in (".py", ".toml", ".md")):
             digest.update(str(path.relative_to(root)).encode() + b"\0" + path.read_bytes() + b"\0")
     return digest.hexdigest()

@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evopolicy_common.catalogue import Entry, installs
-from evopolicy_worker.environments import spaces
-from evopolicy_worker.environments.adapters import versions
-from evopolicy_worker.environments.gymnasium_adapter import GymnasiumFamily
+from evopolicy_worker.environments.interface import spaces
+from evopolicy_worker.environments.interface.adapters import versions
+from evopolicy_worker.environments.interface.gymnasium_adapter import GymnasiumFamily
 from evopolicy_worker.environments.tasks import template
 
 if TYPE_CHECKING:

@@ -16,10 +16,10 @@ import numpy as np
 from evopolicy_common.errors import EvopolicyError, WorkerError
 from evopolicy_common.messages.environment import Case, SpaceSchema
 from evopolicy_common.terminal import one_line
-from evopolicy_worker.environments import spaces
-from evopolicy_worker.environments.base import Environment, Step
-from evopolicy_worker.environments.calls import current as call
-from evopolicy_worker.environments.calls import described, note
+from evopolicy_worker.environments.interface import spaces
+from evopolicy_worker.environments.interface.base import Environment, Step
+from evopolicy_worker.environments.interface.calls import current as call
+from evopolicy_worker.environments.interface.calls import described, note
 
 STEPS = 32
 SEEDS = (0, 1)

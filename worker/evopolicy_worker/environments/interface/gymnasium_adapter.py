@@ -21,18 +21,18 @@ import numpy as np
 from evopolicy_common.catalogue import USUAL_STEPS, Entry, is_shipped
 from evopolicy_common.errors import EvopolicyError, WorkerError
 from evopolicy_common.messages.environment import Case, EnvironmentDescription, SpaceSchema
-from evopolicy_worker.environments import rewards, settings, spaces, trial
 from evopolicy_worker.environments.accelerations import accelerate
-from evopolicy_worker.environments.actions import ActionCodec, compile_actions
-from evopolicy_worker.environments.adapters import adapter, versions
-from evopolicy_worker.environments.base import Environment, Frame, Observation, Step
-from evopolicy_worker.environments.calls import current as call
-from evopolicy_worker.environments.calls import described
-from evopolicy_worker.environments.info import plain_info
-from evopolicy_worker.environments.observations import compile_observation
-from evopolicy_worker.environments.opaque import Opaque, converter, declared, visible
+from evopolicy_worker.environments.interface import rewards, settings, spaces, trial
+from evopolicy_worker.environments.interface.actions import ActionCodec, compile_actions
+from evopolicy_worker.environments.interface.adapters import adapter, versions
+from evopolicy_worker.environments.interface.base import Environment, Frame, Observation, Step
+from evopolicy_worker.environments.interface.calls import current as call
+from evopolicy_worker.environments.interface.calls import described
+from evopolicy_worker.environments.interface.info import plain_info
+from evopolicy_worker.environments.interface.observations import compile_observation
+from evopolicy_worker.environments.interface.opaque import Opaque, converter, declared, visible
+from evopolicy_worker.environments.interface.wrappers import wrapped
 from evopolicy_worker.environments.tasks import task_text
-from evopolicy_worker.environments.wrappers import wrapped
 
 if TYPE_CHECKING:
     import gymnasium

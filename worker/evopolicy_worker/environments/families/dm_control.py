@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from evopolicy_common.catalogue import Entry
-from evopolicy_worker.environments import spaces
 from evopolicy_worker.environments.families.mujoco import MujocoFamily, check_rendering
+from evopolicy_worker.environments.interface import spaces
 from evopolicy_worker.environments.tasks import template
 
 if TYPE_CHECKING:

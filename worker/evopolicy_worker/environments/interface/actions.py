@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evopolicy_common.messages.environment import SpaceSchema
-from evopolicy_worker.environments.spaces import bounds
+from evopolicy_worker.environments.interface.spaces import bounds
 
 _FAST_ELEMENTS = 32
 """Up to this many elements a loop over Python floats is faster than numpy's comparisons."""

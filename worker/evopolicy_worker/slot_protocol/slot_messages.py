@@ -9,8 +9,8 @@ import msgspec
 from evopolicy_common.catalogue import Entry
 from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome, Job, PolicyFailure, Tier
-from evopolicy_worker.environments.calls import Limits
-from evopolicy_worker.episodes.begun import PackedBegun
+from evopolicy_worker.environments.interface.calls import Limits
+from evopolicy_worker.slot_protocol.begun import PackedBegun
 
 LENGTH = struct.Struct("<I")
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, cast
 
 from evopolicy_common.catalogue import Entry
-from evopolicy_worker.environments.gymnasium_adapter import GymnasiumFamily
+from evopolicy_worker.environments.interface.gymnasium_adapter import GymnasiumFamily
 
 if TYPE_CHECKING:
     import gymnasium

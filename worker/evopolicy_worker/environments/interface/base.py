@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from evopolicy_common.errors import WorkerError
 from evopolicy_common.messages.environment import Case, EnvironmentDescription
-from evopolicy_worker.environments.actions import ActionCodec
+from evopolicy_worker.environments.interface.actions import ActionCodec
 
 Observation = Any
 """numpy array, int, str, dict or tuple of these, as the observation space says."""

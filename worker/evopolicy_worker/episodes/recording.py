@@ -22,9 +22,9 @@ import msgspec
 from evopolicy_common.errors import WorkerError
 from evopolicy_common.messages.environment import Case, EnvironmentDescription
 from evopolicy_worker import environments
-from evopolicy_worker.environments.calls import note
+from evopolicy_worker.environments.interface.calls import note
 from evopolicy_worker.episodes.video import Made, Order
-from evopolicy_worker.slots.slot_messages import LENGTH
+from evopolicy_worker.slot_protocol.slot_messages import LENGTH
 
 START_S = 120.0
 """Time for the process to start and import its simulator."""

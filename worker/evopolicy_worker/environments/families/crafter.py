@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from evopolicy_common.catalogue import Entry
-from evopolicy_worker.environments.gymnasium_adapter import GymnasiumFamily
+from evopolicy_worker.environments.interface.gymnasium_adapter import GymnasiumFamily
 
 if TYPE_CHECKING:
     import gymnasium

@@ -14,15 +14,15 @@ from functools import cache
 from importlib import metadata
 from pathlib import Path
 
-import evopolicy_worker
 from evopolicy_worker.environments.accelerations import ACCELERATIONS
 
 REVISION = 1
 """Incremented when a change in the shared modules changes episodes. Scores of different revisions are not compared."""
-_ROOT = Path(evopolicy_worker.__path__[0])
+_ROOT = Path(__file__).parents[2]
+"""The package `evopolicy_worker`."""
 _SHARED = (
     *(
-        f"environments/{name}.py"
+        f"environments/interface/{name}.py"
         for name in (
             "actions",
             "base",
@@ -36,6 +36,7 @@ _SHARED = (
         )
     ),
     "episodes/*.py",
+    "slot_protocol/begun.py",
     "sandbox/inside/*.py",
 )
 """Modules that every episode uses."""
@@ -79,7 +80,7 @@ def _version(name: str) -> str:
 
 
 def _is_ours(family: type) -> bool:
-    return family.__module__.startswith(f"{evopolicy_worker.__name__}.")
+    return family.__module__.startswith(f"{__name__.partition('.')[0]}.")
 
 
 def _matching(pattern: str) -> list[Path]:

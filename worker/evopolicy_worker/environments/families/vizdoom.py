@@ -23,8 +23,8 @@ import numpy as np
 from evopolicy_common.catalogue import Entry
 from evopolicy_common.errors import WorkerError
 from evopolicy_common.processes.parent_death import ending_with_parent
-from evopolicy_worker.environments import spaces
-from evopolicy_worker.environments.gymnasium_adapter import GymnasiumFamily
+from evopolicy_worker.environments.interface import spaces
+from evopolicy_worker.environments.interface.gymnasium_adapter import GymnasiumFamily
 from evopolicy_worker.environments.tasks import template
 
 if TYPE_CHECKING:

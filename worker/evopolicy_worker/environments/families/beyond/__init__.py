@@ -1,1 +1,0 @@
-"""Families beyond those of the paper."""
