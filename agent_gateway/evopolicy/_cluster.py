@@ -32,15 +32,15 @@ from evopolicy_common.records.policies.bundles import Bundle
 from evopolicy_common.wire.credentials import local_state_dir
 from evopolicy_gateway import shipped
 from evopolicy_gateway.agents.function import Workspace
-from evopolicy_gateway.cli.options import default_exp_id, limits_from, one_environment, packages_for
 from evopolicy_gateway.cli.run_options import RunOptions
-from evopolicy_gateway.http.listener import Listener
 from evopolicy_gateway.jail.settings import JailSettings
 from evopolicy_gateway.operator import cluster as operator
 from evopolicy_gateway.operator.trials import policy_bundle
-from evopolicy_gateway.operator.watch import RunView
 from evopolicy_gateway.run.lifecycle import RunLifecycle
+from evopolicy_gateway.run.options import default_exp_id, limits_from, one_environment, packages_for
 from evopolicy_gateway.run.plan import Plan
+from evopolicy_gateway.run.watch import RunView
+from evopolicy_gateway.run_folder.listener import Listener
 
 T = TypeVar("T")
 

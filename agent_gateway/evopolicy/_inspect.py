@@ -34,13 +34,13 @@ from evopolicy._runs import Run
 from evopolicy_common import catalogue
 from evopolicy_common.processes import host
 from evopolicy_gateway.agents.client import Client, ProtocolError, Refusal
-from evopolicy_gateway.cli.options import default_exp_id
-from evopolicy_gateway.harnesses.prompts import Prompts
-from evopolicy_gateway.http import listener
-from evopolicy_gateway.http.listener import Listener
-from evopolicy_gateway.run.layout import RunFolder
 from evopolicy_gateway.run.lifecycle import RunLifecycle
+from evopolicy_gateway.run.options import default_exp_id
 from evopolicy_gateway.run.plan import Plan
+from evopolicy_gateway.run_folder import listener
+from evopolicy_gateway.run_folder.layout import RunFolder
+from evopolicy_gateway.run_folder.listener import Listener
+from evopolicy_gateway.workspace.prompts import Prompts
 
 _KEY = "evopolicy_run"
 """Name in a sample's store: the run's folder."""

@@ -29,7 +29,7 @@ from evopolicy_common.processes import proc
 from evopolicy_common.wire import codec, credentials, keys
 from evopolicy_common.wire.requests import Requester
 from evopolicy_common.wire.transport import connect
-from evopolicy_gateway.run import processes
+from evopolicy_gateway.processes import trees as processes
 
 SUBMITS = 3
 EPISODES = 6

@@ -47,7 +47,7 @@ from evopolicy_common.wire import codec, credentials, keys, transport
 from evopolicy_common.wire.credentials import Credentials
 from evopolicy_coordinator.core.contract.settings import CoreSettings
 from evopolicy_gateway.run.gateway import Close, Gateway
-from evopolicy_gateway.run.layout import OpenedRun, RunFolder, save
+from evopolicy_gateway.run_folder.layout import OpenedRun, RunFolder, save
 from evopolicy_gateway.submits.pipeline import SubmitPipeline
 from evopolicy_gateway.workspace.agents_md import Urls
 

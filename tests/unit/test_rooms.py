@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 from collections import Counter
 from functools import cache
 from pathlib import Path
@@ -193,9 +194,40 @@ def test_what_commands_print_goes_through_the_terminal_module() -> None:
             assert not named & {"print", "echo", "secho", "Console"}, name
 
 
-def test_no_folder_of_the_product_has_more_than_sixteen_modules() -> None:
-    folders = Counter(path.parent for room in ROOMS.values() for path in room.rglob("*.py"))
-    assert not {str(folder.relative_to(ROOT)): count for folder, count in folders.items() if count > 16}
+def test_no_folder_of_the_product_is_in_an_import_circle() -> None:
+    """A package's own modules are one folder; what two folders share lies in a third, below both."""
+    known = modules()
+    folder = {n: n if p.name == "__init__.py" else n.rpartition(".")[0] for n, p in known.items()}
+    graph: dict[str, set[str]] = {each: set() for each in folder.values()}
+    for name, path in known.items():
+        graph[folder[name]] |= {folder[other] for other in imported(name, path, known)} - {folder[name]}
+    assert circles(graph) == []
+
+
+def test_folders_import_only_from_rows_above_them_in_the_architecture() -> None:
+    """The table of folders in ARCHITECTURE.md: packages, and their folders from the ground up."""
+    place: dict[str, int] = {}
+    package = ""
+    text = (ROOT / "ARCHITECTURE.md").read_text(encoding="utf-8").partition("| package | folder |")[2]
+    for number, line in enumerate(text.partition("\n\n")[0].splitlines()[2:]):
+        package = (re.findall(r"`(evopolicy_\w+)`", line.split("|")[1]) or [package])[0]
+        for folder in re.findall(r"`(\w+)/`", line.split("|")[2]):
+            place[f"{package}.{folder}"] = number
+        if "(root)" in line:
+            place[package] = number
+    known = modules()
+    top = {
+        n: ".".join((n if p.name == "__init__.py" else n.rpartition(".")[0]).split(".")[:2])
+        for n, p in known.items()
+    }
+    for name, path in known.items():
+        for other in imported(name, path, known):
+            ours, theirs = top[name], top[other]
+            if ours != theirs and ours in place and theirs.startswith(ours.partition(".")[0] + "."):
+                assert place[theirs] <= place[ours], f"{name} imports {other}"
+    assert {
+        each for each in top.values() if "." in each and not each.startswith("evopolicy.")
+    } <= place.keys()
 
 
 def test_every_package_is_where_it_should_be() -> None:

@@ -20,18 +20,17 @@ from evopolicy_common.cli.conventions import setup_logging
 from evopolicy_common.errors import ConfigError, EvopolicyError
 from evopolicy_common.logs import structlog
 from evopolicy_common.records.secrets import Redaction, is_secret, note_passed, without_keys
-from evopolicy_gateway.agent_supervisor.agent_log import AgentLog
-from evopolicy_gateway.agent_supervisor.agent_process import environment_of
-from evopolicy_gateway.agent_supervisor.clock import Activity, AgentClock
 from evopolicy_gateway.harnesses import config_of, make
-from evopolicy_gateway.harnesses.agent_config import AgentConfig
-from evopolicy_gateway.harnesses.base import Stage
-from evopolicy_gateway.harnesses.prompts import Prompts
+from evopolicy_gateway.harnesses.interface.agent_config import AgentConfig
+from evopolicy_gateway.harnesses.interface.base import Stage
 from evopolicy_gateway.inputs import kept as inputs
 from evopolicy_gateway.inputs import own_config
 from evopolicy_gateway.jail.jail import Jail
-from evopolicy_gateway.operator import child_messages
-from evopolicy_gateway.operator.child_messages import (
+from evopolicy_gateway.processes import child_messages
+from evopolicy_gateway.processes import trees as processes
+from evopolicy_gateway.processes.agent_log import AgentLog
+from evopolicy_gateway.processes.agent_process import environment_of
+from evopolicy_gateway.processes.child_messages import (
     AgentDoing,
     AgentEnded,
     AgentSurvives,
@@ -40,7 +39,8 @@ from evopolicy_gateway.operator.child_messages import (
     Orders,
     StartAgent,
 )
-from evopolicy_gateway.run import processes
+from evopolicy_gateway.processes.clock import Activity, AgentClock
+from evopolicy_gateway.workspace.prompts import Prompts
 
 END_GRACE_S = 3.0
 """Time from SIGTERM to SIGKILL."""

@@ -13,8 +13,7 @@ from evopolicy_common.cli.frame import App
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.terminal import say_lines
 from evopolicy_gateway import shipped
-from evopolicy_gateway.harnesses import prompts
-from evopolicy_gateway.workspace import agents_md
+from evopolicy_gateway.workspace import agents_md, prompts
 
 app = App()
 

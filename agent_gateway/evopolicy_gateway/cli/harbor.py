@@ -13,7 +13,7 @@ from evopolicy_common.errors import ConfigError
 from evopolicy_common.terminal import say
 from evopolicy_common.wire.http import bound, serving
 from evopolicy_gateway.harbor.scores import make_app, tasks_in, token_of, write_task
-from evopolicy_gateway.http.listener import Listener, listener_of
+from evopolicy_gateway.run_folder.listener import Listener, listener_of
 from evopolicy_gateway.workspace.agents_md import base_url
 
 app = App()

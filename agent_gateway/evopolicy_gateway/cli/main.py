@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import typer
 
 from evopolicy_common.cli.frame import App, Group, Version, run_app
-from evopolicy_gateway.run import processes
+from evopolicy_gateway.processes import trees as processes
 
 
 class Place(NamedTuple):

@@ -21,11 +21,12 @@ from evopolicy_gateway import shipped
 from evopolicy_gateway.cli import options
 from evopolicy_gateway.cli.option_groups import spread
 from evopolicy_gateway.cli.run_options import JailOptions, ListenerOptions, RunOptions
-from evopolicy_gateway.http import listener
 from evopolicy_gateway.jail.settings import JailSettings
 from evopolicy_gateway.operator.cluster import Cluster
-from evopolicy_gateway.run.layout import folder_of
+from evopolicy_gateway.run.options import cases_of, default_exp_id, limits_of, one_environment, packages_for
 from evopolicy_gateway.run.plan import Plan
+from evopolicy_gateway.run_folder import listener
+from evopolicy_gateway.run_folder.layout import folder_of
 from evopolicy_gateway.suite import runs as plain_runs
 from evopolicy_gateway.suite.ends import exit_code
 
@@ -83,7 +84,7 @@ def run(
         options.check_packages(policy_package, local=local)
         options.check_browser(browser, local=local)
         held = jail.of_remote_agent() if given.agent == listener.AGENT else jail.settings()
-        plans = _plans(given, [options.one_environment(env)], held, served)
+        plans = _plans(given, [one_environment(env)], held, served)
         where = Cluster(connect=tuple(connect or ()), file=credentials_file, patient=given.resume)
         if local:
             where = Cluster(
@@ -200,13 +201,13 @@ def try_policy(
 
     with fail_on_our_errors():
         trial = trials.Trial(
-            env=options.one_environment(env),
+            env=one_environment(env),
             policy=shipped.found(policy_dir, Path.cwd()),
             split="train",
-            cases=options.cases_of(cases),
+            cases=cases_of(cases),
             out=out,
             tier=tier,
-            limits=options.limits_of(limit or ()),
+            limits=limits_of(limit or ()),
         )
         where = _trial_cluster(
             connect,
@@ -250,7 +251,7 @@ def play_random(
     from evopolicy_gateway.operator import trials
 
     with fail_on_our_errors():
-        chosen = None if cases is None else options.cases_of(cases)
+        chosen = None if cases is None else cases_of(cases)
         kept = options.state_of(state, fresh=fresh)
         where = _trial_cluster(connect, credentials_file, slots, kept, data, browser, policy_package)
         env_ids = catalogue.resolve(env)
@@ -317,7 +318,7 @@ def _plans(
     if given.resume and (given.overwrite or given.exp_id is None):
         raise ConfigError("--resume needs --exp-id, and cannot be combined with --overwrite")
     started_in = Path.cwd()
-    exp_id = given.exp_id or options.default_exp_id()
+    exp_id = given.exp_id or default_exp_id()
     served = served or ListenerOptions()
     where, agent_host = served.listener(), served.host_of(given.agent)
     texts = given.texts(started_in)
@@ -372,11 +373,7 @@ def _trial_cluster(
     if connect or file:
         options.check_packages(packages, local=False)
         return Cluster(connect=tuple(connect or ()), file=file)
-    found = (
-        options.check_packages(packages, local=True)
-        if policy is None
-        else options.packages_for(policy, packages)
-    )
+    found = options.check_packages(packages, local=True) if policy is None else packages_for(policy, packages)
     return Cluster(local_slots=slots, state=state, data=data, policy_packages=found, browser=chosen)
 
 

@@ -13,7 +13,6 @@ from evopolicy_common.messages.environment import ObservationForm, PolicyScope, 
 from evopolicy_common.messages.gateway import FeedbackDetail, FinishRule, SimulationRule, VideoOption
 from evopolicy_common.messages.run_settings import RunSettings
 from evopolicy_gateway import harnesses
-from evopolicy_gateway.agent_supervisor.clock import SILENCE_S
 from evopolicy_gateway.cli.options import (
     AGENT,
     JAIL,
@@ -25,14 +24,14 @@ from evopolicy_gateway.cli.options import (
     Limits,
     ProfileOption,
     TierName,
-    limits_of,
-    run_settings,
 )
-from evopolicy_gateway.http.listener import Listener, agent_host_of, listener_of
 from evopolicy_gateway.jail.settings import JailSettings, Mode, absolute
+from evopolicy_gateway.processes.clock import SILENCE_S
 from evopolicy_gateway.run import texts
+from evopolicy_gateway.run.options import limits_of, run_settings
 from evopolicy_gateway.run.plan import WALL_S
 from evopolicy_gateway.run.texts import Texts
+from evopolicy_gateway.run_folder.listener import Listener, agent_host_of, listener_of
 
 Several = list[str] | None
 """An option that may be repeated."""

@@ -9,7 +9,7 @@ import typer
 from evopolicy_common.cli.conventions import fail_on_our_errors
 from evopolicy_common.cli.frame import App
 from evopolicy_common.terminal import say_json, say_lines
-from evopolicy_gateway import schemas
+from evopolicy_gateway.cli import schemas
 
 app = App()
 

@@ -19,12 +19,12 @@ from evopolicy_common.cli.frame import App, Version, run_app
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.logs import structlog
 from evopolicy_common.processes.preflight import foreseen
-from evopolicy_gateway.http.listener import AgentPlace, place_of
-from evopolicy_gateway.operator import child_messages
-from evopolicy_gateway.operator.child_messages import Orders, Progress, Ready, RunClosed, Waits
-from evopolicy_gateway.operator.locks import alone
+from evopolicy_gateway.processes import child_messages
+from evopolicy_gateway.processes.child_messages import Orders, Progress, Ready, RunClosed, Waits
 from evopolicy_gateway.run.gateway import Close, Gateway
-from evopolicy_gateway.run.layout import RunFolder, folder_of
+from evopolicy_gateway.run_folder.layout import RunFolder, folder_of
+from evopolicy_gateway.run_folder.listener import AgentPlace, place_of
+from evopolicy_gateway.run_folder.locks import alone
 from evopolicy_gateway.submits.pipeline import SubmitPipeline
 from evopolicy_gateway.workspace import staging as workspace
 from evopolicy_gateway.workspace.agents_md import Urls

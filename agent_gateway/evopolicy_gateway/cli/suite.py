@@ -32,8 +32,9 @@ from evopolicy_common.records.suite_folder import FINISHED, INDEX, Index
 from evopolicy_common.wire.credentials import SWEEP_STATE
 from evopolicy_gateway.cli import options
 from evopolicy_gateway.operator.cluster import Cluster, connected
-from evopolicy_gateway.operator.locks import alone
+from evopolicy_gateway.run.options import settings_of
 from evopolicy_gateway.run.plan import Plan
+from evopolicy_gateway.run_folder.locks import alone
 from evopolicy_gateway.suite import decisions, suite_file, suite_index
 from evopolicy_gateway.suite.claimed import ClaimedSweep, look
 from evopolicy_gateway.suite.decisions import Changed, Decision
@@ -122,7 +123,7 @@ def suite(
             limits = msgspec.structs.replace(wanted.parallel, machine=parallel)
             wanted = msgspec.structs.replace(wanted, parallel=limits)
         if profile is not None:
-            chosen = options.settings_of(profile)["profile"]
+            chosen = settings_of(profile)["profile"]
             defaults = msgspec.structs.replace(wanted.defaults, profile=chosen)
             wanted = msgspec.structs.replace(wanted, defaults=defaults)
         root = (runs or Path("runs") / wanted.name).absolute()

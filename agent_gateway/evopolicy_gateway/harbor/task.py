@@ -11,9 +11,9 @@ import json
 import re
 from collections.abc import Mapping
 
-from evopolicy_gateway.harnesses.prompts import FIRST
-from evopolicy_gateway.http.listener import TOKEN_VARIABLE
-from evopolicy_gateway.run.layout import RunFolder
+from evopolicy_gateway.run_folder.layout import RunFolder
+from evopolicy_gateway.run_folder.listener import TOKEN_VARIABLE
+from evopolicy_gateway.workspace.prompts import FIRST
 
 WORKDIR = "/work"
 """The workspace in the container."""

@@ -14,8 +14,6 @@ import msgspec
 
 from evopolicy_common.errors import ConfigError
 from evopolicy_gateway import shipped
-from evopolicy_gateway.harnesses.agent_config import AcpTable, AgentConfig, read_agent
-from evopolicy_gateway.harnesses.base import Harness
 from evopolicy_gateway.harnesses.coding_agents import llm
 from evopolicy_gateway.harnesses.coding_agents.acp import AcpAgent
 from evopolicy_gateway.harnesses.coding_agents.acp_stream import Acp
@@ -26,6 +24,8 @@ from evopolicy_gateway.harnesses.coding_agents.configured import ConfiguredCli
 from evopolicy_gateway.harnesses.coding_agents.dialect import Dialect
 from evopolicy_gateway.harnesses.coding_agents.llm import Llm
 from evopolicy_gateway.harnesses.command import CommandHarness, ReplayHarness
+from evopolicy_gateway.harnesses.interface.agent_config import AcpTable, AgentConfig, read_agent
+from evopolicy_gateway.harnesses.interface.base import Harness
 from evopolicy_gateway.harnesses.remote import RemoteHarness
 
 FORMS = "evolve, random, replay:DIR, command:PROGRAM…, codex, codex:MODEL, claude-code, claude-code:MODEL, llm:openai/MODEL, llm:anthropic/MODEL, acp:PROGRAM…, file:AGENT.toml, remote"

@@ -15,11 +15,11 @@ from typing import Any
 import orjson
 
 from evopolicy_common.errors import ConfigError
-from evopolicy_gateway.agent_supervisor.agent_process import AgentProcess
 from evopolicy_gateway.agents import replay
-from evopolicy_gateway.harnesses import prompts
-from evopolicy_gateway.harnesses.base import Harness, Stage
-from evopolicy_gateway.operator.child_messages import AgentEnded
+from evopolicy_gateway.harnesses.interface.base import Harness, Stage
+from evopolicy_gateway.processes.agent_process import AgentProcess
+from evopolicy_gateway.processes.child_messages import AgentEnded
+from evopolicy_gateway.workspace import prompts
 
 _PIPE_TIMEOUT_S = 1.0
 _STOP_TIMEOUT_S = 10.0

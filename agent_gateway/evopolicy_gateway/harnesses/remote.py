@@ -5,9 +5,9 @@ It ends when the budget is spent, when its time is up, or when the operator runs
 
 from __future__ import annotations
 
-from evopolicy_gateway.harnesses.base import Harness, Stage
-from evopolicy_gateway.operator.child_messages import AgentEnded
-from evopolicy_gateway.run.layout import RunFolder
+from evopolicy_gateway.harnesses.interface.base import Harness, Stage
+from evopolicy_gateway.processes.child_messages import AgentEnded
+from evopolicy_gateway.run_folder.layout import RunFolder
 
 _LOOK_S = 0.5
 

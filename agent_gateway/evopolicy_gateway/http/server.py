@@ -12,8 +12,8 @@ from evopolicy_common.errors import ConfigError
 from evopolicy_common.processes.preflight import LOOPBACK, no_loopback
 from evopolicy_common.records.blobs import write_atomically
 from evopolicy_common.wire.http import bound
-from evopolicy_gateway.http.listener import Listener
-from evopolicy_gateway.run.layout import RunFolder, save, saved
+from evopolicy_gateway.run_folder.layout import RunFolder, save, saved
+from evopolicy_gateway.run_folder.listener import Listener
 from evopolicy_gateway.workspace.agents_md import Urls, urls_at, urls_below
 
 _REBIND_TRIES = 20

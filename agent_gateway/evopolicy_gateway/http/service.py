@@ -26,9 +26,9 @@ from evopolicy_common.errors import RequestError
 from evopolicy_common.logs import structlog
 from evopolicy_common.messages.gateway import CANCELLED
 from evopolicy_gateway.http.info import info_document, progress_document
-from evopolicy_gateway.http.submit_request import MAX_BODY_BYTES, refuse_size
 from evopolicy_gateway.http.task import task_markdown
 from evopolicy_gateway.submits.pipeline import RUN_CLOSED, SubmitPipeline
+from evopolicy_gateway.submits.submit_request import MAX_BODY_BYTES, refuse_size
 from evopolicy_gateway.submits.tickets import ConflictError, Ticket
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger()

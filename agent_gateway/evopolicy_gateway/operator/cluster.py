@@ -21,7 +21,7 @@ from evopolicy_common.terminal import say
 from evopolicy_common.wire import transport
 from evopolicy_common.wire.credentials import Credentials
 from evopolicy_gateway.operator.live_view import live_view
-from evopolicy_gateway.operator.operations import Operations, find_credentials
+from evopolicy_gateway.run.operations import Operations, find_credentials
 
 CONNECT_S = 10.0
 """Patience with a coordinator that was not reached yet, seconds."""

@@ -25,7 +25,7 @@ from evopolicy_common.records.policies import bundles
 from evopolicy_common.records.policies.checkpoints import bundle_of
 from evopolicy_common.terminal import one_line, say, say_json
 from evopolicy_gateway.operator.cluster import Cluster, connected
-from evopolicy_gateway.operator.operations import Operations
+from evopolicy_gateway.run.operations import Operations
 from evopolicy_gateway.submits.formatting import cut_text
 
 

@@ -28,12 +28,12 @@ from evopolicy_common.records.blobs import BlobStore
 from evopolicy_common.refusals import RUN_OVER
 from evopolicy_common.wire import credentials, transport
 from evopolicy_common.wire.http import serving
-from evopolicy_gateway.http.listener import AgentPlace, agent_place, ends_unseen
 from evopolicy_gateway.http.server import bind
 from evopolicy_gateway.http.service import make_app
-from evopolicy_gateway.run.coordinator_client import CoordinatorClient
-from evopolicy_gateway.run.layout import OpenedRun, RunFolder, saved
-from evopolicy_gateway.submits.journal import Closed, Journal
+from evopolicy_gateway.run_folder.journal import Closed, Journal
+from evopolicy_gateway.run_folder.layout import OpenedRun, RunFolder, saved
+from evopolicy_gateway.run_folder.listener import AgentPlace, agent_place, ends_unseen
+from evopolicy_gateway.submits.coordinator_client import CoordinatorClient
 from evopolicy_gateway.submits.pipeline import SubmitPipeline
 from evopolicy_gateway.workspace import staging as workspace
 from evopolicy_gateway.workspace.agents_md import Urls

@@ -38,10 +38,9 @@ from evopolicy_common.records.secrets import without_keys
 from evopolicy_common.wire import credentials
 from evopolicy_common.wire.credentials import Credentials
 from evopolicy_gateway import harnesses
-from evopolicy_gateway.http.listener import TOKEN_VARIABLE, agent_place, place_notice
 from evopolicy_gateway.jail.jail import JailOrder
-from evopolicy_gateway.operator import child_messages, child_rpc
-from evopolicy_gateway.operator.child_messages import (
+from evopolicy_gateway.processes import child_messages, child_rpc
+from evopolicy_gateway.processes.child_messages import (
     AgentDoing,
     AgentEnded,
     AgentSurvives,
@@ -55,14 +54,15 @@ from evopolicy_gateway.operator.child_messages import (
     StartAgent,
     Waits,
 )
-from evopolicy_gateway.operator.child_rpc import Child
-from evopolicy_gateway.operator.locks import alone
-from evopolicy_gateway.operator.operations import Operations
-from evopolicy_gateway.operator.watch import Watch
+from evopolicy_gateway.processes.child_rpc import Child
 from evopolicy_gateway.run import record
-from evopolicy_gateway.run.layout import IntendedRun, OpenedRun, save, saved
+from evopolicy_gateway.run.operations import Operations
 from evopolicy_gateway.run.plan import Plan
 from evopolicy_gateway.run.times import Stopwatch
+from evopolicy_gateway.run.watch import Watch
+from evopolicy_gateway.run_folder.layout import IntendedRun, OpenedRun, save, saved
+from evopolicy_gateway.run_folder.listener import TOKEN_VARIABLE, agent_place, place_notice
+from evopolicy_gateway.run_folder.locks import alone
 from evopolicy_gateway.workspace import staging as workspace
 from evopolicy_gateway.workspace.agents_md import LAST_WORDS_S
 

@@ -15,13 +15,13 @@ from evopolicy_common.messages.run_settings import RunSettings
 from evopolicy_common.processes.preflight import check_installed, check_loopback, check_text, check_writable
 from evopolicy_common.processes.scratch import remove_tree
 from evopolicy_gateway import harnesses
-from evopolicy_gateway.agent_supervisor.clock import SILENCE_S
-from evopolicy_gateway.harnesses.agent_config import AgentConfig
-from evopolicy_gateway.http.listener import Listener, check_agent
+from evopolicy_gateway.harnesses.interface.agent_config import AgentConfig
 from evopolicy_gateway.jail.settings import JailSettings
-from evopolicy_gateway.operator.locks import check_free
-from evopolicy_gateway.run.layout import IntendedRun, RunFolder, run_folder, saved
+from evopolicy_gateway.processes.clock import SILENCE_S
 from evopolicy_gateway.run.texts import Texts
+from evopolicy_gateway.run_folder.layout import IntendedRun, RunFolder, run_folder, saved
+from evopolicy_gateway.run_folder.listener import Listener, check_agent
+from evopolicy_gateway.run_folder.locks import check_free
 
 WALL_S = 12 * 3600.0
 """Default wall limit of an agent, seconds."""

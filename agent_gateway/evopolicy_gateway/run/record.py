@@ -53,14 +53,14 @@ from evopolicy_common.records.run_record import (
 )
 from evopolicy_common.records.secrets import without_keys
 from evopolicy_common.records.summary import utc_text
-from evopolicy_gateway.operator.operations import Operations
 from evopolicy_gateway.run import replays
-from evopolicy_gateway.run.layout import RunFolder, Staged, saved
+from evopolicy_gateway.run.operations import Operations
 from evopolicy_gateway.run.plan import Plan
 from evopolicy_gateway.run.times import Times
 from evopolicy_gateway.run.transitions import Transitions, count_transitions
-from evopolicy_gateway.submits.journal import Accepted, AnyEntry, Journal, Rejected, Requested
-from evopolicy_gateway.submits.names import submit_id
+from evopolicy_gateway.run_folder.journal import Accepted, AnyEntry, Journal, Rejected, Requested
+from evopolicy_gateway.run_folder.layout import RunFolder, Staged, saved
+from evopolicy_gateway.run_folder.names import submit_id
 
 _RESUMABLE = (OSError, StorageError, TransportError, ConfigError)
 """Errors with a remedy, after which `--resume` writes everything."""

@@ -16,7 +16,7 @@ from evopolicy_common.errors import RefusedError
 from evopolicy_common.messages.operator import RunFinished
 from evopolicy_common.records.blobs import digest_of, write_atomically
 from evopolicy_common.records.run_record import Replay
-from evopolicy_gateway.operator.operations import Operations
+from evopolicy_gateway.run.operations import Operations
 
 FOLDER = "replays"
 

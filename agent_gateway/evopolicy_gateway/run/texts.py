@@ -12,10 +12,10 @@ import msgspec
 
 from evopolicy_common.records.run_record import AgentInput, inputs_digest
 from evopolicy_gateway import shipped
-from evopolicy_gateway.harnesses.agent_config import AgentConfig
-from evopolicy_gateway.harnesses.prompts import Prompts, read_prompts, read_text
+from evopolicy_gateway.harnesses.interface.agent_config import AgentConfig
 from evopolicy_gateway.inputs import declared as inputs
 from evopolicy_gateway.workspace.agents_md import check_agents_md
+from evopolicy_gateway.workspace.prompts import Prompts, read_prompts, read_text
 
 
 class Texts(msgspec.Struct, frozen=True, kw_only=True):

@@ -12,7 +12,7 @@ from pathlib import Path
 import msgspec
 
 from evopolicy_common.errors import DECODE_ERRORS, StorageError
-from evopolicy_gateway.run.layout import save
+from evopolicy_gateway.run_folder.layout import save
 
 
 class Times(msgspec.Struct, frozen=True, kw_only=True):

@@ -34,19 +34,7 @@ from evopolicy_common.messages.gateway import (
 )
 from evopolicy_common.records.blobs import BlobStore, digest_of
 from evopolicy_common.refusals import RUN_OVER, Refusal
-from evopolicy_gateway.http.submit_request import Bounds, parse
-from evopolicy_gateway.run.coordinator_client import HELD_WAIT_S, RESULTS_WAIT_S, CoordinatorClient
-from evopolicy_gateway.submits import formatting, snapshots
-from evopolicy_gateway.submits.episode_files import (
-    episode_files,
-    episode_share,
-    set_aside_files,
-    shows_texts,
-    takes_much,
-)
-from evopolicy_gateway.submits.feedback import SubmitTree
-from evopolicy_gateway.submits.formatting import EpisodeScore
-from evopolicy_gateway.submits.journal import (
+from evopolicy_gateway.run_folder.journal import (
     Accepted,
     AnyEntry,
     Closed,
@@ -58,7 +46,19 @@ from evopolicy_gateway.submits.journal import (
     SetAside,
     Settled,
 )
-from evopolicy_gateway.submits.names import episode_name
+from evopolicy_gateway.run_folder.names import episode_name
+from evopolicy_gateway.submits import formatting, snapshots
+from evopolicy_gateway.submits.coordinator_client import HELD_WAIT_S, RESULTS_WAIT_S, CoordinatorClient
+from evopolicy_gateway.submits.episode_files import (
+    episode_files,
+    episode_share,
+    set_aside_files,
+    shows_texts,
+    takes_much,
+)
+from evopolicy_gateway.submits.feedback import SubmitTree
+from evopolicy_gateway.submits.formatting import EpisodeScore
+from evopolicy_gateway.submits.submit_request import Bounds, parse
 from evopolicy_gateway.submits.tickets import ConflictError, Ticket
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger()

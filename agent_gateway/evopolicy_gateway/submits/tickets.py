@@ -9,8 +9,8 @@ from collections.abc import Callable
 import msgspec
 
 from evopolicy_common.errors import RequestError
-from evopolicy_gateway.submits.journal import Accepted, Requested
-from evopolicy_gateway.submits.names import submit_id
+from evopolicy_gateway.run_folder.journal import Accepted, Requested
+from evopolicy_gateway.run_folder.names import submit_id
 from evopolicy_gateway.submits.snapshots import Snapshot
 
 

@@ -33,10 +33,10 @@ from evopolicy_common.records.suite_folder import FINISHED, INDEX, PAUSED, Entry
 from evopolicy_common.wire.credentials import Credentials
 from evopolicy_gateway import harnesses
 from evopolicy_gateway.harnesses.coding_agents import session
-from evopolicy_gateway.operator.child_messages import AgentDoing
-from evopolicy_gateway.operator.operations import Operations
-from evopolicy_gateway.run.layout import OpenedRun, RunFolder, saved
+from evopolicy_gateway.processes.child_messages import AgentDoing
+from evopolicy_gateway.run.operations import Operations
 from evopolicy_gateway.run.plan import Plan
+from evopolicy_gateway.run_folder.layout import OpenedRun, RunFolder, saved
 from evopolicy_gateway.suite import suite_index, sweep
 from evopolicy_gateway.suite.decisions import Decision, Found
 from evopolicy_gateway.suite.suite_file import SuiteFile

@@ -17,9 +17,9 @@ from evopolicy_common.records.suite_folder import Entry, Index
 from evopolicy_common.terminal import number
 from evopolicy_common.wire.credentials import Credentials
 from evopolicy_gateway.operator.cluster import Cluster, connected
-from evopolicy_gateway.operator.operations import Operations
-from evopolicy_gateway.operator.watch import RunView, Watch
+from evopolicy_gateway.run.operations import Operations
 from evopolicy_gateway.run.plan import Plan
+from evopolicy_gateway.run.watch import RunView, Watch
 from evopolicy_gateway.suite.decisions import Decision
 from evopolicy_gateway.suite.ends import next_step
 from evopolicy_gateway.suite.suite_file import Parallel

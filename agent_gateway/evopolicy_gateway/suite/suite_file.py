@@ -29,11 +29,11 @@ from evopolicy_common.messages.gateway import (
 from evopolicy_common.regular_files import read_given
 from evopolicy_common.wire import keys
 from evopolicy_gateway import harnesses
-from evopolicy_gateway.agent_supervisor.clock import SILENCE_S
-from evopolicy_gateway.cli.options import limits_from, run_settings
-from evopolicy_gateway.harnesses.agent_config import AgentConfig
+from evopolicy_gateway.harnesses.interface.agent_config import AgentConfig
 from evopolicy_gateway.jail.settings import JailSettings
+from evopolicy_gateway.processes.clock import SILENCE_S
 from evopolicy_gateway.run import texts
+from evopolicy_gateway.run.options import limits_from, run_settings
 from evopolicy_gateway.run.plan import WALL_S, Plan
 
 Positive = Annotated[int, Meta(ge=1)]

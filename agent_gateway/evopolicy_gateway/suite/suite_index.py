@@ -16,7 +16,7 @@ from evopolicy_common.records.blobs import write_atomically
 from evopolicy_common.records.run_record import RunRecord
 from evopolicy_common.records.suite_folder import INDEX, SCHEMA_VERSION, Entry, Index, State
 from evopolicy_common.records.summary import utc_text
-from evopolicy_gateway.harnesses.usage import tokens_in
+from evopolicy_gateway.harnesses.interface.usage import tokens_in
 from evopolicy_gateway.run.plan import Plan
 
 _NO_RUN = "its agent failed before its first submit; its logs/agent.jsonl and logs/harness.log tell why"

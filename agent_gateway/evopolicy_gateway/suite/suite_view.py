@@ -17,9 +17,9 @@ from evopolicy_common.console import Terminal, table
 from evopolicy_common.messages.gateway import FREE_SLOT
 from evopolicy_common.records.suite_folder import FINISHED, Entry
 from evopolicy_common.terminal import number, say_json
-from evopolicy_gateway.harnesses.usage import tokens_in
-from evopolicy_gateway.operator.child_messages import AgentDoing
-from evopolicy_gateway.operator.watch import PHASES, Row, View
+from evopolicy_gateway.harnesses.interface.usage import tokens_in
+from evopolicy_gateway.processes.child_messages import AgentDoing
+from evopolicy_gateway.run.watch import PHASES, Row, View
 
 _SHOWN_ROWS = 24
 _WIDTHS = {"budget": 7, "submits": 7, "best mean": 9, "tokens": 6, "state": 30, "last action": 11}

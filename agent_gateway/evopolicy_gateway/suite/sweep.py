@@ -17,11 +17,11 @@ import msgspec
 from evopolicy_common.records.run_record import RunRecord
 from evopolicy_common.records.suite_folder import Entry, Index
 from evopolicy_common.wire.credentials import Credentials
-from evopolicy_gateway.operator.operations import Operations
-from evopolicy_gateway.operator.watch import Watch
 from evopolicy_gateway.run.lifecycle import RunLifecycle
+from evopolicy_gateway.run.operations import Operations
 from evopolicy_gateway.run.plan import Plan
 from evopolicy_gateway.run.record import why_failed
+from evopolicy_gateway.run.watch import Watch
 from evopolicy_gateway.suite.decisions import Decision, side_by_side
 from evopolicy_gateway.suite.suite_file import Parallel
 from evopolicy_gateway.suite.suite_index import directory_of

@@ -8,9 +8,9 @@ import msgspec
 
 from evopolicy_common.messages.gateway import FeedbackDetail, RunOpened
 from evopolicy_common.records.canary import CANARY
-from evopolicy_gateway.harnesses.prompts import check_text
+from evopolicy_gateway.run_folder.names import episode_name, submit_id
 from evopolicy_gateway.submits.episode_files import episode_share, shows_texts
-from evopolicy_gateway.submits.names import episode_name, submit_id
+from evopolicy_gateway.workspace.prompts import check_text
 
 
 class Urls(msgspec.Struct, frozen=True, kw_only=True):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from evopolicy_common.messages.gateway import RunOpened
 from evopolicy_common.records.blobs import digest_of, write_atomically
 from evopolicy_common.records.run_record import PROTOCOL_VERSION
-from evopolicy_gateway.run.layout import RunFolder, Staged, save, saved
+from evopolicy_gateway.run_folder.layout import RunFolder, Staged, save, saved
 from evopolicy_gateway.workspace.agents_md import NO_URLS, Urls, agents_md
 from evopolicy_gateway.workspace.initial_policy import initial_policy
 

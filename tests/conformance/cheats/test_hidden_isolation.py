@@ -26,7 +26,7 @@ from programs.signalling_policy import LEVELS
 from waiting import TIMEOUT_S
 
 from evopolicy_common.records.run_record import RunRecord, decode_run_record
-from evopolicy_gateway.run.layout import RunFolder
+from evopolicy_gateway.run_folder.layout import RunFolder
 
 pytestmark = pytest.mark.slow
 

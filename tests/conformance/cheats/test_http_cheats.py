@@ -19,8 +19,8 @@ from urllib.parse import urlsplit
 import pytest
 from gateway_double import Double, Served, answering, gateway_on, opened, prepare
 
-from evopolicy_gateway.http.listener import Listener
-from evopolicy_gateway.run.layout import save
+from evopolicy_gateway.run_folder.layout import save
+from evopolicy_gateway.run_folder.listener import Listener
 from evopolicy_gateway.submits import pipeline as submits
 from evopolicy_gateway.submits.feedback import SubmitTree
 

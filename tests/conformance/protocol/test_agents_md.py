@@ -12,7 +12,7 @@ from gateway_double import Served, opened, served
 from hypothesis import given
 from hypothesis import strategies as st
 
-from evopolicy_gateway.http.submit_request import Bounds, parse
+from evopolicy_gateway.submits.submit_request import Bounds, parse
 from evopolicy_gateway.workspace.agents_md import NO_URLS, agents_md
 
 TIMEOUT_S = 30.0

@@ -16,7 +16,7 @@ from gateway_double import Double, Served, opened, served
 from evopolicy_common.messages.episode import PolicyFailure
 from evopolicy_common.messages.worker import BlobPut
 from evopolicy_common.records.summary import decode_summary
-from evopolicy_gateway.http.submit_request import MAX_BODY_BYTES
+from evopolicy_gateway.submits.submit_request import MAX_BODY_BYTES
 
 
 def play(tmp_path: Path, script: Callable[[Served], Awaitable[None]], double: Double | None = None) -> Double:

@@ -15,11 +15,11 @@ from evopolicy_common.messages.run_settings import ELSEWHERE, RunSettings
 from evopolicy_common.messages.worker import Message, Refused
 from evopolicy_common.processes import host
 from evopolicy_common.refusals import Refusal
-from evopolicy_gateway.http import listener
-from evopolicy_gateway.http.listener import AgentPlace, Listener
-from evopolicy_gateway.run import coordinator_client
 from evopolicy_gateway.run.gateway import Close, Gateway
-from evopolicy_gateway.run.layout import IntendedRun, RunFolder, save
+from evopolicy_gateway.run_folder import listener
+from evopolicy_gateway.run_folder.layout import IntendedRun, RunFolder, save
+from evopolicy_gateway.run_folder.listener import AgentPlace, Listener
+from evopolicy_gateway.submits import coordinator_client
 
 KERNEL = "0f2e9a7c-11d0-4b35-8d2f-5a3c9e7b1d60"
 

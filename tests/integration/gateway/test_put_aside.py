@@ -13,9 +13,9 @@ import pytest
 from gateway_double import Double, answering, gateway_on, opened, packed_episode, prepare, served
 
 from evopolicy_common.records.episodes import rendered
-from evopolicy_gateway.run.layout import RunFolder
+from evopolicy_gateway.run_folder.journal import Died, Journal, SetAside
+from evopolicy_gateway.run_folder.layout import RunFolder
 from evopolicy_gateway.submits import formatting
-from evopolicy_gateway.submits.journal import Died, Journal, SetAside
 
 BODY = {"env_instances": [1, 2, 3]}
 WHOLE = {"trajectory.jsonl", "stdout.txt", "stderr.txt"}
@@ -77,7 +77,7 @@ from pathlib import Path
 from evopolicy_gateway.submits import pipeline as submits
 from evopolicy_gateway.run.gateway import Gateway
 from evopolicy_common.records.episodes import rendered
-from evopolicy_gateway.run.layout import RunFolder
+from evopolicy_gateway.run_folder.layout import RunFolder
 
 real = submits.episode_files
 

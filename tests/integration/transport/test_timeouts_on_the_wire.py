@@ -20,9 +20,9 @@ from evopolicy_common.wire import codec, keys, operator_client, requests, transp
 from evopolicy_common.wire.credentials import Credentials, Role
 from evopolicy_common.wire.requests import Requester
 from evopolicy_common.wire.transport import IncomingQuery, Link
-from evopolicy_gateway.operator.operations import Operations
-from evopolicy_gateway.run import coordinator_client
-from evopolicy_gateway.run.coordinator_client import CoordinatorClient
+from evopolicy_gateway.run.operations import Operations
+from evopolicy_gateway.submits import coordinator_client
+from evopolicy_gateway.submits.coordinator_client import CoordinatorClient
 from evopolicy_results.verify import run as verify_run
 
 SOON_S = 0.2

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from unittest.mock import patch
 
 from evopolicy_common.processes import proc
-from evopolicy_gateway.run import processes
+from evopolicy_gateway.processes import trees as processes
 
 
 def alive(pid: int) -> bool:

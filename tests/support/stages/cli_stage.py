@@ -16,13 +16,13 @@ from typing import Any
 from machines.own_processes import only_what_starts_inside
 
 from evopolicy_common.records.secrets import Redaction
-from evopolicy_gateway.agent_supervisor.agent_log import AgentLog
-from evopolicy_gateway.agent_supervisor.clock import AgentClock
 from evopolicy_gateway.agent_supervisor.supervisor import secrets_in
 from evopolicy_gateway.harnesses import make
-from evopolicy_gateway.harnesses.agent_config import AgentConfig
-from evopolicy_gateway.harnesses.base import Stage
-from evopolicy_gateway.operator.child_messages import AgentDoing, AgentEnded
+from evopolicy_gateway.harnesses.interface.agent_config import AgentConfig
+from evopolicy_gateway.harnesses.interface.base import Stage
+from evopolicy_gateway.processes.agent_log import AgentLog
+from evopolicy_gateway.processes.child_messages import AgentDoing, AgentEnded
+from evopolicy_gateway.processes.clock import AgentClock
 
 FAKES = Path(__file__).parents[1] / "fake_clis"
 TIMEOUT_S = 150.0

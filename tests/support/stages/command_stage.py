@@ -11,12 +11,12 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from evopolicy_gateway.agent_supervisor.agent_log import AgentLog
-from evopolicy_gateway.agent_supervisor.agent_process import environment_of
-from evopolicy_gateway.agent_supervisor.clock import Activity
-from evopolicy_gateway.harnesses.base import Stage
 from evopolicy_gateway.harnesses.command import CommandHarness
-from evopolicy_gateway.operator.child_messages import AgentEnded
+from evopolicy_gateway.harnesses.interface.base import Stage
+from evopolicy_gateway.processes.agent_log import AgentLog
+from evopolicy_gateway.processes.agent_process import environment_of
+from evopolicy_gateway.processes.child_messages import AgentEnded
+from evopolicy_gateway.processes.clock import Activity
 
 TIMEOUT_S = 30.0
 

@@ -17,12 +17,12 @@ from evopolicy_common.messages.run_settings import RunSettings
 from evopolicy_common.records.run_record import RunRecord
 from evopolicy_common.records.suite_folder import Index
 from evopolicy_common.wire.credentials import Credentials
-from evopolicy_gateway.operator.child_messages import AgentDoing
 from evopolicy_gateway.operator.cluster import Cluster as LocalCluster
-from evopolicy_gateway.run.layout import RunFolder
+from evopolicy_gateway.processes.child_messages import AgentDoing
 from evopolicy_gateway.run.plan import Plan
 from evopolicy_gateway.run.record import run_record
 from evopolicy_gateway.run.times import Times
+from evopolicy_gateway.run_folder.layout import RunFolder
 from evopolicy_gateway.suite import runs, suite_index, sweep
 from evopolicy_gateway.suite.claimed import ClaimedSweep
 from evopolicy_gateway.suite.decisions import Found, decide

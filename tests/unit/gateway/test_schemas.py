@@ -18,7 +18,7 @@ from invented.run_dirs import write_run
 from jsonschema import Draft202012Validator
 
 from evopolicy_common.records.suite_folder import Entry, Index
-from evopolicy_gateway import schemas
+from evopolicy_gateway.cli import schemas
 from evopolicy_gateway.suite.suite_index import save
 
 ROOT = Path(__file__).parents[3]

@@ -36,7 +36,7 @@ from evopolicy_coordinator.web.content.confined import NotThereError
 from evopolicy_coordinator.web.content.run_detail import Detail
 from evopolicy_coordinator.web.content.run_folders import Reader
 from evopolicy_gateway.harbor import scores
-from evopolicy_gateway.run.layout import RunFolder
+from evopolicy_gateway.run_folder.layout import RunFolder
 from evopolicy_results.publish.collect import find_runs
 from evopolicy_results.reading import published
 from evopolicy_results.reading.reader import load_runs

@@ -17,8 +17,6 @@ from typing import Any
 import orjson
 
 from evopolicy_common.errors import ConfigError
-from evopolicy_gateway.agent_supervisor.agent_process import AgentProcess
-from evopolicy_gateway.harnesses.base import AgentError, Stage
 from evopolicy_gateway.harnesses.coding_agents.acp_stream import (
     MODE_THAT_ASKS,
     Acp,
@@ -33,8 +31,10 @@ from evopolicy_gateway.harnesses.coding_agents.cli_agent import CliAgent
 from evopolicy_gateway.harnesses.coding_agents.dialect import TurnReader, mapping, string
 from evopolicy_gateway.harnesses.coding_agents.turn import Capped
 from evopolicy_gateway.harnesses.coding_agents.turn_failure import TurnFailure, turn_failure_of
-from evopolicy_gateway.operator.child_messages import AgentDoing, AgentEnded
-from evopolicy_gateway.run import processes
+from evopolicy_gateway.harnesses.interface.base import AgentError, Stage
+from evopolicy_gateway.processes import trees as processes
+from evopolicy_gateway.processes.agent_process import AgentProcess
+from evopolicy_gateway.processes.child_messages import AgentDoing, AgentEnded
 
 _START_TIMEOUT_S = 120.0
 """Time for each of the requests before the first prompt, seconds."""

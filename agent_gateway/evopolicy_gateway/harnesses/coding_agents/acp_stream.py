@@ -15,7 +15,6 @@ from typing import Any, NamedTuple
 
 import orjson
 
-from evopolicy_gateway.harnesses.agent_config import AcpTable, AgentConfig
 from evopolicy_gateway.harnesses.coding_agents.dialect import (
     Dialect,
     TurnReader,
@@ -24,7 +23,8 @@ from evopolicy_gateway.harnesses.coding_agents.dialect import (
     mappings,
     string,
 )
-from evopolicy_gateway.harnesses.usage import Usage, count
+from evopolicy_gateway.harnesses.interface.agent_config import AcpTable, AgentConfig
+from evopolicy_gateway.harnesses.interface.usage import Usage, count
 
 _ENDED = ("end_turn", "max_tokens", "max_turn_requests", "refusal")
 """Reasons to stop after which the agent may be prompted again."""

@@ -21,16 +21,16 @@ from typing import Any, Literal
 
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.logs import structlog
-from evopolicy_gateway.harnesses.base import AgentError, Harness, Stage
 from evopolicy_gateway.harnesses.coding_agents import session
 from evopolicy_gateway.harnesses.coding_agents.dialect import Dialect, TurnReader, first_line
 from evopolicy_gateway.harnesses.coding_agents.session import SessionState
 from evopolicy_gateway.harnesses.coding_agents.turn import Capped, play_turn
 from evopolicy_gateway.harnesses.coding_agents.turn_failure import TurnFailure, backoff_s
-from evopolicy_gateway.harnesses.usage import Usage
+from evopolicy_gateway.harnesses.interface.base import AgentError, Harness, Stage
+from evopolicy_gateway.harnesses.interface.usage import Usage
 from evopolicy_gateway.inputs import own_config
 from evopolicy_gateway.inputs.kept import Kept
-from evopolicy_gateway.operator.child_messages import AgentDoing, AgentEnded
+from evopolicy_gateway.processes.child_messages import AgentDoing, AgentEnded
 
 _PROBE_TIMEOUT_S = 60.0
 _MAX_PAUSE_S = 3600.0

@@ -16,7 +16,7 @@ from typing import Any
 
 from evopolicy_gateway.harnesses.coding_agents.dialect import Dialect, TurnReader, first_line, mapping, string
 from evopolicy_gateway.harnesses.coding_agents.turn_failure import turn_failure_of
-from evopolicy_gateway.harnesses.usage import Usage, count
+from evopolicy_gateway.harnesses.interface.usage import Usage, count
 
 _BYPASS = "--dangerously-bypass-approvals-and-sandbox"
 _ISOLATION = ("--ignore-user-config", "--ignore-rules")

@@ -10,10 +10,10 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 from evopolicy_common.errors import ConfigError
-from evopolicy_gateway.harnesses.agent_config import AgentConfig, Cli, Events
 from evopolicy_gateway.harnesses.coding_agents.dialect import Dialect, TurnReader, first_line
 from evopolicy_gateway.harnesses.coding_agents.turn_failure import turn_failure_of
-from evopolicy_gateway.harnesses.usage import Usage, count
+from evopolicy_gateway.harnesses.interface.agent_config import AgentConfig, Cli, Events
+from evopolicy_gateway.harnesses.interface.usage import Usage, count
 from evopolicy_gateway.inputs.kept import MCP_FILE
 
 _MCP = {"{mcp_config}": MCP_FILE}

@@ -11,9 +11,9 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from typing import Any
 
-from evopolicy_gateway.harnesses.agent_config import AgentConfig
 from evopolicy_gateway.harnesses.coding_agents.turn_failure import TurnFailure
-from evopolicy_gateway.harnesses.usage import Usage
+from evopolicy_gateway.harnesses.interface.agent_config import AgentConfig
+from evopolicy_gateway.harnesses.interface.usage import Usage
 from evopolicy_gateway.inputs.kept import Kept
 
 _MAX_VERSION_CHARS = 2000

@@ -14,9 +14,9 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from evopolicy_common.errors import ConfigError
-from evopolicy_gateway.harnesses.agent_config import AgentConfig, LlmApi
 from evopolicy_gateway.harnesses.coding_agents.claude_code import ClaudeReader
 from evopolicy_gateway.harnesses.coding_agents.dialect import Dialect
+from evopolicy_gateway.harnesses.interface.agent_config import AgentConfig, LlmApi
 from evopolicy_gateway.inputs.declared import IN_JAIL, SKILL
 
 _RETRIES = 4

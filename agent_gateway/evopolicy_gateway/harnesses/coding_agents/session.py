@@ -11,7 +11,7 @@ import msgspec
 
 from evopolicy_common.errors import DECODE_ERRORS
 from evopolicy_common.records.blobs import write_atomically
-from evopolicy_gateway.harnesses.usage import Usage
+from evopolicy_gateway.harnesses.interface.usage import Usage
 
 
 class SessionState(msgspec.Struct, kw_only=True):

@@ -11,12 +11,12 @@ from collections.abc import Callable
 
 import orjson
 
-from evopolicy_gateway.agent_supervisor.agent_process import AgentProcess
-from evopolicy_gateway.harnesses.base import Stage
 from evopolicy_gateway.harnesses.coding_agents.dialect import Dialect, TurnReader
 from evopolicy_gateway.harnesses.coding_agents.turn_failure import TurnFailure, turn_failure_of
-from evopolicy_gateway.operator.child_messages import AgentDoing
-from evopolicy_gateway.run import processes
+from evopolicy_gateway.harnesses.interface.base import Stage
+from evopolicy_gateway.processes import trees as processes
+from evopolicy_gateway.processes.agent_process import AgentProcess
+from evopolicy_gateway.processes.child_messages import AgentDoing
 
 DONE_TIMEOUT_S = 30.0
 """Time that a program has to exit after it reported the end of its turn, seconds."""

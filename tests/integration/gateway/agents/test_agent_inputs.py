@@ -16,8 +16,8 @@ from evopolicy_gateway import harnesses
 from evopolicy_gateway.cli.run_options import RunOptions
 from evopolicy_gateway.inputs.declared import read
 from evopolicy_gateway.jail.settings import JailSettings
-from evopolicy_gateway.run.layout import IntendedRun, save
 from evopolicy_gateway.run.plan import Plan
+from evopolicy_gateway.run_folder.layout import IntendedRun, save
 
 SUBMIT = "curl -s -X POST -d '{\"env_instances\": [0, 1]}' $EVOPOLICYGYM_SUBMIT_URL"
 LOOK = "cd /inputs/skills/lamps; cat SKILL.md; ./scripts/read.sh; touch new || echo shut; rm SKILL.md || echo kept"

@@ -21,7 +21,7 @@ from stages.cli_stage import play, settings
 from stages.declared_inputs import DESCRIPTION, as_toml, declare
 from stages.model_api import CACHED, CREATED, INPUT, OUTPUT, REASONING, ModelApi, Step
 
-from evopolicy_gateway.harnesses.agent_config import AcpTable, AgentConfig, read_agent
+from evopolicy_gateway.harnesses.interface.agent_config import AcpTable, AgentConfig, read_agent
 
 AGENTS = Path(__file__).parents[4] / "examples" / "agents"
 CLIS = os.environ.get("EVOPOLICY_REAL_CLIS", "")

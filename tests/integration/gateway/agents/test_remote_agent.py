@@ -25,8 +25,8 @@ from waiting import wait_until
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.records.run_record import decode_run_record
 from evopolicy_gateway.cli.main import app as evopolicy
-from evopolicy_gateway.http.listener import Listener, finish, listener_of
-from evopolicy_gateway.run.layout import RunFolder, save
+from evopolicy_gateway.run_folder.layout import RunFolder, save
+from evopolicy_gateway.run_folder.listener import Listener, finish, listener_of
 
 HOST = "127.0.0.2"
 """Of this machine, and not what a gateway listens on by itself."""

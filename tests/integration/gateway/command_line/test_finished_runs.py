@@ -21,9 +21,9 @@ from evopolicy_common.messages.run_settings import RunSettings
 from evopolicy_common.records.policies import checkpoints
 from evopolicy_common.records.run_difference import differences
 from evopolicy_gateway.operator.cluster import Cluster
-from evopolicy_gateway.operator.watch import RunView
 from evopolicy_gateway.run import record
 from evopolicy_gateway.run.plan import Plan
+from evopolicy_gateway.run.watch import RunView
 from evopolicy_gateway.suite import runs, sweep
 
 FUNCTIONS = sorted(

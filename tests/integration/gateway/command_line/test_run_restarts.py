@@ -16,8 +16,8 @@ from commands import agent, command, record_in, run_arguments, run_dir, run_on, 
 from coordinator_harness import Coordinator
 from waiting import TIMEOUT_S, wait_until
 
-from evopolicy_gateway.http import listener
-from evopolicy_gateway.run.layout import RunFolder
+from evopolicy_gateway.run_folder import listener
+from evopolicy_gateway.run_folder.layout import RunFolder
 
 
 def test_a_killed_gateway_comes_back_while_its_agent_goes_on(operator_file: Path, tmp_path: Path) -> None:

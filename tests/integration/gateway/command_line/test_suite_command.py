@@ -440,7 +440,7 @@ def test_a_terminal_shows_a_live_table(tmp_path: Path, operator_file: Path) -> N
 
 KILLED = """
 import os, sys
-from evopolicy_gateway.operator.operations import Operations
+from evopolicy_gateway.run.operations import Operations
 from evopolicy_gateway.run import lifecycle
 from evopolicy_gateway.cli.main import main
 

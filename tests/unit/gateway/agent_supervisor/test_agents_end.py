@@ -14,9 +14,8 @@ from pathlib import Path
 import pytest
 from machines.cgroups import freezer
 
-from evopolicy_gateway.http.listener import Listener
-from evopolicy_gateway.operator import child_messages, locks
-from evopolicy_gateway.operator.child_messages import (
+from evopolicy_gateway.processes import child_messages
+from evopolicy_gateway.processes.child_messages import (
     AgentEnded,
     AgentSurvives,
     AnyEvent,
@@ -25,8 +24,10 @@ from evopolicy_gateway.operator.child_messages import (
     StartAgent,
     StopAgent,
 )
-from evopolicy_gateway.operator.operations import Operations
-from evopolicy_gateway.run.layout import OpenedRun, RunFolder, save
+from evopolicy_gateway.run.operations import Operations
+from evopolicy_gateway.run_folder import locks
+from evopolicy_gateway.run_folder.layout import OpenedRun, RunFolder, save
+from evopolicy_gateway.run_folder.listener import Listener
 
 TIMEOUT_S = 60.0
 AGENT = "import os, time; open(os.path.join({folder!r}, str(os.getpid())), 'w').close(); time.sleep(1000)"

@@ -10,10 +10,10 @@ from stages.cli_stage import FAKES, Played, play, settings
 
 from evopolicy_common.errors import ConfigError
 from evopolicy_gateway import harnesses
-from evopolicy_gateway.harnesses.agent_config import AcpTable
-from evopolicy_gateway.harnesses.base import AgentError
 from evopolicy_gateway.harnesses.coding_agents.acp_stream import AcpReader, permission, usage_of
-from evopolicy_gateway.harnesses.usage import Usage
+from evopolicy_gateway.harnesses.interface.agent_config import AcpTable
+from evopolicy_gateway.harnesses.interface.base import AgentError
+from evopolicy_gateway.harnesses.interface.usage import Usage
 
 PROGRAM = (str(FAKES / "acp-agent"),)
 

@@ -13,14 +13,20 @@ from stages.cli_stage import FAKES, play, settings
 
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.records.secrets import Redaction
-from evopolicy_gateway.agent_supervisor.clock import AgentClock
 from evopolicy_gateway.harnesses import entry_name, make
-from evopolicy_gateway.harnesses.agent_config import AgentConfig, Cli, Events, TokenPaths, read_agent
 from evopolicy_gateway.harnesses.coding_agents.claude_code import ClaudeReader
 from evopolicy_gateway.harnesses.coding_agents.codex import usage_of
 from evopolicy_gateway.harnesses.coding_agents.configured import ConfiguredCli, ConfiguredReader, values
 from evopolicy_gateway.harnesses.coding_agents.turn_failure import MAX_BACKOFF_S, backoff_s, turn_failure_of
-from evopolicy_gateway.harnesses.usage import MAX_COUNT, Usage
+from evopolicy_gateway.harnesses.interface.agent_config import (
+    AgentConfig,
+    Cli,
+    Events,
+    TokenPaths,
+    read_agent,
+)
+from evopolicy_gateway.harnesses.interface.usage import MAX_COUNT, Usage
+from evopolicy_gateway.processes.clock import AgentClock
 
 EXAMPLES = Path(__file__).parents[4] / "examples" / "agents"
 

@@ -12,8 +12,8 @@ from stages.model_api import CACHED, CREATED, INPUT, OUTPUT, ModelApi, Step
 from evopolicy_common.errors import ConfigError
 from evopolicy_gateway import harnesses
 from evopolicy_gateway.agents.llm import apis, shell
-from evopolicy_gateway.harnesses.agent_config import AgentConfig, LlmApi
-from evopolicy_gateway.harnesses.usage import Prices
+from evopolicy_gateway.harnesses.interface.agent_config import AgentConfig, LlmApi
+from evopolicy_gateway.harnesses.interface.usage import Prices
 
 pytestmark = pytest.mark.slow
 

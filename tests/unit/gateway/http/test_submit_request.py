@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evopolicy_common.errors import RequestError
-from evopolicy_gateway.http.submit_request import MAX_BODY_BYTES, Bounds, parse
+from evopolicy_gateway.submits.submit_request import MAX_BODY_BYTES, Bounds, parse
 
 BOUNDS = Bounds(n_env_instances=64, min_episodes=1, max_episodes=128, remaining_budget=100)
 

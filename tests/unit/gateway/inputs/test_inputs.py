@@ -17,8 +17,8 @@ from evopolicy_common.errors import ConfigError
 from evopolicy_common.records.run_record import inputs_digest
 from evopolicy_gateway.agents.llm.apis import open_api
 from evopolicy_gateway.harnesses import make
-from evopolicy_gateway.harnesses.agent_config import AcpTable, AgentConfig, Cli
 from evopolicy_gateway.harnesses.coding_agents.cli_agent import CliAgent
+from evopolicy_gateway.harnesses.interface.agent_config import AcpTable, AgentConfig, Cli
 from evopolicy_gateway.inputs import declared
 from evopolicy_gateway.inputs.declared import McpServer, read
 from evopolicy_gateway.inputs.kept import MCP_FILE, Kept, keep

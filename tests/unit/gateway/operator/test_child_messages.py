@@ -7,8 +7,8 @@ from typing import Any, get_args
 import msgspec
 import pytest
 
-from evopolicy_gateway.operator import child_messages
-from evopolicy_gateway.operator.child_messages import AnyEvent, CloseRun
+from evopolicy_gateway.processes import child_messages
+from evopolicy_gateway.processes.child_messages import AnyEvent, CloseRun
 
 LONG: dict[str, Any] = {"x" * 1000: {"input": list(range(400_000))}}
 

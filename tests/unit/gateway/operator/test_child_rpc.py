@@ -12,7 +12,7 @@ import asyncio, sys
 from pathlib import Path
 from evopolicy_gateway.operator import child_rpc
 from evopolicy_gateway.run import processes
-from evopolicy_gateway.operator.child_rpc import Child
+from evopolicy_gateway.processes.child_rpc import Child
 
 async def main():
     processes.become_subreaper()

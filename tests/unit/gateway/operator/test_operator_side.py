@@ -22,20 +22,20 @@ from evopolicy_common.messages.episode import LARGEST_LIMIT, LARGEST_LIMITS, Res
 from evopolicy_common.messages.operator import RunProgress
 from evopolicy_common.messages.run_settings import PUBLISHED, off_profile
 from evopolicy_common.records.run_record import decode_run_record, encode_run_record
-from evopolicy_gateway.cli.options import cases_of, limits_of, one_environment, packages_for
 from evopolicy_gateway.cli.play import _unjailed
 from evopolicy_gateway.cli.run_options import RunOptions
 from evopolicy_gateway.jail.settings import JailSettings
-from evopolicy_gateway.operator import child_messages
-from evopolicy_gateway.operator.child_messages import AgentDoing, Progress
 from evopolicy_gateway.operator.cluster import Cluster
-from evopolicy_gateway.operator.watch import RunView
-from evopolicy_gateway.run.layout import Staged
+from evopolicy_gateway.processes import child_messages
+from evopolicy_gateway.processes.child_messages import AgentDoing, Progress
+from evopolicy_gateway.run.options import cases_of, limits_of, one_environment, packages_for
 from evopolicy_gateway.run.plan import Plan
 from evopolicy_gateway.run.record import run_record
 from evopolicy_gateway.run.times import Times
 from evopolicy_gateway.run.transitions import Transitions
-from evopolicy_gateway.submits.journal import Rejected
+from evopolicy_gateway.run.watch import RunView
+from evopolicy_gateway.run_folder.journal import Rejected
+from evopolicy_gateway.run_folder.layout import Staged
 
 
 def plan(tmp_path: Path, **fields: Any) -> Plan:

@@ -11,8 +11,8 @@ from evopolicy_common.console import Terminal
 from evopolicy_common.messages.gateway import FREE_SLOT
 from evopolicy_common.messages.operator import RunProgress
 from evopolicy_common.terminal import harmless
-from evopolicy_gateway.operator.child_messages import AgentDoing, Progress
-from evopolicy_gateway.operator.watch import RunView, first_line
+from evopolicy_gateway.processes.child_messages import AgentDoing, Progress
+from evopolicy_gateway.run.watch import RunView, first_line
 from evopolicy_gateway.suite.suite_view import SuiteView
 
 STEERING = (

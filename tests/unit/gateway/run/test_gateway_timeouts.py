@@ -23,13 +23,14 @@ from starlette.responses import PlainTextResponse
 
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.wire import http as server
-from evopolicy_gateway.agent_supervisor import agent_process
 from evopolicy_gateway.agents.client import Client, ProtocolError
-from evopolicy_gateway.harnesses import base, command
+from evopolicy_gateway.harnesses import command
 from evopolicy_gateway.harnesses.coding_agents import cli_agent, turn
+from evopolicy_gateway.harnesses.interface import base
 from evopolicy_gateway.http import service as http
 from evopolicy_gateway.jail import settings as jail_settings
-from evopolicy_gateway.operator.child_rpc import Child
+from evopolicy_gateway.processes import agent_process
+from evopolicy_gateway.processes.child_rpc import Child
 from evopolicy_gateway.run import lifecycle
 from evopolicy_gateway.run.lifecycle import RunLifecycle
 
@@ -143,9 +144,9 @@ def test_a_child_of_a_cli_that_holds_its_pipe_does_not_hold_up_the_turn(
 
 SUPERVISOR = """
 import asyncio, sys
-from evopolicy_gateway.operator.child_messages import StartAgent, StopAgent
+from evopolicy_gateway.processes.child_messages import StartAgent, StopAgent
 from evopolicy_gateway.agent_supervisor import supervisor
-from evopolicy_gateway.harnesses.base import Harness
+from evopolicy_gateway.harnesses.interface.base import Harness
 
 class Deaf(Harness):
     name, command = "deaf", []

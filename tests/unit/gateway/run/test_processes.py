@@ -11,7 +11,7 @@ import pytest
 from machines.own_processes import alive
 
 from evopolicy_common.processes.proc import descendants
-from evopolicy_gateway.run.processes import end_orphans
+from evopolicy_gateway.processes.trees import end_orphans
 
 SUPERVISOR = """
 import os, subprocess, sys, time

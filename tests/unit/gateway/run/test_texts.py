@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 from evopolicy_common.errors import ConfigError
-from evopolicy_gateway.harnesses.agent_config import AgentConfig
-from evopolicy_gateway.harnesses.prompts import FIRST, NEXT_TURN, STANDARD, Prompts
+from evopolicy_gateway.harnesses.interface.agent_config import AgentConfig
 from evopolicy_gateway.run.texts import Texts, read
+from evopolicy_gateway.workspace.prompts import FIRST, NEXT_TURN, STANDARD, Prompts
 
 
 def test_without_files_the_texts_are_the_standard_ones_and_have_no_digest(tmp_path: Path) -> None:

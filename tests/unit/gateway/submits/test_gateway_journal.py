@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evopolicy_common.errors import StorageError
-from evopolicy_gateway.submits.journal import (
+from evopolicy_gateway.run_folder.journal import (
     Accepted,
     AnyEntry,
     Closed,

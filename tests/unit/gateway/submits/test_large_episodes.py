@@ -27,8 +27,8 @@ from evopolicy_common.records.blobs import digest_of
 from evopolicy_common.records.episodes import npz, rendered, trajectory
 from evopolicy_common.records.episodes.trajectory import Recorder
 from evopolicy_common.wire import codec
-from evopolicy_gateway.run.coordinator_client import LARGE_BYTES, CoordinatorClient
 from evopolicy_gateway.submits import pipeline
+from evopolicy_gateway.submits.coordinator_client import LARGE_BYTES, CoordinatorClient
 from evopolicy_gateway.submits.episode_files import episode_files, episode_share
 
 ROW = b'{"t":0,"obs":null,"action":0,"reward":0.5,"terminated":true,"truncated":false,"info":{}}\n'

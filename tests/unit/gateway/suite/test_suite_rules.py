@@ -15,7 +15,7 @@ from evopolicy_common import catalogue
 from evopolicy_common.console import Terminal
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.records.suite_folder import Entry, Index
-from evopolicy_gateway.operator.child_messages import AgentDoing, Progress
+from evopolicy_gateway.processes.child_messages import AgentDoing, Progress
 from evopolicy_gateway.run.plan import Plan
 from evopolicy_gateway.suite import suite_index
 from evopolicy_gateway.suite.decisions import (

@@ -18,7 +18,7 @@ from evopolicy_common.messages.episode import ResourceLimits
 from evopolicy_common.records.blobs import digest_of
 from evopolicy_gateway.http.info import info_document
 from evopolicy_gateway.http.task import task_markdown
-from evopolicy_gateway.run.layout import RunFolder, run_folder
+from evopolicy_gateway.run_folder.layout import RunFolder, run_folder
 from evopolicy_gateway.workspace.agents_md import NO_URLS, STANDARD, agents_md, check_agents_md, urls_at
 from evopolicy_gateway.workspace.initial_policy import constant_action, initial_policy
 from evopolicy_gateway.workspace.staging import stage

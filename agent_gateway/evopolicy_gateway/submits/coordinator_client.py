@@ -39,8 +39,8 @@ from evopolicy_common.refusals import NOT_NOW
 from evopolicy_common.wire import codec, keys
 from evopolicy_common.wire.requests import Requester
 from evopolicy_common.wire.transport import Link
-from evopolicy_gateway.http.listener import AgentPlace
-from evopolicy_gateway.submits.journal import Requested
+from evopolicy_gateway.run_folder.journal import Requested
+from evopolicy_gateway.run_folder.listener import AgentPlace
 
 RESULTS_WAIT_S = 10.0
 """How long the coordinator may hold a results request, seconds."""

@@ -19,7 +19,7 @@ from rich.text import Text
 from evopolicy_common.console import NarrowTable, Terminal
 from evopolicy_common.messages.operator import RunProgress
 from evopolicy_common.terminal import harmless
-from evopolicy_gateway.operator.child_messages import AgentDoing, Progress
+from evopolicy_gateway.processes.child_messages import AgentDoing, Progress
 
 PHASES = {
     "open": "train",

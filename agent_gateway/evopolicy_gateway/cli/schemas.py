@@ -19,7 +19,7 @@ from evopolicy_common.records import suite_folder
 from evopolicy_common.records.code_metrics import PUBLISHED_SCHEMA
 from evopolicy_common.records.run_record import RECORD_VERSION, RunRecord
 from evopolicy_common.records.summary import Summary
-from evopolicy_gateway.harnesses.agent_config import AgentConfig
+from evopolicy_gateway.harnesses.interface.agent_config import AgentConfig
 from evopolicy_gateway.suite.suite_file import SuiteFile
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"

@@ -8,8 +8,8 @@ from collections.abc import AsyncIterator
 
 from evopolicy_common.processes import child_process
 from evopolicy_common.processes.child_process import ChildProcess
-from evopolicy_gateway.operator.child_messages import AnyEvent, Order, event_of, line
-from evopolicy_gateway.run import processes
+from evopolicy_gateway.processes import trees as processes
+from evopolicy_gateway.processes.child_messages import AnyEvent, Order, event_of, line
 
 
 async def end_orphans() -> list[int]:

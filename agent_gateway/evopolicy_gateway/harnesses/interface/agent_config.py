@@ -18,9 +18,9 @@ from msgspec import Meta
 
 from evopolicy_common.errors import DECODE_ERRORS, ConfigError
 from evopolicy_common.regular_files import read_given
-from evopolicy_gateway.harnesses.prompts import Prompts
-from evopolicy_gateway.harnesses.usage import Prices
+from evopolicy_gateway.harnesses.interface.usage import Prices
 from evopolicy_gateway.inputs.declared import McpServer
+from evopolicy_gateway.workspace.prompts import Prompts
 
 
 class TokenPaths(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from evopolicy_gateway.run import processes
+from evopolicy_gateway.processes import trees as processes
 
 SILENCE_S = 3600.0
 """Default limit of an agent's inactivity, seconds: longer than any pause for thought, far shorter than its wall

@@ -20,13 +20,13 @@ from typing import Any
 import msgspec
 
 from evopolicy_common.errors import EvopolicyError
-from evopolicy_gateway.agent_supervisor.agent_log import AgentLog
-from evopolicy_gateway.agent_supervisor.agent_process import AgentProcess
-from evopolicy_gateway.agent_supervisor.clock import Activity, AgentClock
-from evopolicy_gateway.harnesses.prompts import Prompts
 from evopolicy_gateway.inputs.kept import Kept
 from evopolicy_gateway.jail.jail import Jail
-from evopolicy_gateway.operator.child_messages import AgentDoing, AgentEnded
+from evopolicy_gateway.processes.agent_log import AgentLog
+from evopolicy_gateway.processes.agent_process import AgentProcess
+from evopolicy_gateway.processes.child_messages import AgentDoing, AgentEnded
+from evopolicy_gateway.processes.clock import Activity, AgentClock
+from evopolicy_gateway.workspace.prompts import Prompts
 
 _INFO_TIMEOUT_S = 30.0
 

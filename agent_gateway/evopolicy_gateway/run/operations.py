@@ -29,8 +29,8 @@ from evopolicy_common.wire import credentials
 from evopolicy_common.wire.credentials import Credentials
 from evopolicy_common.wire.operator_client import TIMEOUT_S, WAIT_S, OperatorClient
 from evopolicy_common.wire.transport import Link
-from evopolicy_gateway.operator.locks import until_free
-from evopolicy_gateway.run.layout import IntendedRun, OpenedRun, RunFolder, saved
+from evopolicy_gateway.run_folder.layout import IntendedRun, OpenedRun, RunFolder, saved
+from evopolicy_gateway.run_folder.locks import until_free
 
 T = TypeVar("T")
 

@@ -10,7 +10,7 @@ from collections.abc import AsyncIterator, Mapping, Sequence
 from pathlib import Path
 
 from evopolicy_common.processes.parent_death import ending_with_parent
-from evopolicy_gateway.agent_supervisor.agent_log import MAX_LINE_BYTES, AgentLog
+from evopolicy_gateway.processes.agent_log import MAX_LINE_BYTES, AgentLog
 
 _CHUNK = 64 << 10
 _LAST_WORDS_S = 1.0
