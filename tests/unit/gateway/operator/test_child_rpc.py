@@ -10,8 +10,8 @@ from pathlib import Path
 OPERATOR = """
 import asyncio, sys
 from pathlib import Path
-from evopolicy_gateway.operator import child_rpc
-from evopolicy_gateway.run import processes
+from evopolicy_gateway.processes import child_rpc
+from evopolicy_gateway.processes import trees as processes
 from evopolicy_gateway.processes.child_rpc import Child
 
 async def main():

@@ -325,7 +325,7 @@ def test_giving_up_a_run_ends_although_nobody_hears_of_it(
 
 UNKILLABLE = """
 import subprocess, sys
-from evopolicy_gateway.run import processes
+from evopolicy_gateway.processes import trees as processes
 child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(1000)"])
 processes.KILL_PATIENCE_S = 0.2
 signal_all, processes._signal_all = processes._signal_all, lambda pids, number: None

@@ -16,7 +16,7 @@ from evopolicy_gateway.processes.trees import end_orphans
 SUPERVISOR = """
 import os, subprocess, sys, time
 from evopolicy_common.processes import proc
-from evopolicy_gateway.run import processes
+from evopolicy_gateway.processes import trees as processes
 processes.become_subreaper()
 stubborn = "import os, signal, time; signal.signal(15, signal.SIG_IGN); {} open(os.environ['N'] + str(os.getpid()), 'w'); time.sleep(1000)"
 kinds = ["", "os.setsid() if os.getpgrp() != os.getpid() else 0;", "os.fork() and os._exit(0);",
@@ -80,7 +80,7 @@ while not os.path.exists(sys.argv[1]) and os.getppid() == parent:
 
 SEARCHER = """
 import subprocess, sys
-from evopolicy_gateway.run import processes
+from evopolicy_gateway.processes import trees as processes
 processes.become_subreaper()
 breeder = subprocess.Popen([sys.executable, "-c", sys.argv[1], *sys.argv[2:]])
 for _ in range(160):  # a search that looks twice at the processes touches one in every twentieth
@@ -117,7 +117,7 @@ ctypes.CDLL(None).syscall({"x86_64": 60, "aarch64": 93}[os.uname().machine], 0)
 ENDS = """
 import os, subprocess, sys, time
 from evopolicy_common.processes import proc
-from evopolicy_gateway.run import processes
+from evopolicy_gateway.processes import trees as processes
 processes.become_subreaper()
 child = subprocess.Popen([sys.executable, "-S", "-c", sys.argv[1]])
 deadline = time.monotonic() + 20
