@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import secrets
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import msgspec
 from msgspec.structs import replace
@@ -28,6 +28,7 @@ from evopolicy_common.messages.run_settings import (
     episode_counts,
     off_profile,
 )
+from evopolicy_common.messages.status import StatusRequest
 from evopolicy_common.messages.worker import BlobGet, BlobPut, Message
 from evopolicy_common.records.blobs import BlobStore, is_digest
 from evopolicy_common.records.journal import SALT_BYTES
@@ -63,21 +64,6 @@ from evopolicy_coordinator.splits import FurtherSplit, SplitSource
 from evopolicy_coordinator.storage.state_folder import Identity
 from evopolicy_coordinator.storage.store import stored_blobs
 
-_VERBS: dict[type[Message], str] = {
-    worker.Register: "register",
-    worker.LeaseRequest: "lease",
-    worker.Heartbeat: "beat",
-    worker.ReportResults: "done",
-    BlobPut: "blob",
-    BlobGet: "blob",
-    gateway.OpenRun: "open",
-    gateway.RequestPermit: "permit",
-    gateway.StateRequest: "state",
-    gateway.Submit: "submit",
-    gateway.ResultsRequest: "results",
-    gateway.CloseRun: "close",
-}
-
 
 class Rights(Protocol):
     """The core's knowledge of access rights."""
@@ -89,15 +75,16 @@ class Rights(Protocol):
 class Parsed(msgspec.Struct, frozen=True):
     """A request whose sender is authenticated and allowed to make it."""
 
-    room: str
-    """`work`, `gw`, `ops`."""
+    subtree: str
+    """Of its key: `work`, `gw`, `ops`."""
     asker: str
     """The worker's or the run's name, or `operator`."""
-    message: Message
+    message: Any
+    """A `Message` of a kind in `REQUESTS`."""
 
 
 class RequestParser:
-    """Parses requests. Holds no state of its own."""
+    """Parses requests. `REQUESTS` has a row for each kind. The accepted definitions change through it, nothing else."""
 
     def __init__(
         self,
@@ -128,12 +115,12 @@ class RequestParser:
 
         Raises RefusedError for a wrong token or key, ProtocolError when the payload is not a message.
         """
-        room, _, tail = key.removeprefix(self._prefix).partition("/")
-        if room == "work":
+        subtree, _, tail = key.removeprefix(self._prefix).partition("/")
+        if subtree == "work":
             return self._parse_worker(tail, payload)
-        if room == "gw":
+        if subtree == "gw":
             return self._parse_gateway(tail, payload, rights)
-        if room == "ops":
+        if subtree == "ops":
             message = codec.decode(codec.operator_requests, payload)
             self._check_token("operator", self._identity.operator_token, message.token)
             return Parsed("ops", "operator", message)
@@ -141,7 +128,7 @@ class RequestParser:
 
     def _parse_worker(self, tail: str, payload: bytes) -> Parsed:
         message = codec.decode(codec.worker_requests, payload)
-        check_key(tail, _VERBS[type(message)])
+        check_key(tail, REQUESTS[type(message)].verb)
         if isinstance(message, worker.Register):
             self._check_token("worker", self._identity.worker_token, message.token)
             check_registration(message)
@@ -155,7 +142,7 @@ class RequestParser:
     def _parse_gateway(self, tail: str, payload: bytes, rights: Rights) -> Parsed:
         message = codec.decode(codec.gateway_requests, payload)
         run = message.sender if isinstance(message, BlobPut | BlobGet) else message.run
-        check_key(tail, f"{run}/{_VERBS[type(message)]}")
+        check_key(tail, f"{run}/{REQUESTS[type(message)].verb}")
         capability = rights.capability(run)
         check_token(capability if capability is not None else secrets.token_urlsafe(32), message.token)
         return Parsed("gw", run, message)
@@ -182,12 +169,11 @@ class RequestParser:
 
     def asks_for_change(self, key: str, payload: bytes) -> bool:
         """Whether the request would create something (a run, a submit, an evaluation). Does not check the token."""
-        room = key.removeprefix(self._prefix).partition("/")[0]
+        subtree = key.removeprefix(self._prefix).partition("/")[0]
+        decoders: dict[str, Any] = {"gw": codec.gateway_requests, "ops": codec.operator_requests}
+        decoder = decoders.get(subtree)
         try:
-            if room == "gw":
-                return isinstance(codec.decode(codec.gateway_requests, payload), gateway.Submit)
-            wanted = operator.CreateRun | operator.Evaluate | operator.Rescore | operator.Disclose
-            return room == "ops" and isinstance(codec.decode(codec.operator_requests, payload), wanted)
+            return decoder is not None and REQUESTS[type(codec.decode(decoder, payload))].creates
         except ProtocolError:
             return False
 
@@ -196,27 +182,24 @@ class RequestParser:
         """Whether `event` reads splits or blobs for the message."""
         if isinstance(message, worker.ReportResults):
             return any(result.packed is not None for result in message.results)
-        asks = operator.CreateRun | operator.Evaluate | operator.Rescore | operator.Disclose
-        return isinstance(message, asks)
+        row = REQUESTS[type(message)]
+        return row.creates and not row.verb
 
     def event(self, parsed: Parsed, request: int, stimulus_id: str) -> AnyEvent:
         """Returns the event that the request is for the core. Raises RefusedError when it cannot be served.
 
         Not for blob and status requests. Call it on a thread for messages that `reads_files`.
         """
-        message = parsed.message
-        if isinstance(message, _WITH_CURSOR):
+        message: Any = parsed.message
+        row = REQUESTS[type(message)]
+        if row.made is not None:
+            return row.made(self, message, request, stimulus_id)
+        if "cursor" in message.__struct_fields__:
             message = replace(message, cursor=finite_cursor(message.cursor))
-        if isinstance(message, _WITH_WAIT):
+        if "wait_s" in message.__struct_fields__:
             message = replace(message, wait_s=finite_wait(message.wait_s))
-        make = _EVENTS.get(type(message))
-        if make is not None:
-            return make(self, message, request, stimulus_id)
-        checked = _CHECKS[type(message)](self, message)
+        checked = message if row.check is None else row.check(self, message)
         return events.Requested(stimulus_id=stimulus_id, request=request, message=checked)
-
-    def _as_it_is(self, m: Message) -> Message:
-        return m
 
     # Workers.
 
@@ -572,39 +555,55 @@ class RequestParser:
             )
 
 
-_WITH_CURSOR = (gateway.ResultsRequest, operator.EvaluationPoll)
-_WITH_WAIT = (
-    worker.LeaseRequest,
-    worker.Heartbeat,
-    gateway.RequestPermit,
-    gateway.ResultsRequest,
-    operator.WaitRun,
-    operator.EvaluationPoll,
-)
-_CHECKS: dict[type[Message], Callable[[RequestParser, Any], Message]] = {
-    worker.LeaseRequest: RequestParser._as_it_is,
-    worker.Heartbeat: RequestParser._as_it_is,
-    worker.ReportResults: RequestParser._checked_results,
-    gateway.OpenRun: RequestParser._checked_open,
-    gateway.StateRequest: RequestParser._as_it_is,
-    gateway.RequestPermit: RequestParser._checked_permit,
-    gateway.Submit: RequestParser._checked_submit,
-    gateway.ResultsRequest: RequestParser._checked_poll,
-    gateway.CloseRun: RequestParser._checked_close,
-    operator.WaitRun: RequestParser._as_it_is,
-    operator.EvaluationPoll: RequestParser._as_it_is,
-    operator.CancelRun: RequestParser._as_it_is,
-    operator.AgentGone: RequestParser._as_it_is,
-    operator.RepinRun: RequestParser._checked_repin,
-    operator.SetWorker: RequestParser._as_it_is,
+class Request(NamedTuple):
+    """How requests of one kind are served. An operator's have no verb: all have the same key."""
+
+    verb: str = ""
+    """The last part of its key."""
+    check: Callable[[RequestParser, Any], Message] | None = None
+    """Returns the message as the event has it. Raises RefusedError."""
+    made: Callable[[RequestParser, Any, int, str], AnyEvent] | None = None
+    """Builds the event, where the shell adds ids, secrets or cases."""
+    creates: bool = False
+    """Whether it would create something: a run, a submit, an evaluation. An operator's is built from files."""
+
+
+REQUESTS: dict[type[Message], Request] = {
+    worker.Register: Request("register", made=RequestParser._registered),
+    worker.LeaseRequest: Request("lease"),
+    worker.Heartbeat: Request("beat"),
+    worker.ReportResults: Request("done", RequestParser._checked_results),
+    BlobPut: Request("blob"),
+    BlobGet: Request("blob"),
+    gateway.OpenRun: Request("open", RequestParser._checked_open),
+    gateway.RequestPermit: Request("permit", RequestParser._checked_permit),
+    gateway.StateRequest: Request("state"),
+    gateway.Submit: Request("submit", RequestParser._checked_submit, creates=True),
+    gateway.ResultsRequest: Request("results", RequestParser._checked_poll),
+    gateway.CloseRun: Request("close", RequestParser._checked_close),
+    operator.CreateRun: Request(made=RequestParser._run_created, creates=True),
+    operator.Evaluate: Request(made=RequestParser.evaluation_requested, creates=True),
+    operator.Rescore: Request(creates=True),
+    operator.Disclose: Request(creates=True),
+    operator.WaitRun: Request(),
+    operator.EvaluationPoll: Request(),
+    operator.CancelRun: Request(),
+    operator.AgentGone: Request(),
+    operator.RepinRun: Request(check=RequestParser._checked_repin),
+    operator.SetWorker: Request(),
+    # The service answers these itself; they never become events.
+    operator.Claim: Request(),
+    StatusRequest: Request(),
+    operator.RecordedRequest: Request(),
+    operator.JournalRequest: Request(),
+    operator.OpeningRequest: Request(),
+    operator.SignRequest: Request(),
+    operator.DescribeEnvironment: Request(),
+    operator.FurtherCasesRequest: Request(),
+    operator.EnvironmentsRequest: Request(),
+    operator.ApproveEnvironment: Request(),
 }
-"""Checks of a request before it goes into an event."""
-_EVENTS: dict[type[Message], Callable[[RequestParser, Any, int, str], AnyEvent]] = {
-    worker.Register: RequestParser._registered,
-    operator.CreateRun: RequestParser._run_created,
-    operator.Evaluate: RequestParser.evaluation_requested,
-}
-"""Builders of events to which the shell adds ids, secrets or cases."""
+"""All kinds of requests."""
 
 
 def _derived(run: RunRow | None) -> RunRow | None:

@@ -161,9 +161,9 @@ class Service:
             return
         try:
             parsed = self._parser.parse(query.key, query.payload, core)
-            if parsed.room == "gw":
+            if parsed.subtree == "gw":
                 self._heard[parsed.asker] = self.host.now()
-            self._serve(core, query, parsed)
+            _ANSWERS.get(type(parsed.message), Service._serve_event)(self, core, query, parsed)
         except RefusedError as error:
             self._refuse(query, error)
         except ProtocolError as error:
@@ -173,45 +173,48 @@ class Service:
             log.exception("request failed", key=query.key)
             query.drop()
 
-    def _serve(self, core: Core, query: IncomingQuery, parsed: Parsed) -> None:
+    def _serve_event(self, core: Core, query: IncomingQuery, parsed: Parsed) -> None:
+        """Passes the request to the core, which answers it with an effect."""
         message = parsed.message
-        if isinstance(message, BlobPut):
-            self._serve_put(core, query, parsed, message)
-        elif isinstance(message, BlobGet):
-            self._serve_get(core, query, parsed, message)
-        elif isinstance(message, operator.Claim):
-            self._spawn(self._serve_claim(query, message))
-        elif isinstance(message, StatusRequest):
-            query.reply(self._status_bytes(core, message.max_age_s), lane_of(parsed.asker))
-        elif isinstance(message, operator.RecordedRequest):
-            self._reader.recorded(message, answer_to(query, parsed.asker))
-        elif isinstance(message, operator.JournalRequest | operator.OpeningRequest | operator.SignRequest):
-            self._reader.published(message, answer_to(query, parsed.asker))
-        elif isinstance(message, operator.DescribeEnvironment):
-            self._spawn(self._serve_read(query, self._description(core, message)))
-        elif isinstance(message, operator.FurtherCasesRequest):
-            self._spawn(self._serve_read(query, partial(self._further_cases, message)))
-        elif isinstance(message, operator.EnvironmentsRequest):
-            workers = core.state.workers.values()
-            page = _page(self._parser.definitions.offered(workers), message.cursor)
-            if page.finished:
-                page = replace(page, undescribed=undescribed(workers))
-            query.reply(answer_bytes(page), lane_of(parsed.asker))
-        elif isinstance(message, operator.ApproveEnvironment):
-            self._parser.definitions.approve(message.env, message.digest, core.state.workers.values())
-            query.reply(answer_bytes(operator.Done()), lane_of(parsed.asker))
-        elif self._parser.reads_files(message):
+        if self._parser.reads_files(message):
             self._spawn(self._serve_from_thread(query, self._pinned(core, parsed)))
-        else:
-            request = self._pending.admit(query, parsed.asker)
-            try:
-                event = self._parser.event(parsed, request, self._stimulus_of(message))
-            except BaseException:
-                self._pending.take(request)
-                raise
-            if isinstance(message, LeaseRequest):
-                event = msgspec.structs.replace(event, waited_s=self._loop.time() - query.arrived)
-            self.host.handle(event)
+            return
+        request = self._pending.admit(query, parsed.asker)
+        try:
+            event = self._parser.event(parsed, request, self._stimulus_of(message))
+        except BaseException:
+            self._pending.take(request)
+            raise
+        if isinstance(message, LeaseRequest):
+            event = msgspec.structs.replace(event, waited_s=self._loop.time() - query.arrived)
+        self.host.handle(event)
+
+    def _serve_status(self, core: Core, query: IncomingQuery, parsed: Parsed) -> None:
+        query.reply(self._status_bytes(core, parsed.message.max_age_s), lane_of(parsed.asker))
+
+    def _serve_recorded(self, core: Core, query: IncomingQuery, parsed: Parsed) -> None:
+        self._reader.recorded(parsed.message, answer_to(query, parsed.asker))
+
+    def _serve_published(self, core: Core, query: IncomingQuery, parsed: Parsed) -> None:
+        self._reader.published(parsed.message, answer_to(query, parsed.asker))
+
+    def _serve_description(self, core: Core, query: IncomingQuery, parsed: Parsed) -> None:
+        self._spawn(self._serve_read(query, self._description(core, parsed.message)))
+
+    def _serve_further_cases(self, core: Core, query: IncomingQuery, parsed: Parsed) -> None:
+        self._spawn(self._serve_read(query, partial(self._further_cases, parsed.message)))
+
+    def _serve_environments(self, core: Core, query: IncomingQuery, parsed: Parsed) -> None:
+        workers = core.state.workers.values()
+        page = _page(self._parser.definitions.offered(workers), parsed.message.cursor)
+        if page.finished:
+            page = replace(page, undescribed=undescribed(workers))
+        query.reply(answer_bytes(page), lane_of(parsed.asker))
+
+    def _serve_approval(self, core: Core, query: IncomingQuery, parsed: Parsed) -> None:
+        wanted, workers = parsed.message, core.state.workers.values()
+        self._parser.definitions.approve(wanted.env, wanted.digest, workers)
+        query.reply(answer_bytes(operator.Done()), lane_of(parsed.asker))
 
     def _pinned(self, core: Core, parsed: Parsed) -> Parsed:
         """Returns the request with the environment definition that its episodes are played in."""
@@ -315,7 +318,10 @@ class Service:
         found = self._parser.further_cases(message, row, self._reader.revealed())
         return operator.FurtherCases(cases=found.cases, epoch=found.epoch)
 
-    async def _serve_claim(self, query: IncomingQuery, message: operator.Claim) -> None:
+    def _serve_claim(self, core: Core, query: IncomingQuery, parsed: Parsed) -> None:
+        self._spawn(self._claim(query, parsed.message))
+
+    async def _claim(self, query: IncomingQuery, message: operator.Claim) -> None:
         """Serves a claim without the core: claims change no run."""
         try:
             answer: Message = await self._claims.ask(message, self.host.now())
@@ -333,28 +339,30 @@ class Service:
             return
         query.reply(answer_bytes(answer))
 
-    def _serve_put(self, core: Core, query: IncomingQuery, parsed: Parsed, message: BlobPut) -> None:
+    def _serve_put(self, core: Core, query: IncomingQuery, parsed: Parsed) -> None:
+        message = parsed.message
         most, run_id, submitted = MAX_BUNDLE_BYTES, None, frozenset[str | None]()
-        if parsed.room == "work":
+        if parsed.subtree == "work":
             _check_session(core, parsed.asker, message.token)
             most = codec.MAX_BLOB_BYTES
-        elif parsed.room == "gw":
+        elif parsed.subtree == "gw":
             run = core.state.runs.get(parsed.asker)
             if run is None or run.state.phase != "open":
                 raise RefusedError(*_over(core, parsed.asker))
             run_id, submitted = run.id, frozenset(row.bundle for row in run.submits)
         answer = answer_to(query, parsed.asker)
-        self._reader.put(f"{parsed.room}/{parsed.asker}", run_id, message, most, answer, submitted)
+        self._reader.put(f"{parsed.subtree}/{parsed.asker}", run_id, message, most, answer, submitted)
 
-    def _serve_get(self, core: Core, query: IncomingQuery, parsed: Parsed, message: BlobGet) -> None:
-        if parsed.room == "work":
+    def _serve_get(self, core: Core, query: IncomingQuery, parsed: Parsed) -> None:
+        message = parsed.message
+        if parsed.subtree == "work":
             worker = _check_session(core, parsed.asker, message.token)
             if not any(lease.job.names_blob(message.digest) for lease in worker.leases.values()):
                 raise RefusedError(
                     Refusal.UNKNOWN_BLOB,
                     f"worker {parsed.asker!r} holds no job that names blob {message.digest[:64]!r}",
                 )
-        run = parsed.asker if parsed.room == "gw" else None
+        run = parsed.asker if parsed.subtree == "gw" else None
         self._reader.get(run, message, answer_to(query, parsed.asker))
 
     @property
@@ -523,6 +531,23 @@ class Service:
             f"{len(self._pending)} requests wait for the disk: it has been writing for {writing_s:.0f} s",
             *of_core,
         )
+
+
+_ANSWERS: dict[type[Message], Callable[[Service, Core, IncomingQuery, Parsed], None]] = {
+    BlobPut: Service._serve_put,
+    BlobGet: Service._serve_get,
+    operator.Claim: Service._serve_claim,
+    StatusRequest: Service._serve_status,
+    operator.RecordedRequest: Service._serve_recorded,
+    operator.JournalRequest: Service._serve_published,
+    operator.OpeningRequest: Service._serve_published,
+    operator.SignRequest: Service._serve_published,
+    operator.DescribeEnvironment: Service._serve_description,
+    operator.FurtherCasesRequest: Service._serve_further_cases,
+    operator.EnvironmentsRequest: Service._serve_environments,
+    operator.ApproveEnvironment: Service._serve_approval,
+}
+"""Requests that are answered without an event for the core."""
 
 
 def _check_session(core: Core, name: str, session: str) -> Worker:

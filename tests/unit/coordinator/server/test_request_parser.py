@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import msgspec
 import pytest
@@ -25,7 +25,7 @@ from evopolicy_common.records.blobs import BlobStore
 from evopolicy_common.wire import codec, keys
 from evopolicy_coordinator.core.contract.records import RunRow
 from evopolicy_coordinator.server import request_checks
-from evopolicy_coordinator.server.request_parser import RequestParser
+from evopolicy_coordinator.server.request_parser import REQUESTS, RequestParser
 from evopolicy_coordinator.server.uploads import Uploads
 from evopolicy_coordinator.splits import SplitSource
 from evopolicy_coordinator.storage.state_folder import ROLES, Identity
@@ -481,3 +481,8 @@ def test_a_rescore_by_policies_of_whole_submits_plays_all_cases_at_once(
     with pytest.raises(RefusedError, match="all cases are played at once"):
         parser.rescore_requested(message, 7, "s", row, result)
     parser.rescore_requested(msgspec.structs.replace(message, indexes=(0, 1, 2)), 7, "s", row, result)
+
+
+def test_every_kind_of_request_has_one_row() -> None:
+    unions = (worker.WorkerRequest, gateway.GatewayRequest, operator.OperatorRequest)
+    assert REQUESTS.keys() == {kind for union in unions for kind in get_args(union)}
