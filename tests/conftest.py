@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import gc
 import os
+import re
 import shutil
 import signal
 import tempfile
@@ -14,58 +15,8 @@ from typing import Any
 import hypothesis
 import pytest
 
-_SYSTEM = (
-    "conformance/cheats/test_golden_traffic.py",
-    "conformance/cheats/test_hidden_isolation.py",
-    "conformance/cheats/test_parting_cheats.py",
-    "conformance/cheats/test_worker_forges_returns.py",
-    "conformance/environments/test_accelerations.py",
-    "conformance/protocol/test_published_agents.py",
-    "conformance/protocol/test_run_artifacts.py",
-    "faults",
-    "integration/coordinator/test_foreign_environments_on_a_cluster.py",
-    "integration/coordinator/test_published_fields.py",
-    "integration/coordinator/test_published_policies.py",
-    "integration/coordinator/test_published_results.py",
-    "integration/coordinator/test_published_sweeps.py",
-    "integration/coordinator/test_rescore_command.py",
-    "integration/coordinator/test_verify_command.py",
-    "integration/deploy/test_kubernetes.py",
-    "integration/deploy/test_slurm.py",
-    "integration/gateway/command_line/test_cancelled_run.py",
-    "integration/gateway/command_line/test_finished_runs.py",
-    "integration/gateway/test_elastic_workers.py",
-    "integration/gateway/agents/test_llm_agent_runs.py",
-    "integration/gateway/test_hostile_home.py",
-    "integration/gateway/test_policy_packages.py",
-    "integration/gateway/command_line/test_local_command.py",
-    "integration/gateway/command_line/test_one_state.py",
-    "integration/gateway/command_line/test_run_restarts.py",
-    "integration/gateway/command_line/test_suite_command.py",
-    "integration/gateway/command_line/test_waiting_commands.py",
-    "integration/install",
-    "integration/multihost",
-    "integration/python",
-    "integration/report/test_cheats_on_a_board.py",
-    "integration/report/test_recordings.py",
-    "integration/report/test_tutorial.py",
-    "integration/report/test_two_labs.py",
-    "integration/test_every_bad_value.py",
-    "integration/web",
-    "unit/gateway/public/test_exports.py",
-)
-"""Files and folders that play many whole runs on clusters of their own: half of the time of all tests."""
-
-
-_FAMILIES = (
-    "conformance/environments/browser",
-    "conformance/environments/test_crafter_worlds.py",
-    "conformance/environments/test_families.py",
-    "conformance/environments/test_lazy_families.py",
-    "conformance/environments/test_vizdoom_slots.py",
-    "families",
-)
-"""Files and folders that play environments of families beyond Core16's."""
+_LAYER = re.compile(rb"^pytestmark = \[?\s*pytest\.mark\.(system|families)\b", re.MULTILINE)
+"""A file of another layer than `make test` says so in its first mark."""
 
 
 _ONE_BY_ONE = ("tests/families/test_proof_of_life.py::", "tests/integration/test_every_bad_value.py::")
@@ -103,7 +54,8 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
     """`make test` does not import the files that it leaves out: each of its processes would."""
     left_out = config.getoption("markexpr") == "not system and not families"
-    return True if left_out and _in(collection_path, (*_SYSTEM, *_FAMILIES)) else None
+    is_test = left_out and collection_path.name.startswith("test_") and collection_path.suffix == ".py"
+    return True if is_test and _LAYER.search(collection_path.read_bytes()) else None
 
 
 def _beside_others(config: pytest.Config) -> bool:
@@ -119,7 +71,7 @@ def _in(path: Path, names: tuple[str, ...]) -> bool:
 
 @pytest.hookimpl(tryfirst=True)  # before -m selects by marker
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Marks the layers, and puts files with slow tests first, unit tests last, others in the order of their paths.
+    """Puts files with slow tests first, unit tests last, others in the order of their paths.
 
     With `--dist loadfile --no-loadscope-reorder` processes take files in this order, so that they end at about the same
     time. By itself xdist begins with the files of most tests, and the longest tests, alone in their files, come last.
@@ -134,10 +86,6 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     for (begin, end), kind in zip(spans, (slow, {*files} - slow - unit, unit - slow), strict=True):
         ordered = [path for path in files if path in kind]
         place |= {path: begin + (end - begin) * k / len(ordered) for k, path in enumerate(ordered)}
-    for name, files_of in (("system", _SYSTEM), ("families", _FAMILIES)):
-        for item in items:
-            if _in(item.path, files_of):
-                item.add_marker(name)
     items.sort(key=lambda item: place[item.path])
 
 
@@ -148,9 +96,6 @@ def pytest_collection_finish() -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    missing = [name for name in (*_SYSTEM, *_FAMILIES) if not (Path(__file__).parent / name).exists()]
-    if missing:
-        raise pytest.UsageError(f"tests/conftest.py names files that are missing: {', '.join(missing)}")
     # Local commands share one state per user: not the developer's, and another for each process of tests.
     os.environ["XDG_STATE_HOME"] = tempfile.mkdtemp(prefix="evp-state-")
     # A shell ignores Ctrl-C for what it starts in the background, and children inherit that: tests that press it could

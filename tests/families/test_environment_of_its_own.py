@@ -23,6 +23,8 @@ from evopolicy_common.catalogue.installs import Made
 from evopolicy_common.records.run_record import decode_run_record
 from evopolicy_results.statistics.intervals import over_cases
 
+pytestmark = pytest.mark.families
+
 FAMILY, ENV = "mo_gymnasium", "gymnasium/deep-sea-treasure-v0"
 POLICY = Path(__file__).parent / "policies" / ENV.replace("/", "_")
 N_CASES = 32

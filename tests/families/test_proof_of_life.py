@@ -21,6 +21,8 @@ from evopolicy_results.statistics.intervals import over_cases
 from evopolicy_worker import check_env
 from evopolicy_worker.environments import describe, missing
 
+pytestmark = pytest.mark.families
+
 TABLE = proofs.table()
 each_family = pytest.mark.parametrize("proof", proofs.together(), ids=lambda proof: proof.family)
 ROLES = {"core16", "toy", "breadth", "paper13"}

@@ -18,7 +18,7 @@ from typing import Any
 import pytest
 from fault_matrix import Case, cases
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
+pytestmark = [pytest.mark.system, pytest.mark.slow, pytest.mark.timeout(600)]
 
 
 SUPPORT = Path(__file__).parents[1] / "support"

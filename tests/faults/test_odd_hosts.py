@@ -12,7 +12,7 @@ import pytest
 
 from evopolicy_common.records.run_record import decode_run_record
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.system, pytest.mark.slow, pytest.mark.timeout(300)]
 
 NO_SHM = """
 mkdir dev && mount -t tmpfs none dev

@@ -8,6 +8,8 @@ import pytest
 from documents import commands
 from option_values import VALUES, Case, Player, cases, player
 
+pytestmark = pytest.mark.system
+
 
 @pytest.fixture(scope="module", name="play")
 def _play(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Player]:

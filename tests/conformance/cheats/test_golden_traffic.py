@@ -13,7 +13,7 @@ from attacks.leak_search import Needles
 from evopolicy_common.records.run_record import decode_run_record
 from evopolicy_common.wire import codec
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.system, pytest.mark.slow]
 
 
 @pytest.fixture(scope="module")

@@ -15,6 +15,8 @@ from evopolicy_common.records.policies.checkpoints import METADATA
 from evopolicy_common.records.run_difference import differences
 from evopolicy_common.records.run_record import decode_run_record
 
+pytestmark = pytest.mark.system
+
 AGENT = Path(__file__).with_name("programs") / "parting_agent.py"
 
 

@@ -24,6 +24,8 @@ from evopolicy_common.messages import operator
 from evopolicy_common.records.run_record import decode_run_record
 from evopolicy_coordinator.cli.status import status_app
 
+pytestmark = pytest.mark.system
+
 TIMEOUT_S = 150.0
 EPISODES = 6
 HIDDEN = 2

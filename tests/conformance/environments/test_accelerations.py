@@ -18,6 +18,8 @@ from evopolicy_worker.environments import Environment, make
 from evopolicy_worker.environments.accelerations import ACCELERATIONS, table
 from evopolicy_worker.environments.interface.gymnasium_adapter import GymnasiumEnvironment
 
+pytestmark = pytest.mark.system
+
 IDS = accelerated_ids()
 STEPS = {"gym/racing": 60, "gymnasium/parking-v0": 50, "gymnasium/roundabout-v0": 11}
 """Steps of an episode where one is slow without acceleration; 150 elsewhere."""

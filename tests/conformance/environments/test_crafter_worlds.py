@@ -20,7 +20,10 @@ env = crafter.Env(seed={SEED})
 sys.stdout.buffer.write(env.reset().tobytes() + env._world._mat_map.tobytes() + env._world._obj_map.tobytes())
 """
 
-pytestmark = pytest.mark.skipif(bool(missing(ENV)), reason=f"{ENV} needs {missing(ENV)}")
+pytestmark = [
+    pytest.mark.families,
+    pytest.mark.skipif(bool(missing(ENV)), reason=f"{ENV} needs {missing(ENV)}"),
+]
 
 
 def test_a_world_is_the_one_that_the_package_makes() -> None:

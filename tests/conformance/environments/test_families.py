@@ -17,6 +17,8 @@ from evopolicy_worker.environments import Environment, make, missing
 from evopolicy_worker.environments.checks import conformance
 from evopolicy_worker.environments.tasks import template
 
+pytestmark = pytest.mark.families
+
 Warm = Callable[[str], Environment]
 SAMPLE = (
     "gymnasium/CartPole-v1",

@@ -21,6 +21,8 @@ from evopolicy_worker import descriptions
 from evopolicy_worker.environments import describe, process_environment, registry
 from evopolicy_worker.environments.browser import page
 
+pytestmark = pytest.mark.families
+
 SIMULATORS = {
     "box2d": {"Box2D"},
     "mujoco": {"mujoco"},

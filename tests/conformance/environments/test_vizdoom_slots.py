@@ -17,7 +17,10 @@ from evopolicy_worker.environments import missing
 
 ENV = "gymnasium/VizdoomPredictPosition-v1"
 
-pytestmark = pytest.mark.skipif(bool(missing(ENV)), reason=f"{ENV} needs {missing(ENV)}")
+pytestmark = [
+    pytest.mark.families,
+    pytest.mark.skipif(bool(missing(ENV)), reason=f"{ENV} needs {missing(ENV)}"),
+]
 
 
 @pytest.fixture

@@ -15,7 +15,7 @@ from published_checker import check_run
 
 from evopolicy_common.records.run_record import RunRecord
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
+pytestmark = [pytest.mark.system, pytest.mark.slow, pytest.mark.timeout(600)]
 
 
 class Agent(NamedTuple):

@@ -15,6 +15,8 @@ from published_checker import code_metrics as published_metrics
 from evopolicy_common import catalogue
 from evopolicy_common.records.code_metrics import code_metrics
 
+pytestmark = pytest.mark.system
+
 ROOT = Path(__file__).parents[3]
 
 CORE16 = catalogue.suites()["core16"].environments

@@ -13,6 +13,8 @@ from pathlib import Path
 import pytest
 from coordinator_harness import Coordinator
 
+pytestmark = pytest.mark.system
+
 PACKAGE = Path(__file__).parents[2] / "support" / "foreign_package"
 FILE = """
 id = "acme/glider"

@@ -17,6 +17,8 @@ from evopolicy_common.records.run_record import RunRecord
 from evopolicy_results.publish import contents, fields, rules
 from evopolicy_results.publish.findings import Checked
 
+pytestmark = pytest.mark.system
+
 FILES = {
     "manifest.json": contents.MANIFEST,
     "signature.json": contents.SIGNATURE,

@@ -10,6 +10,8 @@ from typing import Any
 import pytest
 from commands import evopolicy
 
+pytestmark = pytest.mark.system
+
 ROOT = Path(__file__).parents[3]
 AGENT = """
 import json, os, sys, urllib.request

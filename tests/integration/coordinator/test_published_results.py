@@ -29,6 +29,8 @@ from evopolicy_results.publish import contents, rules, run_rules
 from evopolicy_results.publish import replay as replays
 from evopolicy_results.publish.findings import KINDS, Finding
 
+pytestmark = pytest.mark.system
+
 
 @pytest.fixture(scope="module")
 def results(tmp_path_factory: pytest.TempPathFactory) -> Results:

@@ -9,6 +9,8 @@ from pathlib import Path
 import pytest
 from commands import evopolicy
 
+pytestmark = pytest.mark.system
+
 SWEEP = """
 name = "sweep"
 environments = ["toy/line"]

@@ -24,6 +24,8 @@ from evopolicy_common.records.splits import SplitFile
 from evopolicy_coordinator.splits import load_or_create_secret
 from evopolicy_coordinator.storage.store import Reader
 
+pytestmark = pytest.mark.system
+
 ENV = "toy/line"
 AGENT = """
 import json, os, sys, urllib.request

@@ -13,6 +13,8 @@ from typing import Any
 
 import pytest
 
+pytestmark = pytest.mark.system
+
 VERIFY = "from evopolicy_common.cli.frame import run_app; from evopolicy_results.cli.verify import app; run_app(app)"
 AGENT = """
 import json, os, urllib.request

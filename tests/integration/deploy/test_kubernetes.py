@@ -11,6 +11,8 @@ import yaml
 from documents import APPS, parse
 from installed import python_with
 
+pytestmark = pytest.mark.system
+
 DEPLOY = Path(__file__).parents[3] / "deploy"
 FILES = sorted((DEPLOY / "kubernetes").glob("*.yaml"))
 VERSIONS = ("1.34", "1.37")

@@ -18,7 +18,7 @@ from machines.own_certs import free_port
 from restless_runs import SIZE, agent_code, assert_same
 from waiting import wait_until
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
+pytestmark = [pytest.mark.system, pytest.mark.slow, pytest.mark.timeout(600)]
 
 SCRIPT = Path(__file__).parents[3] / "deploy" / "slurm" / "worker.sbatch"
 PAGE = Path(__file__).parents[3] / "docs" / "how-to" / "slurm.md"

@@ -9,10 +9,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import pytest
 from commands import agent, command
 from coordinator_harness import Coordinator
 from restless_runs import SIZE, agent_code, assert_same
 from waiting import TIMEOUT_S, wait_until
+
+pytestmark = pytest.mark.system
 
 
 @contextmanager

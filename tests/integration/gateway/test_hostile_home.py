@@ -14,6 +14,8 @@ from commands import SMALL
 
 from evopolicy_coordinator.storage.state_folder import StateFolder
 
+pytestmark = pytest.mark.system
+
 EVOPOLICY = f"{sys.executable} -m evopolicy_gateway.cli"
 WORKER = f"{sys.executable} -m evopolicy_worker.cli"
 COORDINATOR = f"{sys.executable} -m evopolicy_coordinator.cli"

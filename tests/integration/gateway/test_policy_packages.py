@@ -15,6 +15,8 @@ from commands import agent, command, record_in, run_dir
 import evopolicy as evp
 from evopolicy_common.records.run_record import RunRecord
 
+pytestmark = pytest.mark.system
+
 POLICY = """
 import os
 import scipy.optimize

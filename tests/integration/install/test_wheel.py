@@ -30,6 +30,8 @@ from stages.model_api import ModelApi, Step
 
 from evopolicy_common.records.run_record import decode_run_record
 
+pytestmark = pytest.mark.system
+
 ROOT = Path(__file__).parents[3]
 NAMED = re.compile(r"\b(?:(?:examples|deploy|docs)/[\w.@/-]*\w|constraints\.txt|\w[\w-]*\.toml)")
 REPOSITORY_ONLY = (

@@ -14,6 +14,8 @@ import pytest
 from machines import hosts
 from machines.hosts import Host, Network
 
+pytestmark = pytest.mark.system
+
 PEER = """
 import socket, sys
 with socket.create_server((sys.argv[1], 7000)) as server:

@@ -22,7 +22,7 @@ from sites import EPISODES, REAL, SUBMITS, TIMEOUT_S, TOTAL, TOY, Sites, sites
 from evopolicy_common.messages.status import StatusReply
 from evopolicy_common.records.run_difference import differences
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
+pytestmark = [pytest.mark.system, pytest.mark.slow, pytest.mark.timeout(900)]
 
 DELAY_S = 0.1
 LOSS = 0.01

@@ -19,7 +19,7 @@ from machines.hosts import Host
 
 from evopolicy_common.records.run_record import decode_run_record
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
+pytestmark = [pytest.mark.system, pytest.mark.slow, pytest.mark.timeout(900)]
 
 PAGE = Path(__file__).parents[3] / "docs" / "how-to" / "second-machine.md"
 FIRST = "10.92.1.1"

@@ -17,6 +17,8 @@ from waiting import TIMEOUT_S
 
 import evopolicy as evp
 
+pytestmark = pytest.mark.system
+
 POLICY = """
 class Policy:
     def __init__(self, obs_space, action_space, env_meta):

@@ -22,7 +22,7 @@ from waiting import wait_until
 
 from evopolicy_common.records.run_record import Tokens
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
+pytestmark = [pytest.mark.system, pytest.mark.slow, pytest.mark.timeout(600)]
 
 ROOT = Path(__file__).parents[3]
 PAGE = ROOT / "docs" / "how-to" / "inspect.md"

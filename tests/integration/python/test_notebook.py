@@ -16,7 +16,7 @@ from jupyter_client.manager import start_new_kernel
 from nbclient import NotebookClient
 from waiting import wait_until
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
+pytestmark = [pytest.mark.system, pytest.mark.slow, pytest.mark.timeout(600)]
 
 NOTEBOOK = Path(__file__).parents[3] / "examples" / "notebooks" / "tutorial.ipynb"
 ENDLESS = """

@@ -20,7 +20,7 @@ from stages.model_api import ModelApi, Step
 
 from evopolicy_common.records.run_record import decode_run_record
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
+pytestmark = [pytest.mark.system, pytest.mark.slow, pytest.mark.timeout(600)]
 
 DOCS = Path(__file__).parents[3] / "docs"
 FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.DOTALL | re.MULTILINE)

@@ -17,6 +17,8 @@ import pytest
 
 import evopolicy as evp
 
+pytestmark = pytest.mark.system
+
 ROOT = Path(__file__).parents[3]
 PAGE = ROOT / "docs" / "how-to" / "python.md"
 POLICY = """

@@ -30,7 +30,7 @@ from evopolicy_results.publish.findings import Checked
 from evopolicy_results.publish.replay import replay
 from evopolicy_results.publish.run_rules import return_of
 
-pytestmark = pytest.mark.timeout(900)
+pytestmark = [pytest.mark.system, pytest.mark.timeout(900)]
 PAGE = Path(__file__).parents[3] / "docs/how-to/publish.md"
 RUN, RESULT = f"runs/0000/{contents.RUN}", f"runs/0000/{contents.RESULT}"
 HELDOUT = "runs/0000/actions/heldout-001"

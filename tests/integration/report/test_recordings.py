@@ -23,6 +23,8 @@ from evopolicy_results.behaviour.trace import trace
 from evopolicy_results.cli.report import app
 from evopolicy_results.reading.reader import load_runs
 
+pytestmark = pytest.mark.system
+
 TIMEOUT_S = 600.0
 ENVIRONMENTS = ("toy/line", "gymnasium/FetchPickAndPlace-v4")
 """The second one's episode is another when it is drawn without care."""

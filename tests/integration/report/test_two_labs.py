@@ -17,7 +17,7 @@ from evopolicy_common.records.run_record import decode_run_record
 from evopolicy_results.publish import contents
 from evopolicy_results.publish.archive import Archive, Writer
 
-pytestmark = pytest.mark.timeout(900)
+pytestmark = [pytest.mark.system, pytest.mark.timeout(900)]
 ROOT = Path(__file__).parents[3]
 
 

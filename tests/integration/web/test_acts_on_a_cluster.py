@@ -8,10 +8,13 @@ import sys
 from pathlib import Path
 
 import httpx
+import pytest
 from commands import command, toy_cluster
 from waiting import wait_until
 
 from evopolicy_coordinator.web.access import kept_tokens
+
+pytestmark = pytest.mark.system
 
 
 def test_a_worker_is_paused_and_resumed_and_a_refusal_is_reported(tmp_path: Path) -> None:

@@ -17,6 +17,8 @@ from waiting import TIMEOUT_S, wait_until
 
 from evopolicy_coordinator.web.access import kept_tokens
 
+pytestmark = pytest.mark.system
+
 SUITE = """
 name = "watched"
 environments = ["toy/line"]

@@ -51,7 +51,7 @@ def test_same_secret_gives_same_cases_and_another_gives_others() -> None:
 def test_derived_splits_are_disjoint_and_of_the_length_asked_for(counts: dict[Any, int], space: int) -> None:
     """A small seed space makes draws collide all the time."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(splits, "_SEED_LIMIT", space)
+        patch.setattr(splits, "SEED_LIMIT", space)
         drawn = derive(b"s" * 32, "suite", "env", counts)
     assert {split: len(cases) for split, cases in drawn.items()} == counts
     assert overlaps(drawn) == []
@@ -61,7 +61,7 @@ def test_derived_splits_are_disjoint_and_of_the_length_asked_for(counts: dict[An
 @given(longer=st.fixed_dictionaries({split: st.integers(0, 20) for split in SPLITS}))
 def test_making_a_split_longer_changes_no_case(longer: dict[Any, int]) -> None:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(splits, "_SEED_LIMIT", 200)
+        patch.setattr(splits, "SEED_LIMIT", 200)
         short = derive(b"s" * 32, "suite", "env", {"train": 5, "validation": 5, "heldout": 5})
         long = derive(b"s" * 32, "suite", "env", {split: 5 + n for split, n in longer.items()})
     for split in SPLITS:

@@ -19,6 +19,8 @@ from evopolicy_worker.environments.browser import chromium, page
 from evopolicy_worker.environments.checks import conformance
 from evopolicy_worker.environments.interface.settings import BROWSER
 
+pytestmark = pytest.mark.families
+
 ENV = "miniwob/click-test-v1"
 BROKEN = {
     "it ends at once": (b"#!/bin/sh\n", "has ended|has gone"),

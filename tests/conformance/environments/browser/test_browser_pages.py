@@ -15,6 +15,8 @@ from evopolicy_worker.environments.browser.devtools import BrowserLostError
 from evopolicy_worker.environments.browser.keys import ALT, CONTROL, SHIFT, combined
 from evopolicy_worker.environments.browser.page import Address, Page
 
+pytestmark = pytest.mark.families
+
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Page]:

@@ -13,6 +13,8 @@ from waiting import wait_until
 from evopolicy_common.errors import WorkerError
 from evopolicy_common.messages.episode import Tier
 
+pytestmark = pytest.mark.families
+
 SOLVER = """
     import numpy as np
 

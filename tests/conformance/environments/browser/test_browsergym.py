@@ -20,6 +20,8 @@ from evopolicy_worker.environments.browser.browsergym_env import BrowserGymEnv
 from evopolicy_worker.environments.browser.page import shared
 from evopolicy_worker.environments.checks import conformance, episodes
 
+pytestmark = pytest.mark.families
+
 Warm = Callable[[str], Environment]
 SAMPLE = (
     "browsergym/miniwob.click-menu-2",

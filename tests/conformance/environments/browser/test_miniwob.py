@@ -24,6 +24,8 @@ from evopolicy_worker.environments.checks import conformance, episodes
 from evopolicy_worker.environments.interface.base import Step
 from evopolicy_worker.environments.interface.settings import BROWSER
 
+pytestmark = pytest.mark.families
+
 SAMPLE = (
     "miniwob/click-test-v1",
     "miniwob/click-tab-v1",

@@ -9,6 +9,8 @@ import pytest
 from commands import command, record_in, run_dir
 from stages.model_api import CACHED, INPUT, OUTPUT, ModelApi, Step
 
+pytestmark = pytest.mark.system
+
 SUBMIT = (
     "echo '# better' >> system/policy.py; curl -s -X POST"
     " -d '{\"env_instances\": [0, 1]}' $EVOPOLICYGYM_SUBMIT_URL"

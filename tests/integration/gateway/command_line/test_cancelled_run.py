@@ -12,6 +12,8 @@ import pytest
 from commands import Command, agent, command, record_in, run_arguments, run_dir
 from waiting import wait_until
 
+pytestmark = pytest.mark.system
+
 SLOW = """
 open("system/policy.py", "w").write(
     "import time\\n"

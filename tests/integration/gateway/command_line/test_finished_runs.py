@@ -26,6 +26,8 @@ from evopolicy_gateway.run.plan import Plan
 from evopolicy_gateway.run.watch import RunView
 from evopolicy_gateway.suite import runs, sweep
 
+pytestmark = pytest.mark.system
+
 FUNCTIONS = sorted(
     name
     for name, value in vars(record).items()

@@ -15,6 +15,8 @@ from evopolicy_common.processes import scratch
 from evopolicy_common.records.policies.checkpoints import read_meta
 from evopolicy_common.records.summary import decode_summary
 
+pytestmark = pytest.mark.system
+
 
 def test_local_plays_a_whole_run_and_leaves_nothing_behind(tmp_path: Path) -> None:
     with command(

@@ -16,7 +16,7 @@ from evopolicy_coordinator.core.contract.records import KernelRow
 from evopolicy_coordinator.splits import derive
 from evopolicy_coordinator.storage.store import Store
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
+pytestmark = [pytest.mark.system, pytest.mark.slow, pytest.mark.timeout(900)]
 
 
 def played(folder: Path, exp_id: str, *arguments: str) -> tuple[dict[str, str], str]:

@@ -12,12 +12,15 @@ import time
 import urllib.request
 from pathlib import Path
 
+import pytest
 from commands import agent, command, record_in, run_arguments, run_dir, run_on, toy_cluster
 from coordinator_harness import Coordinator
 from waiting import TIMEOUT_S, wait_until
 
 from evopolicy_gateway.run_folder import listener
 from evopolicy_gateway.run_folder.layout import RunFolder
+
+pytestmark = pytest.mark.system
 
 
 def test_a_killed_gateway_comes_back_while_its_agent_goes_on(operator_file: Path, tmp_path: Path) -> None:

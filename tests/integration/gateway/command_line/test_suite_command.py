@@ -23,6 +23,8 @@ from waiting import wait_until
 
 from evopolicy_common.records.run_record import decode_run_record
 
+pytestmark = pytest.mark.system
+
 FAKES = Path(__file__).parents[3] / "support" / "fake_clis"
 
 SUITE = """

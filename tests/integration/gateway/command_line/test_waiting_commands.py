@@ -15,6 +15,8 @@ from waiting import wait_until
 from evopolicy_common.wire import credentials
 from evopolicy_common.wire.credentials import Credentials
 
+pytestmark = pytest.mark.system
+
 POLICY = "class Policy:\n  def __init__(self, *a): pass\n  def reset(self, i): pass\n  def act(self, obs): return [0.0]\n"
 WORKER_IS_PAUSED = (
     "waiting for a worker that offers toy/line with sandbox tier bwrap: those that do are paused"

@@ -28,6 +28,8 @@ from evopolicy_common.records.blobs import write_atomically
 from evopolicy_common.records.suite_folder import Entry, Index
 from evopolicy_gateway.suite.suite_index import save
 
+pytestmark = pytest.mark.system
+
 VERSIONS = [
     Version({"policy.py": "x = 1"}, (1.0, 2.0), 0.5),
     Version({"policy.py": "x = 2"}, (3.0, 5.0), 2.5),
