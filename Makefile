@@ -1,4 +1,5 @@
-# make demo   installs into .venv, then plays a whole run
+# make demo   installs into .venv what Core16 and a run need, then plays a whole run
+# make families  installs every other family of environments into .venv
 # make test   installs, then runs the tests of every layer, but for:
 # make test-system  those that play many whole runs on clusters of their own
 # make test-families  those that play every family of environments
@@ -19,27 +20,42 @@
 # make sim    the coordinator's core under a simulated network with faults
 VENV := .venv
 BIN := $(VENV)/bin
+PIP = $(BIN)/python -m pip install -q --disable-pip-version-check
 PYTHON ?= $(shell for p in python3.13 python3.12 python3.11 python3; do \
 	$$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo $$p && break; done)
+# Each stamp: an installation that includes those before it.
+CORE := $(VENV)/.core
+FAMILIES := $(VENV)/.families
 STAMP := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help install paper-worker demo test test-system test-families check check-envs docs bench bench-start bench-peers bench-throughput bench-scale bench-channels bench-report bench-coverage bench-isolation bench-web bench-web-live faults sim clean
+.PHONY: help install families paper-worker demo test test-system test-families check check-envs docs bench bench-start bench-peers bench-throughput bench-scale bench-channels bench-report bench-coverage bench-isolation bench-web bench-web-live faults sim clean
 
 help:
 	@sed -n 's/^# make/make/p' Makefile
 
 install: $(STAMP)
 
-$(STAMP): pyproject.toml constraints.txt
+families: $(FAMILIES)
+
+$(CORE): pyproject.toml constraints.txt
 	@test -n "$(PYTHON)" || { echo "error: no Python 3.11 or newer found; install one, or name it: make PYTHON=/path/to/python3"; exit 2; }
 	@bash deploy/setup-host.sh
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	@echo "installing into $(VENV) (a minute or two the first time)"
-	@$(BIN)/python -m pip install -q --disable-pip-version-check -c constraints.txt -e '.[coordinator,gateway,families,dev]'
-	@$(BIN)/python -m pip install -q --disable-pip-version-check --no-deps \
-	$$($(BIN)/python -c 'from evopolicy_common.catalogue import installs; print(*installs.apart())')
-	@touch $(STAMP)
+	@$(PIP) -c constraints.txt -e '.[local]'
+	@touch $@
+
+$(FAMILIES): $(CORE)
+	@echo "installing every family of environments into $(VENV)"
+	@$(PIP) -c constraints.txt -e '.[local,families]'
+	@$(PIP) --no-deps $$($(BIN)/python -c 'from evopolicy_common.catalogue import installs; print(*installs.apart())')
+	@touch $@
+
+$(STAMP): $(FAMILIES)
+	@echo "installing the tools for tests into $(VENV)"
+	@$(PIP) -c constraints.txt -e '.[local,families,dev]'
+	@touch $@
 
 # Another fingerprint class than the usual worker's: no run is played by both.
 paper-worker:
@@ -50,7 +66,7 @@ paper-worker:
 	@.venv-paper/bin/python -m pip install -q --disable-pip-version-check --no-deps -r deploy/paper-versions.txt
 	@echo "next: .venv-paper/bin/evopolicy-worker --env core16"
 
-demo: install
+demo: $(CORE)
 	@$(BIN)/evopolicy demo
 
 # More processes than cores, since many tests wait for timers and other processes. One by one: make test ARGS="-n 0"
@@ -64,10 +80,12 @@ test-families: LAYERS = families
 test-system: PROCESSES = $$(( $$(nproc) + 4 ))
 # These compute without pause, and have limits on time.
 test-families: PROCESSES = $$(nproc)
+test: HOST = --tests
+test-system test-families: HOST = --all-tests
 # The tests start hundreds of processes: none of them shall compile our modules anew, whatever the shell asks of Python.
 test test-system test-families: export PYTHONDONTWRITEBYTECODE :=
 test test-system test-families: install
-	@bash deploy/setup-host.sh --tests
+	@bash deploy/setup-host.sh $(HOST)
 # In a fresh checkout one process compiles the tests, not each of them at the same time.
 	@test -e tests/unit/__pycache__ || $(BIN)/python -m pytest -q --collect-only -m "$(LAYERS)" >/dev/null 2>&1 || true
 	@short="$$(mktemp -d /tmp/evp-XXXXXX)"; $(BIN)/python -m pytest -n $(PROCESSES) --dist loadfile --no-loadscope-reorder --basetemp="$$short/t" \

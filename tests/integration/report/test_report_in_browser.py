@@ -13,6 +13,8 @@ from typer.testing import CliRunner
 
 from evopolicy_results.cli.report import app
 
+pytestmark = pytest.mark.system  # make test installs no browser
+
 COLUMN = """(() => {
   const table = document.getElementById(%r);
   return [...table.tBodies[0].rows].filter((row) => !row.hidden).map((row) => row.cells[%d].textContent.trim());

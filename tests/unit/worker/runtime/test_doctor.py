@@ -63,6 +63,7 @@ def test_kernel_that_does_not_tell_its_boot_id_is_reported(
     assert "mount /proc" in check.advice
 
 
+@pytest.mark.system  # make test installs no browser
 def test_the_browser_that_environments_use_has_a_row(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     def row() -> doctor.Check:
         chromium.program.cache_clear()
