@@ -1,4 +1,4 @@
-"""structlog as all modules import it: without rich, on which every process of ours would spend a fifth of its start.
+"""structlog as all modules import it: without rich, whose import would take a fifth of the time in which a process of ours starts.
 
 structlog takes rich, where it is installed, to draw tracebacks; ours are text before its renderers see them.
 """

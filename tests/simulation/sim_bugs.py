@@ -276,11 +276,11 @@ BUGS = (
         "job.group.template.bundle is None",
         "True",
     ),
-    Bug("keep what was handed back in memory only", results, "_goes_on", "step.persist(", "str("),
+    Bug("keep what was handed back in memory only", results, "_keep_begun", "step.persist(", "str("),
     Bug(
         "drop what was handed back",
         results,
-        "_goes_on",
+        "_keep_begun",
         "job.begun, job.begun_attempt = result.begun, result.attempt",
         "job.begun_attempt = result.attempt",
     ),

@@ -177,7 +177,7 @@ async def _outcomes(operations: Operations, message: Evaluate, console: Terminal
         async for outcome, total, waits_for in operations.evaluate(message):
             if outcome is not None:
                 outcomes.append(outcome)
-                waiting.goes_on()
+                waiting.ended()
             elif waiting.worth_saying(waits_for):
                 console.print(f"{message.env}: waiting for {waits_for}", soft_wrap=True)
             progress.update(task, completed=len(outcomes), total=total)

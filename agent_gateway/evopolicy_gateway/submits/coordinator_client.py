@@ -104,7 +104,7 @@ class CoordinatorClient:
                     raise
                 raise ConfigError(
                     "the coordinator is of an older version, which cannot keep hidden episodes from the agent's machine:"
-                    f" update it, or use the version of evopolicy that it is of ({error.message})"
+                    f" update it, or install its version of evopolicy here ({error.message})"
                 ) from error
             if permit.granted:
                 return True

@@ -350,16 +350,16 @@ class SubmitPipeline:
             if error.status in RUN_OVER:
                 self._refused(error)
                 ticket.fail(self._refusal(RUN_CLOSED if ticket.accepted is None else "closed"))
-            elif not await self._goes_on_without(ticket, error):
+            elif not await self._abandon(ticket, error):
                 return
         except Exception as error:
-            if not await self._goes_on_without(ticket, error):
+            if not await self._abandon(ticket, error):
                 return
         self.in_flight_s += time.monotonic() - started
         self.in_flight = None
         self._on_change()
 
-    async def _goes_on_without(self, ticket: Ticket, error: Exception) -> bool:
+    async def _abandon(self, ticket: Ticket, error: Exception) -> bool:
         """True when the submit is abandoned. The first failure ends this gateway; the next gateway retries."""
         key = ticket.request.key
         log.error("submit failed", submit=ticket.submit_id, exc_info=error)

@@ -42,15 +42,15 @@ class Waiting:
         self._since = asyncio.get_running_loop().time()
         self._last = ""
 
-    def goes_on(self) -> None:
-        """The wait is over."""
+    def ended(self) -> None:
+        """The wait is over: the next one counts from now."""
         self._since = asyncio.get_running_loop().time()
         self._last = ""
 
     def worth_saying(self, what: str) -> bool:
         """Whether to report now that it waits for `what`; an empty `what` means that it does not wait."""
         if not what:
-            self.goes_on()
+            self.ended()
             return False
         # 0.9: callers poll every few seconds, so a check just before the limit would delay the notice by a whole round.
         slow = asyncio.get_running_loop().time() - self._since > 0.9 * AFTER_S

@@ -25,13 +25,13 @@ def check(state: State) -> None:
         want(
             state,
             run.id,
-            transitions.goes_on(transitions.RUN, phase),
+            transitions.has_successor(transitions.RUN, phase),
             "a finished run is not among the open ones",
         )
         unsettled = [
             row.submit_index
             for row in run.submits
-            if transitions.goes_on(transitions.SUBMIT, row.status or "open")
+            if transitions.has_successor(transitions.SUBMIT, row.status or "open")
         ]
         want(
             state,
@@ -102,7 +102,7 @@ def _audits(state: State) -> None:
         for row in run.audits.values():
             n = len(row.replayed_by)
             waits = (
-                transitions.goes_on(transitions.AUDIT, row.state)
+                transitions.has_successor(transitions.AUDIT, row.state)
                 and row.actions is not None
                 and n == row.compared
             )
@@ -155,7 +155,7 @@ def _jobs(state: State) -> None:
             want(
                 state,
                 key,
-                transitions.goes_on(transitions.JOB, job.place),
+                transitions.has_successor(transitions.JOB, job.place),
                 "an open job has a further transition",
             )
             if job.reserved is not None:

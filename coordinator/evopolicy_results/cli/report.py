@@ -161,7 +161,9 @@ def _study(
         progress=lambda done, total: tell("runs read", done, total),
     )
     if rescore and not is_name(rescore):
-        raise ConfigError(f"--scores {rescore!r} is no name of a re-score")
+        raise ConfigError(
+            f"--scores {rescore!r} cannot be the name of a re-score: use letters, digits, '.', '_' and '-'"
+        )
     scores = _read_table(tables[0]) if tables else None
     return study_of(
         rescored(loaded.runs, rescore) if rescore else loaded.runs,

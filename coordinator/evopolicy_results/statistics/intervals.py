@@ -35,7 +35,7 @@ from evopolicy_results.statistics.samples import Floats
 
 LEAST_CASES = 5
 """With fewer cases no method reaches its coverage."""
-_NOUGHT = 1e-9
+_RELATIVE_ZERO = 1e-9
 """Relative bound: a smaller spread is rounding error."""
 
 Method = Literal["bootstrap-t", "adjusted Wald", "score", "crossed t", "Welch t", "none"]
@@ -163,14 +163,14 @@ def bootstrap_t(columns: Floats, *, resamples: int = RESAMPLES, seed: int = 0) -
     """
     n = len(columns)
     centre, spread = columns.mean(axis=0), columns.std(axis=0, ddof=1)
-    varies = spread > _NOUGHT * np.maximum(1e-300, np.abs(columns).max(axis=0))
+    varies = spread > _RELATIVE_ZERO * np.maximum(1e-300, np.abs(columns).max(axis=0))
     scaled = np.where(varies, (columns - centre) / np.where(varies, spread, 1.0), 0.0)
     drawn = weights(n, n, resamples, seed) / n
     means = drawn @ scaled
     variances = np.maximum(0.0, drawn @ scaled**2 - means**2) / (n - 1)
     with np.errstate(divide="ignore", invalid="ignore"):
         t = np.abs(means) / np.sqrt(variances)
-    t = np.where(variances > _NOUGHT**2, t, np.inf)
+    t = np.where(variances > _RELATIVE_ZERO**2, t, np.inf)
     quantile = np.quantile(t, CONFIDENCE, axis=0, method="inverted_cdf")
     half: Floats = np.where(varies, np.where(varies, quantile, 0.0) * spread / math.sqrt(n), np.inf)
     return half
@@ -225,7 +225,7 @@ def _crossed(value: float, parts: Sequence[Components], by_case: Floats) -> Esti
     if n_cases < 2:
         return Estimate(value=value, over="runs and cases", reason=TOO_FEW_CASES)
     total, df = _variance(parts, components(by_case[None, :]).cases, n_cases)
-    if total <= (_NOUGHT * abs(value)) ** 2:
+    if total <= (_RELATIVE_ZERO * abs(value)) ** 2:
         reason = no_spread(min(part.n_runs for part in parts))
         return Estimate(value=value, over="runs and cases", reason=reason)
     return _t_interval(value, total, df, "crossed t", "runs and cases")
@@ -275,9 +275,9 @@ def _two_levels(returns: Sequence[Floats]) -> tuple[float, float] | None:
 
 
 def _constant(values: Floats) -> bool:
-    return float(np.ptp(values)) <= _NOUGHT * float(np.abs(values).max(initial=0.0))
+    return float(np.ptp(values)) <= _RELATIVE_ZERO * float(np.abs(values).max(initial=0.0))
 
 
 def _is_nought(variance: float, groups: Sequence[Floats]) -> bool:
     scale = max(float(np.abs(group).max()) for group in groups)
-    return variance <= (_NOUGHT * scale) ** 2
+    return variance <= (_RELATIVE_ZERO * scale) ** 2

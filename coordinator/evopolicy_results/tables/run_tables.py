@@ -81,7 +81,7 @@ def _runs(study: Study, link_of: LinkOf) -> Table:
             Column(
                 "journal",
                 "Journal",
-                note="Entry with the run's result, and the journal's head there: whoever noted heads sees a journal that was rewritten.",
+                note="Entry with the run's result, and the journal's head there. A head that you noted earlier shows whether the journal was rewritten.",
             ),
         ),
         rows=rows,

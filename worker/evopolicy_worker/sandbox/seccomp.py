@@ -82,7 +82,8 @@ _NOT_TO_ITSELF = (9, 19, 20, 21, 22)  # SIGKILL, SIGSTOP, SIGTSTP, SIGTTIN, SIGT
 _EXTENDED_ATTRIBUTES = ("listxattr", "llistxattr", "flistxattr", "getxattr", "lgetxattr", "fgetxattr")
 _CLONE_THREAD = 0x00010000
 _CLONE_NAMESPACES = 0x7E020000
-_YOUNGEST = 450
+_HIGHEST_LISTED = 450
+"""The highest system call number that the lists know; later calls do not exist for a sandboxed process (ENOSYS)."""
 
 Interval = tuple[int, list[Instruction]]
 """The first system call number of an interval, and the instructions that decide on its calls."""
@@ -234,8 +235,8 @@ def _intervals(numbers: dict[str, int], blocks: dict[str, list[Instruction]]) ->
     """The code for every call number, as intervals in ascending order. Each extends to the start of the next."""
     by_number = {number: blocks.get(name, [ALLOWED]) for name, number in numbers.items()}
     found: list[Interval] = []
-    for number in range(_YOUNGEST + 1):
-        code = by_number.get(number, [refuse(errno.EPERM if number < _YOUNGEST else errno.ENOSYS)])
+    for number in range(_HIGHEST_LISTED + 1):
+        code = by_number.get(number, [refuse(errno.EPERM if number < _HIGHEST_LISTED else errno.ENOSYS)])
         if not found or found[-1][1] != code:
             found.append((number, code))
     return found

@@ -132,9 +132,6 @@ def advance(state: State, run: Run, step: Step) -> None:
     if best is not None and heldout_group(run.id, best.submit_index) not in run.hidden_returns:
         _open(state, templates.build("heldout", run, best, step.now, step.stimulus_id), step)
         return
-    if finished.unspent(run):
-        _finish(state, run, None, step, unplayed=True)
-        return
     if random_group(run.id) in run.hidden_returns and not audit_end.holds_up(state, run, step):
         _finish(state, run, best, step)
 

@@ -47,7 +47,7 @@ JOB: Table = {
 }
 
 
-def goes_on(table: Table, state: str) -> bool:
+def has_successor(table: Table, state: str) -> bool:
     """Whether `state` has a successor."""
     return bool(table[state])
 

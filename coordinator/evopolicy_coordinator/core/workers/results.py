@@ -52,7 +52,7 @@ def take(state: State, news: ResultsPersisted, step: Step) -> None:
     silent = lease is None or _silent(state, lease, step.now)
     leased_s = None if lease is None else step.now - lease.granted_at
     if result.kind != "done":
-        _goes_on(job, lease, result, step, silent=silent)
+        _keep_begun(job, lease, result, step, silent=silent)
     if lease is not None:
         leases.release(state, worker, lease, step, f"reported: {result.kind}", sure=True)
     if result.kind == "done":
@@ -65,7 +65,7 @@ def take(state: State, news: ResultsPersisted, step: Step) -> None:
         leases.give_back(state, job, failure, worker, step, ran=True, error=result.error)
 
 
-def _goes_on(job: JobState, lease: Lease | None, result: JobResult, step: Step, *, silent: bool) -> None:
+def _keep_begun(job: JobState, lease: Lease | None, result: JobResult, step: Step, *, silent: bool) -> None:
     """Keep the actions of an unfinished attempt's policy for the next attempt, unless that plays already."""
     kept = result.begun is not None and not (silent and result.limit_verdict)
     if kept and job.lease in (None, lease) and result.attempt > job.begun_attempt:

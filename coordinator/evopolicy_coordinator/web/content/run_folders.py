@@ -103,7 +103,7 @@ class RunFacts(msgspec.Struct, frozen=True, kw_only=True):
     closed_reason: str = ""
     hidden_cases: str = "shared"
     score: float | None = None
-    """Hidden: for whom `Runs.may_show` says so."""
+    """Hidden; shown only where `Runs.may_show` permits it."""
     random: float | None = None
     """Uniform random actions on the same hidden cases."""
     finished: bool = False
@@ -432,7 +432,7 @@ def _may_be_alive(status: RunStatus) -> bool:
 
 
 def _sweep_folders(roots: Iterable[Path]) -> list[tuple[Path, Index | None]]:
-    """The sweeps at and directly below the roots, with their indexes; and a root that is none, for what else is in it."""
+    """The sweeps at and directly below the roots, with their indexes. A root that is no sweep has the index None: single runs may lie in it."""
     found: dict[Path, Index | None] = {}
     for root in roots:
         if (root / INDEX).exists():

@@ -14,7 +14,7 @@ from evopolicy_coordinator.core.structures.polls import PollKind
 from evopolicy_coordinator.core.structures.trace import InvariantError
 from evopolicy_coordinator.core.tables import step
 from evopolicy_coordinator.core.tables.model import GroupKind
-from evopolicy_coordinator.core.tables.transitions import AUDIT, JOB, RUN, SUBMIT, Table, check, goes_on
+from evopolicy_coordinator.core.tables.transitions import AUDIT, JOB, RUN, SUBMIT, Table, check, has_successor
 
 CORE = Path(evopolicy_coordinator.core.__file__).parent
 
@@ -50,7 +50,7 @@ def test_each_kind_of_long_poll_has_an_answer_when_its_time_is_up() -> None:
 @pytest.mark.parametrize("table", [RUN, SUBMIT, AUDIT, JOB])
 def test_a_table_of_transitions_is_closed_and_ends(table: Table) -> None:
     assert {after for states in table.values() for after in states} <= set(table)
-    assert [state for state in table if not goes_on(table, state)]
+    assert [state for state in table if not has_successor(table, state)]
 
 
 def test_what_may_not_follow_is_refused() -> None:

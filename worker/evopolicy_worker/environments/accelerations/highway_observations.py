@@ -91,7 +91,7 @@ class TrafficInScalars(KinematicObservation):  # type: ignore[misc]
 
 
 class ScalarObservations(AbstractEnv):  # type: ignore[misc]
-    """An environment that observes so."""
+    """An environment whose observations are computed without data frames."""
 
     def define_spaces(self) -> None:
         super().define_spaces()
