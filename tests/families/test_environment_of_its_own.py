@@ -203,7 +203,7 @@ def workers(coordinator: Coordinator, offered: Mapping[str, str]) -> Iterator[No
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
-def test_three_differently_installed_workers_play_a_suite_and_each_run_names_its_own(
+def test_each_run_of_a_mixed_suite_names_its_workers_installation(
     tmp_path: Path, program: Path, made: Made
 ) -> None:
     third = set_up(program, "minigrid")

@@ -63,7 +63,7 @@ def can_mount() -> bool:
 
 
 @pytest.mark.parametrize("name", HOSTS)
-def test_a_run_is_played_or_refused_with_the_remedy_on_a_host_with(name: str, tmp_path: Path) -> None:
+def test_a_run_is_played_or_refused_on_a_host_with(name: str, tmp_path: Path) -> None:
     if not can_mount():
         pytest.skip(
             "needs mount namespaces, which cannot be made here: run the tests as root, a container privileged"

@@ -126,7 +126,7 @@ def test_every_command_is_in_a_document_and_its_help_has_an_example() -> None:
     assert [name for name, each in commands() if "Example: " not in f"{each.epilog} {each.help}"] == []
 
 
-def test_the_architecture_names_every_folder_of_a_room_and_of_its_larger_parts() -> None:
+def test_the_architecture_names_every_folder_of_a_room() -> None:
     table = text_of("ARCHITECTURE.md").partition("Folders inside the rooms")[2].partition("\n## ")[0]
     named = set(re.findall(r"`(\w+)/`", table))
     parts = [

@@ -240,3 +240,12 @@ def test_no_two_test_files_have_the_same_name() -> None:
     """pytest collects one of two such files alone, and then only where a layer has both."""
     names = Counter(path.name for path in (ROOT / "tests").rglob("test_*.py"))
     assert [name for name, n in names.items() if n > 1] == []
+
+
+def test_a_tests_name_has_at_most_twelve_words_and_ninety_characters() -> None:
+    names = (
+        name
+        for path in (ROOT / "tests").rglob("test_*.py")
+        for name in re.findall(r"^\s*(?:async )?def (test_\w+)\(", path.read_text(), re.MULTILINE)
+    )
+    assert [name for name in names if len(name) > 90 or name.count("_") > 12] == []

@@ -109,11 +109,11 @@ def check_child_gone(run: CheatingRun) -> None:
     assert float(last) < datetime.fromisoformat(closed["timestamp"]).timestamp()
 
 
-def test_a_hidden_child_is_gone_with_its_jail_before_the_run_is_closed(jailed: CheatingRun) -> None:
+def test_a_hidden_child_is_gone_with_its_jail_before_the_close(jailed: CheatingRun) -> None:
     check_child_gone(jailed)
 
 
-def test_a_hidden_child_is_gone_before_the_run_is_closed_without_a_jail_too(unjailed: CheatingRun) -> None:
+def test_an_unjailed_hidden_child_is_gone_before_the_run_is_closed(unjailed: CheatingRun) -> None:
     check_child_gone(unjailed)
 
 
@@ -180,9 +180,7 @@ def test_without_bubblewrap_there_is_no_run_unless_the_jail_is_given_up(
     assert not folder.exists()
 
 
-def test_an_agent_whose_time_is_over_is_asked_before_its_jail_is_torn_down(
-    cheated: Cheated, tmp_path: Path
-) -> None:
+def test_an_agent_out_of_time_is_asked_before_its_jail_ends(cheated: Cheated, tmp_path: Path) -> None:
     program = tmp_path / "agent.py"
     program.write_text(
         "import signal, sys, time\n"

@@ -99,7 +99,7 @@ def test_the_wiretap_has_heard_what_the_coordinator_says_that_it_answered(golden
             assert payload in kept[way] or len(payload) > 30_000, key
 
 
-def test_no_answer_to_a_gateway_holds_more_than_its_type_has_fields_for(golden: GoldenRun) -> None:
+def test_no_answer_to_a_gateway_holds_more_than_its_fields(golden: GoldenRun) -> None:
     for way, key, payload in golden.cluster.crossed(f"/gw/{golden.run}/"):
         if way == "answer":
             assert codec.encode(codec.decode(codec.gateway_replies, payload)) == payload, key
@@ -118,7 +118,7 @@ def test_nothing_hidden_is_in_the_memory_of_the_agents_side(golden: GoldenRun, p
         assert set().union(*seen), "the gateway's memory does not even hold the train returns"
 
 
-def test_nothing_hidden_is_in_the_workspace_or_the_logs_while_the_run_is_scored(golden: GoldenRun) -> None:
+def test_workspace_and_logs_hold_nothing_hidden_while_the_run_is_scored(golden: GoldenRun) -> None:
     hidden = hidden_of(golden)
     assert {"logs/harness.log", "logs/agent.jsonl", "workspace/AGENTS.md"} <= set(golden.found_early)
     for path, data in golden.found_early.items():

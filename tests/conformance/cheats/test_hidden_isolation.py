@@ -162,7 +162,7 @@ def test_without_the_rule_an_agent_hears_its_own_hidden_cases(shared: GoldenClus
     assert met(shared, moments(shared))
 
 
-def test_agent_that_listens_hears_no_hidden_case_and_none_is_played_beside_it(
+def test_no_hidden_case_is_played_beside_an_agent_that_listens(
     isolated: GoldenCluster,
 ) -> None:
     with listening(isolated, "own", 1) as run:
@@ -195,7 +195,7 @@ def test_without_the_rule_a_sibling_hears_what_another_run_is_scored_on(shared: 
         sibling.process.terminate()
 
 
-def test_sibling_hears_nothing_of_a_run_that_is_scored_only_when_it_is_gone(isolated: GoldenCluster) -> None:
+def test_a_run_is_scored_only_after_its_sibling_is_gone(isolated: GoldenCluster) -> None:
     with listening(isolated, "sibling", 1) as sibling:
         sibling.listens()
         with listening(isolated, "scored", 1) as scored:

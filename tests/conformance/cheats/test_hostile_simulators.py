@@ -145,7 +145,7 @@ def test_without_a_jail_the_same_simulator_gets_it_all(slots: Slots, targets: di
 
 
 @pytest.mark.parametrize("tier", ["bwrap", "landlock"])
-def test_what_a_simulator_prints_or_sends_out_of_turn_ends_its_slot_alone(
+def test_a_simulator_that_prints_or_sends_out_of_turn_ends_its_slot(
     tier: Tier, slots: Slots, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     package = tmp_path / "simulators" / "minigrid"

@@ -171,7 +171,7 @@ def test_a_submit_that_is_guessed_is_one_of_its_own_or_none(tmp_path: Path) -> N
     play(tmp_path, script)
 
 
-def test_a_request_inside_another_ones_body_is_never_served_or_has_to_know_the_token(tmp_path: Path) -> None:
+def test_a_request_inside_another_body_is_served_only_with_the_token(tmp_path: Path) -> None:
     async def script(w: Wire) -> None:
         head = f"POST {w.path}/submit HTTP/1.1\r\nHost: {w.host}\r\n"
         inner = f"{head}Content-Length: {len(BODY)}\r\nConnection: close\r\n\r\n".encode() + BODY

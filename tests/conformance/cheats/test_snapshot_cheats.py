@@ -55,7 +55,7 @@ def test_no_submit_holds_what_its_agent_has_not_written(swapped: Swapped) -> Non
         assert path.is_dir() or SECRET.encode() not in path.read_bytes(), path
 
 
-def test_what_is_a_link_a_pipe_or_too_much_is_charged_and_named(swapped: Swapped) -> None:
+def test_links_pipes_and_oversized_files_are_charged_and_named(swapped: Swapped) -> None:
     honest, raced, spoiled = (
         swapped.verdicts[0],
         swapped.verdicts[1 : 1 + N_RACES],

@@ -93,7 +93,7 @@ def test_the_probing_policy_sees_much_and_tells_all_of_it(probed: Probed) -> Non
         assert all(set(facts) == set(probed.names) for facts in episodes)
 
 
-def test_what_a_policy_sees_is_the_same_in_train_validation_and_held_out(probed: Probed) -> None:
+def test_a_policy_sees_the_same_in_train_validation_and_held_out(probed: Probed) -> None:
     fixed = [name for name in probed.names if name not in DIFFER]
     differences = {
         (split, index, name): (facts[name], train_facts[name])

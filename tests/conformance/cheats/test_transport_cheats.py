@@ -62,7 +62,7 @@ def eavesdropped(cheated: Cheated) -> Eavesdropped:
     return Eavesdropped(cheated)
 
 
-def test_an_agent_with_its_own_session_hears_nothing_of_other_runs_and_workers(
+def test_an_agent_with_a_session_hears_no_other_runs_or_workers(
     eavesdropped: Eavesdropped,
 ) -> None:
     assert eavesdropped.report["connected"]
@@ -152,7 +152,7 @@ def test_a_captured_submit_that_is_sent_again_is_charged_and_played_once(coordin
     in_time(scenario())
 
 
-def test_a_key_that_is_used_again_with_another_bundle_is_refused_and_the_first_one_counts(
+def test_a_reused_key_with_another_bundle_is_refused(
     coordinator: Coordinator,
 ) -> None:
     async def scenario() -> None:
@@ -176,7 +176,7 @@ def test_a_key_that_is_used_again_with_another_bundle_is_refused_and_the_first_o
     in_time(scenario())
 
 
-def test_what_another_run_has_brought_cannot_be_played_or_even_found_by_its_digest(
+def test_another_runs_bundle_cannot_be_played_or_found_by_digest(
     coordinator: Coordinator,
 ) -> None:
     async def scenario() -> None:

@@ -280,7 +280,7 @@ def test_worker_of_an_old_protocol_is_refused_with_the_reason(tmp_path: Path) ->
         asyncio.run(scenario(coordinator, workers))
 
 
-def test_worker_of_old_code_gets_no_work_of_a_run_and_is_told_why(tmp_path: Path) -> None:
+def test_a_worker_of_old_code_gets_no_work_and_is_told_why(tmp_path: Path) -> None:
     async def scenario(coordinator: Coordinator, workers: Workers) -> None:
         async with operator_of(coordinator) as client:
             run = await created(client, "versions")

@@ -97,7 +97,7 @@ def test_the_comparison_notices_a_polygon_that_is_left_out(monkeypatch: pytest.M
         compare("gym/racing", [3], random_driver, steps=60)
 
 
-def test_the_comparison_notices_an_angle_off_by_one_unit_in_the_last_place(
+def test_the_comparison_notices_one_unit_in_an_angles_last_place(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     from evopolicy_worker.environments.accelerations import highway_vehicles

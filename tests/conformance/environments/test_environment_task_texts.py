@@ -43,7 +43,7 @@ def test_every_action_has_exactly_one_row(env_id: str, warm: Warm) -> None:
 
 
 @pytest.mark.parametrize("env_id", IDS)
-def test_a_text_has_an_objective_and_all_sections_and_names_the_step_limit(env_id: str, warm: Warm) -> None:
+def test_a_text_has_objective_sections_and_step_limit(env_id: str, warm: Warm) -> None:
     description = warm(env_id).description
     text = description.task_text
     assert re.match(r"# .+\n\n[A-Z].{30,}", text), "no title with an objective below it"

@@ -154,7 +154,7 @@ def test_no_text_announces_a_program_that_is_left_out() -> None:
     assert template.in_words("It lands.\n\nTo see it, run:\n```\npython it.py\n```\n") == "It lands."
 
 
-def test_one_environment_under_two_ids_has_the_text_that_is_written_for_it(warm: Warm) -> None:
+def test_one_environment_under_two_ids_has_one_written_text(warm: Warm) -> None:
     assert warm("gymnasium/Acrobot-v1").description.task_text == warm("gym/acrobot").description.task_text
 
 

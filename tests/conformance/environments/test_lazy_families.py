@@ -135,7 +135,7 @@ def test_a_description_holds_for_one_fingerprint(tmp_path: Path, monkeypatch: py
 @pytest.mark.parametrize(
     "env_id", ["miniwob/click-test-v1", "gymnasium/MiniWorld-OneRoom-v0", "my_pkg:Env-v0"]
 )
-def test_what_is_known_only_of_a_made_environment_is_not_kept_and_nothing_is_started_to_know_it(
+def test_facts_of_a_made_environment_are_neither_kept_nor_forced(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, env_id: str
 ) -> None:
     def start(*given: object) -> None:
@@ -156,7 +156,7 @@ def test_a_description_of_another_environment_is_not_taken(tmp_path: Path) -> No
     assert cache.get("toy/line") is None
 
 
-def test_an_environment_that_cannot_be_described_is_left_out_and_the_others_are_offered(
+def test_an_undescribable_environment_is_left_out_and_others_are_offered(
     tmp_path: Path,
 ) -> None:
     slot = Scripted()
@@ -186,7 +186,7 @@ def test_an_environment_that_cannot_be_described_is_left_out_and_the_others_are_
         ),
     ],
 )
-def test_a_description_that_no_message_can_carry_is_left_out_and_the_others_are_offered(
+def test_an_oversized_description_is_left_out_and_others_are_offered(
     changed: dict[str, Any], why: str
 ) -> None:
     """The worker could not register with it, or the coordinator not store it."""

@@ -45,7 +45,7 @@ def test_a_closed_slot_leaves_no_game(slots: Slots) -> None:
     wait_until(lambda: not [pid for pid in processes if runs(pid)])
 
 
-def test_a_killed_process_leaves_no_game_and_no_shared_memory_without_a_jail(slots: Slots) -> None:
+def test_an_unjailed_killed_process_leaves_no_game_or_shared_memory(slots: Slots) -> None:
     slot = slots.new("none")
     slots.run(slot.start())
     try:

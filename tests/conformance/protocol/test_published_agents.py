@@ -147,7 +147,7 @@ def test_run_directories_of_the_profile_pass_the_published_checker(published: Pl
         assert check_run(folder) == [], folder
 
 
-def test_runs_of_the_profile_are_stamped_with_every_choice_and_marked_as_public(published: Played) -> None:
+def test_runs_of_the_profile_are_stamped_and_marked_as_public(published: Played) -> None:
     for _, record in published.values():
         dimensions = record.experiment_dimensions
         assert (dimensions.profile, dimensions.finish, dimensions.policy_scope) == (
@@ -160,7 +160,7 @@ def test_runs_of_the_profile_are_stamped_with_every_choice_and_marked_as_public(
         assert record.versions.data_secret is False
 
 
-def test_one_policy_plays_a_submit_on_lists_and_what_cannot_be_read_is_zero(published: Played) -> None:
+def test_one_policy_plays_a_submit_on_lists_and_unreadable_is_zero(published: Played) -> None:
     folder, _ = published["variables"]
     episodes = sorted((folder / "workspace/feedback/submit_000/episodes").iterdir())
     outputs = [(episode / "stdout.txt").read_text() for episode in episodes]
@@ -179,9 +179,7 @@ def test_a_silent_agent_is_named_with_what_counts(published: Played) -> None:
 
 
 @pytest.mark.parametrize("name", OWN)
-def test_an_agent_of_the_published_protocol_meets_our_own_choices_without_the_profile(
-    own: Played, name: str
-) -> None:
+def test_a_published_agent_without_the_profile_meets_our_choices(own: Played, name: str) -> None:
     check(own, name, OWN)
 
 

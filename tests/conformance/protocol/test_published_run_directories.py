@@ -50,7 +50,7 @@ def test_a_published_run_is_read_with_what_it_tells(tmp_path: Path, env: str) ->
     assert run.record.hidden_isolation == "unknown"
 
 
-def test_the_selected_submit_is_found_by_its_code_where_it_is_not_told(tmp_path: Path) -> None:
+def test_an_untold_selected_submit_is_found_by_its_code(tmp_path: Path) -> None:
     folder = write_published_run(tmp_path)
     document = json.loads((folder / "run.json").read_bytes())
     del document["outcome"]["best_submit_index"]

@@ -48,7 +48,7 @@ async def whole_run(coordinator: Coordinator, key: str, source: str) -> str:
     return created.run
 
 
-def test_a_backup_of_a_running_coordinator_restores_to_a_run_that_goes_on(
+def test_a_run_continues_from_a_backup_of_a_running_coordinator(
     coordinator: Coordinator, tmp_path: Path
 ) -> None:
     target = tmp_path / "backup"

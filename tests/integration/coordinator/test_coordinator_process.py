@@ -51,7 +51,7 @@ def test_ready_file_tells_where_to_connect_and_goes_with_the_process(coordinator
     assert not coordinator.ready_file.exists()
 
 
-def test_a_state_of_which_no_core_comes_ends_the_process_with_the_reason(coordinator: Coordinator) -> None:
+def test_a_state_that_no_core_loads_ends_the_process(coordinator: Coordinator) -> None:
     async def scenario() -> None:
         async with operator_of(coordinator) as operator:
             created = await operator.create()
@@ -198,7 +198,7 @@ def test_splits_come_from_the_data_folder_where_one_is_named(tmp_path: Path) -> 
         coordinator.kill()
 
 
-def test_full_disk_stops_what_is_new_with_a_clear_error_and_loses_nothing(coordinator: Coordinator) -> None:
+def test_a_full_disk_refuses_new_work_and_loses_nothing(coordinator: Coordinator) -> None:
     """The disk is made full for the running process by a limit on the size of its files."""
 
     async def scenario() -> None:

@@ -179,7 +179,7 @@ def test_workers_find_the_same_coordinator_after_an_orderly_restart(tmp_path: Pa
         holder[0].kill()
 
 
-def test_request_on_its_way_when_the_coordinator_dies_is_answered_by_the_next(tmp_path: Path) -> None:
+def test_a_request_under_way_is_answered_by_the_next_coordinator(tmp_path: Path) -> None:
     holder = [Coordinator(tmp_path / "state")]
 
     async def scenario() -> None:

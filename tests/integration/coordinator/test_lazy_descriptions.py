@@ -98,7 +98,7 @@ def cluster(tmp_path: Path) -> Iterator[Cluster]:
 
 @pytest.mark.slow
 @pytest.mark.timeout(400)
-def test_what_a_run_waits_for_is_described_then_and_kept_for_the_next_start(cluster: Cluster) -> None:
+def test_an_awaited_environment_is_described_and_kept_for_later_starts(cluster: Cluster) -> None:
     ids = {
         each
         for name in ("classic_control", "toy_text", "mujoco")

@@ -362,9 +362,7 @@ def invented(results: Results, *groups: str) -> str:
 
 
 @pytest.mark.parametrize("share", ["all", "1%"])
-def test_a_replay_is_never_ok_for_a_run_whose_held_out_episodes_have_no_recording(
-    results: Results, share: str
-) -> None:
+def test_a_replay_without_held_out_recordings_is_never_ok(results: Results, share: str) -> None:
     done = evopolicy(results.root, "check", invented(results, "heldout-001"), "--replay", share)
     assert done.returncode == 3, done.stdout + done.stderr
     assert "open   recordings: only 0 of 3 held-out episodes have a recording" in done.stdout

@@ -20,7 +20,7 @@ WORDS = {
 
 
 @pytest.mark.parametrize("end", WORDS)
-def test_every_refusal_to_the_gateway_of_an_ended_run_says_that_it_is_over(tmp_path: Path, end: str) -> None:
+def test_every_refusal_to_an_ended_runs_gateway_says_so(tmp_path: Path, end: str) -> None:
     async def scenario() -> None:
         coordinator = Coordinator(tmp_path / "state")
         try:

@@ -102,7 +102,7 @@ def test_worker_out_of_service_gets_no_work_until_it_is_taken_back(
     run(scenario)
 
 
-def test_workers_and_runs_are_listed_and_a_worker_that_is_not_there_is_an_error(
+def test_workers_and_runs_are_listed_and_unknown_workers_refused(
     coordinator: Coordinator,
 ) -> None:
     async def scenario() -> None:
@@ -144,7 +144,7 @@ def test_cancelled_run_is_finished_without_a_score(coordinator: Coordinator) -> 
     run(scenario)
 
 
-def test_run_goes_on_with_workers_of_another_class_when_an_operator_says_why(
+def test_a_run_continues_on_another_class_after_an_operators_repin(
     coordinator: Coordinator,
 ) -> None:
     async def scenario() -> None:

@@ -132,7 +132,7 @@ def test_the_scope_is_recorded_and_kept_out_of_a_comparison(played: Played, tmp_
     assert not (tmp_path / "report").exists()
 
 
-def test_what_came_of_its_actions_is_verified_and_its_clock_shows_in_the_second_check(played: Played) -> None:
+def test_results_of_actions_are_verified_and_clocks_show_in_second_checks(played: Played) -> None:
     report = played.verify("submit")
     assert report["identical"]
     assert report["episodes"] == 4 + 2 + 2 + 2  # train, validation, held-out, random reference
@@ -142,7 +142,7 @@ def test_what_came_of_its_actions_is_verified_and_its_clock_shows_in_the_second_
     }
 
 
-def test_a_sample_does_not_ask_one_policy_for_a_part_of_its_submit(played: Played) -> None:
+def test_a_sample_takes_whole_submits_of_policies_with_that_scope(played: Played) -> None:
     report = played.verify("submit", "--sample", "6", "--seed", "3")
     assert report["episodes"] == 6
     assert report["policy_episodes"] == 0

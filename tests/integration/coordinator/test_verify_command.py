@@ -146,7 +146,7 @@ def test_episodes_that_garbage_collection_removed_are_told_by_the_exit_code(
 
 
 @pytest.mark.timeout(600)
-def test_a_run_with_hidden_cases_of_its_own_is_verified_where_they_are_known(played: Played) -> None:
+def test_a_run_with_own_hidden_cases_is_verified_where_known(played: Played) -> None:
     on = ("--credentials", played.operator)
     played.play("run", "--env", "toy/line", "--hidden-cases", "per-run", "--exp-id", OWN, *on)
     (run,) = [path.parent for path in played.root.glob("runs/*/toy_line/own*/run.json")]
@@ -159,7 +159,7 @@ def test_a_run_with_hidden_cases_of_its_own_is_verified_where_they_are_known(pla
     assert "hidden cases of its own" in done.stdout + done.stderr
 
 
-def test_a_sample_draws_as_many_episodes_as_asked_and_the_same_ones_for_the_same_seed(played: Played) -> None:
+def test_a_sample_has_the_asked_size_and_follows_its_seed(played: Played) -> None:
     run = played.run("toy/line")
     for _ in range(2):
         done = played.verify(run, "--sample", "3", "--seed", "7", "--no-policy")
@@ -196,7 +196,7 @@ def test_numbers_that_no_episode_shows_are_compared_with_the_coordinators(
     assert any(text.startswith("number of returns is 1") for text in found), found
 
 
-def test_without_the_coordinators_records_a_tampered_action_shows_in_what_comes_of_it(
+def test_without_the_coordinator_a_tampered_action_shows_in_its_results(
     played: Played, tmp_path: Path
 ) -> None:
     run = tampered(played.run("toy/line"), tmp_path / "run", 0, action=[0.9])

@@ -63,7 +63,7 @@ def test_the_docker_steps_make_the_folders_that_the_compose_file_mounts(state: P
     assert services["worker"]["command"][2] == "one"
 
 
-def test_the_steps_for_a_site_make_a_router_that_lets_its_worker_in(state: Path, tmp_path: Path) -> None:
+def test_the_steps_for_a_site_admit_its_worker(state: Path, tmp_path: Path) -> None:
     run_blocks("--host FIRST", {"/var/lib/evopolicy": state, "FIRST": Path("first.lab")})
     output = run_blocks("berlin", {"ROUTER": Path("router.berlin.lab")})
     assert "zenohd --config /etc/evopolicy/router/zenohd.json" in output

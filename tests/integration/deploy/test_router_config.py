@@ -112,7 +112,7 @@ def site(tmp_path: Path) -> Site:
 
 
 @pytest.mark.parametrize("role", ["worker", "gateway", "operator"])
-def test_a_role_is_answered_through_the_sites_router_on_its_own_keys_only(site: Site, role: Role) -> None:
+def test_a_sites_router_answers_a_role_on_its_keys_only(site: Site, role: Role) -> None:
     async def scenario() -> None:
         async with site.up() as asked, site.link(role) as link:
             assert await answered(link, OWN_KEY[role], attempts=300)
@@ -246,7 +246,7 @@ def test_the_router_is_given_the_passwords_of_its_own_site_only(site: Site) -> N
         assert (site.folder / name).stat().st_mode & 0o077 == 0
 
 
-def test_the_command_writes_a_file_for_the_folders_place_on_the_routers_host(site: Site) -> None:
+def test_the_command_writes_paths_of_the_routers_host(site: Site) -> None:
     arguments = ["router-config", "site", "--folder", str(site.folder), "--state", str(site.certs.state)]
     done = CliRunner().invoke(app, [*arguments, "--installed-at", "/etc/evopolicy/router"])
     assert done.exit_code == 0, done.output

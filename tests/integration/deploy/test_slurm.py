@@ -132,9 +132,7 @@ def slurm(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Slurm]:
         slurm.stop()
 
 
-def test_workers_of_an_array_are_preempted_and_the_run_comes_to_the_same(
-    slurm: Slurm, tmp_path: Path
-) -> None:
+def test_a_run_comes_to_the_same_when_array_workers_are_preempted(slurm: Slurm, tmp_path: Path) -> None:
     coordinator = Coordinator(tmp_path / "s", "--hidden-isolation", "off")
     operator, worker = (coordinator.ready["credentials"][role] for role in ("operator", "worker"))
     size = (*SIZE, "--credentials", operator)

@@ -38,7 +38,7 @@ def worker(coordinator: Coordinator, root: Path) -> Iterator[subprocess.Popen[by
         process.wait(timeout=TIMEOUT_S)
 
 
-def test_workers_join_and_leave_during_a_run_and_it_comes_to_the_same(tmp_path: Path) -> None:
+def test_workers_that_join_and_leave_do_not_change_a_run(tmp_path: Path) -> None:
     coordinator = Coordinator(tmp_path / "s")
     credentials = coordinator.ready["credentials"]["operator"]
     size = (*SIZE, "--credentials", credentials)

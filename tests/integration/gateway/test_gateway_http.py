@@ -135,7 +135,7 @@ def test_an_unwaited_submit_is_asked_for_until_it_is_done(tmp_path: Path) -> Non
     play(tmp_path, script)
 
 
-def test_a_second_submit_while_one_runs_is_a_conflict_that_names_the_first(tmp_path: Path) -> None:
+def test_a_second_submit_is_a_conflict_that_names_the_first(tmp_path: Path) -> None:
     async def script(s: Served) -> None:
         s.double.go.clear()
         await s.http.post(s.urls.submit + "?wait=false", json={"env_instances": [0]})
@@ -150,7 +150,7 @@ def test_a_second_submit_while_one_runs_is_a_conflict_that_names_the_first(tmp_p
     assert len(play(tmp_path, script).submits) == 2
 
 
-def test_the_same_key_and_body_is_one_submit_and_another_body_a_conflict(tmp_path: Path) -> None:
+def test_the_same_key_with_another_body_is_a_conflict(tmp_path: Path) -> None:
     async def script(s: Served) -> None:
         key = {"Idempotency-Key": "k-1"}
         s.double.go.clear()

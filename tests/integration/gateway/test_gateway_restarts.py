@@ -64,7 +64,7 @@ def test_a_restarted_gateway_has_the_same_urls_and_completes_the_feedback(tmp_pa
     asyncio.run(main())
 
 
-def test_an_answer_survives_the_restart_even_when_the_agent_has_changed_the_file(tmp_path: Path) -> None:
+def test_an_answer_survives_a_restart_and_a_changed_file(tmp_path: Path) -> None:
     async def main() -> None:
         double = Double(opened())
         async with answering(tmp_path, double) as found:
@@ -141,7 +141,7 @@ def test_a_feedback_folder_that_cannot_be_written_is_written_once_it_can(
     asyncio.run(main())
 
 
-def test_feedback_that_the_agent_tampers_with_while_it_is_written_comes_out_whole(tmp_path: Path) -> None:
+def test_feedback_tampered_with_while_written_comes_out_whole(tmp_path: Path) -> None:
     async def main() -> None:
         outside = tmp_path / "outside"
         outside.mkdir()
@@ -251,7 +251,7 @@ def test_a_port_that_somebody_else_has_taken_is_reported(tmp_path: Path, monkeyp
     asyncio.run(main())
 
 
-def test_a_gateway_that_stops_with_a_submit_open_tells_so_without_a_traceback(
+def test_a_gateway_that_stops_during_a_submit_shows_no_traceback(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     async def main() -> None:

@@ -141,7 +141,7 @@ def test_a_machine_without_ipv4_loopback_is_reported_before_anything_is_begun(
         f"mkdir $ODD && cd $ODD && {EVOPOLICY} local {PLAYED} --runs {{home}}/runs",
     ],
 )
-def test_a_path_that_is_not_utf_8_is_reported_before_anything_is_begun(home: Path, command: str) -> None:
+def test_a_path_that_is_not_utf8_is_refused_at_the_start(home: Path, command: str) -> None:
     output = refused("export ODD=$(printf 'odd-\\377')", command.replace("{home}", str(home)), home)
     assert r"odd-\xff" in output
     assert "not UTF-8" in output

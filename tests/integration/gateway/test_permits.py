@@ -127,7 +127,7 @@ def test_run_that_is_cancelled_while_it_waits_is_over(tmp_path: Path) -> None:
     asyncio.run(main())
 
 
-def test_gateway_of_an_agent_that_has_ended_closes_the_run_without_a_permit(tmp_path: Path) -> None:
+def test_an_ended_agents_gateway_closes_the_run_without_a_permit(tmp_path: Path) -> None:
     async def main() -> None:
         double = Double(opened())
         async with answering(tmp_path, double) as found:
@@ -155,7 +155,7 @@ def test_coordinator_of_an_older_version_is_an_error_with_the_remedy(tmp_path: P
 
 
 @pytest.mark.parametrize(("agent_host", "asks_for"), [("", ""), (KERNEL, KERNEL), (ELSEWHERE, "")])
-def test_permit_of_a_remote_agent_is_for_the_kernel_that_its_operator_names(
+def test_a_remote_agents_permit_is_for_the_named_kernel(
     tmp_path: Path, agent_host: str, asks_for: str
 ) -> None:
     folder = RunFolder(tmp_path)
@@ -165,7 +165,7 @@ def test_permit_of_a_remote_agent_is_for_the_kernel_that_its_operator_names(
     assert listener.ends_unseen(folder) == (agent_host != ELSEWHERE)
 
 
-def test_run_of_a_remote_agent_is_closed_when_its_operator_says_that_it_has_ended(tmp_path: Path) -> None:
+def test_a_remote_agents_run_closes_on_its_operators_word(tmp_path: Path) -> None:
     async def main() -> None:
         double = Double(opened())
         async with answering(tmp_path, double) as found:
@@ -199,7 +199,7 @@ def test_run_whose_operator_vouches_for_its_agent_is_closed_at_once(tmp_path: Pa
     asyncio.run(main())
 
 
-def test_gateway_that_is_stopped_while_it_waits_for_an_agents_end_leaves_the_run_open(tmp_path: Path) -> None:
+def test_a_gateway_stopped_before_its_agents_end_leaves_the_run_open(tmp_path: Path) -> None:
     async def main() -> None:
         double = Double(opened())
         async with answering(tmp_path, double) as found:
@@ -234,7 +234,7 @@ def test_agent_that_nobody_watches_ends_by_its_operators_word(tmp_path: Path) ->
     asyncio.run(main())
 
 
-def test_submit_that_hidden_episodes_hold_up_tells_so_and_counts_against_no_limit(tmp_path: Path) -> None:
+def test_time_held_by_hidden_episodes_counts_against_no_limit(tmp_path: Path) -> None:
     async def main() -> None:
         double = Double(opened())
         double.held_s = 5.0

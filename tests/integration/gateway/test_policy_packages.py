@@ -99,9 +99,7 @@ def test_a_rescore_plays_the_checkpoint_with_its_packages(root: Path) -> None:
     assert played.get("failures", {}) == {}
 
 
-def test_a_checkpoint_is_tried_with_the_packages_of_its_run_and_others_where_they_are_named(
-    root: Path, record: RunRecord
-) -> None:
+def test_a_checkpoint_is_tried_with_its_runs_or_the_named_packages(root: Path, record: RunRecord) -> None:
     checkpoint = next((run_dir(root) / "checkpoints").iterdir())
     where = ("--env", "toy/line", "--cases", "0", "--fresh", "--slots", "1")
     code, out, err = finished(root, "try", str(checkpoint), *where)

@@ -101,7 +101,7 @@ asyncio.run(main())
 """
 
 
-def test_an_episode_that_kills_two_gateways_is_put_aside_and_blames_no_other(tmp_path: Path) -> None:
+def test_an_episode_that_kills_two_gateways_is_set_aside(tmp_path: Path) -> None:
     async def child(folder: Path) -> int:
         process = await asyncio.create_subprocess_exec(sys.executable, "-c", KILLED, str(folder))
         return await asyncio.wait_for(process.wait(), 120)

@@ -69,9 +69,7 @@ def ask(host: Host, address: str) -> float:
     return float(host.run(sys.executable, "-c", ASK, address))
 
 
-def test_hosts_reach_each_other_through_a_router_over_a_wire_that_loses_packets(
-    network: Network, tmp_path: Path
-) -> None:
+def test_hosts_reach_each_other_over_a_lossy_wire(network: Network, tmp_path: Path) -> None:
     near, router, far = (network.host(name) for name in ("near", "router", "far"))
     network.cable(router, "10.92.1.1/24", near, "10.92.1.2/24")
     wire = network.wire(router, "10.92.2.1/24", far, "10.92.2.2/24")

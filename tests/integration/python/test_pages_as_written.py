@@ -156,7 +156,7 @@ def test_the_page_about_coding_agents_runs_its_agents(tmp_path: Path) -> None:
     assert sum(bool(one.agent.prompts) and bool(one.experiment_dimensions.agents_md) for one in records) == 1
 
 
-def test_the_command_that_two_pages_name_prints_a_schema_that_accepts_the_pages_suite_file(
+def test_the_documented_schema_accepts_the_documented_suite_file(
     tmp_path: Path,
 ) -> None:
     pages = ("how-to/sweeps.md", "reference/files.md")

@@ -95,9 +95,7 @@ def table(report: Path, name: str) -> list[dict[str, str]]:
     return list(csv.DictReader((report / "tables" / f"{name}.csv").read_text().splitlines()))
 
 
-def test_feedback_use_has_a_row_for_every_submit_with_what_was_read_and_said(
-    report: Path, runs: Path
-) -> None:
+def test_feedback_use_has_a_row_for_every_submit(report: Path, runs: Path) -> None:
     found = table(report, "feedback_use")
     assert len(found) == sum(int(row["submits"]) for row in table(report, "runs"))
     record = json.loads((runs / "Kestrel" / "gym_acrobot" / "exp" / "run.json").read_text())

@@ -131,9 +131,7 @@ def changed(source: Path, target: Path, name: str, change: bytes) -> None:
     writer.close()
 
 
-def test_what_cannot_be_compared_or_does_not_stand_is_apart_with_the_reason(
-    labs: Path, tmp_path: Path
-) -> None:
+def test_incomparable_and_failed_results_stand_apart_with_the_reason(labs: Path, tmp_path: Path) -> None:
     with Archive(labs / "lab-b.evp") as archive:
         record = decode_run_record(archive.read("runs/0000/run.json", 1 << 20))
         document = json.loads(archive.read("runs/0000/run.json", 1 << 20))

@@ -254,7 +254,7 @@ def test_a_machine_is_admitted_and_revoked_while_the_coordinator_listens(tmp_pat
     asyncio.run(scenario())
 
 
-def test_the_last_machine_that_is_revoked_is_not_let_in_without_a_user_either(tmp_path: Path) -> None:
+def test_the_last_revoked_machine_is_refused_without_a_user_too(tmp_path: Path) -> None:
     """Zenoh asks for no password where it knows none: the list must never be empty."""
 
     async def scenario() -> None:

@@ -155,7 +155,7 @@ def test_a_revoked_operator_asks_for_nothing_more(certs: OwnCerts, coordinator: 
     run(scenario, 120)
 
 
-def test_machines_find_their_way_back_when_another_is_issued_or_the_coordinator_restarts(
+def test_machines_reconnect_after_an_issue_or_a_restart(
     certs: OwnCerts,
 ) -> None:
     async def scenario() -> None:
@@ -211,7 +211,7 @@ def test_tls_without_certificates_is_refused_with_the_remedy(tmp_path: Path) -> 
     )
 
 
-def test_insecure_tcp_has_to_be_asked_for_and_is_announced_to_this_clusters_machines(tmp_path: Path) -> None:
+def test_insecure_tcp_is_opt_in_and_announced(tmp_path: Path) -> None:
     coordinator = Coordinator(tmp_path / "state", "--listen", "tcp/0.0.0.0:0", "--insecure-tcp")
     try:
         found = coordinator.credentials("worker")

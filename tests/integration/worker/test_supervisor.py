@@ -274,7 +274,7 @@ def test_slots_are_prepared_before_there_is_work(coordinator: Coordinator, tmp_p
     run(scenario)
 
 
-def test_a_slot_that_cannot_be_prepared_is_started_again_for_its_first_lease(
+def test_an_unprepared_slot_is_started_again_for_its_first_lease(
     coordinator: Coordinator, tmp_path: Path
 ) -> None:
     class Unprepared(ScriptedSlot):
@@ -382,7 +382,7 @@ def test_what_the_coordinator_has_lost_is_sent_again(
     run(scenario)
 
 
-def test_results_wait_for_each_other_while_jobs_wait_and_the_last_ones_for_nothing(
+def test_results_are_batched_while_jobs_wait_but_not_the_last(
     coordinator: Coordinator, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # As good as for ever: a run that ends has not waited for the time to pass.
@@ -476,9 +476,7 @@ def test_a_worker_whose_coordinator_is_away_ends_all_the_same(
     run(scenario)
 
 
-def test_hidden_episodes_are_stopped_when_the_coordinator_is_silent_and_others_are_not(
-    coordinator: Coordinator, tmp_path: Path
-) -> None:
+def test_a_silent_coordinator_stops_hidden_episodes_only(coordinator: Coordinator, tmp_path: Path) -> None:
     stopped: list[str] = []
     playing = asyncio.Event()
     go_on = asyncio.Event()
@@ -570,7 +568,7 @@ def test_a_waiting_submit_stops_hidden_episodes_that_would_never_end(
         ("evopolicy_worker.outbox.Outbox._batch", "reporting"),
     ],
 )
-def test_a_worker_of_which_a_part_cannot_go_on_ends_with_the_reason(
+def test_a_worker_with_a_failed_part_ends_with_the_reason(
     coordinator: Coordinator, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, broken: str, part: str
 ) -> None:
     """Alive, it would lose its leases one after another, or keep what it played, for ever."""

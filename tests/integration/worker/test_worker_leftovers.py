@@ -64,7 +64,7 @@ def semaphores() -> set[str]:
     return {name for name in os.listdir("/dev/shm") if name.startswith("sem.")}
 
 
-def test_a_worker_that_is_killed_at_any_moment_of_its_start_leaves_nothing(tmp_path: Path) -> None:
+def test_a_worker_killed_during_its_start_leaves_nothing(tmp_path: Path) -> None:
     before = semaphores()
     seen: set[int] = set()
     for k in range(8):

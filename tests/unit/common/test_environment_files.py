@@ -164,7 +164,7 @@ def test_a_task_text_comes_from_an_ordinary_file_in_the_folder(tmp_path: Path) -
 
 
 @pytest.mark.parametrize("name", ["my_pkg:MyEnv-v0", "acme/glider", "acme.envs:Sub/Env-v1"])
-def test_environments_that_do_not_ship_are_named_by_module_or_by_a_prefix_of_their_own(name: str) -> None:
+def test_foreign_environments_are_named_by_module_or_own_prefix(name: str) -> None:
     assert catalogue.resolve([name, "gym/acrobot"]) == ["gym/acrobot", name]
     assert catalogue.suite_of(name).name == "other"
 

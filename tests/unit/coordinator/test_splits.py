@@ -68,7 +68,7 @@ def test_making_a_split_longer_changes_no_case(longer: dict[Any, int]) -> None:
         assert long[split][:5] == short[split]
 
 
-def test_run_with_hidden_cases_of_its_own_shares_none_but_all_train_cases(folder: Path) -> None:
+def test_a_run_with_own_hidden_cases_shares_train_cases_only(folder: Path) -> None:
     source = SplitSource(data=None, secret=b"s" * 32)
     shared, first, second = (source.splits("toy", "toy/line", COUNTS, own) for own in ("", "run-1", "run-2"))
     assert first == source.splits("toy", "toy/line", COUNTS, "run-1")
@@ -167,7 +167,7 @@ def test_secret_is_made_once_and_only_its_owner_reads_it(tmp_path: Path) -> None
     assert secret_of(tmp_path) == (secret, "")
 
 
-def test_unjailed_agents_find_no_secret_of_other_runs_and_those_get_a_new_one(tmp_path: Path) -> None:
+def test_unjailed_agents_find_no_other_runs_secret(tmp_path: Path) -> None:
     usual, _ = secret_of(tmp_path)
     own, note = secret_of(tmp_path, unjailed=True)
     assert "cases are of its own" in note

@@ -222,7 +222,7 @@ def test_the_compose_file_has_services_that_start_with_options_that_they_take() 
         assert set(service.get("depends_on", [])) <= services.keys()
 
 
-def test_the_compose_file_has_the_zenoh_router_of_our_version_and_it_offers_nothing_else() -> None:
+def test_the_compose_files_router_matches_our_zenoh_and_offers_nothing_else() -> None:
     router = compose()["services"]["router"]
     assert router["image"] == f"eclipse/zenoh:{metadata.version('eclipse-zenoh')}"
     pinned = re.search(r"^eclipse-zenoh==(.+)$", (ROOT / "constraints.txt").read_text(), re.MULTILINE)
@@ -235,7 +235,7 @@ def test_the_compose_file_has_the_zenoh_router_of_our_version_and_it_offers_noth
     assert users == [router["user"]], "the router reads folders that the image's user owns"
 
 
-def test_only_the_container_with_a_sandbox_inside_is_let_out_of_dockers_filters() -> None:
+def test_only_the_workers_container_leaves_dockers_filters() -> None:
     for name, service in compose()["services"].items():
         assert service["cap_drop"] == ["ALL"]
         assert service["read_only"] is True
@@ -294,7 +294,7 @@ def test_dockerignore_lets_no_caches_through() -> None:
     assert lines.index("deploy/machines") > lines.index("!deploy")
 
 
-def test_the_wheel_takes_every_file_here_and_not_the_folder_of_the_machines_keys() -> None:
+def test_the_wheel_takes_every_file_but_machines_keys() -> None:
     wheel = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["hatch"]["build"]["targets"]["wheel"]
     taken = {Path(path) for path in wheel["force-include"] if path.split("/")[0] == "deploy"}
     assert taken == {Path("deploy", path.name) for path in DEPLOY.iterdir() if path.name != "machines"}

@@ -356,7 +356,7 @@ def test_a_run_that_its_audits_put_in_question_is_refused(tmp_path: Path, found:
     assert [mixture.what for mixture in mixtures(runs)] == [IN_QUESTION] * refused
 
 
-def test_a_run_that_workers_of_other_versions_went_on_with_is_not_like_the_others(tmp_path: Path) -> None:
+def test_a_run_continued_by_other_versions_is_set_apart(tmp_path: Path) -> None:
     write_run(tmp_path, VERSIONS)
     run = write_run(tmp_path, VERSIONS, entry="Agent B")
     record = json.loads((run / "run.json").read_text())

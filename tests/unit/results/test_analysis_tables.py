@@ -250,7 +250,7 @@ def with_names(folder: Path, title: str, family: str) -> None:
     (folder / "run.json").write_text(json.dumps({**record, "env_title": title, "env_family": family}))
 
 
-def test_environments_that_do_not_ship_have_the_title_and_family_that_their_runs_tell(tmp_path: Path) -> None:
+def test_foreign_environments_have_their_runs_titles_and_families(tmp_path: Path) -> None:
     versions = [Version(policy(gain=1.0), (1.0,), 1.0)]
     for entry in ("A", "B"):
         with_names(

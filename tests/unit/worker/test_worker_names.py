@@ -17,7 +17,7 @@ def credentials(user: str, folder: Path) -> Credentials:
     )
 
 
-def test_a_worker_has_its_certificates_name_and_a_second_one_beside_it_another(tmp_path: Path) -> None:
+def test_two_workers_of_one_certificate_have_two_names(tmp_path: Path) -> None:
     found = credentials("worker/second", tmp_path)
     assert default_name(found) == "second"
     beside = default_name(found)
@@ -25,7 +25,7 @@ def test_a_worker_has_its_certificates_name_and_a_second_one_beside_it_another(t
     assert default_name(found) != beside
 
 
-def test_a_worker_without_a_certificate_has_its_hosts_name_and_a_random_part(tmp_path: Path) -> None:
+def test_a_worker_without_a_certificate_has_a_random_name(tmp_path: Path) -> None:
     found = credentials("worker", tmp_path)
     assert default_name(found) != default_name(found)
 

@@ -156,9 +156,7 @@ KEEP = """
 """
 
 
-def test_a_page_that_is_loaded_for_an_episode_finds_nothing_of_an_earlier_one(
-    browser: Page, tmp_path: Path
-) -> None:
+def test_a_loaded_page_finds_nothing_of_an_earlier_episode(browser: Page, tmp_path: Path) -> None:
     (tmp_path / "worker.js").write_text("self.addEventListener('fetch', () => {});")
     attack = address(tmp_path, KEEP)
     for seed in ("1", "2"):
@@ -338,7 +336,7 @@ def test_a_page_that_hangs_or_needs_too_much_memory_is_reported(
     assert browser.run("window.here") == 1
 
 
-def test_a_browser_s_memory_is_limited_and_it_is_replaced_when_it_has_grown(
+def test_a_browser_whose_memory_has_grown_is_replaced(
     browser: Page, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     browser.open(address(tmp_path, "window.here = 1"), "1")

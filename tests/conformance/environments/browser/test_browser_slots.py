@@ -47,7 +47,7 @@ def test_a_policy_clicks_in_a_browser_in_its_slot(slots: Slots, tier: Tier) -> N
         assert outcome.episode_return > 0.9
 
 
-def test_a_process_whose_browser_has_played_a_hidden_episode_plays_no_train_episode(slots: Slots) -> None:
+def test_a_browser_that_played_a_hidden_episode_plays_no_train_episode(slots: Slots) -> None:
     slot = slots.new()
     slots.run(slot.start())
 

@@ -285,7 +285,7 @@ def test_every_call_can_be_made(warm: Warm) -> None:
     assert (step.reward, step.terminated) == (0.0, True)
 
 
-def test_a_snapshot_of_the_documents_comes_when_it_is_asked_for_and_repeats() -> None:
+def test_a_snapshot_of_the_documents_comes_on_request_and_repeats() -> None:
     environment = BrowserGymEnv("enter-text", dom_object=True)
 
     def episode(seed: int) -> list[str]:
@@ -378,7 +378,7 @@ def test_keys_find_an_option_by_the_episode_s_time(warm: Warm) -> None:
     assert [chosen(0.0, 0), chosen(1.2, 0), chosen(0.0, 5)] == ["ab", "ab", "b"]
 
 
-def test_a_held_arrow_of_a_number_field_counts_by_the_episode_s_clock(warm: Warm) -> None:
+def test_a_held_arrow_counts_by_the_episodes_clock(warm: Warm) -> None:
     environment = warm("browsergym/miniwob.guess-number")
 
     def counted(pause_s: float, then: str) -> list[str]:

@@ -107,7 +107,7 @@ def test_text_is_typed(warm: Warm, typing: str) -> None:
     assert step.reward > 0
 
 
-def test_a_text_is_copied_and_pasted_and_no_later_episode_can_paste_it(warm: Warm) -> None:
+def test_no_later_episode_can_paste_a_copied_text(warm: Warm) -> None:
     environment = warm("miniwob/copy-paste-v1")
 
     def fields(obs: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
@@ -257,7 +257,7 @@ def _played(environment: Environment, lose: Callable[[int], None]) -> list[Step]
 
 
 @pytest.mark.parametrize("how", ["the browser is killed", "the page crashes", "the page hangs"])
-def test_an_episode_whose_browser_is_lost_goes_on_as_if_nothing_had_happened(
+def test_an_episode_survives_the_loss_of_its_browser(
     warm: Warm, how: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     environment = warm("miniwob/click-checkboxes-v1")

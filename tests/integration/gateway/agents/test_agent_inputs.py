@@ -68,7 +68,7 @@ def plan(folder: Path, **more: object) -> Plan:
     )
 
 
-def test_a_run_is_not_resumed_with_another_skill_and_not_played_without_a_jail(tmp_path: Path) -> None:
+def test_a_run_with_skills_needs_the_same_skills_and_a_jail(tmp_path: Path) -> None:
     agent_file(tmp_path, "http://127.0.0.1:1")
     opened = plan(tmp_path)
     assert opened.settings.inputs == inputs_digest(opened.texts.inputs) != ""

@@ -136,9 +136,7 @@ def test_a_cli_of_the_example_files_edits_submits_and_is_resumed(
 
 
 @pytest.mark.parametrize("harness", ["codex", "claude-code"])
-def test_the_real_cli_plays_a_whole_run_in_its_jail_and_is_resumed_there(
-    tmp_path: Path, harness: str
-) -> None:
+def test_the_real_cli_plays_and_resumes_a_jailed_run(tmp_path: Path, harness: str) -> None:
     program = Path(CLIS) / {"codex": "codex", "claude-code": "claude"}[harness]
     with ModelApi([*SCRIPT[:2], Step(status=503, text="overloaded"), *SCRIPT[2:]]) as api:
         config = config_for(harness, api)
@@ -216,7 +214,7 @@ def test_a_real_agent_behind_the_protocol_edits_submits_and_goes_on(tmp_path: Pa
 
 
 @pytest.mark.parametrize("name", ACP)
-def test_a_real_agent_behind_the_protocol_plays_a_whole_run_in_its_jail(
+def test_a_real_agent_behind_the_protocol_plays_a_jailed_run(
     tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     home = tmp_path / "home"
@@ -248,7 +246,7 @@ LOOK = "echo '# better' >> system/policy.py; ls -d ~/.*/skills/lamps/SKILL.md; e
 @pytest.mark.parametrize(
     "name", ["claude-code", "codex", "gemini", "qwen", "acp-gemini", "acp-qwen", "acp-opencode", "acp-claude"]
 )
-def test_a_real_agent_has_the_runs_skills_and_mcp_servers_in_its_jail(
+def test_a_jailed_real_agent_has_the_runs_skills_and_servers(
     tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The description of the skill reaches the model, which calls the server's tool; neither can be changed."""

@@ -125,7 +125,7 @@ def test_a_large_body_of_a_stranger_is_not_read_to_its_end(tmp_path: Path) -> No
     play(tmp_path, script)
 
 
-def test_the_token_is_a_file_for_the_operator_alone_and_stays_the_same(tmp_path: Path) -> None:
+def test_the_token_is_a_lasting_file_for_the_operator_alone(tmp_path: Path) -> None:
     async def main() -> None:
         async with open_listener(tmp_path) as s:
             assert stat.S_IMODE(s.folder.bearer.stat().st_mode) == 0o600
@@ -277,9 +277,7 @@ class RemoteRun:
                 self.process.wait(timeout=TIMEOUT_S)
 
 
-def test_a_remote_run_waits_for_its_agent_and_ends_when_the_operator_says_so(
-    operator_file: Path, tmp_path: Path
-) -> None:
+def test_a_remote_run_ends_when_the_operator_says_so(operator_file: Path, tmp_path: Path) -> None:
     run = RemoteRun(operator_file, tmp_path)
     try:
         run.wait_until_served()
@@ -302,9 +300,7 @@ def test_a_remote_run_waits_for_its_agent_and_ends_when_the_operator_says_so(
     assert not run.folder.state.exists()
 
 
-def test_a_remote_run_that_has_spent_its_budget_is_scored_when_its_agent_has_ended(
-    operator_file: Path, tmp_path: Path
-) -> None:
+def test_a_spent_remote_run_is_scored_once_its_agent_has_ended(operator_file: Path, tmp_path: Path) -> None:
     run = RemoteRun(operator_file, tmp_path)
     try:
         run.wait_until_served()

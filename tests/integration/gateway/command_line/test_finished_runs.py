@@ -182,7 +182,7 @@ def test_a_bug_before_the_run_is_closed_does_not_cancel_it(
     assert (run_dir(tmp_path) / "workspace" / "starts").read_text() == "x"
 
 
-def test_a_failure_of_the_view_after_the_last_episode_does_not_cancel_the_run(
+def test_a_failing_view_after_the_last_episode_cancels_no_run(
     operator_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     agent(tmp_path, "open('starts', 'a').write('x')\nsubmit([0, 1, 2, 3, 4, 5])")

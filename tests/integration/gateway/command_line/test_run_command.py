@@ -11,9 +11,7 @@ from waiting import wait_until
 from evopolicy_common.records.summary import decode_summary
 
 
-def test_a_spoken_agent_gets_turns_until_it_stops_and_the_run_is_finalised(
-    operator_file: Path, tmp_path: Path
-) -> None:
+def test_a_prompted_agent_gets_turns_until_it_stops(operator_file: Path, tmp_path: Path) -> None:
     code = """
 for line in sys.stdin:
     prompt = json.loads(line)
@@ -37,7 +35,7 @@ for line in sys.stdin:
     )
 
 
-def test_an_agent_that_stays_when_its_budget_is_spent_is_ended_even_if_it_ignores_being_asked(
+def test_an_agent_that_outstays_its_budget_and_ignores_requests_is_ended(
     operator_file: Path, tmp_path: Path
 ) -> None:
     code = """
@@ -162,9 +160,7 @@ def test_bad_input_gets_its_verdict_and_a_message_that_helps(operator_file: Path
     assert set(record.outcome.val_scores) == {"8", "9", "10"}
 
 
-def test_without_an_ok_submit_there_is_no_score_and_the_exit_code_says_so(
-    operator_file: Path, tmp_path: Path
-) -> None:
+def test_without_an_ok_submit_the_exit_code_says_so(operator_file: Path, tmp_path: Path) -> None:
     code = "open('system/policy.py', 'w').write('1 / 0')\nsubmit([0, 1])"
     exit_code, out, _ = run_on(operator_file, tmp_path, agent(tmp_path, code))
     assert exit_code == 3
@@ -248,7 +244,7 @@ def test_of_two_commands_that_overwrite_one_run_at_once_one_plays_it(
     assert len([*(run_dir(tmp_path) / "workspace").glob("played-*")]) == 1
 
 
-def test_an_agent_that_fails_after_its_submits_has_an_exit_code_of_its_own(
+def test_an_agent_failing_after_its_submits_has_its_own_exit_code(
     operator_file: Path, tmp_path: Path
 ) -> None:
     code, out, _ = run_on(operator_file, tmp_path, agent(tmp_path, "submit([0])\nsys.exit(7)"))

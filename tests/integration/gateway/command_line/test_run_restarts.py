@@ -107,7 +107,7 @@ def test_an_agent_whose_supervisor_dies_again_and_again_has_failed(
     )
 
 
-def test_a_run_whose_command_was_killed_is_gone_on_with_and_a_finished_one_is_reported(
+def test_a_killed_commands_run_is_continued_and_a_finished_one_reported(
     operator_file: Path, tmp_path: Path
 ) -> None:
     code = """
@@ -151,9 +151,7 @@ patient_submit([2, 3], "two")
     assert (run_dir(tmp_path) / "run.json").read_bytes() == before
 
 
-def test_the_agents_time_is_of_the_whole_run_however_often_it_was_interrupted(
-    operator_file: Path, tmp_path: Path
-) -> None:
+def test_interruptions_do_not_reset_the_agents_time(operator_file: Path, tmp_path: Path) -> None:
     code = "os.path.exists('here') or submit([0, 1])\nopen('here', 'w')\ntime.sleep(1000)"
     arguments = [*run_arguments(operator_file, agent(tmp_path, code)), "--resume"]
     with command(tmp_path, *arguments) as running:

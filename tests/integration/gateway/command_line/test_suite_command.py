@@ -138,7 +138,7 @@ def _starts(folder: Path) -> int:
         return 0
 
 
-def test_a_run_without_a_session_is_begun_again_and_the_old_one_kept_aside(tmp_path: Path) -> None:
+def test_a_run_without_a_session_restarts_and_keeps_the_old(tmp_path: Path) -> None:
     agent = tmp_path / "agent.py"
     agent.write_text(
         "import os, json, time, urllib.request\n"
@@ -203,7 +203,7 @@ def two_hosts(root: Path, agent: Path, flag: Path, *, budget: int) -> list[Path]
     return hosts
 
 
-def test_a_dead_hosts_runs_are_taken_over_and_it_takes_their_results_when_it_is_back(
+def test_a_dead_hosts_runs_are_taken_over_and_their_results_return(
     tmp_path: Path, operator_file: Path
 ) -> None:
     agent, flag = tmp_path / "agent.py", tmp_path / "seen" / "flag"
@@ -234,9 +234,7 @@ def test_a_dead_hosts_runs_are_taken_over_and_it_takes_their_results_when_it_is_
     assert [*hosts[0].glob("runs/t/*/*/*/run.json")] == []
 
 
-def test_a_host_whose_run_is_taken_over_during_a_submit_takes_the_others_result(
-    tmp_path: Path, operator_file: Path
-) -> None:
+def test_a_host_overtaken_during_a_submit_takes_the_other_result(tmp_path: Path, operator_file: Path) -> None:
     agent, flag = tmp_path / "agent.py", tmp_path / "seen" / "flag"
     flag.parent.mkdir()
     agent.write_text(
@@ -276,9 +274,7 @@ def test_a_host_whose_run_is_taken_over_during_a_submit_takes_the_others_result(
     assert (indexed["state"], indexed["score"], indexed["directory"]) == ("completed", entry["score"], "")
 
 
-def test_a_wrong_key_is_no_result_and_is_played_again_once_it_is_right(
-    tmp_path: Path, operator_file: Path
-) -> None:
+def test_a_run_with_a_wrong_key_is_played_again(tmp_path: Path, operator_file: Path) -> None:
     write_suite(tmp_path, claude="bad_key,work")
     arguments = ("--credentials", str(operator_file), "--only", "fake claude/*")
     root = tmp_path / "runs" / "t"
@@ -340,9 +336,7 @@ def test_json_events_tell_the_plan_and_the_results(tmp_path: Path, operator_file
     assert "submit" in kinds
 
 
-def test_a_cap_of_the_sweep_interrupts_and_a_higher_one_goes_on_in_the_session(
-    tmp_path: Path, operator_file: Path
-) -> None:
+def test_a_higher_cap_continues_the_interrupted_session(tmp_path: Path, operator_file: Path) -> None:
     write_suite(tmp_path, codex="work,endless,work")
     file = tmp_path / "t.toml"
     whole = file.read_text()
@@ -382,9 +376,7 @@ def test_ctrl_c_leaves_runs_open_and_the_exit_code_tells(tmp_path: Path, operato
         assert "goes on in its session" in second.text
 
 
-def test_a_changed_file_is_refused_with_what_has_changed_and_a_run_without_ok_submit_is_reported(
-    tmp_path: Path, operator_file: Path
-) -> None:
+def test_a_changed_file_is_refused_and_a_scoreless_run_reported(tmp_path: Path, operator_file: Path) -> None:
     broken = tmp_path / "bundles" / "0"
     broken.mkdir(parents=True)
     (broken / "policy.py").write_text("raise ValueError('no policy')\n")
@@ -468,7 +460,7 @@ main()
 
 @pytest.mark.parametrize("changed", [False, True])
 @pytest.mark.parametrize("at", ["created", "saved"])
-def test_a_run_that_was_just_opened_when_its_sweep_was_killed_does_not_stay_open(
+def test_a_killed_sweep_leaves_no_just_opened_run(
     tmp_path: Path, operator_file: Path, at: str, changed: bool
 ) -> None:
     write_suite(tmp_path)

@@ -97,7 +97,7 @@ def test_a_local_coordinator_that_does_not_start_is_reported_and_killed(
     assert [child.exit_code for child in started] == [-signal.SIGKILL]
 
 
-def test_a_coordinator_that_died_is_started_again_and_refused_options_end_the_command(
+def test_a_dead_coordinator_restarts_and_refused_options_end_the_command(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     refuses = "import sys; print('error: --slots 1: what for?', file=sys.stderr); sys.exit(2)"

@@ -32,7 +32,7 @@ def test_a_full_disk_is_reported_unless_who_asks_waits_for_room(
     ("fault", "code"),
     [(errno.ENOSPC, 1), (errno.EROFS, 1), (errno.EDQUOT, 1), (errno.EACCES, 2), (errno.ENOTDIR, 2)],
 )
-def test_only_what_may_pass_ends_a_program_so_that_it_is_started_again(
+def test_only_passing_causes_restart_a_program(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fault: int, code: int
 ) -> None:
     def refuses(**_: Any) -> None:
@@ -50,7 +50,7 @@ def test_a_damaged_store_is_no_reason_to_start_a_program_again() -> None:
     assert ended.value.code == 2
 
 
-def test_an_argument_that_is_not_utf_8_is_reported_and_any_other_such_text_is_a_bug(
+def test_an_argument_that_is_not_utf8_is_reported(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(sys, "argv", ["evopolicy", "status", "--connect", "tcp/odd-\udcff:1"])
@@ -81,7 +81,7 @@ def test_a_fault_and_its_remedy_are_two_clauses(tmp_path: Path) -> None:
         check_writable(tmp_path / "file" / "runs", "--runs")
 
 
-def test_a_path_that_is_not_utf_8_is_reported_in_letters_that_can_be_printed(tmp_path: Path) -> None:
+def test_a_path_that_is_not_utf8_is_reported_printably(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"odd-\\xff: this path is not UTF-8; choose another with --state"):
         check_text(Path(os.fsdecode(b"/odd-\xff")), "--state")
 

@@ -37,7 +37,7 @@ def test_what_is_no_line_of_a_process_is_refused(line: bytes) -> None:
         proc.parse_stat(line)
 
 
-def test_a_family_has_zombies_and_the_time_of_the_dead_and_not_what_is_spared() -> None:
+def test_a_family_counts_zombies_and_dead_but_not_spared_processes() -> None:
     with subprocess.Popen(
         [sys.executable, "-c", PROGRAM], stdin=subprocess.PIPE, stdout=subprocess.PIPE
     ) as child:

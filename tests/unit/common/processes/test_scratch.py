@@ -35,7 +35,7 @@ def test_a_folder_goes_with_its_owner(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_what_a_killed_owner_left_goes_at_the_next_start_of_its_kind_and_not_before(tmp_path: Path) -> None:
+def test_a_killed_owners_files_go_at_the_next_start(tmp_path: Path) -> None:
     owner = subprocess.Popen([sys.executable, "-c", OWNER, str(tmp_path)], stdout=subprocess.PIPE, text=True)
     assert owner.stdout is not None
     left = Path(owner.stdout.readline().strip())
@@ -97,7 +97,7 @@ def test_folders_without_rights_are_removed_and_a_link_is_not_followed(tmp_path:
     assert link.is_symlink()
 
 
-def test_a_folder_whose_maker_was_killed_before_it_was_owned_goes_once_it_is_old(tmp_path: Path) -> None:
+def test_an_ownerless_folder_goes_once_it_is_old(tmp_path: Path) -> None:
     young, old = (tmp_path / f"evopolicy-local-{name}" for name in ("young", "old"))
     for folder in (young, old):
         (folder / "in").mkdir(parents=True)

@@ -32,7 +32,7 @@ META = CheckpointMeta(
 )
 
 
-def test_a_bundle_comes_back_from_its_checkpoint_with_names_that_metadata_have_too(tmp_path: Path) -> None:
+def test_a_bundle_returns_from_its_checkpoint_with_metadatas_names(tmp_path: Path) -> None:
     bundle = pack(
         [
             BundleFile("policy.py", False, b"class Policy: ...\n"),

@@ -102,7 +102,7 @@ def test_file_names_neither_steer_the_terminal_nor_forge_lines(tmp_path: Path) -
     assert len(json.loads(invoked.output)) == 3
 
 
-def test_the_list_of_what_is_left_out_is_reported_with_reasons_and_covers_what_differs(
+def test_the_list_of_omissions_has_reasons_and_covers_all_differences(
     tmp_path: Path,
 ) -> None:
     done = CliRunner().invoke(app, ["diff", "--left-out"])
@@ -117,7 +117,7 @@ def test_the_list_of_what_is_left_out_is_reported_with_reasons_and_covers_what_d
     assert CliRunner().invoke(app, ["diff", str(left), str(right)]).exit_code == 1
 
 
-def test_people_see_scores_first_and_folders_in_place_of_the_files_in_them(tmp_path: Path) -> None:
+def test_people_see_scores_first_and_folders_for_files(tmp_path: Path) -> None:
     left, right = make_run(tmp_path, "a", returns=[2.0]), make_run(tmp_path, "b")
     record = json.loads((right / "run.json").read_text())
     record["outcome"] |= {"best_submit_index": 3, "final_score": 7.0}

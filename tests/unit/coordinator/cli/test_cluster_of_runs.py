@@ -20,7 +20,7 @@ def _sweep(folder: Path, name: str) -> Path:
 
 
 @pytest.mark.parametrize("given", [".", "agent/gym_acrobot/0", ".."])
-def test_a_sweep_with_a_cluster_of_its_own_is_named_with_the_option(
+def test_a_sweep_with_its_own_cluster_is_named_with_the_option(
     tmp_path: Path, given: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     sweep = _sweep(tmp_path, "sweep")
@@ -30,7 +30,7 @@ def test_a_sweep_with_a_cluster_of_its_own_is_named_with_the_option(
     assert f"add --state {sweep}/.cluster\n" in capsys.readouterr().err
 
 
-def test_runs_of_no_sweep_a_state_that_is_named_and_a_running_cluster_are_taken_as_they_are(
+def test_named_states_and_running_clusters_are_taken_as_they_are(
     tmp_path: Path,
 ) -> None:
     sweep = _sweep(tmp_path, "sweep")

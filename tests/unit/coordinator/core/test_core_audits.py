@@ -174,7 +174,7 @@ def test_a_restart_at_any_point_changes_nothing_of_the_audits() -> None:
         assert found.audited + sum(found.not_audited.values()) == found.sampled == 4 + 2 + 2 + 2
 
 
-def test_a_player_cannot_claim_the_audit_of_its_own_episode_after_a_restart() -> None:
+def test_no_restart_lets_a_player_audit_its_own_episode() -> None:
     fleet = Fleet(w1=0.0)
     fleet.train(0)
     fleet.turn("w1")

@@ -77,7 +77,7 @@ def test_closing_with_a_submit_in_flight_waits_for_it() -> None:
     assert [each.status for each in rig.finished().submits] == ["ok", "ok", "ok"]
 
 
-def test_a_run_without_an_ok_submit_says_so_and_still_has_its_random_reference() -> None:
+def test_a_run_without_an_ok_submit_has_its_random_reference() -> None:
     rig = Rig()
     session = rig.register()
     rig.create()
@@ -334,7 +334,7 @@ def test_the_same_key_gives_the_same_run(again: bool) -> None:
     assert rig.create("r2", key="same") == first
 
 
-def test_a_run_that_must_spend_its_budget_and_has_not_is_an_error_without_hidden_episodes() -> None:
+def test_an_unspent_run_that_must_spend_is_an_error() -> None:
     rig = Rig()
     session = rig.register()
     rig.create(budget=4, finish="budget")
@@ -388,7 +388,7 @@ def test_every_episode_of_a_run_is_cut_where_its_policy_is_told() -> None:
 
 
 @pytest.mark.parametrize("reload", [False, True])
-def test_success_of_held_out_episodes_is_in_the_result_even_after_a_restart(reload: bool) -> None:
+def test_held_out_success_is_in_the_result_after_a_restart(reload: bool) -> None:
     rig = Rig()
     session = rig.register()
     rig.create()

@@ -135,7 +135,7 @@ def test_an_operator_takes_a_quarantined_worker_back() -> None:
     assert rig.core.state.quarantined == {}
 
 
-def test_a_run_whose_episodes_a_forger_played_is_in_question_though_another_run_caught_it() -> None:
+def test_a_forger_caught_elsewhere_puts_its_other_runs_in_question() -> None:
     fleet = Fleet(share=0.0, w1=0.0, w2=5.0, w3=0.0)
     fleet.train(0, 1, 2, 3, run="r1")
     fleet.work_off()
@@ -196,7 +196,7 @@ def test_a_machine_cannot_play_under_the_name_of_anothers_worker() -> None:
     order=st.permutations(range(5)),
     episodes=st.integers(1, 8),
 )
-def test_no_honest_worker_is_ever_named_and_a_forger_among_three_always_is(
+def test_a_forger_among_three_is_named_and_no_honest_worker(
     n_honest: int, forges: bool, share: float, order: list[int], episodes: int
 ) -> None:
     adds = {f"w{place}": 0.0 for place in order[:n_honest]}

@@ -41,7 +41,7 @@ def the_hidden_one(rig: Rig, session: str) -> wire.Lease:
 
 
 @pytest.mark.parametrize("restart", [False, True])
-def test_a_job_that_a_submit_stops_goes_on_from_what_its_policy_had_returned(restart: bool) -> None:
+def test_a_stopped_job_continues_from_its_policys_actions(restart: bool) -> None:
     rig = Rig()
     session = rig.register(slots=1)
     rig.create(n_valid=1)
@@ -63,7 +63,7 @@ def test_a_job_that_a_submit_stops_goes_on_from_what_its_policy_had_returned(res
     assert rig.row(BegunRow, "r1/s0/validation", 0).begun is None
 
 
-def test_a_job_that_a_permit_stops_waits_until_its_worker_has_handed_back() -> None:
+def test_a_job_stopped_by_a_permit_waits_for_its_worker() -> None:
     rig = Rig()
     session, lease = playing(rig)
     other = rig.register("w2")
@@ -78,7 +78,7 @@ def test_a_job_that_a_permit_stops_waits_until_its_worker_has_handed_back() -> N
     assert [each.job.begun for each in rig.poll(other)] == [BEGUN]
 
 
-def test_a_worker_that_does_not_name_it_any_more_has_nothing_to_hand_back() -> None:
+def test_a_worker_that_no_longer_names_a_job_holds_nothing() -> None:
     rig = Rig()
     session, lease = playing(rig)
     other = rig.register("w2")
@@ -92,7 +92,7 @@ def test_a_worker_that_does_not_name_it_any_more_has_nothing_to_hand_back() -> N
     assert rig.core.state.jobs[lease.job.job_id].begun is None
 
 
-def test_a_worker_that_falls_silent_or_never_lets_go_holds_it_up_for_a_while_only() -> None:
+def test_a_silent_or_clinging_worker_delays_a_job_only_briefly() -> None:
     for beats in (False, True):
         rig = Rig(job_deadline_s=30.0)
         session, lease = playing(rig)
@@ -130,7 +130,7 @@ def test_another_worker_cannot_hand_back_what_it_was_not_given() -> None:
 
 
 @pytest.mark.parametrize("limit", [False, True])
-def test_a_worker_that_was_silent_for_long_is_not_believed_that_a_limit_ended_the_policy(limit: bool) -> None:
+def test_a_long_silent_workers_limit_verdict_is_not_believed(limit: bool) -> None:
     rig = Rig()
     session, lease = playing(rig)
     rig.pass_time(rig.settings.silence_s + 1.0)

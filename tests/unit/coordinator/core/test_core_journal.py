@@ -126,7 +126,7 @@ def test_no_cases_are_revealed_while_a_run_of_their_epoch_is_open() -> None:
     assert isinstance(entries_of(rig)[-1], Revealed)
 
 
-def test_a_revealed_epoch_is_given_to_no_new_run_even_after_a_restart() -> None:
+def test_no_new_run_gets_a_revealed_epoch_after_a_restart() -> None:
     rig = Rig()
     session = rig.register()
     rig.create()

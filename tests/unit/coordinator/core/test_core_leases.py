@@ -44,7 +44,7 @@ def test_a_lease_lives_as_long_as_heartbeats_name_it() -> None:
     assert rig.poll(second) == []
 
 
-def test_a_lease_of_a_silent_worker_goes_to_another_under_the_next_attempt() -> None:
+def test_a_silent_workers_lease_goes_to_another_as_next_attempt() -> None:
     rig, (first, second), lease = one_job("w1", "w2")
     rig.beat(first, lease)
     keep(rig, 18.0, (second, ()))
@@ -88,7 +88,7 @@ def test_a_worker_that_was_frozen_is_told_that_its_lease_is_gone() -> None:
     assert rig.beat(first, lease).cancelled == (lease.lease_id,)
 
 
-def test_a_result_of_an_expired_attempt_is_taken_while_the_job_is_open_and_stops_the_other() -> None:
+def test_an_expired_attempts_result_counts_while_its_job_is_open() -> None:
     rig, (first, second), lease = one_job("w1", "w2")
     keep(rig, 18.0, (second, ()))
     (again,) = rig.poll(second, wait_s=5.0)
@@ -201,7 +201,7 @@ def test_a_liveliness_hint_is_no_proof() -> None:
     assert rig.core.state.workers["w1"].state == "lost"
 
 
-def test_what_a_lost_worker_played_reruns_alone_and_what_waited_behind_it_does_not() -> None:
+def test_only_a_lost_workers_played_job_reruns_alone() -> None:
     rig = Rig()
     first = rig.register("w1", slots=1)
     rig.create()
@@ -255,9 +255,7 @@ def test_a_busy_worker_is_emptied_for_a_suspect() -> None:
     assert [each.job.job_id for each in rig.poll(second, 2)] == [lease.job.job_id]
 
 
-def test_a_worker_that_is_emptied_for_a_suspect_gets_work_again_when_the_suspect_is_claimed_elsewhere() -> (
-    None
-):
+def test_a_worker_emptied_for_a_suspect_claimed_elsewhere_works_again() -> None:
     rig, _, lease = one_job("w1")
     rig.load()
     second, third = rig.register("w2"), rig.register("w3")
@@ -277,7 +275,7 @@ def test_a_worker_that_is_emptied_for_a_suspect_gets_work_again_when_the_suspect
     assert len(rig.poll(third, 1)) == 1
 
 
-def test_a_train_suspect_does_not_wait_for_hidden_jobs_of_the_worker_that_is_emptied_for_it() -> None:
+def test_a_train_suspect_does_not_wait_for_hidden_jobs() -> None:
     rig, (first, second), lease = one_job("w1", "w2")
     rig.create("r2", n_valid=2)
     rig.submit(0, run="r2", key="x")
@@ -292,7 +290,7 @@ def test_a_train_suspect_does_not_wait_for_hidden_jobs_of_the_worker_that_is_emp
     assert [each.job.job_id for each in rig.poll(second, 2)] == [lease.job.job_id]
 
 
-def test_infrastructure_failures_back_off_on_another_worker_and_are_counted_for_the_operator() -> None:
+def test_infrastructure_failures_back_off_and_are_counted() -> None:
     rig, (first, second), lease = one_job("w1", "w2")
     rig.report_results(first, result(lease, "failed", error="disk full"))
     rig.pass_time(1.0)
@@ -385,7 +383,7 @@ def test_what_was_never_granted_is_neither_taken_nor_adopted_after_a_restart() -
     assert rig.row(OutcomeRow, GROUP, 0).outcome.episode_return == 6.0
 
 
-def test_a_result_of_a_lease_that_was_never_granted_accuses_no_run_of_nondeterminism() -> None:
+def test_an_ungranted_leases_result_accuses_no_run_of_nondeterminism() -> None:
     rig, (first,), lease = one_job("w1")
     other = rig.register("w2")
     rig.play(first, lease, value=6.0)
@@ -393,7 +391,7 @@ def test_a_result_of_a_lease_that_was_never_granted_accuses_no_run_of_nondetermi
     assert rig.core.state.runs["r1"].state.nondeterministic_results == 0
 
 
-def test_a_result_of_another_job_under_ones_own_lease_gives_the_leased_job_back() -> None:
+def test_a_result_for_another_job_gives_the_leased_job_back() -> None:
     rig, (first,), lease = one_job("w1")
     wrong = msgspec.structs.replace(result(lease, "done"), job_id=f"{GROUP}/7")
     rig.report_results(first, wrong)
@@ -402,7 +400,7 @@ def test_a_result_of_another_job_under_ones_own_lease_gives_the_leased_job_back(
     assert again.job == lease.job
 
 
-def test_a_worker_that_registers_again_keeps_what_it_claims_and_loses_the_rest() -> None:
+def test_a_reregistered_worker_keeps_only_its_claimed_leases() -> None:
     rig = Rig()
     first = rig.register("w1")
     rig.create()
@@ -418,7 +416,7 @@ def test_a_worker_that_registers_again_keeps_what_it_claims_and_loses_the_rest()
     assert rig.report_results(first, done(lease)).status == "unknown_worker"
 
 
-def test_a_held_back_heartbeat_is_answered_at_once_when_a_lease_is_to_stop() -> None:
+def test_a_delayed_heartbeat_is_answered_when_a_lease_must_stop() -> None:
     rig, (first,), lease = one_job("w1")
     assert rig.beat(first, lease, wait_s=5.0) is None
     request = rig._requests
@@ -455,7 +453,7 @@ def test_no_poll_waits_longer_than_the_longest_wait() -> None:
     assert {lease, beat, "wait"} <= rig.replies.keys()
 
 
-def test_a_limit_verdict_of_a_worker_that_was_silent_for_long_is_not_counted() -> None:
+def test_a_limit_verdict_of_a_silent_worker_is_not_counted() -> None:
     rig, (first,), lease = one_job("w1")
     rig.pass_time(2.0)
     rig.beat(first, lease)
@@ -464,7 +462,7 @@ def test_a_limit_verdict_of_a_worker_that_was_silent_for_long_is_not_counted() -
     assert rig.core.state.groups[GROUP].done == 0
 
 
-def test_a_limit_verdict_of_a_job_during_which_the_loop_stood_still_is_not_counted() -> None:
+def test_a_limit_verdict_during_a_blocked_loop_is_not_counted() -> None:
     rig, (first,), lease = one_job("w1")
     rig.pass_time(2.0)
     rig.beat(first, lease)
@@ -475,7 +473,7 @@ def test_a_limit_verdict_of_a_job_during_which_the_loop_stood_still_is_not_count
     assert rig.core.state.groups[GROUP].done == 0
 
 
-def test_an_environment_that_an_operator_asks_for_is_described_by_those_that_offer_it() -> None:
+def test_an_operators_environment_is_described_by_its_workers() -> None:
     rig = Rig()
     one, other = rig.register("w1", envs=(), undescribed=("my/a", "my/b")), rig.register("w2")
     for env in ("my/a", "my/none"):

@@ -65,7 +65,7 @@ def test_nothing_hidden_is_leased_where_a_related_agent_may_be_alive(restart: bo
     assert splits(rig.poll(other, 8)) == {"validation"}
 
 
-def test_an_agent_of_a_run_with_other_hidden_cases_is_no_obstacle_unless_all_are() -> None:
+def test_an_unrelated_agent_is_no_obstacle_unless_strict() -> None:
     for rule, wanted in (("related", {"random", "validation"}), ("strict", {"random"})):
         rig = Rig(hidden_isolation=rule)
         session = rig.register(slots=8)
@@ -74,7 +74,7 @@ def test_an_agent_of_a_run_with_other_hidden_cases_is_no_obstacle_unless_all_are
         assert splits(rig.poll(session, 8)) == wanted
 
 
-def test_who_knows_an_agent_gone_from_one_kernel_does_not_end_it_elsewhere() -> None:
+def test_an_agent_gone_from_one_kernel_is_not_ended_elsewhere() -> None:
     rig = Rig()
     rig.register()
     rig.create("r1", agent="lost")
@@ -86,7 +86,7 @@ def test_who_knows_an_agent_gone_from_one_kernel_does_not_end_it_elsewhere() -> 
     assert rig.row(PermitRow, "r1", HERE).ended_at is not None
 
 
-def test_an_agent_whose_permit_was_ended_by_mistake_stops_hidden_jobs_when_it_asks_again() -> None:
+def test_an_agent_that_asks_again_stops_hidden_jobs() -> None:
     rig = Rig()
     session = rig.register(slots=8)
     scored(rig, session)
@@ -118,7 +118,7 @@ def test_an_agent_whose_kernel_is_not_known_keeps_hidden_cases_from_all() -> Non
     assert [run.agent_host for run in rig.status().runs] == ["", "everywhere"]
 
 
-def test_a_worker_whose_kernel_is_not_known_plays_nothing_hidden_and_is_told_why() -> None:
+def test_a_worker_on_an_unknown_kernel_plays_nothing_hidden() -> None:
     rig = Rig()
     session = rig.register(slots=8, boot_id="")
     scored(rig, session)
@@ -128,7 +128,7 @@ def test_a_worker_whose_kernel_is_not_known_plays_nothing_hidden_and_is_told_why
     assert registered.hidden_bar == rig.status().workers[0].hidden_bar
 
 
-def test_a_permit_stops_hidden_jobs_uncharged_and_waits_until_their_worker_has_let_go() -> None:
+def test_a_permit_stops_hidden_jobs_and_waits_for_their_worker() -> None:
     rig = Rig()
     session = rig.register(slots=8)
     scored(rig, session)
@@ -146,9 +146,7 @@ def test_a_permit_stops_hidden_jobs_uncharged_and_waits_until_their_worker_has_l
     assert rig.core.state.runs["r0"].state.infrastructure_retries == 0
 
 
-def test_a_permit_that_is_not_granted_in_time_says_what_it_waits_for_and_bars_hidden_jobs_until_it_is_asked_again() -> (
-    None
-):
+def test_a_late_permit_names_its_wait_and_bars_hidden_jobs() -> None:
     rig = Rig()
     session = rig.register(slots=8)
     scored(rig, session)
@@ -196,7 +194,7 @@ def test_a_silent_workers_kernel_stays_barred_until_it_has_surely_stopped() -> N
     assert rig.replies[request].granted
 
 
-def test_a_silent_worker_that_is_heard_again_without_its_leases_frees_its_kernel_at_once() -> None:
+def test_a_returning_worker_without_leases_frees_its_kernel() -> None:
     rig = Rig()
     session = rig.register(slots=8)
     scored(rig, session)
@@ -209,7 +207,7 @@ def test_a_silent_worker_that_is_heard_again_without_its_leases_frees_its_kernel
     assert rig.permit("r1", HERE).granted
 
 
-def test_a_lease_that_is_on_its_way_is_not_taken_for_one_that_was_let_go_of() -> None:
+def test_a_lease_in_transit_is_not_taken_for_a_released_one() -> None:
     rig = Rig()
     session = rig.register(slots=8)
     scored(rig, session)
@@ -224,7 +222,7 @@ def test_a_lease_that_is_on_its_way_is_not_taken_for_one_that_was_let_go_of() ->
     assert rig.permit("r1", HERE).granted
 
 
-def test_after_a_restart_workers_that_were_known_count_as_playing_until_they_are_heard() -> None:
+def test_known_workers_count_as_playing_after_a_restart_until_heard() -> None:
     rig = Rig()
     session = rig.register(slots=8)
     scored(rig, session)
@@ -267,9 +265,7 @@ def test_a_permit_ends_with_its_run() -> None:
 
 @pytest.mark.parametrize("restart", [False, True])
 @pytest.mark.parametrize("confirmed", [False, True])
-def test_a_cancelled_runs_permit_ends_when_its_gateway_says_so_or_after_a_while(
-    restart: bool, confirmed: bool
-) -> None:
+def test_a_cancelled_runs_permit_ends_by_its_gateway_or_time(restart: bool, confirmed: bool) -> None:
     rig = Rig()
     session = rig.register(slots=8)
     scored(rig, session)
@@ -427,14 +423,14 @@ def test_a_gateway_that_asks_for_permits_opens_its_run_without_one() -> None:
     assert permits.held(rig.core.state, "r1") == []
 
 
-def test_where_a_remote_agent_is_said_to_be_counts_in_place_of_its_gateways_host() -> None:
+def test_a_remote_agents_stated_place_replaces_its_gateways_host() -> None:
     rig = Rig()
     rig.register()
     rig.create("r1", agent="gateway", agent_host="remote")
     assert [row.boot_id for _, row in permits.held(rig.core.state, "r1")] == ["remote"]
 
 
-def test_an_agent_that_the_operator_vouches_for_needs_no_permit_and_the_run_says_so() -> None:
+def test_a_vouched_agent_needs_no_permit_and_is_stamped() -> None:
     rig = Rig()
     session = rig.register(slots=8)
     rig.create("r1", agent="", agent_host=ELSEWHERE)

@@ -45,7 +45,7 @@ def waiting(rig: Rig, session: str) -> None:
     keep_alive(rig, session, WAIT_S + 4.0)
 
 
-def test_hidden_cases_that_waited_for_long_keep_new_agents_away_and_let_those_at_work_end() -> None:
+def test_long_waiting_hidden_cases_keep_new_agents_away() -> None:
     rig = Rig()
     session = rig.register(slots=8)
     waiting(rig, session)
@@ -76,7 +76,7 @@ def test_the_order_is_turned_back_when_nothing_hidden_is_left() -> None:
     assert rig.replies[request].granted
 
 
-def test_before_that_a_new_agent_stops_hidden_cases_as_often_as_it_takes() -> None:
+def test_before_that_new_agents_stop_hidden_cases() -> None:
     rig = Rig()
     session = rig.register(slots=8)
     closed(rig, session, "r0")
@@ -151,7 +151,7 @@ def test_submits_that_wait_for_hidden_cases_say_so() -> None:
     assert rig.tell(asked(gateway.StateRequest, request=rig.request(), run="r1")).state.held_s == held_s
 
 
-def test_the_time_for_which_a_submit_is_held_does_not_count_against_its_limit() -> None:
+def test_the_time_a_submit_is_held_counts_against_no_limit() -> None:
     rig = Rig()
     session = rig.register(slots=1)
     rig.create("r1", agent="remote", limits=ResourceLimits(submit_wall_s=20.0))
@@ -207,7 +207,7 @@ def test_a_run_that_keeps_others_waiting_for_too_long_is_cancelled(where: str, r
     assert "validation" in splits(rig.poll(session, 8))
 
 
-def test_an_agent_that_keeps_others_waiting_is_named_until_its_time_is_up() -> None:
+def test_an_agent_that_delays_others_is_named_until_its_limit() -> None:
     rig = Rig(agent_wait_s=600.0)
     session = rig.register(slots=8)
     closed(rig, session, "r0")
@@ -222,7 +222,7 @@ def test_an_agent_that_keeps_others_waiting_is_named_until_its_time_is_up() -> N
     assert "r1" not in rig.core.state.runs
 
 
-def test_a_worker_that_asks_for_no_work_keeps_no_kernel_from_being_turned_over() -> None:
+def test_an_idle_worker_does_not_prevent_a_reservation() -> None:
     rig = Rig()
     session = rig.register(slots=8)
     closed(rig, session, "r0")
@@ -264,7 +264,7 @@ def test_a_kernel_whose_workers_are_gone_is_turned_back(why: str) -> None:
     assert rig.permit("r2", HERE).granted
 
 
-def test_of_several_kernels_the_one_with_the_fewest_related_agents_is_turned_over() -> None:
+def test_the_kernel_with_the_fewest_related_agents_is_reserved() -> None:
     rig = Rig()
     sessions = [rig.register(name, slots=8) for name in ("w1", "w2")]
     closed(rig, sessions[0], "r0")
@@ -280,7 +280,7 @@ def test_of_several_kernels_the_one_with_the_fewest_related_agents_is_turned_ove
     assert turned == ["kernel-of-w2"]
 
 
-def test_hidden_cases_of_a_closed_run_go_before_train_jobs_of_others_on_their_kernel() -> None:
+def test_a_closed_runs_hidden_cases_precede_others_train_jobs() -> None:
     rig = Rig()
     session = rig.register(slots=1)
     waiting(rig, session)
@@ -358,7 +358,7 @@ def test_one_host_one_slot_and_four_runs_come_to_an_end() -> None:
     assert {rig.finished(run).hidden_isolation for run in runs} == {"exclusive"}
 
 
-def test_a_train_job_and_hidden_ones_of_related_runs_never_share_a_kernel() -> None:
+def test_related_train_and_hidden_jobs_never_share_a_kernel() -> None:
     rig = Rig()
     first, second = rig.register("w1", slots=4, boot_id="one"), rig.register("w2", slots=4, boot_id="one")
     closed(rig, first, "r0")
@@ -379,7 +379,7 @@ def test_a_train_job_and_hidden_ones_of_related_runs_never_share_a_kernel() -> N
     assert splits(rig.poll(first, 4)) == ["validation"]
 
 
-def test_a_rescore_waits_for_agents_of_runs_that_share_hidden_cases_with_its_run() -> None:
+def test_a_rescore_waits_for_agents_of_related_runs() -> None:
     rig = Rig()
     session = rig.register(slots=8)
     rig.create("r1", agent=HERE)

@@ -68,7 +68,7 @@ def test_two_runs_share_the_slots_whatever_they_have_waiting() -> None:
     assert got == {"r1": 8, "r2": 8}
 
 
-def test_a_worker_cannot_make_up_the_time_that_the_fair_share_counts_in() -> None:
+def test_a_worker_cannot_forge_the_fair_shares_time() -> None:
     rig = Rig()
     session = rig.register(slots=2)
     rig.create("r1", budget=64, most=64)
@@ -151,7 +151,7 @@ def test_new_work_goes_to_the_worker_that_has_its_bundle_warm() -> None:
     assert len(rig.replies[request].leases) == 1
 
 
-def test_a_waiting_train_job_stops_early_validation_and_the_hidden_job_comes_back_later() -> None:
+def test_a_waiting_train_job_stops_early_validation_for_a_while() -> None:
     rig = Rig()
     session = rig.register(slots=1)
     validating(rig, session)
@@ -169,7 +169,7 @@ def test_a_waiting_train_job_stops_early_validation_and_the_hidden_job_comes_bac
     assert rig.core.state.runs["r1"].state.infrastructure_retries == 0
 
 
-def test_a_worker_whose_poll_waits_is_told_there_at_once_what_to_stop() -> None:
+def test_a_waiting_poll_is_told_at_once_what_to_stop() -> None:
     rig = Rig()
     session = rig.register(slots=2)
     validating(rig, session)
@@ -182,7 +182,7 @@ def test_a_worker_whose_poll_waits_is_told_there_at_once_what_to_stop() -> None:
     assert [split_of(lease.job) for lease in rig.poll(session, 2)] == ["train", "train"]
 
 
-def test_short_early_validation_comes_in_batches_and_train_gets_its_slot_all_the_same() -> None:
+def test_batched_early_validation_still_leaves_train_its_slot() -> None:
     rig = Rig()
     session = rig.register(slots=2)
     validating(rig, session)
@@ -199,7 +199,7 @@ def test_short_early_validation_comes_in_batches_and_train_gets_its_slot_all_the
     assert split_of(rig.poll(session, 2)[0].job) == "train"
 
 
-def test_a_train_job_stops_hidden_ones_on_the_worker_it_failed_on_once_it_may_go_there_again() -> None:
+def test_a_retried_train_job_stops_hidden_jobs_on_its_worker() -> None:
     rig = Rig()
     session = rig.register("w1", slots=1)
     validating(rig, session)
@@ -217,7 +217,7 @@ def test_a_train_job_stops_hidden_ones_on_the_worker_it_failed_on_once_it_may_go
     assert rig.beat(session, hidden).cancelled == (hidden.lease_id,)
 
 
-def test_a_train_job_that_waits_already_stops_a_hidden_one_that_is_adopted_from_a_heartbeat() -> None:
+def test_a_waiting_train_job_stops_an_adopted_hidden_job() -> None:
     rig = Rig()
     session = rig.register(slots=1)
     rig.create(n_valid=1)
@@ -323,7 +323,7 @@ def pinned_versions(file: str) -> dict[str, str]:
     return dict(re.findall(r"^([\w-]+)==([\w.]+)$", text.lower(), re.MULTILINE))
 
 
-def test_a_worker_with_the_papers_versions_is_a_class_of_its_own_and_named_so() -> None:
+def test_a_worker_with_the_papers_versions_is_its_own_class() -> None:
     paper = pinned_versions("deploy/paper-versions.txt")
     usual = {name: version for name, version in pinned_versions("constraints.txt").items() if name in paper}
     assert paper.keys() == usual.keys() == {"gymnasium", "highway-env", "minigrid", "mujoco"}
@@ -372,9 +372,7 @@ def test_what_plays_other_environments_makes_no_other_class_of_this_one(
         ({"task_text": "easier"}, "task_text  there, easier here"),
     ],
 )
-def test_two_definitions_of_one_environment_are_two_classes_and_the_difference_is_named(
-    changed: dict[str, Any], named: str
-) -> None:
+def test_two_definitions_of_one_environment_are_two_classes(changed: dict[str, Any], named: str) -> None:
     rig = Rig()
     rig.register("w1", described=(versioned(),))
     rig.create()
@@ -403,7 +401,7 @@ def test_a_definition_is_the_same_whoever_plays_it_and_whatever_its_defaults() -
 
 
 @pytest.mark.parametrize(("state", "ends"), [("draining", True), ("paused", False)])
-def test_a_worker_out_of_service_gets_no_more_work_also_after_a_restart(
+def test_a_worker_out_of_service_gets_no_work_after_restarts(
     state: Literal["draining", "paused"], ends: bool
 ) -> None:
     rig = Rig()
@@ -427,7 +425,7 @@ def test_a_worker_out_of_service_gets_no_more_work_also_after_a_restart(
 
 
 @pytest.mark.parametrize("how", ["paused", "lost"])
-def test_a_run_opened_while_its_only_worker_was_away_is_played_when_it_is_back(
+def test_a_run_opened_without_workers_is_played_on_their_return(
     how: Literal["paused", "lost"],
 ) -> None:
     rig = Rig()
@@ -468,7 +466,7 @@ def test_what_waits_too_long_is_named_with_what_it_waits_for() -> None:
     assert rig.core.trace("r1/s0/train")
 
 
-def test_what_a_connected_worker_has_yet_to_describe_waits_for_that_and_for_no_other_worker() -> None:
+def test_a_run_waits_for_its_connected_workers_description_only() -> None:
     rig = Rig()
     rig.create()
     flow = rig.core.state.runs["r1"].flow
@@ -484,7 +482,7 @@ def test_what_a_connected_worker_has_yet_to_describe_waits_for_that_and_for_no_o
     assert waits_for_workers(rig.core.state, flow) is None
 
 
-def test_what_waits_after_faults_of_ours_is_named_with_the_last_of_them() -> None:
+def test_jobs_waiting_after_faults_are_named_with_the_last() -> None:
     rig = Rig(stall_s=0.1, retry_base_s=10.0)
     session = rig.register()
     rig.create()
@@ -496,7 +494,7 @@ def test_what_waits_after_faults_of_ours_is_named_with_the_last_of_them() -> Non
     assert stall.endswith("after 1 faults, the last: failed on w1: no space left on device")
 
 
-def test_a_poll_that_lay_unread_until_its_worker_gave_it_up_gets_no_lease() -> None:
+def test_a_poll_read_after_its_worker_gave_up_gets_no_lease() -> None:
     rig = Rig()
     session = rig.register()
     rig.create()
@@ -505,7 +503,7 @@ def test_a_poll_that_lay_unread_until_its_worker_gave_it_up_gets_no_lease() -> N
     assert len(rig.poll(session, 1, wait_s=10.0, waited_s=9.0)) == 1
 
 
-def test_a_parked_poll_that_was_given_up_while_the_loop_stood_still_gets_no_lease() -> None:
+def test_a_parked_poll_given_up_during_a_block_gets_no_lease() -> None:
     rig = Rig()
     session = rig.register()
     rig.create()
@@ -518,7 +516,7 @@ def test_a_parked_poll_that_was_given_up_while_the_loop_stood_still_gets_no_leas
     assert len(rig.poll(session, 1)) == 1
 
 
-def test_a_poll_that_was_read_late_is_answered_while_its_worker_still_waits() -> None:
+def test_a_late_read_poll_is_answered_while_its_worker_waits() -> None:
     rig = Rig()
     session = rig.register()
     assert rig.poll(session, 1, wait_s=10.0, waited_s=8.0) is None

@@ -43,7 +43,7 @@ def test_rejected_request_costs_no_budget(ids: tuple[int, ...], status: str) -> 
     assert not [row for row in rig.rows.values() if isinstance(row, SubmitRow)]
 
 
-def test_the_same_key_gives_the_same_submit_and_another_request_under_it_a_conflict() -> None:
+def test_one_key_is_one_submit_and_another_request_a_conflict() -> None:
     rig, session = started()
     first = rig.submit(0, 1)
     assert rig.submit(0, 1) == first
@@ -94,7 +94,7 @@ def test_one_page_has_all_results_of_a_report() -> None:
     assert rig.replies[poll].upto == 3
 
 
-def test_a_bundle_without_a_policy_ends_the_submit_with_its_verdict_and_is_charged_in_full() -> None:
+def test_a_bundle_without_a_policy_is_charged_in_full() -> None:
     rig, session = started()
     rig.submit(0, 1, 2)
     leases = {lease.job.episodes[0].index: lease for lease in rig.poll(session, 8)}
@@ -132,7 +132,7 @@ def test_a_snapshot_that_could_not_be_made_is_a_verdict_and_charged() -> None:
     assert isinstance(rig.submit(0, key="k1"), gateway.SubmitAccepted)
 
 
-def test_a_slot_that_died_under_a_worker_of_an_earlier_version_is_played_again() -> None:
+def test_an_earlier_versions_dead_slot_is_played_again() -> None:
     rig, session = started()
     rig.submit(0)
     for attempt in range(4):
@@ -148,7 +148,7 @@ def test_a_slot_that_died_under_a_worker_of_an_earlier_version_is_played_again()
     assert rig.row(SubmitRow, "r1", 0).status == "ok"
 
 
-def test_a_limit_on_the_whole_submit_keeps_the_episodes_before_the_first_unfinished() -> None:
+def test_a_submit_limit_keeps_episodes_before_the_first_unfinished() -> None:
     rig, session = started(limits=ResourceLimits(submit_wall_s=30.0))
     rig.pass_time(20.0)
     rig.beat(session)
@@ -162,7 +162,7 @@ def test_a_limit_on_the_whole_submit_keeps_the_episodes_before_the_first_unfinis
     assert (row.status, row.n_kept, row.released) == ("rollout_timeout", 2, 3)
 
 
-def test_a_fault_of_ours_costs_a_submit_neither_its_limit_nor_its_budget() -> None:
+def test_a_fault_of_ours_costs_neither_limit_nor_budget() -> None:
     rig, session = started(limits=ResourceLimits(submit_wall_s=30.0))
     rig.submit(0)
     for _ in range(4):
@@ -183,7 +183,7 @@ def test_a_fault_of_ours_costs_a_submit_neither_its_limit_nor_its_budget() -> No
     assert rig.row(SubmitRow, "r1", 0).status == "rollout_timeout"
 
 
-def test_a_fault_of_ours_counts_after_an_episode_with_more_faults_is_done() -> None:
+def test_a_fault_counts_after_an_episode_with_more_is_done() -> None:
     rig, session = started(limits=ResourceLimits(submit_wall_s=30.0))
     rig.submit(0, 1)
     leases = {lease.job.episodes[0].index: lease for lease in rig.poll(session, 8)}
@@ -200,7 +200,7 @@ def test_a_fault_of_ours_counts_after_an_episode_with_more_faults_is_done() -> N
     assert rig.row(SubmitRow, "r1", 0).status is None
 
 
-def test_scope_submit_is_one_job_and_hidden_cases_come_in_chunks_of_the_same_length() -> None:
+def test_scope_submit_plays_hidden_cases_in_equal_chunks() -> None:
     rig, session = started(policy_scope="submit", n_valid=5)
     rig.submit(4, 4, 9)
     (lease,) = rig.poll(session, 8)
@@ -244,7 +244,7 @@ def test_outcomes_that_do_not_fit_the_job_are_the_workers_failure() -> None:
     assert rig.core.state.runs["r1"].state.infrastructure_retries == len(bad)
 
 
-def test_returns_that_an_earlier_version_stored_have_a_mean_even_if_their_sum_is_not_finite() -> None:
+def test_stored_returns_with_an_infinite_sum_have_a_mean() -> None:
     rig, session = started()
     rig.submit(0, 1, 2)
     for lease in rig.poll(session, 2):

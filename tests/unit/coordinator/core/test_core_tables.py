@@ -43,7 +43,7 @@ def test_each_piece_of_news_has_someone_who_hears_it() -> None:
     assert set(NEWS) == wanted
 
 
-def test_each_kind_of_long_poll_has_an_answer_when_its_time_is_up() -> None:
+def test_each_kind_of_long_poll_is_answered_in_time() -> None:
     assert set(POLLS) == set(get_args(PollKind))
 
 

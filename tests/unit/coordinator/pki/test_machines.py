@@ -19,7 +19,7 @@ def own(tmp_path: Path) -> OwnCerts:
     return OwnCerts(tmp_path)
 
 
-def test_a_folder_holds_all_that_a_machine_needs_and_nobody_else_may_read_it(own: OwnCerts) -> None:
+def test_a_machines_folder_is_complete_and_private(own: OwnCerts) -> None:
     folder = own.issue("worker", "w")
     assert {path.name for path in folder.iterdir()} == {"ca.pem", "cert.pem", "key.pem", "worker.json"}
     assert folder.stat().st_mode & 0o777 == 0o700
@@ -101,7 +101,7 @@ def test_a_session_of_this_machine_is_nobodys_to_revoke(own: OwnCerts) -> None:
     assert Machines(own.state).is_shut_out("1234:made up")
 
 
-def test_issuing_a_name_again_is_asked_for_by_name_and_voids_what_was(own: OwnCerts) -> None:
+def test_reissuing_a_name_is_explicit_and_voids_the_old_folder(own: OwnCerts) -> None:
     before = of(own.issue("worker", "w"))
     session = Machines(own.state).session_for(before.token)
     with pytest.raises(ConfigError, match="--renew"):

@@ -82,7 +82,7 @@ def shelf(tmp_path: Path) -> Shelf:
     return Shelf(tmp_path)
 
 
-def test_an_auditor_is_given_the_very_actions_and_nothing_that_came_of_them(shelf: Shelf) -> None:
+def test_an_auditor_gets_the_actions_without_their_results(shelf: Shelf) -> None:
     data = recording(*(float(k) for k in range(1, 7)), obs=7.0)
     shelf.put(GROUP, played(data))
     event = shelf.prepare()
@@ -167,7 +167,7 @@ def test_a_third_opinion_is_held_against_both(shelf: Shelf) -> None:
     assert compared.with_first is None
 
 
-def test_audits_of_unfinished_runs_are_loaded_again_and_their_actions_are_not_collected(
+def test_audits_of_unfinished_runs_survive_restarts_and_collection(
     tmp_path: Path,
 ) -> None:
     root = tmp_path / "state"

@@ -33,7 +33,7 @@ def claim(holder: str, ttl_s: float = 60.0, name: str = "a/env/0", **more: Any) 
     return Claim(token="", suite="s", name=name, holder=holder, ttl_s=ttl_s, **more)
 
 
-def test_a_held_claim_is_not_given_to_another_until_its_time_is_up(tmp_path: Path) -> None:
+def test_a_held_claim_is_exclusive_until_its_time_is_up(tmp_path: Path) -> None:
     async def work(claims: Claims) -> None:
         assert (await claims.ask(claim("one"), 0.0)).granted
         refused = await claims.ask(claim("two"), 59.0)

@@ -71,7 +71,7 @@ def test_episodes_submits_and_leases_of_a_whole_run_are_counted_once(rig: Metere
     assert metrics_text["evopolicy_slots active"] == 2
 
 
-def test_a_submit_that_was_open_at_a_restart_is_counted_at_its_end(rig: MeteredRig, tmp_path: Path) -> None:
+def test_a_submit_open_at_a_restart_counts_at_its_end(rig: MeteredRig, tmp_path: Path) -> None:
     rig.create()
     session = rig.register()
     rig.submit(0)

@@ -89,7 +89,7 @@ def test_a_refusal_is_answered_with_its_status_and_words() -> None:
     assert text == Refused(status=Refusal.BUSY, message="submit 3 is still running; one runs at a time")
 
 
-def test_what_an_open_submit_waits_for_stands_in_the_state_of_its_run() -> None:
+def test_a_runs_state_names_its_open_submits_wait() -> None:
     in_flight = gateway.SubmitInFlight(submit_index=0, n_episodes=2, n_done=0)
     state = gateway.RunState(remaining_budget=1, n_submits=1, is_finalized=False, in_flight=in_flight)
     text = message(Reply(request=1, message=gateway.StateReply(state=state), waits_for=because("scoring")))

@@ -158,7 +158,7 @@ def test_run_with_impossible_settings_is_refused(
     assert message in error.message
 
 
-def test_what_an_agent_is_said_to_have_done_is_bounded_and_closes_its_run_all_the_same(
+def test_a_bounded_agent_report_still_closes_its_run(
     parser: RequestParser,
 ) -> None:
     key = keys.gateway_key("c", "r", "close")
@@ -272,7 +272,7 @@ def test_recordings_to_replay_are_stored_with_the_size_that_is_announced(
     assert refused(parser, OPS, evaluate(cases=(0,), replays=(small,), bundle=None)).status == "bad_blob"
 
 
-def test_a_blob_that_is_too_large_for_outcomes_or_begun_actions_is_never_read(
+def test_an_oversized_blob_is_never_read(
     parser: RequestParser, blobs: BlobStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(codec, "MAX_PACKED_BYTES", 1000)
@@ -395,9 +395,7 @@ def published_tree(root: Path, n_train: int) -> Path:
     return root
 
 
-def test_profile_published_plays_the_published_files_by_the_published_rules_or_not_at_all(
-    blobs: BlobStore, tmp_path: Path
-) -> None:
+def test_profile_published_plays_published_files_or_not_at_all(blobs: BlobStore, tmp_path: Path) -> None:
     def at(data: Path | None) -> RequestParser:
         source = SplitSource(data=data, secret=b"s" * 32)
         return RequestParser(IDENTITY, blobs, source, Uploads(), allowed_imports=(), denied_imports=())

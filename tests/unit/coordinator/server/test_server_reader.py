@@ -142,7 +142,7 @@ def test_blob_put_in_chunks_is_got_in_chunks(rig: Rig) -> None:
     assert bytes(got) == data
 
 
-def test_upload_given_up_halfway_is_forgotten_at_the_next_start_and_begun_again(rig: Rig) -> None:
+def test_an_upload_given_up_halfway_is_forgotten_and_restarted(rig: Rig) -> None:
     data = b"bundle" * 100
     assert rig.put(put(data, data=data[:50])) == BlobAck(have=50)
     rig.blobs.drop_unfinished()
@@ -172,9 +172,7 @@ def test_a_gateway_is_not_told_whether_others_have_stored_a_blob(rig: Rig) -> No
     assert rig.put(put(data, data=b""), run="r-1") == BlobAck(have=size)
 
 
-def test_uploads_of_a_run_that_no_submit_names_are_limited_in_number_and_size(
-    rig: Rig, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_unclaimed_uploads_of_a_run_are_limited(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(uploads_module, "MAX_UNCLAIMED", 3)
     monkeypatch.setattr(uploads_module, "MAX_UNCLAIMED_BYTES", 100)
     bundles = [b"a", b"bb", b"ccc", b"dddd"]

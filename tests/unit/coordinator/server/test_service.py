@@ -61,7 +61,7 @@ def test_what_was_answered_is_there_after_a_restart(tmp_path: Path) -> None:
     play(tmp_path, second)
 
 
-def test_request_that_could_not_be_written_did_not_happen_and_can_be_asked_again(tmp_path: Path) -> None:
+def test_an_unwritten_request_did_not_happen_and_may_be_repeated(tmp_path: Path) -> None:
     async def scenario(world: World) -> None:
         created = await world.create()
         world.full = True
@@ -191,9 +191,7 @@ def test_stopping_answers_what_was_handled_and_ends_every_wait(tmp_path: Path) -
     play(tmp_path, scenario)
 
 
-def test_a_disk_that_does_not_come_to_an_end_is_named_in_status_and_log(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_stuck_disk_is_named_in_status_and_log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     async def scenario(world: World) -> None:
         goes_on = threading.Event()
         write = world.store.write
@@ -289,7 +287,7 @@ def test_a_clock_set_back_between_two_starts_ends_nothing_before_it_began(
     play(tmp_path, second)
 
 
-def test_a_poll_that_its_worker_gave_up_while_the_loop_stood_still_gets_no_lease(tmp_path: Path) -> None:
+def test_a_poll_given_up_during_a_blocked_loop_gets_no_lease(tmp_path: Path) -> None:
     async def scenario(world: World) -> None:
         session = (await register(world).message()).session
         created = await world.create()
@@ -320,7 +318,7 @@ async def failed(world: World) -> str:
     return str(error.value)
 
 
-def test_a_state_that_cannot_be_loaded_again_ends_the_service_with_the_reason(
+def test_an_unloadable_state_ends_the_service_with_the_reason(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     async def scenario(world: World) -> None:
@@ -355,7 +353,7 @@ def test_a_state_that_cannot_be_loaded_at_the_start_is_reported(
         play(tmp_path, scenario)
 
 
-def test_a_core_that_fails_after_each_load_ends_the_service_with_the_reason(
+def test_a_core_failing_after_each_load_ends_the_service(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     loads: list[float] = []
@@ -408,7 +406,7 @@ def test_a_core_that_fails_now_and_then_is_loaded_each_time(
     play(tmp_path, scenario)
 
 
-def test_a_row_that_the_store_never_takes_ends_the_service_with_the_reason(
+def test_a_row_that_the_store_refuses_ends_the_service(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     async def scenario(world: World) -> None:
@@ -428,7 +426,7 @@ def test_a_row_that_the_store_never_takes_ends_the_service_with_the_reason(
     play(tmp_path, scenario)
 
 
-def test_a_row_that_cannot_be_read_ends_the_service_and_names_row_and_remedy(tmp_path: Path) -> None:
+def test_an_unreadable_row_ends_the_service_with_the_remedy(tmp_path: Path) -> None:
     async def scenario(world: World) -> None:
         created = await world.create()
         with contextlib.closing(sqlite3.connect(tmp_path / "db")) as db, db:
@@ -442,7 +440,7 @@ def test_a_row_that_cannot_be_read_ends_the_service_and_names_row_and_remedy(tmp
     play(tmp_path, scenario)
 
 
-def test_who_asks_for_what_cannot_be_read_is_refused_and_others_are_served(tmp_path: Path) -> None:
+def test_a_request_for_unreadable_data_is_refused_and_others_served(tmp_path: Path) -> None:
     async def scenario(world: World) -> None:
         created = await world.create()
         claim = operator.Claim(token="operate", suite="s", name="n", holder="h", ttl_s=9.0)

@@ -73,7 +73,7 @@ def test_folder_of_another_cluster_or_a_damaged_one_is_refused_and_unlocked(tmp_
         StateFolder.open(tmp_path, "a/b")
 
 
-def test_too_long_a_path_has_a_short_link_that_is_the_same_again(tmp_path: Path, short_home: Path) -> None:
+def test_too_long_a_path_has_a_stable_short_link(tmp_path: Path, short_home: Path) -> None:
     deep = tmp_path / ("x" * 100)
     found = []
     for _ in range(2):

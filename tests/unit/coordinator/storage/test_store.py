@@ -263,7 +263,7 @@ def test_only_train_groups_belong_to_a_gateway() -> None:
 
 
 @pytest.mark.parametrize("version", range(1, SCHEMA_VERSION))
-def test_a_database_of_an_older_version_is_migrated_with_all_that_is_in_it(path: Path, version: int) -> None:
+def test_an_older_database_is_migrated_with_all_its_rows(path: Path, version: int) -> None:
     db = sqlite3.connect(path, isolation_level=None)
     for script in store_module._MIGRATIONS[:version]:
         db.executescript(script)
@@ -349,7 +349,7 @@ def test_disk_use_names_the_row_that_it_cannot_read(store: Store, path: Path) ->
         disk_use.collect(path.parent, 0.0)
 
 
-def test_what_the_disk_may_take_later_is_told_from_what_it_never_will(store: Store) -> None:
+def test_passing_disk_errors_are_told_from_lasting_ones(store: Store) -> None:
     store.write([run_row(), state_row(), submit_row(), outcome_row(TRAIN, 0, 0)])
     with pytest.raises(DamagedStoreError, match="contradicts another"):
         store.write([outcome_row(TRAIN, 1, 0)])

@@ -98,7 +98,7 @@ def test_the_cluster_page_has_the_queue_by_priority_and_the_disks(tmp_path: Path
     assert str(tmp_path.resolve()) in page, "the disk of the runs here"
 
 
-def test_a_run_can_be_repinned_to_classes_that_get_no_work_of_it_and_to_no_other(tmp_path: Path) -> None:
+def test_a_run_can_be_repinned_to_barred_classes_only(tmp_path: Path) -> None:
     folder = open_run(tmp_path)
     workers = (
         worker("w-own", classes={"gym/acrobot": "class-own"}),

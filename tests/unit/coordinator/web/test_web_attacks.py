@@ -77,7 +77,7 @@ def test_a_token_in_an_address_opens_nothing(tmp_path: Path) -> None:
         assert stranger.get(f"/login?token={TOKENS.read}").headers.get("set-cookie") is None
 
 
-def test_a_wrong_token_gets_no_cookie_and_the_right_one_a_strict_one(tmp_path: Path) -> None:
+def test_only_the_right_token_gets_a_strict_cookie(tmp_path: Path) -> None:
     with client(site_of(tmp_path), None) as stranger:
         wrong = stranger.post("/login", content="token=no", headers={"origin": ORIGIN})
         assert (wrong.status_code, wrong.headers.get("set-cookie")) == (401, None)
@@ -526,7 +526,7 @@ def test_scores_in_a_sweeps_index_are_hidden_as_well(tmp_path: Path) -> None:
         assert shown([reader.get("/").text])
 
 
-def test_a_written_report_waits_for_every_agent_and_allows_only_its_own_script(tmp_path: Path) -> None:
+def test_a_served_report_waits_for_agents_and_allows_its_script(tmp_path: Path) -> None:
     report = tmp_path / "report"
     report.mkdir()
     (report / "index.html").write_text("<p>4242.5</p>")

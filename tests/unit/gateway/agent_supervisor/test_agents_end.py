@@ -99,7 +99,7 @@ def supervisor(tmp_path: Path) -> Iterator[SupervisorProcess]:
     found.process.communicate()
 
 
-def test_agent_that_survives_is_reported_and_has_not_ended_before_it_is_gone(
+def test_a_surviving_agent_is_reported_until_it_is_gone(
     supervisor: SupervisorProcess,
 ) -> None:
     with freezer() as held:

@@ -155,7 +155,7 @@ def test_lessons_offer_the_seeker_once_the_view_is_understood(random_play: list[
     assert [family.name for family in lessons.learn(random_play)] == ["seeker"]
 
 
-def test_grids_are_found_at_the_top_and_in_a_dict_but_pictures_are_not() -> None:
+def test_grids_are_found_at_any_level_and_pictures_are_not() -> None:
     assert find_grid(OBS_SPACE) == (True, "view")
     assert find_grid(OBS_SPACE["spaces"]["view"]) == (True, None)
     assert find_grid({"type": "Image", "shape": [96, 96, 3], "dtype": "uint8"}) == (False, None)

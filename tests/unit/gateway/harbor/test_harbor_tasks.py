@@ -130,7 +130,7 @@ def test_a_run_that_no_remote_agent_plays_has_no_task(tmp_path: Path) -> None:
     assert not (tmp_path / "tasks").exists()
 
 
-def test_a_verifier_ends_the_run_and_gets_its_score_when_it_is_there(tmp_path: Path) -> None:
+def test_a_verifier_ends_the_run_and_gets_its_score(tmp_path: Path) -> None:
     folder = open_run(tmp_path)
     client = TestClient(make_app({"t": folder}, "t"))
     for headers in ({}, {"Authorization": "Bearer u"}, {b"Authorization": b"Bearer \xe9"}):

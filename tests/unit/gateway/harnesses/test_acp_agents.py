@@ -80,7 +80,7 @@ def test_a_session_that_could_not_begin_is_asked_for_again(tmp_path: Path) -> No
     assert kept(found, "requests").count("session/new") == 2
 
 
-def test_a_model_that_can_be_neither_chosen_nor_seen_in_the_program_ends_the_run(tmp_path: Path) -> None:
+def test_a_model_that_can_be_neither_chosen_nor_seen_ends_the_run(tmp_path: Path) -> None:
     with pytest.raises(AgentError, match="put the model into `program`"):
         played(tmp_path / "a", "work", model="some-model")
     found = played(tmp_path / "b", "work", model="some-model", extra_args=("--model=some-model",))
@@ -96,7 +96,7 @@ def test_an_effort_that_cannot_be_chosen_ends_the_run(tmp_path: Path) -> None:
     assert found.ending.reason == "agent_stopped"
 
 
-def test_a_session_plays_in_the_mode_in_which_the_agent_asks_for_permission(tmp_path: Path) -> None:
+def test_a_session_plays_in_the_mode_that_asks_permission(tmp_path: Path) -> None:
     """Others let a model of the agent's own decide what it may do, or refuse what the run's rules allow."""
     played(tmp_path / "modes", "work,crash,work,modes")
     # Also in a session that is loaded after a crash.
@@ -113,7 +113,7 @@ def test_a_model_is_chosen_by_its_id_or_its_name(tmp_path: Path) -> None:
         assert kept(found, "chosen") == ["mode default", "model small-1"]
 
 
-def test_a_model_that_is_offered_under_no_name_is_that_of_the_program(tmp_path: Path) -> None:
+def test_a_model_offered_under_no_name_is_the_programs(tmp_path: Path) -> None:
     found = played(tmp_path, "work,options", model="huge", extra_args=("--model=huge",))
     assert kept(found, "chosen") == ["mode default"]
 
@@ -209,7 +209,7 @@ def test_tokens_are_counted_whatever_an_agent_counts_into_its_input(
     assert usage_of(reported) == usage
 
 
-def test_tokens_that_come_with_each_request_are_added_up_where_the_answer_has_none() -> None:
+def test_tokens_of_requests_are_added_where_the_answer_has_none() -> None:
     chunk = {"sessionUpdate": "agent_message_chunk", "content": {"type": "text", "text": ""}}
     counts = {
         "inputTokens": 100,

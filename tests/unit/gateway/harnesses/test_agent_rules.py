@@ -164,7 +164,7 @@ def test_the_clock_stands_still_in_a_pause() -> None:
     assert clock.left_s() == -1.0
 
 
-def test_what_its_submits_waited_for_hidden_episodes_is_given_back_to_the_clock() -> None:
+def test_time_waited_for_hidden_episodes_returns_to_the_clock() -> None:
     now = [0.0]
     clock = AgentClock(10.0, lambda: now[0])
     now[0] = 9.0

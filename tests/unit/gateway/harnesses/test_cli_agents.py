@@ -29,7 +29,7 @@ def sessions_of(played: Played) -> set[str]:
 
 
 @both
-def test_an_agent_that_stops_is_told_what_is_left_in_the_same_session(tmp_path: Path, harness: str) -> None:
+def test_an_agent_that_stops_is_told_its_remaining_budget(tmp_path: Path, harness: str) -> None:
     played = play(tmp_path, settings(harness), "work", budget=4)
     assert ended(played).reason == "agent_stopped"
     assert ended(played).turns == 2
@@ -156,9 +156,7 @@ def test_a_silent_cli_is_ended_and_its_session_resumed(tmp_path: Path, harness: 
 
 
 @both
-def test_a_stream_that_never_ends_is_ended_from_outside_and_still_tells_its_facts(
-    tmp_path: Path, harness: str
-) -> None:
+def test_an_endless_stream_is_ended_and_keeps_its_facts(tmp_path: Path, harness: str) -> None:
     played = play(
         tmp_path, settings(harness, model="m"), "work,endless", budget=9, over_when=thinks_without_end
     )

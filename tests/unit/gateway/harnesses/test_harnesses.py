@@ -93,7 +93,7 @@ def test_a_program_that_works_without_a_word_is_not_silent(tmp_path: Path, work:
     assert ending.reason == "agent_stopped"
 
 
-def test_an_agent_is_not_silent_while_its_submit_runs_or_when_it_asks_again(tmp_path: Path) -> None:
+def test_an_agent_is_not_silent_during_its_submits(tmp_path: Path) -> None:
     async def main() -> None:
         activity = Activity(0.5, tmp_path / "nothing", cpu_s=lambda: 0.0)
         silence = asyncio.create_task(activity.silence())

@@ -156,7 +156,7 @@ def test_a_call_that_cannot_be_read_is_answered_with_the_reason() -> None:
     assert (fine.command, fine.timeout_s, fine.fault) == ("ls", shell.MOST_S, "")
 
 
-def test_a_command_ends_in_time_with_all_that_it_started_and_its_output_is_bounded() -> None:
+def test_a_command_ends_in_time_with_its_descendants() -> None:
     text, succeeded = shell.run("sleep 1000 & echo begun; sleep 1000", 0.5)
     assert "begun" in text
     assert "ended after 0.5 s" in text

@@ -125,7 +125,7 @@ def test_odd_servers_are_refused_with_the_entry(tmp_path: Path) -> None:
         read((), {"the lamp": McpServer(command="sh")}, tmp_path)
 
 
-def test_a_run_has_copies_of_its_own_which_stay_when_the_source_is_gone_from_disk(tmp_path: Path) -> None:
+def test_a_runs_own_copies_outlive_their_source(tmp_path: Path) -> None:
     found = kept(tmp_path, tmp_path / "run")
     shown = dict(found.shown("~/.agents/skills"))
     assert sorted(shown.values()) == ["/inputs/mcp.json", "/inputs/mcp/lamp", "~/.agents/skills/lamps"]

@@ -50,9 +50,7 @@ def test_nothing_is_written_over_a_link_that_the_agent_left(home: Path, tmp_path
     assert list(target.iterdir()) == []
 
 
-def test_nothing_is_written_over_a_link_of_an_agent_that_played_without_a_copy(
-    home: Path, tmp_path: Path
-) -> None:
+def test_nothing_is_written_over_an_agents_link(home: Path, tmp_path: Path) -> None:
     """The operator gave the login only when the run was resumed."""
     copy((), tmp_path / "run")
     target = tmp_path / "operators"

@@ -52,7 +52,7 @@ def test_what_is_not_a_named_host_and_port_is_refused(request_line: str, status:
     assert answer.split()[1] == status
 
 
-def test_a_host_that_is_not_allowed_is_logged_once_and_not_without_end(
+def test_a_forbidden_host_is_logged_once(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     logged: list[str] = []

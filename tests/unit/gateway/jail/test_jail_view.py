@@ -116,7 +116,7 @@ def test_only_an_open_network_shares_this_machines(tmp_path: Path) -> None:
     assert "--unshare-net" not in arguments(tmp_path / "b", [], open_network=True)
 
 
-def test_a_second_program_of_an_agent_finds_the_links_of_the_first_in_its_tmp_and_home(
+def test_an_agents_second_program_finds_the_firsts_links(
     tmp_path: Path,
 ) -> None:
     for home in ("/home/somebody", str(tmp_path)):
@@ -142,9 +142,7 @@ def test_a_second_program_of_an_agent_finds_the_links_of_the_first_in_its_tmp_an
 
 
 @pytest.mark.parametrize("what", ["inputs", "read"])
-def test_links_on_the_way_to_a_mount_are_removed_before_bubblewrap_follows_them(
-    tmp_path: Path, what: str
-) -> None:
+def test_links_towards_a_mount_are_removed_before_bubblewrap_follows(tmp_path: Path, what: str) -> None:
     """bubblewrap creates missing folders of a mount's place while it sees the whole machine, and follows links meanwhile."""
     private, outside, home = tmp_path / "private", tmp_path / "outside", tmp_path / "home"
     skill = home / ".agents" / "skills" / "lamps"

@@ -34,6 +34,6 @@ def test_no_event_is_longer_than_its_reader_takes(kind: type[child_messages.Even
     assert isinstance(child_messages.event_of(line), kind)
 
 
-def test_what_is_known_of_an_agent_is_passed_on_unless_it_is_too_much() -> None:
+def test_an_agents_facts_are_passed_on_unless_too_large() -> None:
     assert b'"turns":3' in child_messages.line(CloseRun(reason="agent_stopped", agent={"turns": 3}))
     assert b'"agent":{"left_out":' in child_messages.line(CloseRun(reason="agent_stopped", agent=LONG))

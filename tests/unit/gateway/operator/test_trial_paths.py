@@ -14,9 +14,7 @@ from evopolicy_gateway.operator.trials import policy_bundle
     ("name", "problem"),
     [("empty", "holds no policy.py"), ("policy.py", "is a file"), ("absent", "there is no folder")],
 )
-def test_a_path_without_a_policy_is_refused_with_the_reason_and_the_remedy(
-    tmp_path: Path, name: str, problem: str
-) -> None:
+def test_a_path_without_a_policy_is_refused_with_the_remedy(tmp_path: Path, name: str, problem: str) -> None:
     (tmp_path / "empty").mkdir()
     (tmp_path / "policy.py").touch()
     with pytest.raises(ConfigError) as refused:

@@ -46,7 +46,7 @@ def test_what_can_be_shown_is_shown_as_it_is() -> None:
     assert first_line(text) == "Größe ×2, 日本 ✓"
 
 
-def test_what_a_run_waits_for_is_said_once_and_a_free_slot_is_no_news() -> None:
+def test_a_runs_wait_is_told_once() -> None:
     out = io.StringIO()
     console = Terminal(file=out, width=200)
     missing = "a worker that offers toy/line with sandbox tier bwrap"

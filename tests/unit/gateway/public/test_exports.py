@@ -160,9 +160,7 @@ def test_tensorboard_reads_returns_over_the_budget_once(runs: Path, tmp_path: Pa
     assert found["random/mean_return"] == [(5, -7.0)]
 
 
-def test_runs_of_one_name_and_runs_that_replace_others_have_curves_of_their_own(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_runs_of_one_name_have_curves_of_their_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def n_curves() -> int:
         done = export(tmp_path / "a", tmp_path / "b", "--to", "tensorboard", "--out", tmp_path / "events")
         assert done.returncode == 0, done.stderr

@@ -61,7 +61,7 @@ def test_info_that_does_not_come_is_not_waited_for(monkeypatch: pytest.MonkeyPat
         base._get_json(url)
 
 
-def test_info_of_a_gateway_that_is_killed_while_it_answers_did_not_come() -> None:
+def test_info_of_a_gateway_killed_while_answering_did_not_come() -> None:
     def begin_to_answer(listening: socket.socket) -> None:
         link, _ = listening.accept()
         with link:
@@ -130,7 +130,7 @@ def test_a_cli_that_is_done_and_does_not_exit_is_ended(
     assert (played.ending.reason, played.ending.turns, played.ending.retries) == ("agent_stopped", 1, 0)
 
 
-def test_a_child_of_a_cli_that_holds_its_pipe_does_not_hold_up_the_turn(
+def test_a_child_holding_a_clis_pipe_does_not_delay_the_turn(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(turn, "_PIPE_TIMEOUT_S", SOON_S)
@@ -203,7 +203,7 @@ async def _sent(url: str, text: str) -> bytes:
         writer.close()
 
 
-def test_a_body_that_does_not_come_is_refused_and_its_rest_not_waited_for(
+def test_a_missing_body_is_refused_without_further_wait(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(http, "BODY_WAIT_S", SOON_S)
@@ -241,7 +241,7 @@ def test_a_body_of_a_stranger_is_not_waited_for(monkeypatch: pytest.MonkeyPatch)
     assert received[-1]["more_body"] is False
 
 
-def test_a_submit_that_is_not_waited_for_is_answered_before_it_is_decided(
+def test_an_unawaited_submit_is_answered_before_it_is_decided(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(http, "DECIDED_WAIT_S", SOON_S)
@@ -267,7 +267,7 @@ def test_an_idle_connection_is_closed(tmp_path: Path, monkeypatch: pytest.Monkey
     assert asyncio.run(main()).startswith(b"HTTP/1.1 200")
 
 
-def test_a_request_that_does_not_end_does_not_hold_up_the_services_end(
+def test_an_endless_request_does_not_delay_the_services_end(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(server, "CLOSE_GRACE_S", 1)

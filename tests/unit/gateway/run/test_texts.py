@@ -31,7 +31,7 @@ def test_texts_replace_or_extend_the_standard_ones(tmp_path: Path) -> None:
     assert [len(digest) for digest in texts.digests.values()] == [64, 64, 0]
 
 
-def test_the_prompts_of_an_agents_file_count_unless_the_run_has_its_own(tmp_path: Path) -> None:
+def test_an_agent_files_prompts_count_unless_the_run_has_some(tmp_path: Path) -> None:
     config = AgentConfig(harness="codex", prompts=Prompts(first="hers"))
     (tmp_path / "p.toml").write_text('first = "mine"\n')
     assert read(None, None, config, tmp_path).prompts.begin() == "hers"

@@ -38,7 +38,7 @@ def test_what_processes_tell_adds_up_over_their_deaths_and_over_commands(tmp_pat
     assert Stopwatch(path).times == second.times
 
 
-def test_what_was_waited_for_hidden_episodes_is_kept_and_in_no_other_figure(tmp_path: Path) -> None:
+def test_time_waited_for_hidden_episodes_is_a_figure_of_its_own(tmp_path: Path) -> None:
     path = tmp_path / "times.json"
     first = Stopwatch(path)
     first.permit_reported(2.0)

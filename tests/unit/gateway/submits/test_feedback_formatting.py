@@ -308,7 +308,7 @@ TEXTS = {"stdout.txt", "stderr.txt", "error.txt"}
         ("pictures", "npz", {"trajectory.jsonl", "observations.npz", "video.mp4", *TEXTS}),
     ],
 )
-def test_a_level_of_detail_has_its_files_and_hides_what_a_policy_says_of_the_rest(
+def test_a_level_of_detail_has_its_files_and_hides_the_rest(
     detail: FeedbackDetail, storage: ObsStorage, names: set[str]
 ) -> None:
     files = shown(detail, storage)

@@ -72,7 +72,7 @@ def test_beginning_again_forgets_what_was_written(tmp_path: Path) -> None:
     assert (tmp_path / "submit_000" / "episodes" / "ep_000" / "a").read_bytes() == b"newer"
 
 
-def test_a_committed_folder_of_a_gateway_that_died_before_its_journal_is_replaced(tmp_path: Path) -> None:
+def test_a_folder_committed_without_a_journal_entry_is_replaced(tmp_path: Path) -> None:
     for text in (b"1", b"2"):
         tree = SubmitTree(tmp_path, "submit_000")
         tree.begin()

@@ -77,7 +77,7 @@ def system_is_a_link(folder: Path) -> None:
         (pipe, "import_error", "named pipe"),
     ],
 )
-def test_a_folder_that_cannot_be_a_bundle_has_a_verdict_that_names_why(
+def test_a_folder_that_cannot_be_a_bundle_has_a_verdict(
     tmp_path: Path, spoil: Callable[[Path], None], category: str, named: str
 ) -> None:
     folder = system(tmp_path)

@@ -49,9 +49,7 @@ def test_a_wrong_option_of_each_run_is_the_commands_own(
     assert direct.output.getvalue() == ""
 
 
-def test_a_commands_own_runs_go_on_where_they_are_resumed_and_end_with_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_commands_own_runs_continue_when_resumed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     direct = Direct(tmp_path, monkeypatch)
     direct.plans[1] = msgspec.structs.replace(direct.plans[1], resume=True)
 

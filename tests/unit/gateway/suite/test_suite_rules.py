@@ -267,7 +267,7 @@ def test_a_setting_that_a_later_version_adds_makes_no_other_run(tmp_path: Path) 
             assert defining["settings"]["limits"] == {"act_wall_s": 2.0}
 
 
-def test_what_a_jail_lets_through_makes_another_run_and_where_programs_lie_does_not(tmp_path: Path) -> None:
+def test_a_jails_permissions_make_another_run_but_program_paths_do_not(tmp_path: Path) -> None:
     before = suite_in(tmp_path)[1].digest
     shown = FILE.replace("[agents.run]", '[agents.jail]\nread = ["/opt"]\n[agents.run]')
     assert suite_in(tmp_path, shown)[1].digest == before
@@ -359,7 +359,7 @@ def related(one: Plan, other: Plan) -> bool:
 
 
 @given(st.lists(PLACES, max_size=12), st.lists(PLACES, max_size=6))
-def test_runs_related_to_fewest_under_way_come_first_and_others_keep_their_order(
+def test_runs_with_fewest_related_ones_under_way_come_first(
     places: list[tuple[str, str]], busy: list[tuple[str, str]]
 ) -> None:
     under_way = [

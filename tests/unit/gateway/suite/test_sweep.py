@@ -102,7 +102,7 @@ def test_unrelated_environments_are_played_side_by_side(
     assert stage.begun[:2] == ["a/toy/line/0", "a/toy/maze/0"]
 
 
-def test_a_provider_that_is_away_holds_back_further_runs_with_it_until_it_is_back(
+def test_an_unavailable_provider_holds_back_its_further_runs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     agents = CODEX.format("a") + EVOLVE.format("c") + CODEX.format("b")
@@ -127,7 +127,7 @@ def test_a_provider_that_is_away_holds_back_further_runs_with_it_until_it_is_bac
 
 
 @pytest.mark.parametrize("cap", ["max_tokens = 149", "max_cost = 0.2"])
-def test_a_cap_of_the_sweep_leaves_coding_agents_open_and_begins_no_further_run(
+def test_a_sweeps_cap_begins_no_further_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cap: str
 ) -> None:
     agents = CODEX.format("a") + EVOLVE.format("c") + EVOLVE.format("d")

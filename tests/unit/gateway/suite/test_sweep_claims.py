@@ -16,9 +16,7 @@ from evopolicy_gateway.suite import claimed, sweep
 from evopolicy_gateway.suite.decisions import Decision, Found, decide
 
 
-def test_a_run_is_announced_to_the_cluster_as_soon_as_it_is_open(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_open_run_is_announced_to_the_cluster(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     text = HEAD + "[parallel]\nclaim_ttl_s = 3600.0\n" + EVOLVE.format("a")
     stage = Stage(tmp_path, text, monkeypatch)
     monkeypatch.setattr(sweep, "LOOK_S", 0.01)
@@ -36,7 +34,7 @@ def test_a_run_is_announced_to_the_cluster_as_soon_as_it_is_open(
     assert index.runs[name].settings["settings"]["env"] == "toy/line"
 
 
-def test_a_dead_hosts_run_is_taken_over_as_a_new_attempt_and_ended_at_the_cluster(
+def test_a_dead_hosts_run_is_ended_and_attempted_anew(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     stage = Stage(tmp_path, HEAD + EVOLVE.format("a"), monkeypatch)
@@ -53,7 +51,7 @@ def test_a_dead_hosts_run_is_taken_over_as_a_new_attempt_and_ended_at_the_cluste
     assert any("taken over from other" in line for line in stage.events)
 
 
-def test_a_claim_that_another_host_has_meanwhile_ends_the_run_here_and_its_result_is_taken(
+def test_a_claim_lost_to_another_host_ends_the_run_here(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     stage = Stage(tmp_path, HEAD + "[parallel]\nclaim_ttl_s = 1.0\n" + EVOLVE.format("a"), monkeypatch)

@@ -153,7 +153,7 @@ def test_a_file_that_holds_no_rows_of_a_trajectory_is_refused(tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("row", ['{"action": ' + "[" * 100_000, '{"action": ' + "9" * 5000 + "}", "[]"])
-def test_a_row_of_any_shape_is_refused_as_one_that_cannot_be_read(tmp_path: Path, row: str) -> None:
+def test_a_row_of_any_wrong_shape_is_refused_as_unreadable(tmp_path: Path, row: str) -> None:
     (tmp_path / "trajectory.jsonl").write_text(row + "\n")
     with pytest.raises(ValueError):  # noqa: PT011
         read_rows(tmp_path)

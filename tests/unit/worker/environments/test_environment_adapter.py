@@ -172,7 +172,7 @@ def test_a_family_that_is_not_installed_is_not_offered(monkeypatch: pytest.Monke
         make("gymnasium/MiniGrid-FourRooms-v0")
 
 
-def test_every_environment_that_ships_has_an_adapter_and_is_offered_where_its_packages_are() -> None:
+def test_every_shipped_environment_has_an_adapter_and_is_offered() -> None:
     core16 = catalogue.suites()["core16"].environments
     assert set(core16) <= set(registry.offered()) <= set(catalogue.entries())
     assert not any(registry.missing(env_id) for env_id in core16)

@@ -81,9 +81,7 @@ def test_a_picture_is_an_image_stored_beside_the_rows(shape: tuple[int, ...]) ->
         ((15, 96, 3), "npz"),
     ],
 )
-def test_other_bytes_are_a_box_kept_in_the_rows_unless_they_are_many(
-    shape: tuple[int, ...], storage: str
-) -> None:
+def test_other_bytes_are_a_box_in_the_rows_unless_many(shape: tuple[int, ...], storage: str) -> None:
     schema = to_schema(spaces.Box(0, 255, shape, np.uint8))
     assert schema["type"] == "Box"
     assert obs_storage(schema) == storage

@@ -268,9 +268,7 @@ def test_observations_of_every_space_reach_the_policy_as_they_are(everything: En
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_random_actions_of_every_space_are_in_it_and_are_what_a_recording_plays(
-    everything: Environment, seed: int
-) -> None:
+def test_random_actions_lie_in_their_space_and_replay_equally(everything: Environment, seed: int) -> None:
     codec, rng = everything.action_codec, np.random.default_rng(seed)
     recorder = Recorder()
     obs = everything.reset(Case(seed=seed))

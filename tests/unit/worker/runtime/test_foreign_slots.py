@@ -53,7 +53,7 @@ def test_a_process_that_has_played_a_hidden_episode_plays_no_train_episode(slots
         slots.run(slot.close())
 
 
-def test_a_process_that_replaces_one_that_died_of_a_hidden_episode_plays_no_train_episode(
+def test_a_process_replaced_in_a_hidden_episode_plays_no_train_episode(
     slots: Slots,
 ) -> None:
     slot = slot_of(slots, "Keeper", kwargs={"dies_of": 0.89})
@@ -70,9 +70,7 @@ def test_a_process_that_replaces_one_that_died_of_a_hidden_episode_plays_no_trai
 
 
 @pytest.mark.parametrize("how", ["raise in close", "leave when pushed"])
-def test_an_environment_that_breaks_down_and_cannot_be_closed_plays_the_episode_again(
-    slots: Slots, how: str
-) -> None:
+def test_an_environment_that_cannot_be_closed_plays_again(slots: Slots, how: str) -> None:
     slot = slot_of(slots, "Bad", kwargs={"how": how})
     slots.run(slot.start())
     try:
@@ -83,7 +81,7 @@ def test_an_environment_that_breaks_down_and_cannot_be_closed_plays_the_episode_
         slots.run(slot.close())
 
 
-def test_pages_with_options_of_ones_own_have_browser_and_fonts_in_their_fingerprint(
+def test_pages_with_own_options_have_browser_and_fonts_fingerprinted(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     versions = {"chromium": "1.2", "fonts": "f"}
@@ -149,7 +147,7 @@ def test_success_of_hidden_episodes_is_recorded_where_the_definition_names_none(
         ("hold", "environment acme/Bad, make, reset or step: it has not returned for 4 s"),
     ],
 )
-def test_what_breaks_its_word_is_refused_where_it_is_described_and_the_next_slot_goes_on(
+def test_an_environment_that_breaks_its_description_is_refused(
     slots: Slots, how: str, why: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(slot_module, "SILENT_S", 8.0)
@@ -236,7 +234,7 @@ def test_a_close_that_hangs_ends_the_process_at_the_next_episode(slots: Slots) -
         slots.run(slot.close())
 
 
-def test_a_policy_that_drives_an_environment_beyond_its_bounds_plays_on_and_the_operator_is_told(
+def test_observations_beyond_bounds_are_played_and_the_operator_told(
     slots: Slots,
 ) -> None:
     slot = slot_of(slots, "Bad", kwargs={"how": "outside"})
@@ -275,7 +273,7 @@ def test_memory_is_looked_at_from_outside_the_call(monkeypatch: pytest.MonkeyPat
     )
 
 
-def test_only_time_in_which_the_process_ran_counts_and_only_of_one_call(
+def test_only_a_calls_running_time_counts(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     guard = Guard(Limits(call_s=5.0))
@@ -316,7 +314,7 @@ class Policy:
 """
 
 
-def test_opaque_objects_are_encoded_by_their_family_on_the_way_to_the_policy_and_back(slots: Slots) -> None:
+def test_opaque_objects_are_encoded_by_their_family_both_ways(slots: Slots) -> None:
     slot = slot_of(slots, "Browser")
     slots.run(slot.start())
     try:

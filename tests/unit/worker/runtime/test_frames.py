@@ -218,7 +218,7 @@ def test_the_filter_lets_threads_be_made_and_nothing_else(monkeypatch: pytest.Mo
     assert allowed(program, 0x40000000) == bpf.KILL_PROCESS
 
 
-def test_the_filter_lets_a_process_do_nothing_to_itself_that_looks_like_another(
+def test_the_filter_refuses_signals_that_look_like_anothers(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(seccomp.platform, "machine", lambda: "x86_64")
@@ -257,7 +257,7 @@ def test_the_filter_lets_nothing_of_a_shared_file_carry_a_message(monkeypatch: p
         assert allowed(program, number) & 0xFFFF == 1
 
 
-def test_the_filter_keeps_a_policy_from_what_is_counted_for_the_whole_machine(
+def test_the_filter_bars_what_is_counted_for_the_machine(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(seccomp.platform, "machine", lambda: "x86_64")

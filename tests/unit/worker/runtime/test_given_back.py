@@ -81,9 +81,7 @@ def prefix(job: Job, place: int = 0) -> list[float]:
 
 
 @pytest.mark.parametrize("tier", ["bwrap", "landlock"])
-def test_a_policy_whose_luck_is_the_clock_throws_once_however_often_it_is_stopped(
-    slots: Slots, tier: str
-) -> None:
+def test_a_policy_that_uses_the_clock_draws_once_despite_stops(slots: Slots, tier: str) -> None:
     slot = slots.slot(tier)  # type: ignore[arg-type]
     job = hidden(tier=tier)
     thrown: list[list[float]] = []
@@ -146,7 +144,7 @@ def test_an_honest_policy_comes_to_the_same_when_it_is_stopped(slots: Slots) -> 
     assert outcome.episode_return == whole.episode_return
 
 
-def test_nothing_stands_of_a_policy_that_has_returned_nothing_or_plays_for_training(slots: Slots) -> None:
+def test_begun_actions_exist_only_for_returned_hidden_actions(slots: Slots) -> None:
     slot = slots.slot()
 
     async def at_once(job: Job, source: str) -> None:

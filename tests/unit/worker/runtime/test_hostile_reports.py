@@ -191,9 +191,7 @@ def policy(tmp_path_factory: pytest.TempPathFactory, monitor: Monitor) -> Iterat
 
 
 @pytest.mark.parametrize("used", ["1" + "0" * 30, "-1", str(1 << 63), "1e400", "NaN"])
-def test_a_forged_count_in_a_report_costs_the_policy_its_episode_and_not_the_slot(
-    slots: Slots, used: str
-) -> None:
+def test_a_forged_count_costs_the_episode_and_not_the_slot(slots: Slots, used: str) -> None:
     report = f'{{"stage":"act","kind":"action","message":"m","traceback":"","used":{used}}}'
     forged = f"b = {report.encode()!r}; os.write(4, struct.pack('<IBxxx', len(b), 6) + b); time.sleep(60)"
     outcome = slots.play(misbehaving(act=forged))
@@ -317,7 +315,7 @@ def test_an_action_that_breaks_the_environment_is_the_policys_failure(
     assert outcome.length == 60
 
 
-def test_what_breaks_before_the_policys_first_action_or_by_the_machine_is_ours(
+def test_failures_before_the_first_action_are_ours(
     player: Player, slots: Slots, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(Fragile, "how", "disk")

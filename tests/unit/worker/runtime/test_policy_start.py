@@ -99,7 +99,7 @@ def test_a_policys_generators_begin_as_numpy_seeds_them(
 
 
 @pytest.mark.parametrize("tier", ["bwrap", "landlock", "none"])
-def test_a_policy_finds_its_own_process_as_if_it_had_been_made_for_it(slots: Slots, tier: str) -> None:
+def test_a_policy_finds_its_process_as_if_new(slots: Slots, tier: str) -> None:
     outcome = slots.play(SEES, tier=tier)
     assert outcome.failure is None
     streams, is_first, home, temporary, binds, has_pwd, drawn, numpys, modules, left = json.loads(

@@ -101,7 +101,7 @@ def test_unseeded_numpy_generators_of_all_kinds_are_seeded(slots: Slots) -> None
     assert rows(slots.play(policy, policy_seed=bytes(16)))[0].action != one
 
 
-def test_the_policy_is_given_spaces_and_env_meta_and_nothing_of_the_case(slots: Slots) -> None:
+def test_the_policy_gets_spaces_and_env_meta_but_no_case(slots: Slots) -> None:
     policy = """
         import json, os, sys
 
@@ -259,7 +259,7 @@ def test_hidden_evaluation_with_scope_submit_renews_the_policy_as_told(slots: Sl
     assert printed == ["1 [0]\n", "1 [0, 1]\n", "1 [2]\n", "1 [2, 3]\n"]
 
 
-def test_with_scope_submit_a_policy_that_raised_goes_on_and_one_that_died_is_built_anew(slots: Slots) -> None:
+def test_with_scope_submit_a_raising_policy_stays_and_a_dead_is_rebuilt(slots: Slots) -> None:
     policy = """
         import os
 
@@ -403,7 +403,7 @@ def test_float_settings_are_the_defaults_whatever_was_set_before(slots: Slots) -
         libm.fesetround(0)
 
 
-def test_a_policy_computes_with_the_defaults_on_one_thread_in_a_fixed_locale(slots: Slots) -> None:
+def test_a_policy_computes_on_one_thread_in_a_fixed_locale(slots: Slots) -> None:
     policy = """
         import ctypes, locale, os, time
         class Policy:
@@ -434,7 +434,7 @@ def test_a_policy_computes_with_the_defaults_on_one_thread_in_a_fixed_locale(slo
     assert output.endswith("0 True\n")
 
 
-def test_an_episode_is_cut_after_the_jobs_steps_and_no_later_than_its_environments(slots: Slots) -> None:
+def test_an_episode_ends_at_the_jobs_or_the_environments_limit(slots: Slots) -> None:
     for max_steps, length in ((7, 7), (1000, 60), (0, 60)):
         outcome = slots.play(HONEST, max_steps=max_steps)
         played = rows(outcome)

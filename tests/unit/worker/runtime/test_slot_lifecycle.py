@@ -65,7 +65,7 @@ def test_progress_is_reported_while_a_job_runs(slots: Slots) -> None:
 
 
 @pytest.mark.parametrize("victim", ["env process", "zygote"])
-def test_the_death_of_a_slots_process_is_reported_and_start_makes_it_new(slots: Slots, victim: str) -> None:
+def test_a_dead_slot_process_is_reported_and_restarted(slots: Slots, victim: str) -> None:
     slot = slots.new()
 
     async def work() -> tuple[EpisodeOutcome, ...]:
@@ -101,7 +101,7 @@ def test_a_closed_slot_leaves_no_process_and_no_file(slots: Slots) -> None:
     assert not slot._scratch.exists()
 
 
-def test_without_a_file_system_of_its_own_a_policys_folder_is_gone_after_the_next(slots: Slots) -> None:
+def test_without_an_own_file_system_the_policys_folder_is_removed(slots: Slots) -> None:
     for _ in range(3):
         slots.play(HONEST, tier="landlock")
     folders = list((slots.slot("landlock")._scratch / "policies").iterdir())
@@ -137,7 +137,7 @@ def test_without_bubblewrap_the_error_says_what_to_install(
     why_not.cache_clear()
 
 
-def test_a_tier_that_works_is_offered_and_none_only_when_it_is_asked_for() -> None:
+def test_working_tiers_are_offered_and_none_only_on_request() -> None:
     assert available_tiers()[0] == "bwrap"
     assert "none" not in available_tiers()
     assert available_tiers(unsandboxed=True) == (*available_tiers(), "none")

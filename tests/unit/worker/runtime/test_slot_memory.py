@@ -43,9 +43,7 @@ def test_memory_counts_children_whether_or_not_the_kernel_shows_what_is_shared(
 
 
 @given(base=st.integers(1 << 20, 1 << 33), memory=st.integers(1 << 20, 1 << 33))
-def test_the_limit_of_the_address_space_grants_the_memory_and_hides_where_the_heap_began(
-    base: int, memory: int
-) -> None:
+def test_the_address_space_limit_grants_memory_and_hides_the_heap(base: int, memory: int) -> None:
     granted = address_space(base, memory)
     assert 0 <= granted - base - memory < 1 << 20
     assert (granted - memory) % (1 << 20) == 0

@@ -109,7 +109,7 @@ def test_a_policy_that_fails_gets_its_verdict_and_is_replaced(
         ),
     ],
 )
-def test_a_limit_of_time_is_reported_with_its_value_and_what_was_used(
+def test_a_time_limit_is_reported_with_value_and_use(
     slots: Slots, source: str, changes: dict[str, float], category: str, limit: float
 ) -> None:
     failure = slots.play(source, limits=limits(**changes)).failure
@@ -136,7 +136,7 @@ def test_a_limit_of_time_is_reported_with_its_value_and_what_was_used(
         ({"policy.py": misbehaving(init="bytearray(1 << 30)")}, "init_error", "268,435,456"),
     ],
 )
-def test_a_bundle_without_a_policy_is_reported_at_index_0_and_not_played(
+def test_a_bundle_without_a_policy_is_reported_at_index_0(
     slots: Slots, source: dict[str, str | bytes], category: str, words: str
 ) -> None:
     at_first = slots.play(source, first=0, limits=limits(init_wall_s=0.5))
@@ -182,7 +182,7 @@ def test_limits_of_files_and_actions_are_the_jobs_own(slots: Slots) -> None:
         assert words in failure.message
 
 
-def test_a_policy_that_breaks_the_code_that_answers_for_it_is_told_so(slots: Slots) -> None:
+def test_a_policy_that_breaks_its_player_is_told_so(slots: Slots) -> None:
     failure = slots.play(misbehaving(act="os.dup2(3, 4)")).failure
     assert failure is not None
     assert "answers for the policy was broken" in failure.message

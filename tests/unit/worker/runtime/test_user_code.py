@@ -29,7 +29,7 @@ def test_modules_packages_and_metadata_of_a_folder_are_shown(tmp_path: Path) -> 
     assert shown(tmp_path) == {"my_env.py", "fast.so", "pack", "x.egg-info"}
 
 
-def test_runs_state_keys_dot_files_and_linked_folders_inside_a_package_are_hidden(tmp_path: Path) -> None:
+def test_private_files_inside_a_package_are_hidden(tmp_path: Path) -> None:
     make(tmp_path, "pack/__init__.py", "pack/a/b.py", "pack/.env", "pack/own.pem", "outside/secret")
     make(tmp_path, "pack/runs/e/v/x/run.json", "pack/state/identity.json", "pack/state/more/x")
     (tmp_path / "pack" / "linked").symlink_to(tmp_path / "outside")

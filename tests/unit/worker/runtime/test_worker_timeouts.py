@@ -85,9 +85,7 @@ def test_a_child_that_does_not_seal_itself_is_killed(tmp_path: Path, monkeypatch
 
 
 @pytest.mark.parametrize("options", [{}, {"policy_scope": "submit", "first": 0, "n": 2}])
-def test_a_policy_that_does_not_let_go_of_its_output_is_not_waited_for(
-    slots: Slots, options: dict[str, Any]
-) -> None:
+def test_a_policy_that_holds_its_output_is_not_awaited(slots: Slots, options: dict[str, Any]) -> None:
     source = """
         import sys, time
 
@@ -134,9 +132,7 @@ def test_a_slot_that_does_not_heed_a_cancel_is_ended(slots: Slots, monkeypatch: 
     slots.run(cancelled())
 
 
-def test_a_slots_process_that_hangs_up_and_stays_is_reported_without_its_status(
-    slots: Slots, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_slot_process_that_hangs_up_is_reported(slots: Slots, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(slot, "LAST_WORDS_S", SOON_S)
     own = slots.new("none")
 

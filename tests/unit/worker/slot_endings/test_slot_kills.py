@@ -38,9 +38,7 @@ def played(
 
 
 @pytest.mark.parametrize("tier", ["bwrap", "landlock"])
-def test_a_policy_that_is_killed_from_outside_is_started_again_and_nothing_shows(
-    slots: Slots, tier: str
-) -> None:
+def test_a_policy_killed_from_outside_restarts_unnoticed(slots: Slots, tier: str) -> None:
     slot = slots.slot(tier)  # type: ignore[arg-type]
     undisturbed = slots.play(stateful(0.0), tier=tier, limits=PATIENT)
     slot._stderr.clear()
@@ -77,7 +75,7 @@ def test_where_a_policy_may_signal_itself_a_kill_is_its_own(slots: Slots) -> Non
     assert outcome.length == 60
 
 
-def test_a_policy_of_several_episodes_that_is_killed_from_outside_is_played_again_elsewhere(
+def test_a_killed_policy_of_several_episodes_is_played_elsewhere(
     slots: Slots,
 ) -> None:
     with pytest.raises(SandboxError, match="SIGKILL, and neither the policy nor a limit can have done that"):
@@ -145,7 +143,7 @@ def test_an_end_of_a_policys_parent_starts_the_policy_again(slots: Slots, number
 
 
 @pytest.mark.parametrize("tier", ["bwrap", "landlock"])
-def test_a_process_that_is_killed_before_it_has_a_policy_is_no_loss(slots: Slots, tier: str) -> None:
+def test_a_process_killed_before_its_policy_is_no_loss(slots: Slots, tier: str) -> None:
     slot = slots.slot(tier)  # type: ignore[arg-type]
     slots.play(HONEST, tier=tier)
 
@@ -199,7 +197,7 @@ def test_an_episode_under_kills_and_stops_of_anything_is_the_same_episode(slots:
         assert essence(outcome) == essence(undisturbed)
 
 
-def test_a_sandbox_that_ends_while_nothing_is_played_costs_the_next_job_a_retry_and_no_more(
+def test_an_idle_sandboxs_end_costs_one_retry(
     slots: Slots,
 ) -> None:
     slot = slots.new()

@@ -113,7 +113,7 @@ class Policy:
 """
 
 
-def test_no_wall_limit_counts_the_time_for_which_a_policy_waits_for_a_processor(
+def test_no_wall_limit_counts_time_without_a_processor(
     slots: Slots,
 ) -> None:
     slot = slots.slot()
@@ -160,7 +160,7 @@ def eats(n_bytes: int) -> str:
 @pytest.mark.parametrize(
     ("eaten", "limit", "category"), [(100 << 20, 48 << 20, "oom"), (12 << 20, 4 << 20, None)]
 )
-def test_a_policy_that_the_machine_ends_for_want_of_memory_failed_if_the_memory_was_its_own(
+def test_a_policy_killed_for_its_own_memory_has_failed(
     slots: Slots, eaten: int, limit: int, category: str | None
 ) -> None:
     slot = slots.slot()

@@ -46,7 +46,7 @@ def test_moving_one_deadline_for_ever_takes_no_memory() -> None:
     assert len(timers._heap) < 200
 
 
-def test_a_trace_keeps_the_last_lines_about_a_key_and_what_is_below_it() -> None:
+def test_a_trace_keeps_the_last_lines_about_a_key() -> None:
     trace = Trace(lines=3)
     for at, key in enumerate(("r1/s0/train/0", "r2", "r1/s0/train/0#1", "w1")):
         trace.add(float(at), "s", key, "leased" if key != "w1" else "lost r1/s0/train/0#1")
