@@ -13,6 +13,7 @@ from waiting import wait_until
 
 from evopolicy_common.processes import scratch
 from evopolicy_common.records.policies.checkpoints import read_meta
+from evopolicy_common.records.secrets import PASSED, read_passed
 from evopolicy_common.records.summary import decode_summary
 
 pytestmark = pytest.mark.system
@@ -37,8 +38,13 @@ def test_local_plays_a_whole_run_and_leaves_nothing_behind(tmp_path: Path) -> No
     assert record.outcome.random_reference is not None
     assert record.agent.harness == record.agent.entry == "evolve"
     assert record.versions.fingerprint["numpy"]
-    left = {path.name for path in folder.iterdir()} - {".passed.json"}  # only with a passed value
-    assert left == {"checkpoints", "logs", "run.json", "workspace"}
+    left = {path.name for path in folder.iterdir()}
+    assert left == {PASSED, "checkpoints", "logs", "run.json", "workspace"}
+    # Digests of what the agent got by the tests' `--jail-env`, and of nothing else.
+    passed = read_passed(folder)
+    assert passed is not None
+    assert len(passed.values) == 1
+    assert [*passed.places(running.mark.encode())] == [(0, len(running.mark))]
     best = folder / "checkpoints" / f"submit_{record.outcome.best_submit_index:03d}"
     assert (best / "policy.py").read_bytes() == (folder / "workspace/system/policy.py").read_bytes()
     meta = read_meta(best, 6)
