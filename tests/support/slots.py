@@ -11,10 +11,21 @@ from pathlib import Path
 from textwrap import dedent
 from typing import Any, TypeVar
 
+import msgspec
+
 from evopolicy_common.messages.environment import Case
-from evopolicy_common.messages.episode import EpisodeOutcome, EpisodeSpec, Job, ResourceLimits, Tier
+from evopolicy_common.messages.episode import (
+    BlobRef,
+    EpisodeOutcome,
+    EpisodeSpec,
+    Job,
+    ResourceLimits,
+    Tier,
+)
 from evopolicy_common.processes import proc
+from evopolicy_common.records.blobs import digest_of
 from evopolicy_common.records.episodes.trajectory import Row, decode
+from evopolicy_worker.slot_protocol.begun import unpack
 from evopolicy_worker.slots.slot import Slot
 
 T = TypeVar("T")
@@ -174,6 +185,21 @@ def rows(outcome: EpisodeOutcome) -> list[Row]:
     assert outcome.trajectory is not None
     assert outcome.trajectory.inline is not None
     return list(decode(outcome.trajectory.inline).rows())
+
+
+def going_on(job: Job, slot: Slot) -> Job:
+    """The job as it is leased the next time."""
+    back = slot.begun
+    if back is None:
+        return job
+    ref = BlobRef(digest=digest_of(back.data), size=len(back.data), inline=back.data)
+    return msgspec.structs.replace(job, begun=ref)
+
+
+def prefix(job: Job, place: int = 0) -> list[float]:
+    """The actions that the job goes on from."""
+    packed = unpack(job).get(place)
+    return [] if packed is None else [float(each.action[0]) for each in packed.unpacked().taken]
 
 
 # A slot's processes.

@@ -139,6 +139,8 @@ class Job(msgspec.Struct, frozen=True, kw_only=True):
     """An episode is cut after this many steps; 0: only its environment ends it."""
     begun: BlobRef | None = None
     """The policy's actions of an earlier attempt, which remain valid (`JobResult.begun`); None for a first attempt."""
+    environment_faults: Int = 0
+    """How many earlier attempts the environment has ended, by hanging or otherwise (`JobResult.environment_fault`)."""
 
 
 class PolicyFailure(msgspec.Struct, frozen=True, kw_only=True):

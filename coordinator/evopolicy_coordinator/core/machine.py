@@ -194,6 +194,12 @@ NEWS: dict[tuple[type, str], tuple[Rule, ...]] = {
     (step.EpisodesDone, "random"): (audits.sample, finalisation.progressed),
     (step.EpisodesDone, "evaluation"): (evaluations.progressed,),
     (step.EpisodesDone, "audit"): (audits.replayed,),
+    (step.EnvironmentFailed, "train"): (finalisation.environment_failed,),
+    (step.EnvironmentFailed, "validation"): (finalisation.environment_failed,),
+    (step.EnvironmentFailed, "heldout"): (finalisation.environment_failed,),
+    (step.EnvironmentFailed, "random"): (finalisation.environment_failed,),
+    (step.EnvironmentFailed, "evaluation"): (evaluations.environment_failed,),
+    (step.EnvironmentFailed, "audit"): (),  # its run waits for it for a limited time only
     (step.SubmitEnded, ""): (finalisation.submit_ended,),
     (step.AuditsMoved, ""): (finalisation.audits_moved,),
     (step.AgentOverdue, ""): (finalisation.agent_overdue,),

@@ -142,6 +142,7 @@ class Bad(Glider):
         obs, reward, terminated, truncated, info = super().step(action)
         if self.sound:
             return obs, reward, terminated, truncated, info
+        pushed = abs(float(action[0]) - 0.9) < 1e-3
         if self.how == "nan":
             reward = float("nan")
         elif self.how == "outside":
@@ -157,7 +158,7 @@ class Bad(Glider):
         elif self.how == "fork and wait":
             if os.fork() == 0:
                 time.sleep(3600)
-        elif self.how == "hold":
+        elif self.how == "hold" or (self.how == "hold when pushed" and pushed):
             # Holds the interpreter, as an extension module that never returns does.
             ctypes.PyDLL(None).sleep(3600)
         elif self.how == "error":
@@ -168,9 +169,9 @@ class Bad(Glider):
             os.write(1, b"y" * 1000)
         elif self.how == "threads":
             threading.Thread(target=time.sleep, args=(3600,), daemon=True).start()
-        elif self.how == "raise in close" and abs(float(action[0]) - 0.9) < 1e-3:
+        elif self.how == "raise in close" and pushed:
             raise ValueError("too strong")
-        elif self.how == "leave when pushed" and abs(float(action[0]) - 0.9) < 1e-3:
+        elif self.how == "leave when pushed" and pushed:
             sys.exit("too strong")
         elif self.how == "exit":
             os._exit(3)
@@ -208,7 +209,7 @@ class Bad(Glider):
             obs = "a hill\nto the left"
         elif self.how == "no observation":
             obs = None
-        elif self.how == "hang":
+        elif self.how == "hang" or (self.how == "hang when pushed" and pushed):
             time.sleep(3600)
         return obs, reward, terminated, truncated, info
 

@@ -69,8 +69,8 @@ from evopolicy_worker.sandbox.jail import Jail
 from evopolicy_worker.sandbox.zygote import Zygote
 from evopolicy_worker.slot_protocol import endings
 from evopolicy_worker.slot_protocol import slot_messages as messages
-from evopolicy_worker.slot_protocol.begun import Begun, Returned, is_kept, unpack
-from evopolicy_worker.slot_protocol.endings import EndedFromOutsideError, Ending
+from evopolicy_worker.slot_protocol.begun import Begun, Log, Returned, is_kept, unpack
+from evopolicy_worker.slot_protocol.endings import EndedFromOutsideError
 
 MAX_FAULT = 4000
 """Characters of an error that are reported."""
@@ -93,6 +93,7 @@ class Player:
         self._policies = Policies(zygote, jail, monitor, scratch)
         self._environments: OrderedDict[str, Environment] = OrderedDict()
         self._videos = VideoRecorder()
+        self._log = Log(scratch)
 
     def play(
         self,
@@ -130,6 +131,8 @@ class Player:
                     begun = Begun(failure=failure)
                 if is_kept(job):
                     progress.begins(k, begun)
+                if job.bundle is not None:
+                    self._log.begins(job.job_id, k, begun)
                 failure, frame, film_of = self._play(k, job, spec, policies, progress, tell, begun)
                 films += film_of
                 progress.episodes_done += 1
@@ -195,8 +198,8 @@ class Player:
                     raise
                 # The same actions would fail again, and another worker would give the policy a second attempt.
                 note(f"{job.env} broke down on a policy's actions: {fault_of(error)}")
-                begun.failure = begun.failure or endings.broken_down(Ending("environment", "exit"))
                 begun.taken.clear()
+                begun.fail(begun.failure or endings.BROKE_DOWN)
                 with contextlib.suppress(BaseException):  # of what broke down
                     self._environments.pop(job.env).close()
 
@@ -210,6 +213,7 @@ class Player:
         self._environments.clear()
         self._videos.close()
         self._policies.close()
+        self._log.close()
 
     def describe(self, env_id: str) -> EnvironmentDescription:
         """An environment's description. The environment is created for it and kept for later jobs. Raises WorkerError
@@ -338,7 +342,7 @@ class _Episode:
     def _note(self, failure: PolicyFailure, step: int | None = None) -> None:
         if self._progress.cancelled:
             raise CancelledJobError
-        self._begun.failure = msgspec.structs.replace(failure, step_index=step)
+        self._begun.fail(msgspec.structs.replace(failure, step_index=step))
 
     def _steps(
         self, policy: PolicyProcess | None, full: Recorder | None, actions: Recorder | None
@@ -361,7 +365,7 @@ class _Episode:
         success: bool | None = None
         total, t = 0.0, 0
         taken = self._begun.taken
-        n_taken, keep = len(taken), taken.append
+        n_taken, take = len(taken), self._begun.take
         float_environment.reset()
         obs = environment.reset(self._spec.case)
         while True:
@@ -371,7 +375,7 @@ class _Episode:
                     returned = policy.act(obs)
                     if t >= n_taken:
                         action, invalid = repair(returned)
-                        keep(Returned(returned, action))
+                        take(Returned(returned, action))
                 except PolicyFailedError as error:
                     self._note(error.failure, t)
                     policy = None

@@ -1,26 +1,38 @@
 """The policy's actions in an unfinished episode: reported when a job is returned, so that the next attempt continues
-from there.
+from there. They are also in a file of the slot's scratch folder, which survives the process that plays.
 
 Rules:
 - Actions are stored as played, after repair. Their size follows from the action space and the number of steps, so a
   policy cannot make it too large to report.
 - A failure remains valid like an action: the next attempt plays random actions from there.
+- The file is written in every split, since a policy can measure the time between its calls.
 """
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Mapping
+import mmap
+import os
+import struct
+from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
+import numpy as np
 
 from evopolicy_common.errors import DECODE_ERRORS, ProtocolError
 from evopolicy_common.messages.episode import TIME_LIMITS, Job, PolicyFailure
+from evopolicy_common.records.episodes import columns
 from evopolicy_common.records.episodes.trajectory import Recorder, decode
+from evopolicy_common.regular_files import read_regular
 from evopolicy_common.wire.codec import MAX_PACKED_BYTES
 
 MAX_TRACEBACK = 4000
+FILE = "begun"
+_LENGTH = struct.Struct("<I")
+_END = _LENGTH.pack(0)
+_BLOCK_BYTES = 64 << 10
 
 
 class Returned(NamedTuple):
@@ -38,6 +50,19 @@ class Begun:
     def __init__(self, taken: list[Returned] | None = None, failure: PolicyFailure | None = None) -> None:
         self.taken: list[Returned] = [] if taken is None else taken
         self.failure = failure
+        self.log: Log | None = None
+
+    def take(self, each: Returned) -> None:
+        """Adds an action, before it reaches the environment."""
+        self.taken.append(each)
+        if self.log is not None:
+            self.log.add(each.action)
+
+    def fail(self, failure: PolicyFailure) -> None:
+        """The policy has failed."""
+        self.failure = failure
+        if self.log is not None:
+            self.log.write(self)
 
     def packed(self) -> PackedBegun:
         """A snapshot, for another process."""
@@ -56,14 +81,95 @@ class PackedBegun(msgspec.Struct, frozen=True, kw_only=True):
     actions: bytes = b""
     """`trajectory` codec bytes, of which the actions count."""
     failure: PolicyFailure | None = None
+    more: tuple[bytes, ...] = ()
+    """The actions after those, as `Log` adds them, of an episode whose process has ended."""
 
     def unpacked(self) -> Begun:
         """The episode to continue; empty when the bytes of another worker cannot be read."""
         try:
             rows = decode(self.actions).rows() if self.actions else ()
-        except ProtocolError:
+            taken = [row.action for row in rows] + [columns.decoder.decode(each) for each in self.more]
+        except (ProtocolError, *DECODE_ERRORS, ValueError, TypeError, OverflowError, MemoryError):
             return Begun()
-        return Begun([Returned(row.action, row.action) for row in rows], self.failure)
+        return Begun([Returned(action, action) for action in taken], self.failure)
+
+
+class Log:
+    """The file of the running episode: its head, then each further action. Mapped, as a system call for each step would take
+    longer. If the disk is full, it has the first actions only."""
+
+    def __init__(self, folder: Path) -> None:
+        flags = os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC | os.O_NOFOLLOW
+        self._file = os.open(folder / FILE, flags, 0o600)
+        # Not sparse: a page that the disk has no room for would end the process.
+        os.posix_fallocate(self._file, 0, _BLOCK_BYTES)
+        self._map = mmap.mmap(self._file, _BLOCK_BYTES)
+        self._at, self._full = 0, False
+        self._job, self._place = "", 0
+
+    def begins(self, job: str, place: int, begun: Begun) -> None:
+        """The job's episode at this index begins; the file has it from now on."""
+        self._job, self._place = job, place
+        begun.log = self
+        self.write(begun)
+
+    def write(self, begun: Begun) -> None:
+        """Writes the episode anew."""
+        self._at, self._full = 0, False
+        self._append(_encoder.encode(_Head(job=self._job, place=self._place, begun=begun.packed())))
+
+    def add(self, action: Any) -> None:
+        """Adds an action. Lists take a quarter of the time of arrays, and `repair` makes the same actions of them."""
+        self._append(columns.encode(action.tolist() if type(action) is np.ndarray else action))
+
+    def _append(self, data: bytes) -> None:
+        at, n = self._at, len(data)
+        end = at + _LENGTH.size + n
+        if end + _LENGTH.size > len(self._map):
+            self._grow(end + _LENGTH.size)
+        if not self._full:
+            self._map[at : end + _LENGTH.size] = _LENGTH.pack(n) + data + _END
+            self._at = end
+
+    def _grow(self, size: int) -> None:
+        size = -(-max(size, 2 * len(self._map)) // _BLOCK_BYTES) * _BLOCK_BYTES
+        try:
+            os.posix_fallocate(self._file, 0, size)
+            self._map.resize(size)
+        except OSError:
+            self._full = True
+
+    def close(self) -> None:
+        self._map.close()
+        os.close(self._file)
+
+
+class _Head(msgspec.Struct, frozen=True, kw_only=True):
+    job: str
+    place: int
+    """The episode's index in the job."""
+    begun: PackedBegun
+
+
+def _frames(data: bytes) -> Iterator[bytes]:
+    """The parts of a `Log`, up to its end."""
+    at = 0
+    while len(data) - at >= _LENGTH.size and (n := _LENGTH.unpack_from(data, at)[0]):
+        at += _LENGTH.size
+        if len(data) - at < n:
+            return
+        yield data[at : at + n]
+        at += n
+
+
+def recovered(folder: Path, job: str) -> _Places:
+    """The job's episode that an ended process has left in its scratch folder; empty when there is none."""
+    with contextlib.suppress(OSError, StopIteration, *DECODE_ERRORS):
+        frames = _frames(read_regular(folder / FILE, MAX_PACKED_BYTES))
+        head = _head.decode(next(frames))
+        if head.job == job:
+            return {head.place: msgspec.structs.replace(head.begun, more=tuple(frames))}
+    return {}
 
 
 class HandedBack(NamedTuple):
@@ -78,6 +184,7 @@ class HandedBack(NamedTuple):
 _Places = dict[int, PackedBegun]
 _encoder = msgspec.msgpack.Encoder()
 _decoder = msgspec.msgpack.Decoder(_Places)
+_head = msgspec.msgpack.Decoder(_Head)
 
 
 def is_kept(job: Job) -> bool:
@@ -87,7 +194,7 @@ def is_kept(job: Job) -> bool:
 
 def pack(places: Mapping[int, PackedBegun]) -> HandedBack | None:
     """The started episodes of a job by their index; None when there are none, or when they are too large."""
-    found = {place: each for place, each in places.items() if each.actions or each.failure}
+    found = {place: each for place, each in places.items() if each.actions or each.more or each.failure}
     data = _encoder.encode(found)
     if not found or len(data) > MAX_PACKED_BYTES:
         return None

@@ -18,10 +18,14 @@ from evopolicy_common.messages.episode import FailureCategory, PolicyFailure
 First = Literal["policy", "sandbox", "environment", "supervisor"]
 """Which process ended first. `sandbox`: bubblewrap or the zygote, whose end also ends the policy's process.
 `supervisor`: the worker."""
-How = Literal["exit", "fault", "signal", "SIGKILL", "stop", "pipe", "frame"]
+How = Literal["exit", "fault", "signal", "SIGKILL", "stop", "pipe", "frame", "overrun"]
 """`exit`: with a status. `fault`: by a signal that a process's own error causes (`FAULTS`). `signal`: by any other
 signal but SIGKILL. `stop`: stopped and not resumed. `pipe`: it closed its pipe but is alive. `frame`: it sent an
-invalid frame."""
+invalid frame. `overrun`, of the environment: a call took too long, or its memory was too large, and it was ended."""
+
+AGAIN = 3
+"""If an environment has ended so many attempts at a job, and overruns once more after a policy's actions, the actions are
+the cause."""
 
 FAULTS = frozenset(
     {
@@ -48,6 +52,8 @@ class Ending(NamedTuple):
     held: bool = True
     """Whether the policy's process cannot have killed or stopped itself: it is sealed, and has no CPU limit of the
     system."""
+    again: bool = False
+    """For the environment: whether it overran on the policy's actions, and has ended `AGAIN` earlier attempts at the job."""
 
 
 class Row(NamedTuple):
@@ -62,6 +68,7 @@ class Row(NamedTuple):
     limit: bool | None = None
     began: bool | None = None
     held: bool | None = None
+    again: bool | None = None
 
     def fits(self, ending: Ending) -> bool:
         """Whether an ending is of this kind."""
@@ -71,6 +78,7 @@ class Row(NamedTuple):
             and self.limit in (None, ending.limit is not None)
             and self.began in (None, ending.began)
             and self.held in (None, ending.held)
+            and self.again in (None, ending.again)
         )
 
 
@@ -126,6 +134,14 @@ TABLE: tuple[Row, ...] = (
         began=False,
     ),
     Row(
+        "the environment overran on its actions, as in earlier attempts",
+        _set("environment"),
+        _how("overrun"),
+        "killed",
+        again=True,
+    ),
+    Row("the environment overran", _set("environment"), _how("overrun"), "outside", again=False),
+    Row(
         "the environment was killed or stopped",
         _set("environment"),
         _how("signal", "SIGKILL", "stop", "pipe", "frame"),
@@ -134,6 +150,14 @@ TABLE: tuple[Row, ...] = (
     Row("the worker", _set("supervisor"), None, "outside"),
 )
 """Every ending fits exactly one row."""
+
+
+BROKE_DOWN = PolicyFailure(
+    category="killed",
+    step_index=None,
+    message="the environment broke down on the policy's actions; the episode was played again from its first step with random actions",
+)
+"""The policy's failure when the environment's process ends on its actions."""
 
 
 def verdict(ending: Ending) -> FailureCategory | None:
@@ -146,11 +170,7 @@ def verdict(ending: Ending) -> FailureCategory | None:
 
 def broken_down(ending: Ending) -> PolicyFailure | None:
     """The policy's failure for an ending of the environment's process; None for an infrastructure failure."""
-    category = verdict(ending)
-    if category is None:
-        return None
-    text = "the environment broke down on the policy's actions; the episode was played again from its first step with random actions"
-    return PolicyFailure(category=category, step_index=None, message=text)
+    return None if verdict(ending) is None else BROKE_DOWN
 
 
 def how(status: int) -> How:

@@ -3,8 +3,9 @@
 Rules:
 - A job's failure is its policy's (an outcome) or an infrastructure failure (WorkerError, SandboxError, SlotDiedError:
   the job is played elsewhere), as the table in `endings` decides.
-- If the environment's process crashes on a policy's actions, a new process plays the episode with random actions, and
-  then the rest of the job.
+- If the environment's process crashes on a policy's actions, or hangs on them as in earlier attempts, a new process plays
+  the episode with random actions, and then the rest of the job.
+- If the process ends otherwise, the actions that the policy had returned are read from the scratch folder.
 - After `cancel` the slot is usable. After an error `start` restarts it.
 """
 
@@ -96,6 +97,8 @@ class Slot:
         self._scratch = scratch
         self._cancelled = False
         self._sent = ""
+        self._kept = ""
+        """The last job, if its policy's actions remain valid."""
         self._begun: dict[int, PackedBegun] = {}
         self._n_replies = 0
         self._hung = ""
@@ -166,6 +169,7 @@ class Slot:
         the policy had returned. Raises SlotDiedError, SandboxError or WorkerError.
         """
         self._begun = begun.unpack(job)
+        self._kept = job.job_id if begun.is_kept(job) else ""
         self._hung = ""
         if self._process is None:
             raise WorkerError("the slot is not started")
@@ -218,12 +222,20 @@ class Slot:
                         else:
                             raise _error(reply)
                     return () if reply.cancelled else tuple(outcomes)
-                except SlotDiedError as error:
-                    failure = endings.broken_down(Ending("environment", self._how_it_ended(), began=acted))
+                except (SlotDiedError, BrokenEnvironmentError) as error:
+                    told = isinstance(error, BrokenEnvironmentError)
+                    how = "overrun" if told or self._hung else self._how_it_ended()
+                    again = acted and job.environment_faults >= endings.AGAIN
+                    failure = endings.broken_down(Ending("environment", how, began=acted, again=again))
                     if failure is None or self._cancelled or bundle is None:
+                        if told:
+                            raise
                         why = f"environment {job.env}: its process ended while it played; {error}"
                         raise self._broken(why) from error
-                    log.warning("slot died on a policy's actions", job=job.job_id, error=str(error))
+                    log.warning(
+                        "slot died on a policy's actions", job=job.job_id, error=self._hung or str(error)
+                    )
+                    self._hung = ""
                     if begun.is_kept(job):
                         self._begun[len(outcomes)] = PackedBegun(failure=failure)
                 await self.start()
@@ -239,7 +251,7 @@ class Slot:
     @property
     def begun(self) -> HandedBack | None:
         """The policy's actions in the last, unfinished job; None without any."""
-        return begun.pack(self._begun)
+        return begun.pack(self._begun | begun.recovered(self._scratch, self._kept))
 
     async def describe(self, env_ids: Sequence[str]) -> tuple[EnvironmentDescription, ...]:
         """Descriptions of these environments, which are made in the slot's process and stay there for jobs. Raises as
@@ -350,6 +362,7 @@ class Slot:
             if silent_s >= longest_s:
                 self._hung = hung(f"environment {env_id}, reset or step", self._start.limits)
                 self._end_process()
+                silent_s = 0.0
             if stood_s >= STOPPED_S:
                 log.warning("slot was stopped from outside", for_s=stood_s)
                 self._end_process()

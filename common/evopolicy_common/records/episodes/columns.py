@@ -338,8 +338,8 @@ encoder = msgspec.msgpack.Encoder(enc_hook=_enc_hook)
 decoder = msgspec.msgpack.Decoder(ext_hook=_ext_hook)
 
 
-def encode(block: dict[str, Any]) -> bytes:
-    """Encodes a block."""
+def encode(block: Any) -> bytes:
+    """Encodes a block, or another value made of plain ones and arrays."""
     try:
         return encoder.encode(block)
     except (OverflowError, UnicodeEncodeError, TypeError):

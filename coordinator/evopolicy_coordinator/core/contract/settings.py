@@ -30,6 +30,8 @@ class CoreSettings(msgspec.Struct, frozen=True, kw_only=True):
     retry_base_s: float = 0.5
     """First back-off after an infrastructure failure; it doubles with each further one."""
     retry_max_s: float = 60.0
+    environment_wait_s: float = 900.0
+    """An environment that ends every attempt at a job for at least this long is given up, and its run ends with an error."""
     avoid_s: float = 5.0
     """A retried job is kept from the worker that it failed on for this long after its back-off, so that
     another may take it."""

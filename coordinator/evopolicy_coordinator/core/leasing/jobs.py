@@ -1,7 +1,8 @@
 """A job as its worker receives it.
 
 Rule that this module owns: a job's content follows from its group and its position, so it is not stored, and every
-attempt is the same job, except for the actions that the policy returned in an earlier one (`BegunRow`).
+attempt is the same job, except for the actions that the policy returned in an earlier one (`BegunRow`), and the number of
+those that the environment has ended.
 """
 
 from __future__ import annotations
@@ -54,4 +55,5 @@ def build(job: JobState, description: EnvironmentDescription) -> Job:
         limits=template.limits,
         max_steps=template.max_steps,
         begun=job.begun,
+        environment_faults=job.faults.n,
     )

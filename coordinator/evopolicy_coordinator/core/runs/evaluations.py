@@ -20,7 +20,7 @@ from evopolicy_coordinator.core.runs import templates, waits
 from evopolicy_coordinator.core.structures.polls import Poll
 from evopolicy_coordinator.core.tables.model import Ended, Evaluation, JobGroup
 from evopolicy_coordinator.core.tables.state import State
-from evopolicy_coordinator.core.tables.step import EpisodesDone, FlowPinned, Step
+from evopolicy_coordinator.core.tables.step import EnvironmentFailed, EpisodesDone, FlowPinned, Step
 
 
 def request(state: State, event: events.EvaluationRequested, step: Step) -> None:
@@ -91,6 +91,12 @@ def progressed(state: State, news: EpisodesDone, step: Step) -> None:
         end(state, group, "", step)
     else:
         _answer_polls(state, group, step, finished=False)
+
+
+def environment_failed(state: State, news: EnvironmentFailed, step: Step) -> None:
+    """The environment cannot play one of the episodes."""
+    if news.group.run in state.evaluations:
+        end(state, news.group, news.error, step)
 
 
 def cancel(state: State, name: str, step: Step) -> bool:

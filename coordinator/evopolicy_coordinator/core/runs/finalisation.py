@@ -39,7 +39,14 @@ from evopolicy_coordinator.core.runs import (
 )
 from evopolicy_coordinator.core.tables.model import HELDOUT, JobGroup, Run
 from evopolicy_coordinator.core.tables.state import State
-from evopolicy_coordinator.core.tables.step import AgentOverdue, AuditsMoved, EpisodesDone, Step, SubmitEnded
+from evopolicy_coordinator.core.tables.step import (
+    AgentOverdue,
+    AuditsMoved,
+    EnvironmentFailed,
+    EpisodesDone,
+    Step,
+    SubmitEnded,
+)
 
 # ---- hidden groups ----
 
@@ -163,7 +170,15 @@ def agent_overdue(state: State, news: AgentOverdue, step: Step) -> None:
         _cancel(state, news.run, step)
 
 
-def _cancel(state: State, run: Run, step: Step) -> None:
+def environment_failed(state: State, news: EnvironmentFailed, step: Step) -> None:
+    """End a run with an error, as its environment cannot play one of the episodes: its open submit is not charged."""
+    run = state.runs.get(news.group.run)
+    if run is not None:
+        step.log("error", "environment_given_up", run=run.id, why=news.error)
+        _cancel(state, run, step, error=news.error)
+
+
+def _cancel(state: State, run: Run, step: Step, *, error: str | None = None) -> None:
     if run.open is not None:
         index, run.open = run.open, None
         run.ledger.refund(index)
@@ -175,7 +190,7 @@ def _cancel(state: State, run: Run, step: Step) -> None:
         step.change_run(run, phase="closed", closed_at=step.now, close_reason=gateway.CANCELLED)
         permits.cancelled(state, run.id, step)
     permits.drop_asks(state, run.id, Refusal.RUN_CANCELLED, because("run_cancelled", run=run.id), step)
-    _finish(state, run, None, step, cancelled=True, unplayed=True)
+    _finish(state, run, None, step, cancelled=True, unplayed=True, error=error)
 
 
 def _finish(
@@ -186,14 +201,15 @@ def _finish(
     *,
     cancelled: bool = False,
     unplayed: bool = False,
+    error: str | None = None,
 ) -> None:
     """End a run: its result becomes durable, and the core drops its state. `unplayed`: close its
-    open groups unfinished."""
+    open groups unfinished. `error`: why it cannot be scored."""
     audit_end.cancel(state, run, step)
     state.timers.disarm(("audits", run.id))
     for group in [group for group in state.groups.values() if group.run == run.id] if unplayed else []:
         groups.close_group(state, group, step, "run cancelled" if cancelled else "budget not spent")
-    result = finished.result(state, run, best, step.now, cancelled=cancelled)
+    result = finished.result(state, run, best, step.now, cancelled=cancelled, error=error)
     result = journal.ended(state, result, step)
     step.persist(FinishedRow(run=run.id, result=result))
     step.change_run(run, phase="finished", remaining_budget=run.ledger.available, n_submits=len(run.submits))

@@ -113,6 +113,16 @@ class Template:
 
 
 @dataclass(slots=True, eq=False)
+class EnvironmentFaults:
+    """Attempts at a job that its environment has ended, in this incarnation."""
+
+    n: int = 0
+    since: float = 0.0
+    on: set[str] = field(default_factory=set)
+    """Machines."""
+
+
+@dataclass(slots=True, eq=False)
 class JobState:
     """An open job and its place."""
 
@@ -136,6 +146,7 @@ class JobState:
     """Faults after which the submit's wall-clock limit has started again."""
     last_failure: str = ""
     """The last failure and its worker, for an operator."""
+    faults: EnvironmentFaults = field(default_factory=EnvironmentFaults)
     avoid: str | None = None
     """The worker that it last failed on: not leased to it before `avoid_until`, if its lane has another one."""
     avoid_until: float = 0.0

@@ -70,6 +70,19 @@ class JobRetried:
 
 
 @dataclass(slots=True, eq=False)
+class EnvironmentFailed:
+    """The environment has ended so many attempts at a job that it is given up."""
+
+    group: JobGroup
+    error: str
+
+    @property
+    def kind(self) -> str:
+        """Of the group."""
+        return self.group.kind
+
+
+@dataclass(slots=True, eq=False)
 class ResultsDiffered:
     """Two results of one episode differed."""
 
@@ -123,6 +136,7 @@ News = (
     ResultsPersisted
     | EpisodesDone
     | JobRetried
+    | EnvironmentFailed
     | ResultsDiffered
     | FlowPinned
     | SubmitEnded

@@ -14,7 +14,7 @@ Rules that this module owns:
   gateway is the worker's failure.
 - The time that an episode took counts for the fair share only up to the time for which its worker had the lease.
 - A failure that a policy can cause in its slot is an outcome. A failure that it cannot cause is retried without limit:
-  `failed`, or `slot_died` from workers of earlier versions.
+  `failed`, or `slot_died` from workers of earlier versions. An environment that keeps ending a job is given up (`retry`).
 """
 
 from __future__ import annotations
@@ -23,11 +23,17 @@ from evopolicy_common.messages.bounds import LARGEST
 from evopolicy_common.messages.episode import TIME_LIMITS, EpisodeOutcome
 from evopolicy_common.messages.worker import JobResult
 from evopolicy_coordinator.core.contract.records import BegunRow, OutcomeRow
-from evopolicy_coordinator.core.leasing import fleet, groups, leases
+from evopolicy_coordinator.core.leasing import fleet, groups, leases, retry
 from evopolicy_coordinator.core.leasing.retry import JobFailure
 from evopolicy_coordinator.core.tables.model import JobState, Lease, Worker, outcome_digest
 from evopolicy_coordinator.core.tables.state import State
-from evopolicy_coordinator.core.tables.step import EpisodesDone, ResultsDiffered, ResultsPersisted, Step
+from evopolicy_coordinator.core.tables.step import (
+    EnvironmentFailed,
+    EpisodesDone,
+    ResultsDiffered,
+    ResultsPersisted,
+    Step,
+)
 
 MAX_OUTCOME_BYTES = 2 << 20
 """Largest sum of an outcome's texts, names and bytes. A worker uploads larger recordings as blobs. A page has at least one
@@ -63,6 +69,20 @@ def take(state: State, news: ResultsPersisted, step: Step) -> None:
             fleet.failed(state, worker, step)
         failure: JobFailure = "returned" if result.kind == "returned" else "failed"
         leases.give_back(state, job, failure, worker, step, ran=True, error=result.error)
+        if result.environment_fault:
+            _environment_fault(state, worker, job, result.error, step)
+
+
+def _environment_fault(state: State, worker: Worker, job: JobState, error: str, step: Step) -> None:
+    """Count an attempt that the environment has ended; give the environment up after enough of them."""
+    faults, lane = job.faults, job.group.flow.lane
+    faults.n += 1
+    faults.since = faults.since or step.now
+    faults.on.add(worker.machine or worker.name)
+    names = [name for profile in lane.profiles for name in profile.workers] if lane is not None else []
+    able = [each for each in map(state.workers.__getitem__, names) if not job.group.excludes(each)]
+    if retry.in_vain(state.settings, faults, {each.machine or each.name for each in able}, step.now):
+        step.tell(EnvironmentFailed(job.group, f"{error}; {faults.n} attempts at {job.job_id} ended so"))
 
 
 def _keep_begun(job: JobState, lease: Lease | None, result: JobResult, step: Step, *, silent: bool) -> None:

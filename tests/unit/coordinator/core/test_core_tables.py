@@ -38,7 +38,12 @@ def test_each_deadline_that_is_armed_has_a_rule() -> None:
 
 
 def test_each_piece_of_news_has_someone_who_hears_it() -> None:
-    kinds = {step.EpisodesDone: get_args(GroupKind), step.FlowPinned: ("run", "evaluation")}
+    groups = get_args(GroupKind)
+    kinds = {
+        step.EpisodesDone: groups,
+        step.EnvironmentFailed: groups,
+        step.FlowPinned: ("run", "evaluation"),
+    }
     wanted = {(news, kind) for news in get_args(step.News) for kind in kinds.get(news, ("",))}
     assert set(NEWS) == wanted
 

@@ -6,8 +6,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
-from slots import Slots, rows
+from slots import Slots, going_on, make_job, prefix, rows
 from waiting import wait_until
 
 from evopolicy_common.catalogue import Entry
@@ -16,6 +17,7 @@ from evopolicy_worker.environments.browser.page import Page
 from evopolicy_worker.environments.families.foreign import ForeignFamily
 from evopolicy_worker.environments.interface import calls
 from evopolicy_worker.environments.interface.calls import USUAL, Call, Guard, Limits, hung
+from evopolicy_worker.slot_protocol.endings import AGAIN
 from evopolicy_worker.slots import slot as slot_module
 from evopolicy_worker.slots.slot import Slot
 
@@ -193,6 +195,16 @@ class Policy:
     def act(self, obs): return [{action}]
 """
 PUSHES = POLICY.format(action=0.9)
+LUCKY = """
+import time
+class Policy:
+    def __init__(self, *spaces): self.n = 0
+    def reset(self, episode_index): pass
+    def act(self, obs):
+        self.n += 1
+        return [0.9 if self.n == 6 else (time.time_ns() // 1000 % 1_000_000) / 2e6]
+"""
+"""Throws by the clock, then pushes."""
 
 
 @pytest.mark.parametrize("how", WRONG)
@@ -209,14 +221,44 @@ def test_what_prevents_an_episode_is_reported_by_name_and_is_nobodys_result(
         if how == "leak"
         else USUAL
     )
+    again = {"environment_faults": AGAIN} if how.startswith(("hang", "hold")) else {}
     slot = slot_of(slots, "Bad", limits, kwargs={"how": how}, reward_components={"fuel": "spent"})
     slots.run(slot.start())
     try:
         # Also where the policy's actions come first, and random ones play the episode again.
         with pytest.raises(WorkerError, match=WRONG[how]):
-            slots.play_all(PUSHES, slot=slot, env="acme/Bad", n=20 if how == "leak" else 1)
+            slots.play_all(PUSHES, slot=slot, env="acme/Bad", n=20 if how == "leak" else 1, **again)
         slots.run(slot.start())
         assert slots.play_all(None, slot=slot, env="toy/line")[0].length > 0
+    finally:
+        slots.run(slot.close())
+
+
+@pytest.mark.parametrize("how", ["hold", "hang"])
+def test_an_environment_that_hangs_on_actions_gives_no_second_throw(
+    slots: Slots, how: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(slot_module, "_LOOK_S", 0.5)
+    monkeypatch.setattr(slot_module, "SILENT_S", 8.0)
+    slot = slot_of(slots, "Bad", Limits(call_s=4.0), kwargs={"how": f"{how} when pushed"})
+    bundle = slots.bundle(LUCKY)
+    job = make_job(env="acme/Bad", record="actions")
+    stands: list[list[float]] = []
+    try:
+        for _ in range(2):
+            slots.run(slot.start())
+            with pytest.raises(WorkerError, match=r"environment acme/Bad, .*step.*: it has not returned"):
+                slots.run(slot.play(job, bundle, lambda *progress: None))
+            job = going_on(job, slot)
+            stands.append(prefix(job))
+        # The clock gave the policy no second throw.
+        assert len(stands[0]) == 6
+        assert stands[0] == stands[1]
+        slots.run(slot.start())
+        job = msgspec.structs.replace(job, environment_faults=AGAIN)
+        (outcome,) = slots.run(slot.play(job, bundle, lambda *progress: None))
+        assert outcome.failure is not None
+        assert (outcome.failure.category, outcome.length) == ("killed", 8)
     finally:
         slots.run(slot.close())
 

@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import itertools
+import os
+import signal
 import time
+from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
 import pytest
-from slots import HONEST, QUICK, STUCK, Slots, make_job, rows
+from slots import HONEST, QUICK, STUCK, Slots, going_on, make_job, prefix, rows
 
-from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome, Job
+from evopolicy_common.errors import SlotDiedError
+from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome, Job, PolicyFailure
 from evopolicy_common.records.blobs import digest_of
 from evopolicy_worker.slot_protocol import begun
 from evopolicy_worker.slots.slot import Slot
@@ -40,18 +46,9 @@ def hidden(**options: Any) -> Job:
     return make_job(**{"record": "actions", "limits": PATIENT, **options})
 
 
-def going_on(job: Job, slot: Slot) -> Job:
-    """The job as it is leased the next time."""
-    back = slot.begun
-    if back is None:
-        return job
-    ref = BlobRef(digest=digest_of(back.data), size=len(back.data), inline=back.data)
-    return msgspec.structs.replace(job, begun=ref)
-
-
-def begun_by(actions: bytes) -> bytes:
+def begun_by(actions: bytes, *more: bytes) -> bytes:
     """Actions as another worker may have reported them."""
-    return msgspec.msgpack.encode({0: begun.PackedBegun(actions=actions), 7: begun.PackedBegun()})
+    return msgspec.msgpack.encode({0: begun.PackedBegun(actions=actions, more=more), 7: begun.PackedBegun()})
 
 
 async def stopped(
@@ -74,12 +71,6 @@ def actions(outcome: EpisodeOutcome) -> list[float]:
     return [float(row.action[0]) for row in rows(outcome)]
 
 
-def prefix(job: Job, place: int = 0) -> list[float]:
-    """The actions that the job goes on from."""
-    packed = begun.unpack(job).get(place)
-    return [] if packed is None else [float(each.action[0]) for each in packed.unpacked().taken]
-
-
 @pytest.mark.parametrize("tier", ["bwrap", "landlock"])
 def test_a_policy_that_uses_the_clock_draws_once_despite_stops(slots: Slots, tier: str) -> None:
     slot = slots.slot(tier)  # type: ignore[arg-type]
@@ -95,6 +86,37 @@ def test_a_policy_that_uses_the_clock_draws_once_despite_stops(slots: Slots, tie
     assert len(thrown[0]) >= 12
     for shorter, longer in itertools.pairwise([*thrown, actions(outcome)]):
         assert longer[: len(shorter)] == shorter
+
+
+@pytest.mark.parametrize("tier", ["bwrap", "landlock", "none"])
+def test_actions_stand_when_the_process_of_the_environment_is_killed(slots: Slots, tier: str) -> None:
+    slot = slots.new(tier)  # type: ignore[arg-type]
+    job = hidden(tier=tier)
+    thrown: list[list[float]] = []
+
+    async def killed(job: Job, steps: int) -> None:
+        await slot.start()
+        assert slot._process is not None
+        reached = asyncio.Event()
+        playing = asyncio.create_task(
+            slot.play(job, slots.bundle(SLOW), lambda _, n: reached.set() if n >= steps else None)
+        )
+        await reached.wait()
+        os.killpg(slot._process.pid, signal.SIGKILL)
+        with pytest.raises(SlotDiedError):
+            await playing
+
+    try:
+        # In the first attempt, in one that goes on from it, and in one that ends before it has caught up.
+        for steps in (6, 14, 3):
+            slots.run(killed(job, steps))
+            job = going_on(job, slot)
+            thrown.append(prefix(job))
+    finally:
+        slots.run(slot.close())
+    assert [len(each) >= n for each, n in zip(thrown, (6, 14, 14), strict=True)] == [True] * 3
+    assert thrown[1][: len(thrown[0])] == thrown[0]
+    assert thrown[2] == thrown[1]
 
 
 def test_a_failure_stands_and_so_do_the_episodes_before_it(slots: Slots) -> None:
@@ -171,7 +193,51 @@ def test_a_failure_by_a_limit_is_reported_as_one(slots: Slots) -> None:
     assert back.limit_verdict
 
 
-@pytest.mark.parametrize("data", [b"\xc1 none of it", begun_by(b"no recording"), begun_by(b"")])
+def test_the_file_of_an_episode_holds_actions_of_any_form_and_length(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log, episode = begun.Log(tmp_path), begun.Begun([begun.Returned(3, 3)])
+    values = [
+        np.arange(3, dtype=np.int8),
+        {"a": (np.float32(0.5), "x")},
+        "\ud800",
+        2**70,
+        *[[0.1] * 999] * 99,
+    ]
+    log.begins("job", 2, episode)
+    for value in values:
+        episode.take(begun.Returned(value, value))
+    assert begun.recovered(tmp_path, "other") == {}
+    again = begun.recovered(tmp_path, "job")[2].unpacked()
+    kept: list[Any] = [3, [0, 1, 2], {"a": [0.5, "x"]}, "\\ud800", 2**70, *values[4:]]
+    assert [each.action for each in again.taken] == kept
+    # With the failure after them; and on a full disk, as far as there is room.
+    episode.fail(PolicyFailure(category="act_error", step_index=7, message="unlucky"))
+    assert begun.recovered(tmp_path, "job")[2].failure == episode.failure
+
+    def no_room(*where: int) -> None:
+        raise OSError(errno.ENOSPC, "no space left")
+
+    monkeypatch.setattr(os, "posix_fallocate", no_room)
+    episode = begun.Begun()
+    log.begins("job", 0, episode)
+    for number in range(600_000):
+        episode.take(begun.Returned(number, number))
+    found = begun.recovered(tmp_path, "job")[0].unpacked().taken
+    assert [each.action for each in found] == [*range(len(found))]
+    assert 50_000 < len(found) < 600_000
+    log.close()
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"\xc1 none of it",
+        begun_by(b"no recording"),
+        begun_by(b""),
+        begun_by(b"", b"\xc1"),
+    ],
+)
 def test_what_cannot_be_read_is_begun_anew(slots: Slots, data: bytes) -> None:
     job = hidden(begun=BlobRef(digest=digest_of(data), size=len(data), inline=data))
     (outcome,) = slots.run(slots.slot().play(job, slots.bundle(HONEST), lambda *progress: None))

@@ -28,6 +28,11 @@ EXAMPLES: dict[str, tuple[Ending, str | None]] = {
     "bubblewrap or the zygote": (Ending("sandbox", "SIGKILL"), None),
     "the environment crashed on its actions": (Ending("environment", "fault"), "killed"),
     "the environment crashed before any": (Ending("environment", "fault", began=False), None),
+    "the environment overran on its actions, as in earlier attempts": (
+        Ending("environment", "overrun", again=True),
+        "killed",
+    ),
+    "the environment overran": (Ending("environment", "overrun"), None),
     "the environment was killed or stopped": (Ending("environment", "SIGKILL"), None),
     "the worker": (Ending("supervisor", "SIGKILL"), None),
 }
@@ -42,10 +47,10 @@ def test_each_row_of_the_table_gives_its_verdict(row: endings.Row) -> None:
 
 def every_ending() -> Iterator[Ending]:
     limits = (None, "oom", "cpu_limit", "act_timeout", "episode_timeout", "process_limit")
-    for first, how, limit, began, held in itertools.product(
-        get_args(First), get_args(How), limits, (True, False), (True, False)
-    ):
-        yield Ending(first, how, limit, began, held)  # type: ignore[arg-type]
+    either = (True, False)
+    for ending in itertools.product(get_args(First), get_args(How), limits, either, either, either):
+        if ending[:2] != ("policy", "overrun"):
+            yield Ending(*ending)  # type: ignore[arg-type]
 
 
 def test_every_ending_fits_exactly_one_row() -> None:
@@ -61,7 +66,10 @@ def test_whatever_a_policy_can_bring_about_is_its_own() -> None:
             provable = ending.held and ending.limit is None and ending.how in ("SIGKILL", "stop")
             assert ours == provable, ending
         elif ending.first == "environment":
-            assert ours == (not ending.began or ending.how not in ("exit", "fault")), ending
+            its_own = (
+                ending.again if ending.how == "overrun" else ending.began and ending.how in ("exit", "fault")
+            )
+            assert ours == (not its_own), ending
         else:
             assert ours, ending
 

@@ -1,0 +1,114 @@
+"""An environment that keeps ending the same job is given up, and its run ends with an error; nothing waits for it for ever."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+from rigs.core_rig import Rig, asked, done, result, split_of
+
+from evopolicy_common.messages import operator
+from evopolicy_common.messages import worker as wire
+from evopolicy_common.messages.environment import Case
+from evopolicy_common.messages.episode import ResourceLimits
+from evopolicy_coordinator.core.contract.records import EvaluationRow, SubmitRow
+from evopolicy_coordinator.core.leasing.retry import FAULTS_MAX
+
+WHY = "environment toy/line, step 7: it has not returned for 300 s"
+
+
+def failing(
+    rig: Rig, *sessions: str, where: str, ends: Callable[[], bool], most_s: float = 5000.0, busy: str = ""
+) -> list[wire.Job]:
+    """Lets workers play, whose environment ends each job of that list (any if empty); gives its attempts. A busy worker is there."""
+    attempts: list[wire.Job] = []
+    until = rig.now + most_s
+    while rig.now < until and not ends():
+        for session in sessions:
+            for lease in rig.poll(session, n=1):
+                if where in ("", split_of(lease.job)):
+                    attempts.append(lease.job)
+                    fault = result(lease, "failed", error=WHY, environment_fault=True)
+                    rig.report_results(session, fault)
+                else:
+                    rig.report_results(session, done(lease))
+            rig.beat(session)
+        if busy:
+            rig.beat(busy)
+        rig.pass_time(2.0)
+    return attempts
+
+
+@pytest.mark.parametrize("where", ["train", "validation", "heldout", "random"])
+def test_an_environment_that_ends_every_attempt_ends_the_run_with_an_error(where: str) -> None:
+    rig = Rig()
+    session = rig.register(slots=1)
+    rig.create(n_valid=1, n_held=1)
+    rig.submit(0, 1)
+    if where != "train":
+        failing(rig, session, where="none", ends=lambda: rig.core.state.runs["r1"].open is None)
+        rig.close()
+    begun = rig.now
+    attempts = failing(rig, session, where=where, ends=lambda: "r1" not in rig.core.state.runs)
+    told = [job.environment_faults for job in attempts if job.job_id == attempts[0].job_id]
+    assert told == list(range(len(told)))
+    assert len(told) >= FAULTS_MAX
+    assert rig.now - begun >= rig.settings.environment_wait_s
+    ended = rig.finished()
+    assert ended.status == "error"
+    assert ended.error is not None
+    assert ended.error.startswith(WHY)
+    assert (ended.final_score, ended.best_submit_index) == (None, None)
+    assert ended.budget_used == (0 if where == "train" else 2)
+    assert rig.core.state.jobs == {}
+
+
+def test_an_environment_that_fails_now_and_then_is_not_given_up() -> None:
+    rig = Rig()
+    session = rig.register(slots=1)
+    rig.create(n_valid=1)
+    rig.submit(0)
+    # Fast failures, as of a full disk, end no run as long as they may pass.
+    early = rig.settings.environment_wait_s - 100.0
+    attempts = failing(rig, session, where="train", ends=lambda: False, most_s=early)
+    assert len(attempts) > FAULTS_MAX
+    failing(rig, session, where="none", ends=lambda: rig.core.state.runs["r1"].open is None)
+    assert rig.row(SubmitRow, "r1", 0).status == "ok"
+
+
+@pytest.mark.parametrize("machine", ["", "rack-1"])
+def test_one_machine_alone_ends_no_run_that_another_can_play(machine: str) -> None:
+    rig = Rig()
+    liars = [rig.register(name, machine=machine and "liar") for name in ("w1", "w2")[: 2 if machine else 1]]
+    honest = rig.register("w3", machine=machine)
+    rig.create(n_valid=1)
+    rig.submit(0)
+    attempts = failing(rig, *liars, where="train", ends=lambda: False, busy=honest)
+    assert len(attempts) > FAULTS_MAX
+    assert "r1" in rig.core.state.runs
+    failing(rig, honest, where="none", ends=lambda: rig.core.state.runs["r1"].open is None)
+    assert rig.row(SubmitRow, "r1", 0).status == "ok"
+
+
+def test_an_evaluation_of_an_environment_that_fails_ends_with_the_reason() -> None:
+    rig = Rig()
+    session = rig.register()
+    rig.tell(
+        asked(
+            operator.Evaluate,
+            request=rig.request(),
+            evaluation="ev",
+            key="e",
+            env="toy/line",
+            bundle=None,
+            split="train",
+            case_ids=(4, 4),
+            cases=(Case(seed=4), Case(seed=4)),
+            secret=b"x",
+            record="full",
+            sandbox_tier="bwrap",
+            limits=ResourceLimits(),
+        )
+    )
+    failing(rig, session, where="", ends=lambda: not rig.core.state.evaluations)
+    assert rig.row(EvaluationRow, "ev").error.startswith(WHY)
