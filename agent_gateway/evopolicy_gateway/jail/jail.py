@@ -67,9 +67,8 @@ class Way:
         # folders.
         self._files = [_readable(b"".join(os.fsencode(word) + b"\0" for word in jail[1:]))]
         self.words = [*_PATIENT, jail[0], "--args", str(self._files[0])]
-        if (filter_ := filter_program()) is not None:
-            self._files.append(_readable(filter_))
-            self.words += ["--seccomp", str(self._files[1])]
+        self._files.append(_readable(filter_program()))
+        self.words += ["--seccomp", str(self._files[1])]
         self.words += ["--", _base_python(), "-I", "-S", ENTRY]
         if proxy is None:
             self.words += ["-", "-"]

@@ -13,6 +13,7 @@ import msgspec
 
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.processes import distribution
+from evopolicy_gateway.jail.syscalls import GIVE_UP, filter_program
 
 Mode = Literal["bwrap", "open-network", "none"]
 Host = tuple[str, int]
@@ -23,7 +24,6 @@ _HOST = re.compile(r"(?P<name>[A-Za-z0-9](?:[A-Za-z0-9.-]*[A-Za-z0-9])?)(?::(?P<
 _VARIABLE = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 _TIMEOUT_S = 30.0
 _STATE_FOLDERS = (".gateway", "*/.gateway", "*/*/.gateway", "*/*/*/.gateway")
-_GIVE_UP = "or give the jail up by name with --jail none, which run.json then says"
 
 
 class JailSettings(msgspec.Struct, frozen=True, kw_only=True):
@@ -82,10 +82,11 @@ def host(text: str, option: str = "--allow-host") -> Host:
 
 def check_bubblewrap() -> None:
     """Raises ConfigError, with the remedy, when this machine cannot build a jail."""
+    filter_program()
     program = shutil.which("bwrap")
     if program is None:
         raise ConfigError(
-            f"the agent's jail needs bubblewrap, which is not installed: {distribution.install('bubblewrap')}; {_GIVE_UP}"
+            f"the agent's jail needs bubblewrap, which is not installed: {distribution.install('bubblewrap')}; {GIVE_UP}"
         )
     flags = ("--unshare-user", "--unshare-pid", "--unshare-net", "--unshare-ipc", "--unshare-uts")
     command = [program, *flags, "--ro-bind", "/", "/", "--proc", "/proc", "--dev", "/dev", "true"]
@@ -121,4 +122,4 @@ def _check_path(option: str, path: Path) -> None:
 
 
 def _remedy() -> str:
-    return f"permit user namespaces ({distribution.permit_namespaces()}), {_GIVE_UP}"
+    return f"permit user namespaces ({distribution.permit_namespaces()}), {GIVE_UP}"

@@ -18,6 +18,7 @@ import os
 import socket
 import stat
 
+from evopolicy_common.errors import ConfigError
 from evopolicy_common.seccomp import (
     ALLOWED,
     AUDIT_ARCH,
@@ -32,6 +33,7 @@ from evopolicy_common.seccomp import (
 )
 from evopolicy_common.seccomp.numbers import ATTRIBUTES, MODES, REFUSED, SOCKET
 
+GIVE_UP = "or give the jail up by name with --jail none, which run.json then says"
 _REFUSED = {
     # ENOSYS as from a kernel without these calls, which programs can handle.
     errno.ENOSYS: ("io_uring_setup", "add_key", "request_key", "keyctl"),
@@ -46,11 +48,14 @@ _MAKES_A_FILE = os.O_CREAT | (os.O_TMPFILE & ~os.O_DIRECTORY)
 """Flags of `open` with which its mode counts; without them it may be anything."""
 
 
-def filter_program() -> bytes | None:
-    """The filter, 8 bytes an instruction; None on an architecture without a table of calls."""
+def filter_program() -> bytes:
+    """The filter, 8 bytes an instruction. Raises ConfigError on a processor without a table of calls."""
     machine = os.uname().machine
     if machine not in AUDIT_ARCH:
-        return None
+        known = " and ".join(sorted(AUDIT_ARCH))
+        raise ConfigError(
+            f"the agent's jail filters system calls on {known} processors, not on {machine}: play the run on one of those, {GIVE_UP}"
+        )
     body: list[Instruction] = []
     for number, calls in _REFUSED.items():
         for call in calls:

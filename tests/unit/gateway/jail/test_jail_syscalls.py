@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import subprocess
 import sys
@@ -11,11 +12,12 @@ from types import SimpleNamespace
 import pytest
 from machines.filters import allowed
 
+from evopolicy_common.errors import ConfigError
 from evopolicy_common.seccomp import ALLOW, ERRNO
 from evopolicy_common.seccomp.numbers import ATTRIBUTES, MODES
 from evopolicy_gateway.jail import syscalls
 from evopolicy_gateway.jail.jail import Jail, JailOrder
-from evopolicy_gateway.jail.settings import JailSettings
+from evopolicy_gateway.jail.settings import JailSettings, Mode
 
 HERE, PATH, FILE = (1 << 64) - 100, 0x7F00DEADB000, 3
 EPERM, ENOSYS, ENOTSUP = ERRNO | 1, ERRNO | 38, ERRNO | 95
@@ -26,7 +28,6 @@ MAKE, TEMPORARY = os.O_CREAT | os.O_WRONLY, 0o20000000 | os.O_WRONLY
 def test_no_call_gives_a_file_a_set_id_bit(machine: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(syscalls.os, "uname", lambda: SimpleNamespace(machine=machine))
     program = syscalls.filter_program()
-    assert program is not None
     numbers = MODES[machine]
 
     def verdict(call: str, *arguments: int) -> int:
@@ -49,6 +50,16 @@ def test_no_call_gives_a_file_a_set_id_bit(machine: str, monkeypatch: pytest.Mon
     assert verdict("openat", HERE, PATH, os.O_RDONLY, 0o7777) == ALLOW
     assert verdict("openat2", HERE, PATH, PATH, 24) == ENOSYS
     assert {allowed(program, number, machine=machine) for number in ATTRIBUTES[machine]} == {ENOTSUP}
+
+
+@pytest.mark.parametrize("mode", ["bwrap", "open-network", "none"])
+def test_no_jail_without_its_filter_on_a_processor_without_a_table(
+    mode: Mode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(syscalls.os, "uname", lambda: SimpleNamespace(machine="riscv64"))
+    refused = pytest.raises(ConfigError, match=r"aarch64 and x86_64 processors, not on riscv64.*--jail none")
+    with contextlib.nullcontext() if mode == "none" else refused:
+        JailSettings(mode=mode).check()
 
 
 def test_a_program_that_only_tells_its_version_is_filtered_too(
