@@ -5,7 +5,9 @@ of which did all that lasts, which share a jailed agent tells apart by each numb
 ended (0.5 is guessing). On a machine that does other things less arrives.
 
 With `--gaps N` instead: whether a policy tells hidden from train episodes by the time between its calls, from N episodes of each
-kind. Another size: `--gaps 40 --gap-steps 50 --gap-envs gym/acrobot`.
+kind. The last table has a verdict for each environment, policy scope, with and without video: told apart if more guesses are right
+than in all but a few random assignments of the kinds (p of at most 0.05 over the number of rows). Another size:
+`--gaps 40 --gap-steps 50 --gap-envs gym/acrobot`.
 """
 
 from __future__ import annotations
@@ -14,6 +16,7 @@ import argparse
 import os
 import random
 import tempfile
+import time
 from pathlib import Path
 
 import numpy as np
@@ -31,15 +34,23 @@ ACTIONS = {
     "gymnasium/ALE/Pong-v5": 0,
 }
 """Environments for the gaps: flat observations, then symbols and pictures. Actions that end no episode early."""
+PICTURES = ("gym/racing", "gymnasium/ALE/Pong-v5")
 PER_POLICY = 4
 """Episodes of each policy with policy scope "submit"."""
+VARIANTS = ((False, 1), (True, 1), (False, PER_POLICY), (True, PER_POLICY))
+"""With video or without, and the episodes of a policy."""
+ASSIGNMENTS = 1000
+"""Random ones, which give the p-value."""
 
 
 def tell_gaps(slots: Slots, console: Console, chosen: argparse.Namespace) -> None:
-    """A table for each environment: what an episode's gaps say about its kind."""
+    """A table for each environment and variant: what an episode's gaps say about its kind; then the verdicts."""
     rng = random.Random(chosen.seed)
+    level = 0.05 / (len(chosen.gap_envs) * len(VARIANTS))
+    verdicts = Table("environment", "shows", "scope", "video", "right", "p", "told apart", "took, s")
     for env in chosen.gap_envs:
-        for video, per_policy in ((False, 1), (True, 1), (False, PER_POLICY), (True, PER_POLICY)):
+        for video, per_policy in VARIANTS:
+            begun = time.monotonic()
             found = gaps.collect(
                 slots,
                 env,
@@ -51,7 +62,7 @@ def tell_gaps(slots: Slots, console: Console, chosen: argparse.Namespace) -> Non
                 rng=rng,
             )
             hidden = found.hidden
-            share, p = gaps.by_chance(found, 200, np.random.default_rng(chosen.seed))
+            share, p = gaps.by_chance(found, ASSIGNMENTS, np.random.default_rng(chosen.seed))
             scope = "submit" if per_policy > 1 else "episode"
             table = Table(
                 "gap (µs)",
@@ -68,6 +79,20 @@ def tell_gaps(slots: Slots, console: Console, chosen: argparse.Namespace) -> Non
                 test = ks_2samp(train, other).pvalue
                 table.add_row(name, *medians, f"{gaps.area(hidden, values):.3f}", f"{test:.2g}")
             console.print(table)
+            verdicts.add_row(
+                env,
+                "pictures" if env in PICTURES else "flat",
+                scope,
+                "with" if video else "without",
+                f"{share:.3f}",
+                f"{p:.3f}",
+                "yes" if p <= level else "no",
+                f"{time.monotonic() - begun:.0f}",
+            )
+    console.print(verdicts)
+    console.print(
+        f"told apart: p of at most {level:.4f}; load: {os.getloadavg()[1]:.1f} on {os.cpu_count()} CPUs"
+    )
 
 
 def main() -> None:

@@ -179,7 +179,9 @@ class Player:
             episode = _Episode(job, spec, environment, policies, progress, tell, begun)
             try:
                 outcome, log = episode.play(k)
-                kept = begun.packed() if is_kept(job) and len(job.episodes) > 1 else None
+                # In every split, as a policy of several episodes can measure the pause between them.
+                packed = begun.packed() if job.bundle is not None and len(job.episodes) > 1 else None
+                kept = packed if is_kept(job) else None
                 finished = messages.Finished(outcome=_brief(outcome, _share(job)), begun=kept)
                 films = log and job.video and (not job.video_episodes or k < job.video_episodes)
                 film = [_Film(k, spec.case, log, outcome.length)] if films else []
@@ -299,6 +301,7 @@ class _Episode:
         log = (
             actions.finish() if actions is not None and (pauses or job.record != "full" or job.video) else b""
         )
+        feedback, kept = _blob(rows), _blob(log)
         outcome = EpisodeOutcome(
             index=spec.index,
             episode_return=total,
@@ -308,7 +311,7 @@ class _Episode:
             failure=self.failure,
             reward_components=components,
             success=success,
-            trajectory=_blob(rows if job.record == "full" else log),
+            trajectory=feedback if job.record == "full" else kept,
             stdout=ended.stdout,
             stderr=ended.stderr,
             wall_s=wall_s,
