@@ -3,6 +3,8 @@
 Rules that this module owns:
 - A file is untrusted. Its check comes first, and nothing is unpacked of a file that fails.
 - Entries of different signers are different entries, also under one name.
+- Files of one signer are of one journal. If no journal can have led to both of two files, the check `order` fails for both; their
+  runs are shown, since nothing tells which file is true.
 - Differences of processors do not make labs incomparable (`cpu` of the fingerprint); they are shown instead.
 """
 
@@ -15,6 +17,7 @@ from pathlib import Path
 import msgspec
 
 from evopolicy_common.errors import BundleError, ProtocolError
+from evopolicy_common.records import journal
 from evopolicy_common.records.policies import bundles, checkpoints
 from evopolicy_common.records.policies.checkpoints import CheckpointMeta
 from evopolicy_common.records.run_record import Artifacts, encode_run_record
@@ -72,6 +75,8 @@ class LabBundle(msgspec.Struct, kw_only=True):
     refused: str = ""
     """Why no run of it is shown; empty when they are."""
     processors: list[str] = []
+    heads: list[str] = []
+    """Of its journal, after each entry."""
 
     @property
     def page(self) -> str:
@@ -113,6 +118,7 @@ def read_bundles(
                 _read(archive, bundle, labs, folder / f"{number:04d}", seen, replay)
         except ProtocolError as error:
             bundle.refused = str(error)
+    _compare_journals(found)
     _tell_apart(found)
     return found
 
@@ -144,6 +150,8 @@ def _read(
     if again:
         bundle.refused = f"run {again[0]} is also in {seen[f'{checked.signer} {again[0]}']}"
         return
+    lines = contents.journal_entries(archive.read(contents.JOURNAL, contents.MAX_RECORDING_BYTES))
+    bundle.heads = journal.heads(lines)
     processors: dict[str, None] = {}
     by_folder: dict[Path, PublishedRun] = {}
     for run in checked.runs:
@@ -249,6 +257,20 @@ def _sums(rewards: Sequence[float]) -> tuple[float, ...]:
         sums.append(total)
     step = max(1, -(-len(sums) // _POINTS))
     return (*sums[:-1:step], sums[-1])
+
+
+def _compare_journals(found: Sequence[LabBundle]) -> None:
+    """Reports files whose journal is not the beginning of the longest one of their signer."""
+    longest: dict[str, LabBundle] = {}
+    for bundle in found:
+        if bundle.heads and len(bundle.heads) > len(longest.setdefault(bundle.signer, bundle).heads):
+            longest[bundle.signer] = bundle
+    for bundle in found:
+        n, other = len(bundle.heads), longest.get(bundle.signer)
+        if n and other is not None and other.heads[n - 1] != bundle.heads[-1]:
+            for one, another in ((bundle, other), (other, bundle)):
+                text = f"the first {n} entries are others in {another.file} of the same signer: one journal was begun anew, or cut"
+                one.checked.add("order", "failed", text)
 
 
 def _tell_apart(found: Sequence[LabBundle]) -> None:

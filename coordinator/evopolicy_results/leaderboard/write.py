@@ -223,7 +223,7 @@ def _files(bundles: Sequence[LabBundle]) -> dict[str, Any]:
         )
     caption = (
         "Each column after Left out is a check. ok: shown. open: this check cannot decide, or was not made. FAILED: the file"
-        " contradicts itself. Left out: runs that the same coordinator opened for the same entries and that are not in the file."
+        " contradicts itself, or another file of its signer. Left out: runs that the same coordinator opened for the same entries and that are not in the file."
     )
     table = plain_view(
         "files", "Published results", caption, ("File", "Signed by", "Runs", "Left out", *kinds), rows

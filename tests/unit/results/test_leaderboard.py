@@ -12,9 +12,10 @@ from invented.policies import Version, policy
 from invented.run_dirs import write_run
 
 from evopolicy_common.errors import ConfigError
+from evopolicy_common.records import journal
 from evopolicy_common.records.run_record import Artifacts, decode_run_record
 from evopolicy_results.leaderboard import write
-from evopolicy_results.leaderboard.bundles import LabBundle, LabRun, _tell_apart, _unpack
+from evopolicy_results.leaderboard.bundles import LabBundle, LabRun, _compare_journals, _tell_apart, _unpack
 from evopolicy_results.publish.findings import Checked, PublishedRun
 from evopolicy_results.reading.reader import read_run
 
@@ -43,6 +44,20 @@ def test_entries_of_several_signers_get_their_names(tmp_path: Path) -> None:
     found = [bundle(tmp_path, A, "Lab-A", "evolve", "own"), bundle(tmp_path, B, "Lab-B", "evolve")]
     _tell_apart(found)
     assert [entries(each) for each in found] == [["evolve (Lab-A)", "own"], ["evolve (Lab-B)"]]
+
+
+def test_files_of_one_signer_whose_journals_contradict_each_other_are_reported(tmp_path: Path) -> None:
+    found = [bundle(tmp_path / str(n), signer, "", "evolve") for n, signer in enumerate((A, A, A, A, B))]
+    lines = [b"first", b"second", b"third"]
+    anew = [b"first", b"third"]
+    for each, entered in zip(found, (lines[:2], lines, anew, [], anew), strict=True):
+        each.file, each.heads = f"{len(entered)}.evp", journal.heads(entered)
+    _compare_journals(found)
+    told = [[each.text for each in one.checked.findings if each.state == "failed"] for one in found]
+    assert [len(each) for each in told] == [0, 1, 1, 0, 0]
+    assert "the first 2 entries are others in 3.evp of the same signer" in told[2][0]
+    assert found[2].state_of("order") == "failed"
+    assert not any(each.refused for each in found)
 
 
 def test_no_signer_gets_into_the_entry_of_another(tmp_path: Path) -> None:
