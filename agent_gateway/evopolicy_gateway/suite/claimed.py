@@ -3,7 +3,7 @@
 Rules, in addition to those of every sweep:
 
 - A run is played only while this host holds its claim at the coordinator. If another host has taken the claim, the run
-  ends here and its folder stays unchanged.
+  ends here and its folder stays unchanged. A host that takes a claim cancels the run that an earlier holder played for it.
 - Cancelled, the sweep leaves runs open and keeps its claims: the same host can resume them, and others can take them
   over once the claims expire.
 - A provider that is away also holds back further runs of that provider; running ones wait by themselves.
@@ -147,10 +147,12 @@ class ClaimedSweep(Sweep):
             self._not_before[run.name] = time.monotonic() + _ASK_AGAIN_S
             self._view.elsewhere(run.name, claim.holder.partition(":")[0])
             return False
+        others = bool(claim.run) and claim.run != _opened(run)
+        if others:
+            await self._forget(claim.run)
         if claim.previous:
             self._view.note(run.name, f"taken over from {claim.previous.partition(':')[0]}")
-            if claim.run:
-                await self._forget(claim.run)
+        if claim.previous or (others and decision.kind in ("resume", "finish")):
             decision = self._anew(run.name)
         return await super()._begin(decision)
 
@@ -170,6 +172,10 @@ class ClaimedSweep(Sweep):
 
     async def _record(self, decision: Decision, begun: Entry) -> Entry:
         run = decision.run
+        if decision.kind == "finish" and await self._is_taken_over(run):
+            self._view.note(run.name, "another host has it now: its files are not written here")
+            self._anew(run.name)
+            raise asyncio.CancelledError
         self._view.started(run.name, decision.attempt)
         settings = msgspec.structs.replace(run.settings, attempt=decision.attempt)
         aside = None
@@ -292,6 +298,15 @@ class ClaimedSweep(Sweep):
             self._unsaved, self._unwritable = True, str(error)
         else:
             self._unsaved, self._unwritable = False, ""
+
+
+def _opened(run: Plan) -> str:
+    """The cluster's id of the run in the run's folder; empty for none."""
+    with contextlib.suppress(OSError, EvopolicyError):
+        if run.folder.opened.exists():
+            return saved(run.folder.opened, OpenedRun).run
+        return read_record(run.folder.root).run
+    return ""
 
 
 async def look(run: Plan, index: Index, operations: Operations) -> Found:

@@ -12,6 +12,7 @@ from stages.sweep_stage import CODEX, EVOLVE, HEAD, TOKENS, Stage, until
 from evopolicy_common.errors import EvopolicyError
 from evopolicy_common.messages.operator import ClaimState
 from evopolicy_common.records.suite_folder import Entry
+from evopolicy_gateway.run.layout import OpenedRun, save
 from evopolicy_gateway.suite import claimed, sweep
 from evopolicy_gateway.suite.decisions import Decision, Found, decide
 
@@ -90,6 +91,59 @@ def test_a_claim_lost_to_another_host_ends_the_run_here(
     # Started again, with the folder of the run that was ended here still open: nothing is left to do.
     found = Found(entry=entry, opened=True, phase="finished")
     assert decide(run, found) == Decision(run=run, kind="keep", attempt=1)
+
+
+def test_a_finished_run_that_another_host_took_meanwhile_is_not_written_here(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stage = Stage(tmp_path, HEAD + "[parallel]\nclaim_ttl_s = 3600.0\n" + EVOLVE.format("a"), monkeypatch)
+    monkeypatch.setattr(sweep, "FINISH_AGAIN_S", (0.01, 0.01))
+    monkeypatch.setattr(claimed, "_ASK_AGAIN_S", 0.01)
+    run = stage.runs[0]
+    theirs = Entry(
+        name=run.name,
+        agent="a",
+        env="toy/line",
+        repeat=0,
+        digest=run.digest,
+        state="completed",
+        directory="",
+        host="other",
+        score=3.0,
+    )
+    written: list[str] = []
+
+    async def refused(name: str) -> None:
+        written.append(name)
+        stage.cluster.answer = lambda _: ClaimState(granted=False, holder="other:1", run="r-8")
+        raise OSError(28, "No space left on device")
+
+    stage.score = refused
+
+    async def answers() -> None:
+        await until(lambda: any("not written here" in line for line in stage.events))
+        result = msgspec.to_builtins(theirs)
+        stage.cluster.answer = lambda _: ClaimState(granted=False, holder="other:1", run="r-8", result=result)
+
+    stage.beside = answers
+    index = stage.play()
+    assert written == [run.name]
+    entry = index.runs[run.name]
+    assert (entry.state, entry.score, entry.host) == ("completed", 3.0, "other")
+
+
+@pytest.mark.parametrize("ours", [False, True])
+def test_a_host_that_takes_a_claim_that_was_given_back_ends_the_other_hosts_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ours: bool
+) -> None:
+    stage = Stage(tmp_path, HEAD + EVOLVE.format("a"), monkeypatch)
+    if ours:
+        folder = stage.runs[0].folder
+        folder.state.mkdir(parents=True)
+        save(folder.opened, OpenedRun(run="r-7", agents_md=""))
+    stage.cluster.answer = lambda _: ClaimState(granted=True, holder="me", run="r-7")
+    stage.play()
+    assert stage.cluster.cancelled == ([] if ours else ["r-7"])
 
 
 def test_our_own_failure_gives_the_claim_back_and_is_reported(
