@@ -154,9 +154,13 @@ def work(
         # Until the worker can drain, SIGTERM raises SystemExit, so that processes and temporary folders are cleaned up.
         signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
         check_scratch()
+
         # Wrong credentials are reported at once. With --ready-file they do not exist yet; `joined` waits for them
         # later.
-        found = None if ready_file else credentials.find("worker", tuple(connect or ()), credentials_file)
+        def named() -> credentials.Credentials:
+            return credentials.find("worker", tuple(connect or ()), credentials_file)
+
+        found = None if ready_file else named()
 
         async def joined() -> credentials.Credentials:
             if found is not None:
@@ -186,6 +190,7 @@ def work(
                 asyncio.run(
                     _run(
                         joined,
+                        None if ready_file else named,
                         name,
                         wanted,
                         slots,
@@ -271,6 +276,7 @@ def foreign(env_ids: list[str]) -> tuple[catalogue.Entry, ...]:
 
 async def _run(
     joined: Callable[[], Awaitable[credentials.Credentials]],
+    read_again: Callable[[], credentials.Credentials] | None,
     name: str | None,
     env_ids: list[str],
     slots: int | None,
@@ -306,10 +312,12 @@ async def _run(
             msgspec.structs.replace(each, packages={**each.packages, **importable}) for each in found
         )
 
-    async def describe(wanted: Sequence[str]) -> tuple[EnvironmentDescription, ...]:
-        slot = Slot(None, tiers[0], scratch / "slot-descriptions", packages, limits=limits)
+    async def describe(wanted: Sequence[str]) -> tuple[tuple[EnvironmentDescription, ...], dict[str, str]]:
+        folder = scratch / "slot-descriptions"
+        slot = Slot(None, tiers[0], folder, packages, definitions=definitions, limits=limits)
         try:
-            return importing(await descriptions.describe_all(wanted, slot, cache, or_none=True))
+            found, failed = await descriptions.describe_all(wanted, slot, cache)
+            return importing(found), failed
         finally:
             await slot.close()
 
@@ -322,7 +330,8 @@ async def _run(
 
     try:
         known, now, later = descriptions.sorted_out(env_ids, cache)
-        known += await descriptions.describe_all(now, first, cache, or_none=bool(known or later))
+        made, failed = await descriptions.describe_all(now, first, cache)
+        known += made
         if len(env_ids) > MAX_PREPARED:
             await first.close()
         found = await joined()
@@ -333,6 +342,7 @@ async def _run(
             missing_tiers=missing,
             environments=importing(sorted(known, key=lambda each: env_ids.index(each.env))),
             undescribed=tuple(later),
+            failed_environments=failed,
             fingerprint=own,
             host=socket.gethostname(),
             boot_id=host.boot_id(),
@@ -343,7 +353,7 @@ async def _run(
             log.warning("this worker gets no hidden episodes", why=host.NO_BOOT_ID)
         log.info("waiting for the coordinator", endpoints=found.endpoints)
         with contextlib.suppress(asyncio.CancelledError):
-            await _serve(found, options, make_slot, describe, probe)
+            await _serve(found, read_again, options, make_slot, describe, probe)
     finally:
         for slot in kept:
             await slot.close()
@@ -352,6 +362,7 @@ async def _run(
 
 async def _serve(
     found: credentials.Credentials,
+    read_again: Callable[[], credentials.Credentials] | None,
     options: Options,
     make_slot: Callable[[int, Tier], Slot],
     describe: Describe,
@@ -372,7 +383,7 @@ async def _serve(
 
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, stop)
-    async with transport.connect(found, timeout_s=None) as link:
+    async with transport.connect(found, timeout_s=None, read_again=read_again) as link:
         supervisor = Supervisor(link, options, make_slot, describe, probe)
         await supervisor.run()
         log.info("stopped", jobs_done=supervisor.jobs_done)

@@ -6,7 +6,8 @@ Rules:
   it. This process makes none: it has the worker's credentials and is in no jail.
 - At the start a worker describes what does not ship, since operators approve it by its digest, and at most `AT_ONCE` shipped
   environments. It announces other shipped ones undescribed, and describes them once runs wait for them.
-- An environment that cannot be described is not offered; the worker goes on with the others.
+- An environment that cannot be described, or fails its try-out, is not offered. The worker announces the reason, goes on with
+  the others, and tries it again from time to time.
 """
 
 from __future__ import annotations
@@ -120,29 +121,29 @@ def sorted_out(
 
 
 async def describe_all(
-    env_ids: Sequence[str], slot: Describes, cache: Cache | None = None, *, or_none: bool = False
-) -> tuple[EnvironmentDescription, ...]:
-    """Descriptions of environments, made in the slot, as this process must not import simulators. It stays started.
+    env_ids: Sequence[str], slot: Describes, cache: Cache | None = None
+) -> tuple[tuple[EnvironmentDescription, ...], dict[str, str]]:
+    """Descriptions of environments, and by id the reasons why others have none. They are made in the slot, as this process must
+    not import simulators. It stays started.
 
-    An environment that cannot be described is left out, and logged with the reason. Starts the slot again when its
-    processes are killed meanwhile; at most `TRIES` attempts for each. Raises the last WorkerError when none is left, unless
-    there may be none.
+    Starts the slot again when its processes are killed meanwhile; at most `TRIES` attempts for each. Raises WorkerError when
+    the slot does not start.
     """
     found: list[EnvironmentDescription] = []
+    failed: dict[str, str] = {}
     await _started(slot)
     for env_id in env_ids:
         try:
             description = await _described(env_id, slot)
         except WorkerError as error:
-            if not found and not or_none and env_id == env_ids[-1]:
-                raise
             log.error("an environment is not offered", env=env_id, why=str(error))
+            failed[env_id] = str(error)
             await _started(slot)
             continue
         found.append(description)
         if cache is not None:
             cache.put(description)
-    return tuple(found)
+    return tuple(found), failed
 
 
 async def _described(env_id: str, slot: Describes) -> EnvironmentDescription:

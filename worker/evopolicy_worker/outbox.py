@@ -69,11 +69,11 @@ class Outbox:
         ask: Requester[WorkerReply],
         worker: str,
         session: Callable[[], str],
-        register_again: Callable[[str], Awaitable[None]],
+        register_again: Callable[[str, RefusedError], Awaitable[bool]],
         on_settled: Callable[[JobResult], None],
         more_follow: Callable[[], bool],
     ) -> None:
-        """`register_again` receives the session that the coordinator did not know, `on_settled` each result that
+        """`register_again` receives a session and its refusal, and tells whether it registered anew; `on_settled` each result that
         left. `more_follow`: whether leased jobs wait for a slot; when none does any more, call `hurry`."""
         self._ask = ask
         self._worker = worker
@@ -195,8 +195,7 @@ class Outbox:
         return msgspec.structs.replace(blob, inline=None)
 
     async def _refused(self, error: RefusedError, session: str, n: int) -> None:
-        if error.status == Refusal.UNKNOWN_WORKER:
-            await self._register_again(session)
+        if await self._register_again(session, error):
             return
         if error.status == Refusal.MISSING_BLOB and self._n_lost < MAX_LOST:
             log.warning("the coordinator has lost what was uploaded; sending it again", why=error.message)

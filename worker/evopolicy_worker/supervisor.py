@@ -72,6 +72,8 @@ PROBE_PAUSE_S, LONGEST_PROBE_PAUSE_S = 30.0, 600.0
 """Before a tier that does not work is tried again; the pause doubles each time."""
 MAX_WHY = 500
 """Characters of the reason why a tier does not work."""
+MAX_FAILURE, MAX_FAILURES = 2000, 60_000
+"""Characters of the reason why an environment failed, and of all such reasons; the log has them whole."""
 MAX_PREPARED = 4
 """A worker that offers at most this many environments has its slots import all their simulators before work arrives."""
 
@@ -97,8 +99,8 @@ class SlotLike(Protocol):
 
 Probe = Callable[[Tier], Awaitable[None]]
 """Starts a sandbox of a tier and ends it. Raises EvopolicyError or OSError when it does not start."""
-Describe = Callable[[Sequence[str]], Awaitable[tuple[EnvironmentDescription, ...]]]
-"""Describes environments, without those that cannot be; see `descriptions.describe_all`."""
+Describe = Callable[[Sequence[str]], Awaitable[tuple[tuple[EnvironmentDescription, ...], dict[str, str]]]]
+"""Describes environments; see `descriptions.describe_all`."""
 
 
 class Options(msgspec.Struct, frozen=True, kw_only=True):
@@ -110,6 +112,8 @@ class Options(msgspec.Struct, frozen=True, kw_only=True):
     environments: tuple[EnvironmentDescription, ...]
     undescribed: tuple[str, ...] = ()
     """Shipped environments that are described once runs wait for them."""
+    failed_environments: dict[str, str] = {}
+    """Environments that could not be described, with the reasons; tried again from time to time."""
     fingerprint: Fingerprint
     host: str
     boot_id: str = ""
@@ -132,7 +136,8 @@ class Supervisor:
         describe: Describe | None = None,
         probe: Probe | None = None,
     ) -> None:
-        """`describe`: needed where `options.undescribed` has any. `probe`: where `options.missing_tiers` has any."""
+        """`describe`: needed where `options.undescribed` or `options.failed_environments` has any. `probe`: where
+        `options.missing_tiers` has any."""
         self._link = link
         self._tiers, self._missing_tiers = set(options.tiers), dict(options.missing_tiers)
         self._probe = probe
@@ -141,6 +146,7 @@ class Supervisor:
         self._describe = describe
         self._described = {each.env: each for each in options.environments}
         self._undescribed = dict.fromkeys(options.undescribed)
+        self._failed_environments = dict(options.failed_environments)
         self._describing: asyncio.Task[None] | None = None
         cluster = link.credentials.cluster
         self._ask: Requester[WorkerReply] = Requester(
@@ -170,7 +176,7 @@ class Supervisor:
         )
         self._running: dict[str, SlotLike] = {}
         self._cancelled: set[str] = set()
-        self._session = ""
+        self._session = self._token = ""
         self._lease_ttl_s = 0.0
         self._leased: dict[str, Lease] = {}
         """Leases of running jobs, by lease id."""
@@ -191,7 +197,7 @@ class Supervisor:
         report_results = asyncio.create_task(self._outbox.run())
         report_results.add_done_callback(self._report_ended)
         working = asyncio.create_task(self._work_and_report())
-        probing = asyncio.create_task(self._probe_again())
+        probing = asyncio.create_task(self._try_again())
         try:
             await asyncio.wait([working, self._failed], return_when=asyncio.FIRST_COMPLETED)
             if self._failed.done():
@@ -265,13 +271,14 @@ class Supervisor:
                 missing_tiers={tier: why[:MAX_WHY] for tier, why in self._missing_tiers.items()},
                 environments=tuple(self._described.values()),
                 undescribed=tuple(self._undescribed),
+                failed_environments=_told(self._failed_environments),
                 fingerprint=options.fingerprint,
                 host=options.host,
                 boot_id=options.boot_id,
                 installation=installs.own(),
             )
             reply = await self._ask.until_answered("register", message, Registered)
-            self._session, self._lease_ttl_s = reply.session, reply.lease_ttl_s
+            self._session, self._lease_ttl_s, self._token = reply.session, reply.lease_ttl_s, message.token
             self._heartbeat.start(reply.session, reply.heartbeat_s)
             log.info(
                 "registered", worker=options.name, cluster=self._link.credentials.cluster, slots=options.slots
@@ -281,10 +288,15 @@ class Supervisor:
             for env, why in reply.refused_environments.items():
                 log.warning("the coordinator rejected this environment", env=env, why=why)
 
-    async def _register_again(self, session: str) -> None:
+    async def _register_again(self, session: str, error: RefusedError) -> bool:
+        """Registers anew where the session has ended. Returns False for a refusal that this does not help against."""
+        renewed = error.status == Refusal.REVOKED and await self._link.renewed(self._token)
+        if error.status != Refusal.UNKNOWN_WORKER and not renewed:
+            return False
         if session == self._session:
-            log.info("the coordinator does not know this session; registering again")
+            log.info("this session has ended; registering again", why=error.message)
             await self._register()
+        return True
 
     def _on_heartbeat_reply(self, reply: HeartbeatReply | Refused) -> None:
         if isinstance(reply, Refused):
@@ -300,41 +312,54 @@ class Supervisor:
             self._describing = asyncio.create_task(self._describe_wanted(wanted))
 
     async def _describe_wanted(self, wanted: Sequence[str]) -> None:
-        """Describes environments that runs wait for, and registers with them. A description that fails is tried again when
-        the next heartbeat asks."""
+        """Describes environments that runs wait for, or that failed before, and registers with the outcome. Where no slot starts,
+        it is tried again when the next heartbeat asks."""
         assert self._describe is not None
         log.info("describing", environments=wanted)
         try:
-            found = await self._describe(wanted)
+            found, failed = await self._describe(wanted)
         except (EvopolicyError, OSError) as error:
             log.error("environments are not described", environments=wanted, why=str(error))
             return
+        before = self._failed_environments
+        self._failed_environments = {env: why for env, why in before.items() if env not in wanted} | failed
         self._described |= {each.env: each for each in found}
         for env_id in wanted:
-            del self._undescribed[env_id]
-        with contextlib.suppress(RefusedError):  # the lease loop meets the same refusal
-            await self._register()
+            self._undescribed.pop(env_id, None)
+        if found or self._failed_environments != before:
+            with contextlib.suppress(RefusedError):  # the lease loop meets the same refusal
+                await self._register()
 
-    async def _probe_again(self) -> None:
-        """Tries the tiers that do not work until all do, and registers with each that does, or has another reason."""
+    async def _try_again(self) -> None:
+        """Tries tiers and environments that do not work from time to time, and registers with each that does, or has another
+        reason."""
         pause_s = PROBE_PAUSE_S
-        while self._missing_tiers and self._probe is not None:
+        while True:
             await asyncio.sleep(pause_s)
-            pause_s = min(2 * pause_s, LONGEST_PROBE_PAUSE_S)
-            before = dict(self._missing_tiers)
-            for tier in before:
-                try:
-                    await self._probe(tier)
-                except (EvopolicyError, OSError) as error:
-                    self._missing_tiers[tier] = str(error)
-                else:
-                    del self._missing_tiers[tier]
-                    self._tiers.add(tier)
-                    log.info("sandbox tier works now", tier=tier)
-            if self._missing_tiers != before:
-                tell_missing(self._missing_tiers)
-                with contextlib.suppress(RefusedError):  # the lease loop meets the same refusal
-                    await self._register()
+            failing = bool(self._missing_tiers or self._failed_environments)
+            pause_s = min(2 * pause_s, LONGEST_PROBE_PAUSE_S) if failing else PROBE_PAUSE_S
+            if self._missing_tiers and self._probe is not None:
+                await self._probe_tiers(self._probe)
+            if self._failed_environments and (self._describing is None or self._describing.done()):
+                self._describing = asyncio.create_task(
+                    self._describe_wanted(tuple(self._failed_environments))
+                )
+
+    async def _probe_tiers(self, probe: Probe) -> None:
+        before = dict(self._missing_tiers)
+        for tier in before:
+            try:
+                await probe(tier)
+            except (EvopolicyError, OSError) as error:
+                self._missing_tiers[tier] = str(error)
+            else:
+                del self._missing_tiers[tier]
+                self._tiers.add(tier)
+                log.info("sandbox tier works now", tier=tier)
+        if self._missing_tiers != before:
+            tell_missing(self._missing_tiers)
+            with contextlib.suppress(RefusedError):  # the lease loop meets the same refusal
+                await self._register()
 
     def _cancel(self, lease_id: str) -> None:
         """Returns the waiting job, or stops the running one, of a lease that this worker no longer holds."""
@@ -377,10 +402,9 @@ class Supervisor:
             try:
                 reply = await self._ask.until_answered("lease", request, Leases, wait_s=LEASE_POLL_S)
             except RefusedError as error:
-                if error.status != Refusal.UNKNOWN_WORKER:
-                    raise
                 self._held.settle(serial)
-                await self._register_again(session)
+                if not await self._register_again(session, error):
+                    raise
                 continue
             for lease_id in reply.cancelled:
                 self._cancel(lease_id)
@@ -615,6 +639,15 @@ def tell_missing(tiers: Mapping[Tier, str]) -> None:
     """Logs the sandbox tiers that do not work, with the reasons."""
     for tier, why in tiers.items():
         log.warning("sandbox tier does not work; it is tried again", tier=tier, why=why)
+
+
+def _told(failed: Mapping[str, str]) -> dict[str, str]:
+    """The reasons as they are announced: all environments, and of the reasons as much as the coordinator takes."""
+    left, told = MAX_FAILURES, {}
+    for env, why in failed.items():
+        told[env] = why[: min(MAX_FAILURE, left)]
+        left -= len(told[env])
+    return told
 
 
 def _held(lease: Lease, *, running: bool, episodes_done: int = 0, steps: int = 0) -> HeldLease:

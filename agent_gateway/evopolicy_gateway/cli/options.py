@@ -118,6 +118,24 @@ Browser = Annotated[
         show_default=False,
     ),
 ]
+EnvTimeout = Annotated[
+    float | None,
+    typer.Option(
+        min=1.0,
+        help="Time limit for one call of an environment, in seconds, as of evopolicy-worker; default: 300.",
+        rich_help_panel=CLUSTER,
+        show_default=False,
+    ),
+]
+EnvMemory = Annotated[
+    int | None,
+    typer.Option(
+        min=64,
+        help="Memory limit of an environment's process, in MiB, as of evopolicy-worker; default: 4096.",
+        rich_help_panel=CLUSTER,
+        show_default=False,
+    ),
+]
 HiddenCasesOption = Annotated[
     Literal["shared", "per-run"] | None,
     typer.Option(
@@ -164,6 +182,14 @@ def check_browser(requested: Path | None, *, local: bool) -> Path | None:
             "--browser is for a cluster that this command brings up; give it to each evopolicy-worker"
         )
     return None if requested is None else requested.absolute()
+
+
+def check_env_limits(*requested: float | None, local: bool) -> None:
+    """ConfigError where `--env-timeout` or `--env-memory` is given for a cluster that is not brought up here."""
+    if not local and any(each is not None for each in requested):
+        raise ConfigError(
+            "--env-timeout and --env-memory are for a cluster that this command brings up; give them to each evopolicy-worker"
+        )
 
 
 def check_isolation(requested: HiddenIsolation | None, *, local: bool) -> None:

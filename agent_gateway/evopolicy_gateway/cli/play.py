@@ -123,6 +123,8 @@ def local(
     hidden_isolation: options.Isolation = None,
     policy_package: options.PolicyPackages = None,
     browser: options.Browser = None,
+    env_timeout: options.EnvTimeout = None,
+    env_memory: options.EnvMemory = None,
     web: options.Web = False,
     as_json: options.Json = False,
 ) -> None:
@@ -142,6 +144,8 @@ def local(
             hidden_isolation=hidden_isolation,
             policy_packages=options.check_packages(policy_package, local=True),
             browser=options.check_browser(browser, local=True),
+            env_timeout=env_timeout,
+            env_memory=env_memory,
         )
         _play(plans, where, parallel, as_json, web=web)
 
@@ -189,6 +193,8 @@ def try_policy(
     data: options.DataFolder = None,
     policy_package: options.PolicyPackages = None,
     browser: options.Browser = None,
+    env_timeout: options.EnvTimeout = None,
+    env_memory: options.EnvMemory = None,
     as_json: options.Json = False,
 ) -> None:
     """Play a policy on train cases, without a run or an agent.
@@ -219,7 +225,10 @@ def try_policy(
             policy_package,
             trial.policy,
         )
-        where = msgspec.structs.replace(where, unjailed=tier == "none")
+        options.check_env_limits(env_timeout, env_memory, local=where.local_slots is not None)
+        where = msgspec.structs.replace(
+            where, unjailed=tier == "none", env_timeout=env_timeout, env_memory=env_memory
+        )
         where.check_ids([trial.env], trial.split, trial.cases)
         _exit(run_to_end(trials.try_policy(trial, where, as_json=as_json)))
 

@@ -47,6 +47,9 @@ class Cluster(msgspec.Struct, frozen=True, kw_only=True):
     """For a local cluster: packages that policies may import besides numpy."""
     browser: Path | None = None
     """For a local cluster: Chromium's program; None for the machine's own."""
+    env_timeout: float | None = None
+    env_memory: int | None = None
+    """For a local cluster: as `--env-timeout` (seconds) and `--env-memory` (MiB) of `evopolicy-worker`; None for their defaults."""
     patient: bool = False
     """The command continues earlier work, and waits for a coordinator that is away."""
     web: Path | None = None
@@ -104,6 +107,8 @@ async def reached(where: Cluster, workers: Workers | None = None) -> AsyncIterat
                     workers=workers,
                     policy_packages=where.policy_packages,
                     browser=where.browser,
+                    env_timeout=where.env_timeout,
+                    env_memory=where.env_memory,
                 )
             )
             if local.note:

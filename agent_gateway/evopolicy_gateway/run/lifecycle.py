@@ -25,7 +25,7 @@ from typing import Any
 
 import msgspec
 
-from evopolicy_common.errors import ConfigError, EvopolicyError
+from evopolicy_common.errors import BrokenEnvironmentError, ConfigError, EvopolicyError
 from evopolicy_common.messages.gateway import CANCELLED
 from evopolicy_common.messages.operator import RunFinished
 from evopolicy_common.processes import child_process, host
@@ -348,6 +348,8 @@ class RunLifecycle:
         """
         waiting = Waiting()
         async for progress in self._operations.wait(self.run):
+            if not self._ready.done() and progress.env_failure and self._operations.own:
+                self._ready.set_exception(BrokenEnvironmentError(progress.env_failure))
             if not self._ready.done() and waiting.worth_saying(progress.waits_for):
                 self._watch.note(self._name, f"waiting for {progress.waits_for}")
             finished = progress.finished

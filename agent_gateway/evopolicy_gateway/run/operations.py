@@ -44,7 +44,7 @@ class Operations(OperatorClient):
 
     def __init__(self, link: Link, opened: Callable[[str, Sequence[Path]], None] | None = None) -> None:
         """`opened`: as `LocalCluster.opened`; None for a cluster that was not started here."""
-        super().__init__(link)
+        super().__init__(link, own=opened is not None)
         self._opened = opened
 
     def watched_by(self, run: str, locks: Sequence[Path]) -> None:

@@ -37,6 +37,8 @@ _LONGEST_PAUSE_S = 5.0
 _MAX_DEATHS = 10
 """Number of successive deaths, each within `_SOON_S` seconds of its start, that counts as an error."""
 _SOON_S = 60.0
+_IN_VAIN = ("ModuleNotFoundError: ", "ImportError: ", "SyntaxError: ")
+"""Beginnings of last words after which another start would end in the same way."""
 
 
 WORKERS_ENDED = "workers-ended"
@@ -139,14 +141,16 @@ async def local_cluster(
     workers: Workers | None = None,
     policy_packages: Sequence[str] = (),
     browser: Path | None = None,
+    env_timeout: float | None = None,
+    env_memory: int | None = None,
 ) -> AsyncIterator[LocalCluster]:
     """A coordinator, open inside the `async with`; it and its workers are ended on exit. Enter it on the main thread.
 
     `kind` names its logs and its folder. `state` None: a temporary folder. `audit`: share of the episodes that a second
     worker replays, 0 to 1. `hidden_isolation`: the coordinator's option, None for its default. `unjailed`: agents could
     read the folder; see the coordinator's `--unjailed-agents`. `policy_packages`: those that policies may import besides numpy.
-    `browser`: the workers' Chromium; None for the machine's own. `workers`: workers to start at once, in parallel with
-    the coordinator. Raises ConfigError when the coordinator does not start (the folder may be in use).
+    `browser`: the workers' Chromium; None for the machine's own. `env_timeout`, `env_memory`: the workers' options (seconds,
+    MiB), None for their defaults. `workers`: workers to start at once, in parallel with the coordinator. Raises ConfigError when the coordinator does not start (the folder may be in use).
     """
     with contextlib.ExitStack() as folders:
         root = folders.enter_context(scratch_folder(kind)) if state is None else state
@@ -181,7 +185,10 @@ async def local_cluster(
             coordinator += ["--unjailed-agents"]
         packages = [word for name in policy_packages for word in ("--policy-package", name)]
         coordinator += packages
-        worker_options = [*packages, *(["--browser", str(browser)] if browser is not None else [])]
+        given = {"--browser": browser, "--env-timeout": env_timeout, "--env-memory": env_memory}
+        worker_options = packages + [
+            word for name, value in given.items() if value is not None for word in (name, str(value))
+        ]
         if hidden_isolation is not None:
             coordinator += ["--hidden-isolation", hidden_isolation]
         processes = _Processes(root / "logs", kind, lock_fd)
@@ -312,6 +319,8 @@ class _Processes:
             reason = last_words(child.log) or f"see {child.log}"
             if code == USAGE_ERROR:
                 raise ConfigError(reason)
+            if reason.startswith(_IN_VAIN):
+                raise ConfigError(f"{name} does not start: {reason}; see {child.log}")
             if deaths == _MAX_DEATHS:
                 raise ConfigError(f"{name} keeps ending: {reason}")
             await asyncio.sleep(min(_LONGEST_PAUSE_S, _RESTART_PAUSE_S * 2 ** (deaths - 1)))

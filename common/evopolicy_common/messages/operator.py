@@ -145,6 +145,8 @@ class RunProgress(Message, frozen=True, kw_only=True, tag="run_progress"):
     finished: RunFinished | None = None
     trouble: Text = ""
     """Why the coordinator accepts no changes, of this run or any other; empty: it accepts them."""
+    env_failure: Text = ""
+    """Why its environment failed on a worker, if no connected worker offers it."""
 
 
 class PlayedAs(msgspec.Struct, frozen=True, kw_only=True):
@@ -287,6 +289,8 @@ class EvaluationPage(Message, frozen=True, kw_only=True, tag="evaluation_page"):
     outcomes: Many[EpisodeOutcome]
     finished: bool
     waits_for: Text = ""
+    env_failure: Text = ""
+    """As in `RunProgress`."""
 
 
 class CancelRun(Message, frozen=True, kw_only=True, tag="cancel_run"):
@@ -442,6 +446,8 @@ class EnvironmentsReply(Message, frozen=True, kw_only=True, tag="environments_re
     finished: bool
     undescribed: Named[Many[Text]] = {}
     """With the last page: shipped environments that workers describe on first use, with the names of these workers."""
+    failed: Named[Named[Text]] = {}
+    """With the last page: by environment, the workers on which it failed, with the reasons."""
 
 
 class ApproveEnvironment(Message, frozen=True, kw_only=True, tag="approve_environment"):

@@ -49,6 +49,8 @@ class WorkerStatus(msgspec.Struct, frozen=True, kw_only=True):
     """Its Python installation, as in `versions.installations` of `run.json`."""
     missing_tiers: Named[Text] = {}
     """Sandbox tiers that should work there and do not, with the reasons."""
+    failed_environments: Named[Text] = {}
+    """Environments that it should offer and that could not be described or failed their try-out, with the reasons."""
 
 
 class RetriedJobs(msgspec.Struct, frozen=True, kw_only=True):

@@ -100,6 +100,8 @@ class Register(Message, frozen=True, kw_only=True, tag="register"):
     """The worker's Python installation (`installs.own`); empty from workers of earlier versions."""
     missing_tiers: Named[Text] = {}
     """Sandbox tiers that should work there and do not, with the reasons."""
+    failed_environments: Named[Text] = {}
+    """Environments that it should offer and that could not be described or failed their try-out, with the reasons."""
 
 
 class Registered(Message, frozen=True, kw_only=True, tag="registered"):

@@ -10,7 +10,7 @@ from typing import Literal
 
 from msgspec.structs import replace
 
-from evopolicy_common.errors import EvopolicyError, RefusedError
+from evopolicy_common.errors import BrokenEnvironmentError, EvopolicyError, RefusedError
 from evopolicy_common.messages.environment import Split
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome
 from evopolicy_common.messages.operator import (
@@ -58,8 +58,11 @@ _SENDER = "operator"
 class OperatorClient:
     """One operator's link. Fills in the token of each message. Raises RefusedError where the coordinator refuses."""
 
-    def __init__(self, link: Link) -> None:
+    def __init__(self, link: Link, *, own: bool = False) -> None:
+        """`own`: the command started this cluster, so that no other worker will come. Evaluations then raise
+        BrokenEnvironmentError when their environment fails on its workers."""
         self._token = link.credentials.token
+        self.own = own
         self._requests = operator_requests(link)
 
     # The cluster.
@@ -69,8 +72,11 @@ class OperatorClient:
         message = StatusRequest(token=self._token, max_age_s=max_age_s)
         return await self._requests.until_answered("status", message, StatusReply, timeout_s=TIMEOUT_S)
 
-    async def environments(self) -> tuple[list[OfferedEnvironment], dict[str, tuple[str, ...]]]:
-        """The environments that connected workers offer; and those that they describe on first use, with the workers."""
+    async def environments(
+        self,
+    ) -> tuple[list[OfferedEnvironment], dict[str, tuple[str, ...]], dict[str, dict[str, str]]]:
+        """The environments that connected workers offer; those that they describe on first use, with the workers; and those
+        that failed, with the reasons by worker."""
         found: list[OfferedEnvironment] = []
         while True:
             message = EnvironmentsRequest(token=self._token, cursor=len(found))
@@ -79,7 +85,7 @@ class OperatorClient:
             )
             found += page.environments
             if page.finished:
-                return found, page.undescribed
+                return found, page.undescribed, page.failed
 
     async def approve(self, env: str, digest: str) -> None:
         """Lets runs use this definition of an environment that does not ship."""
@@ -191,6 +197,8 @@ class OperatorClient:
                 cursor, finished = page.cursor, page.finished
                 for outcome in page.outcomes:
                     yield outcome, page.total, ""
+                if page.env_failure and self.own:
+                    raise BrokenEnvironmentError(page.env_failure)
                 if not page.outcomes:
                     yield None, page.total, page.waits_for
             # One that ended before this request has no number of episodes; an interrupted command cancelled it.

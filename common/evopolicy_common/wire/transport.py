@@ -29,7 +29,7 @@ from typing import Any
 
 import zenoh
 
-from evopolicy_common.errors import TransportError
+from evopolicy_common.errors import ConfigError, TransportError
 from evopolicy_common.logs import structlog
 from evopolicy_common.processes.notices import notify_if_slow
 from evopolicy_common.wire import keys
@@ -40,6 +40,9 @@ log: structlog.stdlib.BoundLogger = structlog.get_logger()
 MAX_MESSAGE_BYTES = 16 << 20
 _REPLY_LANES = 8
 _CLOSE_S = 3.0
+RENEWED_LOOK_S = 2.0
+"""Interval of looks for renewed credentials, seconds."""
+_RENEWED_PAUSE_S = 0.1
 STUCK_S = 2.0
 """Delay after a query's timeout at which the session is considered stuck, seconds."""
 
@@ -138,11 +141,18 @@ class Server:
 class Link:
     """A client's session. Created by `connect`; reconnects by itself while it is open."""
 
-    def __init__(self, session: zenoh.Session, credentials: Credentials) -> None:
+    def __init__(
+        self,
+        session: zenoh.Session,
+        credentials: Credentials,
+        read_again: Callable[[], Credentials] | None = None,
+    ) -> None:
+        """`read_again`: as for `connect`."""
         self.credentials = credentials
+        self._read_again = read_again
         self._session = session
         self._sender = ThreadPoolExecutor(max_workers=4, thread_name_prefix="ask")
-        self._held: list[Any] = []
+        self._alive: dict[str, Any] = {}
 
     @property
     def connected(self) -> bool:
@@ -206,11 +216,30 @@ class Link:
 
     def declare_alive(self, key: str) -> None:
         """Holds a liveliness token on `key` while this link is open."""
-        self._held.append(self._session.liveliness().declare_token(key))
+        self._alive[key] = self._session.liveliness().declare_token(key)
+
+    async def renewed(self, token: str) -> bool:
+        """Whether the credentials have been renewed since they had this token. Waits for a session with those that are on disk."""
+        while self.credentials.token == token:
+            try:
+                found = None if self._read_again is None else await asyncio.to_thread(self._read_again)
+            except (ConfigError, OSError):
+                found = None
+            if found is None or found.token == token:
+                return False
+            await asyncio.sleep(_RENEWED_PAUSE_S)
+        return True
+
+    def replace(self, session: zenoh.Session, credentials: Credentials) -> None:
+        """Goes on with another session. Open requests get no reply, and are sent again. Blocks until the old one is closed."""
+        old, self._session, self.credentials = self._session, session, credentials
+        for key in self._alive:
+            self.declare_alive(key)
+        _close(old)
 
     def close(self) -> None:
         """Closes the session. Open requests get no reply."""
-        self._held.clear()
+        self._alive.clear()
         self._sender.shutdown(wait=False, cancel_futures=True)
         _close(self._session)
 
@@ -220,19 +249,56 @@ class Link:
 
 
 @contextlib.asynccontextmanager
-async def connect(credentials: Credentials, *, timeout_s: float | None = 10.0) -> AsyncIterator[Link]:
-    """A client session, open inside the `async with`.
+async def connect(
+    credentials: Credentials,
+    *,
+    timeout_s: float | None = 10.0,
+    read_again: Callable[[], Credentials] | None = None,
+) -> AsyncIterator[Link]:
+    """A client session, open inside the `async with`. `read_again` reads the credentials anew, which may have been renewed: a
+    session with the renewed ones then replaces the first.
 
     Waits until a router accepts it. Raises TransportError after `timeout_s` seconds (None: waits forever); a wrong
     password has the same effect, as the router does not report it.
     """
     with notify_if_slow(f"the coordinator at {', '.join(credentials.endpoints)}"):
-        session = await _open_client(credentials, timeout_s)
-    link = Link(session, credentials)
+        session, credentials = await _open_client(credentials, timeout_s, read_again)
+    link = Link(session, credentials, read_again)
+    renewing = None if read_again is None else asyncio.create_task(_take_renewed(link, read_again))
     try:
         yield link
     finally:
+        if renewing is not None:
+            renewing.cancel()
+            await asyncio.gather(renewing, return_exceptions=True)
         await asyncio.to_thread(link.close)
+
+
+async def _take_renewed(link: Link, read_again: Callable[[], Credentials]) -> None:
+    """Looks whether the credentials have been renewed. Zenoh reads certificates and password only when it opens a session."""
+    used = _content(link.credentials)
+    while True:
+        await asyncio.sleep(RENEWED_LOOK_S)
+        try:
+            found = await asyncio.to_thread(read_again)
+            content = await asyncio.to_thread(_content, found)
+            if content == used:
+                continue
+            session = await asyncio.to_thread(zenoh.open, client_config(found))
+        except (ConfigError, OSError, zenoh.ZError) as error:
+            # The folder is being copied, or the coordinator does not admit them yet.
+            log.debug("renewed credentials cannot be used yet", why=str(error))
+            continue
+        await asyncio.to_thread(link.replace, session, found)
+        used = content
+        log.info("renewed credentials are in use", user=found.user)
+
+
+def _content(credentials: Credentials) -> tuple[object, ...]:
+    """Credentials with the content of their files."""
+    tls = credentials.tls
+    paths = () if tls is None else (tls.root_ca, tls.certificate, tls.private_key)
+    return credentials, *(Path(path).read_bytes() for path in paths)
 
 
 @contextlib.asynccontextmanager
@@ -451,16 +517,20 @@ _PATIENCE_S = 30.0
 """A client that waits forever logs possible causes once, after this time, seconds."""
 
 
-async def _open_client(credentials: Credentials, timeout_s: float | None) -> zenoh.Session:
-    config = client_config(credentials)
+async def _open_client(
+    credentials: Credentials, timeout_s: float | None, read_again: Callable[[], Credentials] | None
+) -> tuple[zenoh.Session, Credentials]:
     loop = asyncio.get_running_loop()
     patience_s = _PATIENCE_S if timeout_s is None else timeout_s
     deadline = loop.time() + patience_s
     pause = 0.02
     while True:
         try:
-            return await asyncio.to_thread(zenoh.open, config)
+            return await asyncio.to_thread(zenoh.open, client_config(credentials)), credentials
         except zenoh.ZError as error:
+            if read_again is not None:
+                with contextlib.suppress(ConfigError, OSError):  # the folder is being copied
+                    credentials = await asyncio.to_thread(read_again)
             if loop.time() > deadline:
                 text = (
                     f"no connection to {', '.join(credentials.endpoints)} within {patience_s:g} s: is the coordinator up"

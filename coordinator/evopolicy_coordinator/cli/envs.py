@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import fnmatch
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from typing import Annotated
 
 import msgspec
@@ -16,7 +16,7 @@ from evopolicy_common.cli.frame import App
 from evopolicy_common.console import table, terminal
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.operator import OfferedEnvironment
-from evopolicy_common.terminal import say, say_json
+from evopolicy_common.terminal import say, say_json, say_lines
 from evopolicy_common.wire.operator_client import OperatorClient
 from evopolicy_coordinator.cli.status import asking
 
@@ -40,21 +40,23 @@ def envs(
     """List the environments that the cluster's workers offer, their definitions, and whether runs may use them."""
     if context.invoked_subcommand is not None:
         return
-    offered, later = asking(connect, file, OperatorClient.environments)
+    offered, later, failed = asking(connect, file, OperatorClient.environments)
     patterns = [*(only or ()), *([show] if show else ())]
     found = [each for each in offered if _wanted(each.description.env, patterns)]
     later = {env: workers for env, workers in later.items() if _wanted(env, patterns)}
+    failed = {env: reasons for env, reasons in failed.items() if _wanted(env, patterns)}
     if as_json:
         say_json(
             [
                 *found,
                 *({"env": env, "workers": workers, "described": False} for env, workers in later.items()),
+                *({"env": env, "failed": reasons} for env, reasons in failed.items()),
             ]
         )
         return
     if show is not None:
         with fail_on_our_errors():
-            _show(show, found, later)
+            _show(show, found, later, failed)
         return
     shown = table(
         *(
@@ -99,8 +101,11 @@ def envs(
         )
     if found or later:
         terminal().print(shown)
+    elif not failed:
+        say("no connected worker offers such an environment")
+    say_lines(_failures(failed))
+    if found or later or failed:
         return
-    say("no connected worker offers such an environment")
     lacking = {env: installs.advice(env) for env in catalogue.entries() if only and _wanted(env, only)}
     for line in dict.fromkeys(filter(None, lacking.values())):
         say(line)
@@ -135,13 +140,26 @@ def _wanted(env: str, patterns: list[str]) -> bool:
     )
 
 
-def _show(env: str, found: list[OfferedEnvironment], later: Mapping[str, Collection[str]]) -> None:
+def _failures(failed: Mapping[str, Mapping[str, str]]) -> Iterator[str]:
+    for env, reasons in failed.items():
+        for worker, why in reasons.items():
+            yield f"{env} failed on {worker}, which does not offer it: {why}"
+
+
+def _show(
+    env: str,
+    found: list[OfferedEnvironment],
+    later: Mapping[str, Collection[str]],
+    failed: Mapping[str, Mapping[str, str]],
+) -> None:
     if env in later:
         raise ConfigError(
             f"{env} is described when its first run waits for it, by {', '.join(later[env])}; to see it before, start a worker"
             " that offers it alone"
         )
     if not found:
+        if failed:
+            raise ConfigError("; ".join(_failures(failed)))
         advice = installs.advice(env)
         raise ConfigError(
             f"no connected worker offers {env}" + (f"; {advice}" if advice else catalogue.near(env))

@@ -127,16 +127,18 @@ def list_workers(connect: Connect = None, file: CredentialsFile = None, as_json:
             worker.worker, worker.host, worker.state, *counts, _tiers(worker), _names(worker.environments)
         )
     terminal().print(shown if reply.workers else "no worker is connected")
-    say_lines(line for worker in reply.workers for line in _missing_tiers(worker))
+    say_lines(line for worker in reply.workers for line in _lacks(worker))
 
 
 def _tiers(worker: WorkerStatus) -> str:
     return ", ".join([" ".join(worker.tiers), *(f"no {tier}" for tier in worker.missing_tiers)])
 
 
-def _missing_tiers(worker: WorkerStatus) -> Iterator[str]:
+def _lacks(worker: WorkerStatus) -> Iterator[str]:
     for tier, why in worker.missing_tiers.items():
         yield f"{worker.worker} has no sandbox tier {tier}: {why}"
+    for env, why in worker.failed_environments.items():
+        yield f"{worker.worker} does not offer {env}: {why}"
 
 
 def _names(env_ids: Sequence[str]) -> str:
@@ -356,7 +358,7 @@ def _remarks(reply: StatusReply) -> Iterator[str]:
     for worker in reply.workers:
         for run_id, why in worker.refused.items():
             yield f"{worker.worker} gets no work of {run_id}: {why}"
-        yield from _missing_tiers(worker)
+        yield from _lacks(worker)
         if worker.hidden_bar:
             yield f"{worker.worker} plays no hidden episodes now: {worker.hidden_bar}"
     yield from reply.stalls

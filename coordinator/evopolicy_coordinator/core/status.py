@@ -135,6 +135,7 @@ def _worker(state: State, worker: Worker, now: float, refused: dict[str, str]) -
         playing=_playing(live),
         installation=worker.installation,
         missing_tiers=worker.missing_tiers,
+        failed_environments=worker.failed_environments,
     )
 
 

@@ -87,6 +87,7 @@ class Definitions:
         """
         if self._trusting and not requested:
             return ""
+        workers = tuple(workers)
         offering = [each.profile for each in workers]
         offers = {
             each.fingerprints[env].definition or "unknown": None
@@ -98,6 +99,9 @@ class Definitions:
         if catalogue.is_shipped(env) and env in self._shipped:
             return ""
         if not offers:
+            if on := failed(workers).get(env):
+                why = "; ".join(f"{name}: {text}" for name, text in on.items())
+                raise RefusedError(Refusal.INVALID_SETTINGS, f"no worker offers {env}; it failed on {why}")
             known = {name for each in offering for name in each.descriptions}
             raise RefusedError(
                 Refusal.INVALID_SETTINGS,
@@ -182,6 +186,16 @@ def undescribed(workers: Iterable[Worker]) -> dict[str, tuple[str, ...]]:
             for env in worker.undescribed:
                 found.setdefault(env, []).append(worker.name)
     return {env: tuple(sorted(found[env])) for env in sorted(found.keys() - described)}
+
+
+def failed(workers: Iterable[Worker]) -> dict[str, dict[str, str]]:
+    """By environment, the connected workers on which it failed, with the reasons."""
+    found: dict[str, dict[str, str]] = {}
+    for worker in workers:
+        if worker.state != "lost":
+            for env, why in worker.failed_environments.items():
+                found.setdefault(env, {})[worker.name] = why
+    return dict(sorted(found.items()))
 
 
 def digits(description: EnvironmentDescription) -> str:

@@ -44,7 +44,7 @@ from evopolicy_coordinator.core.contract.effects import AuditEffect, ReadEvaluat
 from evopolicy_coordinator.core.contract.events import AuditEvent
 from evopolicy_coordinator.core.contract.records import RunRow
 from evopolicy_coordinator.pki import identity
-from evopolicy_coordinator.server.reason_texts import words
+from evopolicy_coordinator.server.reason_texts import env_failure, operator_words, words
 from evopolicy_coordinator.server.uploads import Uploads
 from evopolicy_coordinator.storage.disk_use import sizes
 from evopolicy_coordinator.storage.store import Reader
@@ -256,7 +256,8 @@ class ServiceReader:
             outcomes=tuple(found.outcome for found in page.rows),
             # A cancelled one has fewer outcomes than cases, and after a restart only the cases are counted.
             finished=effect.finished and (page.cursor >= effect.upto or not page.rows),
-            waits_for=words(effect.waits_for),
+            waits_for=operator_words(effect.waits_for),
+            env_failure=env_failure(effect.waits_for),
         )
 
     def _recorded(self, message: RecordedRequest) -> Message:

@@ -26,6 +26,7 @@ def _workers(
     away: tuple[str, ...],
     connected: bool,
     lacking: tuple[tuple[str, str], ...],
+    failed: tuple[tuple[str, str], ...],
 ) -> str:
     wanted = f"a worker that offers {env} with sandbox tier {tier}"
     if same_versions:
@@ -33,6 +34,9 @@ def _workers(
     if lacking:
         reasons = "; ".join(f"{worker}: {why}" for worker, why in lacking)
         wanted += f" (the tier does not work on {reasons})"
+    if failed:
+        # The reasons may name files and code of the environment, which are not for agents.
+        return f"{wanted}; it failed on {', '.join(worker for worker, _ in failed)}"
     # Agents must learn nothing of audits.
     states = sorted("out of service" if state == "quarantined" else state for state in away)
     if states:
@@ -126,6 +130,17 @@ def words(reason: Reason | None) -> str:
     return text.format(**about) if isinstance(text, str) else text(**about)
 
 
+def env_failure(reason: Reason | None) -> str:
+    """Why the environment that is waited for failed, if no connected worker offers it; empty otherwise. For operators."""
+    failed = () if reason is None or reason.code != "workers" else reason.about["failed"]
+    return failed[0][1] if failed else ""
+
+
+def operator_words(reason: Reason | None) -> str:
+    """A reason as text for operators, with the reason for which an environment failed; empty for None."""
+    return ": ".join(filter(None, (words(reason), env_failure(reason))))
+
+
 def message(effect: Reply | Refuse) -> Message:
     """The reply for the client: the effect's message, with its reason as text."""
     if isinstance(effect, Refuse):
@@ -136,7 +151,10 @@ def message(effect: Reply | Refuse) -> Message:
     text = words(effect.waits_for)
     if isinstance(reply, RunOpened | StateReply):
         return msgspec.structs.replace(reply, state=_with(reply.state, text))
-    assert isinstance(reply, Permit | RunProgress)
+    if isinstance(reply, RunProgress):
+        why = env_failure(effect.waits_for)
+        return msgspec.structs.replace(reply, waits_for=operator_words(effect.waits_for), env_failure=why)
+    assert isinstance(reply, Permit)
     return msgspec.structs.replace(reply, waits_for=text)
 
 

@@ -27,6 +27,8 @@ MAX_FINGERPRINT_BYTES = 64 << 10
 """Every finished run's message has one."""
 MAX_ENVIRONMENTS = 10_000
 """Of one worker. The status for operators lists them."""
+MAX_FAILURES = 64 << 10
+"""Characters of the reasons why one worker's environments failed. The status lists them."""
 _MAX_WAIT_S = 60.0
 _MAX_NAME = 200
 _MAX_WHY = 1000
@@ -118,10 +120,17 @@ def check_registration(message: worker.Register) -> None:
             Refusal.BAD_MESSAGE,
             f"the worker's fingerprint takes {size:,} bytes; {MAX_FINGERPRINT_BYTES:,} are the limit",
         )
-    n = len(message.environments) + len(message.undescribed)
-    if n > MAX_ENVIRONMENTS or not all(map(catalogue.valid_id, message.undescribed)):
+    failed = message.failed_environments
+    n = len(message.environments) + len(message.undescribed) + len(failed)
+    if n > MAX_ENVIRONMENTS or not all(map(catalogue.valid_id, (*message.undescribed, *failed))):
         raise RefusedError(
             Refusal.BAD_MESSAGE, f"{n:,} environments; {MAX_ENVIRONMENTS:,} with valid ids are the limit"
+        )
+    size = sum(map(len, failed.values()))
+    if size > MAX_FAILURES:
+        raise RefusedError(
+            Refusal.BAD_MESSAGE,
+            f"the reasons of failed environments have {size:,} characters; {MAX_FAILURES:,} are the limit",
         )
     tiers = message.missing_tiers
     if not tiers.keys() <= set(get_args(Tier)) or any(len(why) > _MAX_WHY for why in tiers.values()):

@@ -51,11 +51,11 @@ from evopolicy_coordinator.core.runs import finished
 from evopolicy_coordinator.core.tables.model import Worker
 from evopolicy_coordinator.server.claims import Claims
 from evopolicy_coordinator.server.core_host import CoreHost
-from evopolicy_coordinator.server.definitions import undescribed
+from evopolicy_coordinator.server.definitions import failed, undescribed
 from evopolicy_coordinator.server.monitoring.watchdog import LoopWatchdog
 from evopolicy_coordinator.server.pending import PendingQueries
 from evopolicy_coordinator.server.reader import ServiceReader, answer_bytes, answer_to, damaged, lane_of
-from evopolicy_coordinator.server.reason_texts import message, words
+from evopolicy_coordinator.server.reason_texts import message, operator_words, words
 from evopolicy_coordinator.server.refused_workers import RefusedWorkers
 from evopolicy_coordinator.server.request_checks import finite_wait
 from evopolicy_coordinator.server.request_parser import Parsed, RequestParser
@@ -208,7 +208,7 @@ class Service:
         workers = core.state.workers.values()
         page = _page(self._parser.definitions.offered(workers), parsed.message.cursor)
         if page.finished:
-            page = replace(page, undescribed=undescribed(workers))
+            page = replace(page, undescribed=undescribed(workers), failed=failed(workers))
         query.reply(answer_bytes(page), lane_of(parsed.asker))
 
     def _serve_approval(self, core: Core, query: IncomingQuery, parsed: Parsed) -> None:
@@ -384,7 +384,7 @@ class Service:
 
     def _status(self, core: Core) -> StatusReply:
         now = self.host.now()
-        part = core.status(now, words)._asdict()
+        part = core.status(now, operator_words)._asdict()
         part["stalls"] = self._stalls(part["stalls"])
         part["runs"] = tuple(
             replace(run, silent_s=now - max(run.created_at, self._heard.get(run.run, self._started_at)))
@@ -517,7 +517,7 @@ class Service:
         stalls = (
             ()
             if self.host.core is None
-            else self._stalls(self.host.core.status(self.host.now(), words).stalls)
+            else self._stalls(self.host.core.status(self.host.now(), operator_words).stalls)
         )
         if stalls:
             log.warning("stalls", n=len(stalls), first=stalls[:_STALLS_LOGGED])

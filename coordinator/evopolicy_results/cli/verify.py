@@ -129,7 +129,7 @@ async def _verify(order: _Order, where: Where, console: Terminal) -> Report:
     packages = packages_in(run.record.versions.fingerprint)
     async with where.link("verify", needs_state=False, packages=packages) as (link, cluster):
         with playing(console, "verify") as shown:
-            verifier = Verifier(link, run, shown.played, order.tier)
+            verifier = Verifier(link, run, shown.played, order.tier, own=cluster is not None)
             knows_run = await verifier.check_cases()
             chosen = sample([*run.train, *(run.hidden if knows_run else ())], order.sample, order.seed)
             if not chosen:

@@ -22,7 +22,7 @@ import msgspec
 import numpy as np
 
 from evopolicy_common import catalogue
-from evopolicy_common.errors import EvopolicyError, ProtocolError
+from evopolicy_common.errors import BrokenEnvironmentError, EvopolicyError, ProtocolError
 from evopolicy_common.local.cluster import local_cluster
 from evopolicy_common.messages.episode import BlobRef
 from evopolicy_common.messages.operator import DescribeEnvironment, Evaluate
@@ -199,7 +199,7 @@ async def cluster_of(
     link = await stack.enter_async_context(
         transport.connect(credentials.find("operator", (), cluster.operator_file))
     )
-    return OperatorClient(link)
+    return OperatorClient(link, own=True)
 
 
 async def unplayable(ask: OperatorClient, run: PublishedRun) -> tuple[str, bool]:
@@ -211,16 +211,19 @@ async def unplayable(ask: OperatorClient, run: PublishedRun) -> tuple[str, bool]
         token="", key=uuid.uuid4().hex, env=env, bundle=None, split="heldout", cases=(0,), record="actions"
     )
     until = time.monotonic() + DESCRIPTION_S
-    async with contextlib.aclosing(ask.evaluate(first)) as outcomes:
-        async for outcome, _, _ in outcomes:
-            if outcome is not None:
-                break
-            if time.monotonic() > until and not await _offers(ask, env):
-                return (
-                    f"no worker of this machine offers {env}; `evopolicy-worker check-env {env}` tells why",
-                    False,
-                )
-    offered, _ = await ask.environments()
+    try:
+        async with contextlib.aclosing(ask.evaluate(first)) as outcomes:
+            async for outcome, _, _ in outcomes:
+                if outcome is not None:
+                    break
+                if time.monotonic() > until and not await _offers(ask, env):
+                    return (
+                        f"no worker of this machine offers {env}; `evopolicy-worker check-env {env}` tells why",
+                        False,
+                    )
+    except BrokenEnvironmentError as error:
+        return str(error), False
+    offered, *_ = await ask.environments()
     if any(each.description.env == env and not each.description.deterministic for each in offered):
         return f"{env} is marked as not deterministic: the same actions can give another episode", False
     here: dict[str, str] = {}
@@ -234,7 +237,7 @@ async def unplayable(ask: OperatorClient, run: PublishedRun) -> tuple[str, bool]
 
 
 async def _offers(ask: OperatorClient, env: str) -> bool:
-    offered, _ = await ask.environments()
+    offered, *_ = await ask.environments()
     return any(each.description.env == env for each in offered)
 
 

@@ -121,7 +121,7 @@ class Rescorer:
 
     def __init__(self, link: Link, wanted: Wanted, tell: Tell, *, own_workers: bool) -> None:
         """`own_workers`: the cluster's workers have just been started, so the first may still be starting."""
-        self._ask = OperatorClient(link)
+        self._ask = OperatorClient(link, own=own_workers)
         self._wanted = wanted
         self._tell = tell
         self._own_workers = own_workers

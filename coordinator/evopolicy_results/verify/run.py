@@ -99,8 +99,11 @@ class _Recording(msgspec.Struct, kw_only=True):
 class Verifier:
     """One verification on one cluster."""
 
-    def __init__(self, link: Link, run: RunUnderTest, tell: Tell, tier: Tier | None = None) -> None:
-        self._ask = OperatorClient(link)
+    def __init__(
+        self, link: Link, run: RunUnderTest, tell: Tell, tier: Tier | None = None, *, own: bool = False
+    ) -> None:
+        """`own`: as for `OperatorClient`."""
+        self._ask = OperatorClient(link, own=own)
         self._run = run
         self._tell = tell
         self._tier: Tier = tier or run.record.sandbox_tier

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import datetime as dt
 import os
 import subprocess
 import sys
@@ -12,6 +13,7 @@ from pathlib import Path
 
 import msgspec
 import pytest
+from commands import process
 from coordinator_harness import (
     TIMEOUT_S,
     Coordinator,
@@ -23,7 +25,7 @@ from coordinator_harness import (
     operator_of,
     run,
 )
-from machines.own_certs import OwnCerts, of
+from machines.own_certs import DAYS, OwnCerts, now, of
 
 from evopolicy_common.errors import RefusedError, TransportError
 from evopolicy_common.messages.operator import RunFinished
@@ -31,6 +33,12 @@ from evopolicy_common.wire import credentials
 from evopolicy_common.wire.transport import connect
 
 IDS = tuple(range(8))
+POLICY = """
+class Policy:
+    def __init__(self, *spaces): pass
+    def reset(self, episode_index): pass
+    def act(self, obs): return 0
+"""
 
 
 @pytest.fixture
@@ -183,6 +191,38 @@ def test_machines_reconnect_after_an_issue_or_a_restart(
             first.kill()
 
     run(scenario, 150)
+
+
+@pytest.mark.slow  # until the certificate is over, and the leases
+def test_a_worker_whose_certificate_expires_in_a_run_goes_on_with_a_renewed_one(
+    certs: OwnCerts, coordinator: Coordinator
+) -> None:
+    boss = certs.issue("operator", "boss")
+    machine = certs.issue("worker", "w", now() - dt.timedelta(days=DAYS) + dt.timedelta(seconds=15))
+    log = certs.root / "worker.log"
+    arguments = ("--env", "toy/line", "--slots", "1", "--unsandboxed", "--credentials", str(machine))
+
+    async def scenario() -> None:
+        async with operators(boss) as operator:
+            created = await operator.create(sandbox_tier="none")
+            async with connect(of(boss, "gateway"), timeout_s=TIMEOUT_S) as link:
+                gateway = GatewayClient(link, created.run, created.capability)
+                await gateway.submit(bundle_of(POLICY), IDS, "first")
+                await gateway.results(0)
+                while (await operator.status()).workers[0].state != "lost":
+                    assert worker.poll() is None, log.read_text()
+                    await asyncio.sleep(0.2)
+                await gateway.submit(bundle_of(POLICY), IDS, "second")
+                certs.issue("worker", "w", again=True)
+                episodes, _ = await gateway.results(1)
+                assert len(episodes) == len(IDS)
+                await gateway.close()
+            assert (await operator.finished(created.run)).status == "completed"
+
+    with process(log, "evopolicy_worker.cli", *arguments) as worker:
+        run(scenario, 150)
+        assert worker.poll() is None
+    assert "renewed credentials are in use" in log.read_text()
 
 
 def refused(*args: object) -> str:

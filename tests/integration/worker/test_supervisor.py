@@ -30,15 +30,17 @@ from coordinator_harness import (
 from typer.testing import CliRunner
 
 from evopolicy_common.errors import PartFailedError, SandboxError, SlotDiedError, WorkerError
+from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome, Job, Tier
 from evopolicy_common.records.blobs import digest_of
 from evopolicy_common.wire import codec
 from evopolicy_common.wire.requests import Requester
 from evopolicy_common.wire.transport import connect
+from evopolicy_coordinator.cli.envs import app as envs_app
 from evopolicy_coordinator.cli.status import status_app, workers_app
 from evopolicy_worker import outbox, supervisor
 from evopolicy_worker.slot_protocol.begun import HandedBack
-from evopolicy_worker.supervisor import Options, Probe, Supervisor
+from evopolicy_worker.supervisor import Describe, Options, Probe, Supervisor
 
 pytestmark = pytest.mark.slow
 
@@ -126,14 +128,17 @@ async def supervising(
     tiers: tuple[Tier, ...] = ("bwrap",),
     missing: dict[Tier, str] | None = None,
     probe: Probe | None = None,
+    failed: dict[str, str] | None = None,
+    describe: Describe | None = None,
 ) -> AsyncIterator[Supervisor]:
-    """A supervisor that works in the background and is drained at the end."""
+    """A supervisor that works in the background and is drained at the end. `failed`: in place of the environment that works."""
     options = Options(
         name=name,
         slots=slots,
         tiers=tiers,
         missing_tiers=missing or {},
-        environments=(LINE,),
+        environments=() if failed else (LINE,),
+        failed_environments=failed or {},
         fingerprint=FINGERPRINT,
         host="test",
         boot_id=f"kernel-of-{name}",
@@ -145,7 +150,7 @@ async def supervising(
         return kind(script, dress)
 
     async with connect(coordinator.credentials("worker")) as link:
-        found = Supervisor(link, options, make_slot, probe=probe)
+        found = Supervisor(link, options, make_slot, describe, probe)
         task = asyncio.create_task(found.run())
         try:
             yield found
@@ -176,6 +181,47 @@ def test_a_whole_run_goes_through_the_supervisor(coordinator: Coordinator, tmp_p
             # 16 train, 2 × 3 validation, 4 held-out, 4 random; the second submit may have stopped validation that was
             # played by the time it heard of it.
             assert 30 <= worker.jobs_done <= 33
+
+    run(scenario)
+
+
+def test_an_environment_that_failed_is_told_and_tried_again(
+    coordinator: Coordinator, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(supervisor, "PROBE_PAUSE_S", 0.05)
+    works, tried = asyncio.Event(), asyncio.Event()
+    again = "step 4: it raised KeyError again"
+
+    async def describe(wanted: Sequence[str]) -> tuple[tuple[EnvironmentDescription, ...], dict[str, str]]:
+        assert wanted == ("toy/line",)
+        tried.set()
+        return ((LINE,), {}) if works.is_set() else ((), {"toy/line": again})
+
+    async def scenario() -> None:
+        failed = {"toy/line": "step 3: it raised KeyError"}
+        async with (
+            supervising(coordinator, tmp_path, failed=failed, describe=describe),
+            operator_of(coordinator) as operator,
+        ):
+            played = asyncio.create_task(whole_run(coordinator, "waits"))
+            async with asyncio.timeout(30):
+                await tried.wait()
+                while True:
+                    status = await operator.status()
+                    waits = [run.waits_for for run in status.runs if again in run.waits_for]
+                    if waits and status.workers[0].failed_environments == {"toy/line": again}:
+                        break
+                    await asyncio.sleep(0.05)
+            assert f"it failed on w-1: {again}" in waits[0]
+            file = coordinator.ready["credentials"]["operator"]
+            for app, *arguments in ((status_app,), (workers_app, "list"), (envs_app,)):
+                arguments += ["--credentials", file]
+                shown = await asyncio.to_thread(CliRunner().invoke, app, arguments)
+                assert again in shown.stdout.replace("\n", " ")
+            works.set()
+            assert (await played)["status"] == "completed"
+            (worker,) = (await operator.status()).workers
+            assert (worker.environments, worker.failed_environments) == (("toy/line",), {})
 
     run(scenario)
 

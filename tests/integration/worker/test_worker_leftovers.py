@@ -55,7 +55,7 @@ def start(temporary: Path) -> subprocess.Popen[bytes]:
 async def described(env_ids: list[str], scratch: Path) -> tuple[EnvironmentDescription, ...]:
     slot = Slot(None, "bwrap", scratch / "slot")
     try:
-        return await descriptions.describe_all(env_ids, slot)
+        return (await descriptions.describe_all(env_ids, slot))[0]
     finally:
         await slot.close()
 

@@ -257,6 +257,7 @@ class Rig:
                 boot_id=more.get("boot_id", f"kernel-of-{worker}"),
                 machine=more.get("machine", ""),
                 undescribed=more.get("undescribed", ()),
+                failed_environments=more.get("failed", {}),
                 installation=more.get("installation", ""),
             )
         )

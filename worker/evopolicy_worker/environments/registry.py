@@ -22,6 +22,7 @@ from evopolicy_worker.environments.families import foreign
 from evopolicy_worker.environments.interface import settings
 from evopolicy_worker.environments.interface.adapters import versions
 from evopolicy_worker.environments.interface.base import Environment
+from evopolicy_worker.environments.interface.calls import traced
 from evopolicy_worker.environments.interface.gymnasium_adapter import (
     GymnasiumEnvironment,
     GymnasiumFamily,
@@ -83,10 +84,13 @@ def describe(env_id: str) -> EnvironmentDescription:
     """The description of an environment. Makes it, and so imports the simulator; one that does not ship is also tried
     out for a few steps. Raises as `make`, and WorkerError when the trial fails.
     """
-    environment = make(env_id)
-    if not catalogue.is_shipped(env_id) and isinstance(environment, GymnasiumEnvironment):
-        environment.try_out()
-    description = measured(environment)
+    try:
+        environment = make(env_id)
+        if not catalogue.is_shipped(env_id) and isinstance(environment, GymnasiumEnvironment):
+            environment.try_out()
+        description = measured(environment)
+    except WorkerError as error:
+        raise type(error)(f"{error}{traced(error.__cause__)}") from error.__cause__
     left_out, found = tuple(foreign.left_out.get(env_id, ())), _entry(env_id)
     if found.success in left_out:
         raise WorkerError(

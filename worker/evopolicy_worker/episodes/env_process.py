@@ -10,6 +10,7 @@ commands.
 from __future__ import annotations
 
 import contextlib
+import faulthandler
 import os
 import queue
 import resource
@@ -109,6 +110,7 @@ class EnvProcess:
         # In addition to the monitor, for memory allocated between two of its checks; programs often reserve this much more than they use.
         most = 2 * start.limits.memory_bytes
         resource.setrlimit(resource.RLIMIT_DATA, (most, most))
+        faulthandler.enable(all_threads=False)  # so that a crash names the environment's lines
         calls.current.process = os.getpid()
         player = Player(zygote, plan, self._monitor, scratch)
         for command in early:

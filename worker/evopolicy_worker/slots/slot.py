@@ -35,7 +35,7 @@ from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_common.messages.episode import EpisodeOutcome, Job, PolicyFailure, Tier
 from evopolicy_common.processes import proc
 from evopolicy_common.processes.scratch import remove_tree
-from evopolicy_worker.environments.interface.calls import NOTE, USUAL, Limits, hung
+from evopolicy_worker.environments.interface.calls import NOTE, USUAL, Limits, hung, last_words
 from evopolicy_worker.environments.registry import remembers
 from evopolicy_worker.episodes.monitor import is_stopped
 from evopolicy_worker.sandbox import env_jail, jail
@@ -390,7 +390,7 @@ class Slot:
                     status = str(await process.wait())
         await asyncio.sleep(0)
         return (
-            f"the slot's process ended with status {status}; {' | '.join(self._stderr) or 'no stderr output'}"
+            f"the slot's process ended with status {status}; {last_words(self._stderr) or 'no stderr output'}"
         )
 
     async def _listen(self, process: asyncio.subprocess.Process) -> None:

@@ -49,10 +49,15 @@ def has_room(state: State, event: WorkerRegistered) -> bool:
         for each in state.workers.values()
         if each.machine == event.machine and each.name != event.message.worker
     ]
-    size = event.size + sum(map(len, event.message.undescribed))
+    size = event.size + _told_size(event.message)
     size += sum(profile.size for profile in {each.profile for each in others})
-    size += sum(each.undescribed_size for each in others)
+    size += sum(each.told_size for each in others)
     return len(others) < MAX_WORKERS and size <= MAX_DESCRIBED_BYTES
+
+
+def _told_size(message: wire.Register) -> int:
+    failed = message.failed_environments
+    return sum(map(len, (*message.undescribed, *failed, *failed.values())))
 
 
 def register(state: State, event: WorkerRegistered, kernel: Kernel, step: Step) -> Worker:
@@ -74,7 +79,8 @@ def register(state: State, event: WorkerRegistered, kernel: Kernel, step: Step) 
         missing_tiers=dict(message.missing_tiers),
         state="lost",
         undescribed=frozenset(message.undescribed),
-        undescribed_size=sum(map(len, message.undescribed)),
+        failed_environments=dict(message.failed_environments),
+        told_size=_told_size(message),
     )
     if old is not None:
         count_out(old)
@@ -84,8 +90,8 @@ def register(state: State, event: WorkerRegistered, kernel: Kernel, step: Step) 
         for lease in worker.leases.values():
             lease.orphan_until = step.now + state.settings.adoption_s
         state.sessions.pop(old.session, None)
-    for description in message.environments:
-        state.awaited.pop(description.env, None)
+    for env in (*(each.env for each in message.environments), *message.failed_environments):
+        state.awaited.pop(env, None)
     state.workers[message.worker] = worker
     state.sessions[worker.session] = worker.name
     count_in(state, worker)

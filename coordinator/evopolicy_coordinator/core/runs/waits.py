@@ -7,7 +7,8 @@ from evopolicy_coordinator.core.isolation import conflicts
 from evopolicy_coordinator.core.tables.model import Flow, JobGroup
 from evopolicy_coordinator.core.tables.state import State
 
-_LACKING_SHOWN = 3
+_SHOWN = 3
+"""At most so many workers are named with what they lack."""
 
 
 def waits_for(state: State, group: JobGroup) -> Reason | None:
@@ -51,6 +52,11 @@ def waits_for_workers(state: State, flow: Flow) -> Reason | None:
         and flow.tier in worker.missing_tiers
         and (flow.env in worker.profile.classes or flow.env in worker.undescribed)
     ]
+    failed = [
+        (worker.name, worker.failed_environments[flow.env])
+        for worker in state.workers.values()
+        if worker.state != "lost" and flow.env in worker.failed_environments
+    ]
     return because(
         "workers",
         env=flow.env,
@@ -58,5 +64,6 @@ def waits_for_workers(state: State, flow: Flow) -> Reason | None:
         same_versions=len(same) < len(able),
         away=tuple(sorted(away)),
         connected=any(worker.state != "lost" for worker in state.workers.values()),
-        lacking=tuple(lacking[:_LACKING_SHOWN]),
+        lacking=tuple(lacking[:_SHOWN]),
+        failed=() if able or later else tuple(failed[:_SHOWN]),
     )

@@ -615,8 +615,10 @@ class Worker:
     benched_until: float = 0.0
     undescribed: frozenset[str] = frozenset()
     """Environments that it offers and describes only when a run waits for them."""
-    undescribed_size: int = 0
-    """Characters of their ids."""
+    failed_environments: dict[str, str] = field(default_factory=dict)
+    """Environments that it should offer and that failed there, with the reasons."""
+    told_size: int = 0
+    """Characters of `undescribed` and `failed_environments`."""
 
     def numerics(self, env: str) -> str:
         """Identifies what its numbers in an environment depend on, the processor's features included: equal for workers

@@ -143,6 +143,14 @@ def _cluster_notices(cluster: Cluster, status: StatusReply) -> list[dict[str, An
         ),
     )
     tell(
+        "Environments that failed on a worker",
+        (
+            f"{worker.worker}: {env}: {why}"
+            for worker in status.workers
+            for env, why in worker.failed_environments.items()
+        ),
+    )
+    tell(
         "Workers that play no hidden episodes now",
         (f"{worker.worker}: {worker.hidden_bar}" for worker in status.workers if worker.hidden_bar),
     )

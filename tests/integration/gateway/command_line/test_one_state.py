@@ -170,3 +170,7 @@ def test_a_browser_is_that_of_a_cluster_that_the_command_brings_up(tmp_path: Pat
         code, _, err = done(tmp_path, *words, *browser)
         assert code == 2
         assert "give it to each evopolicy-worker" in err
+    words = ("try", "examples", "--env", "toy/line", "--credentials", "x", "--env-timeout", "5")
+    code, _, err = done(tmp_path, *words)
+    assert code == 2
+    assert "give them to each evopolicy-worker" in err

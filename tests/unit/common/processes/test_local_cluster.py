@@ -170,6 +170,17 @@ def test_a_worker_that_dies_again_and_again_is_given_up(
     assert bring_up(tmp_path) == "worker keeps ending: no room"
 
 
+def test_a_worker_whose_modules_are_missing_is_given_up_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    starts = tmp_path / "starts"
+    programs(monkeypatch, SERVES, f"open({str(starts)!r}, 'a').write('.'); import no_such_module")
+    assert bring_up(tmp_path).startswith(
+        "worker does not start: ModuleNotFoundError: No module named 'no_such_module'; see "
+    )
+    assert starts.read_text() == "."
+
+
 def test_a_worker_that_dies_now_and_then_is_started_again_however_often(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -194,7 +205,13 @@ def test_workers_divide_the_slots_of_an_audited_cluster(
 
     async def main() -> None:
         async with local_cluster.local_cluster(
-            "test", data=Path("d"), audit=0.5, policy_packages=["scipy"], browser=Path("/opt/chrome")
+            "test",
+            data=Path("d"),
+            audit=0.5,
+            policy_packages=["scipy"],
+            browser=Path("/opt/chrome"),
+            env_timeout=2.5,
+            env_memory=512,
         ) as cluster:
             await cluster.start_workers(["toy/line", "toy/maze"], slots=5)
 
@@ -210,7 +227,7 @@ def test_workers_divide_the_slots_of_an_audited_cluster(
         "scipy",
     ]
     own = " ".join(started["test-worker"])
-    assert "--policy-package scipy --browser /opt/chrome" in own
+    assert "--policy-package scipy --browser /opt/chrome --env-timeout 2.5 --env-memory 512" in own
     assert started["test-worker"][-6:] == ["--env", "toy/line", "--env", "toy/maze", "--slots", "3"]
     assert started["test-worker-2"][-2:] == ["--slots", "2"]
 

@@ -59,3 +59,4 @@ def test_descriptions_of_a_token_have_a_bounded_size(monkeypatch: pytest.MonkeyP
     assert not joins(rig, "w0", version="3", size=40), "nor in the place of one that stays in use"
     assert joins(rig, "w3", version="3", size=40), "but in the place of one that does not"
     assert not joins(rig, "w5", version="3", undescribed=("toy/another-one-of-many",) * 5)
+    assert not joins(rig, "w5", version="3", failed_environments={"my/x": "why" * 50})

@@ -17,7 +17,7 @@ from evopolicy_common.messages import worker as wire
 from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_coordinator.core.runs.waits import waits_for_workers
 from evopolicy_coordinator.core.workers import scheduler
-from evopolicy_coordinator.server.reason_texts import words
+from evopolicy_coordinator.server.reason_texts import env_failure, words
 from evopolicy_worker.environments.interface.fingerprint import PACKAGES
 
 
@@ -479,6 +479,22 @@ def test_a_run_waits_for_its_connected_workers_description_only() -> None:
     rig.tell(asked(operator.SetWorker, request="away", worker="w2", state="paused"))
     assert words(waits_for_workers(rig.core.state, flow)).endswith(": those that do are paused")
     rig.register("w3")
+    assert waits_for_workers(rig.core.state, flow) is None
+
+
+def test_a_run_learns_why_its_environment_failed_until_a_worker_offers_it() -> None:
+    rig = Rig()
+    rig.create()
+    flow = rig.core.state.runs["r1"].flow
+    rig.register("w1", envs=("toy/maze",), failed={ENV: "step 3: it raised KeyError"})
+    assert env_failure(waits_for_workers(rig.core.state, flow)) == "step 3: it raised KeyError"
+    (worker,) = rig.status().workers
+    assert worker.failed_environments == {ENV: "step 3: it raised KeyError"}
+    rig.register("w2", envs=(), undescribed=(ENV,))
+    assert not env_failure(waits_for_workers(rig.core.state, flow))
+    rig.register("w2", envs=())
+    assert env_failure(waits_for_workers(rig.core.state, flow))
+    rig.register("w1", envs=(ENV,))
     assert waits_for_workers(rig.core.state, flow) is None
 
 

@@ -12,6 +12,7 @@ import pytest
 
 import evopolicy_coordinator.core
 from evopolicy_common.messages import gateway
+from evopolicy_common.messages.operator import RunProgress
 from evopolicy_common.messages.worker import Refused
 from evopolicy_common.refusals import Refusal
 from evopolicy_coordinator.core.contract.effects import Refuse, Reply
@@ -59,6 +60,7 @@ def test_a_reason_about_another_is_put_into_one_sentence() -> None:
         away=("lost", "quarantined"),
         connected=True,
         lacking=(),
+        failed=(),
     )
     assert words(because("no_worker_yet", waits_for=missing)) == (
         "the run waits for a worker that offers gym/x with sandbox tier bwrap, of the versions that the run started with:"
@@ -68,7 +70,8 @@ def test_a_reason_about_another_is_put_into_one_sentence() -> None:
 
 def test_an_installation_is_advised_only_where_a_worker_is_connected() -> None:
     """A local worker that is starting lacks none."""
-    missing = {"env": "gym/acrobot", "tier": "bwrap", "same_versions": False, "away": (), "lacking": ()}
+    missing = {"env": "gym/acrobot", "tier": "bwrap", "same_versions": False, "away": ()}
+    missing |= {"lacking": (), "failed": ()}
     assert "setup gymnasium" in words(because("workers", connected=True, **missing))
     assert words(because("workers", connected=False, **missing)) == (
         "a worker that offers gym/acrobot with sandbox tier bwrap; no worker is connected yet"
@@ -78,10 +81,25 @@ def test_an_installation_is_advised_only_where_a_worker_is_connected() -> None:
 def test_a_tier_that_does_not_work_is_told_with_its_workers() -> None:
     lacking = (("lab-1", "bwrap: No permissions to create a new namespace"), ("lab-2", "no bwrap on PATH"))
     about = {"env": "gym/acrobot", "tier": "bwrap", "same_versions": False, "away": (), "connected": True}
+    about["failed"] = ()
     assert words(because("workers", lacking=lacking, **about)) == (
         "a worker that offers gym/acrobot with sandbox tier bwrap (the tier does not work on lab-1: bwrap: No permissions to"
         " create a new namespace; lab-2: no bwrap on PATH)"
     )
+
+
+def test_why_an_environment_failed_is_told_to_operators_alone() -> None:
+    about = {"env": "my/x", "tier": "bwrap", "same_versions": False, "away": (), "connected": True}
+    why = 'step 3: it raised KeyError: 7; File "/home/me/secret.py", line 3'
+    waits = because("workers", lacking=(), failed=(("lab-1", why), ("lab-2", "another")), **about)
+    for_agents = "a worker that offers my/x with sandbox tier bwrap; it failed on lab-1, lab-2"
+    assert words(waits) == for_agents
+    progress = message(Reply(request=1, message=RunProgress(phase="open", done=0, total=1), waits_for=waits))
+    assert isinstance(progress, RunProgress)
+    assert (progress.waits_for, progress.env_failure) == (f"{for_agents}: {why}", why)
+    permit = message(Reply(request=1, message=gateway.Permit(granted=False), waits_for=waits))
+    assert isinstance(permit, gateway.Permit)
+    assert permit.waits_for == for_agents
 
 
 def test_a_refusal_is_answered_with_its_status_and_words() -> None:

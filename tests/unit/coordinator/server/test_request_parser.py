@@ -301,6 +301,9 @@ def test_an_oversized_blob_is_never_read(
         ({"environments": (describe(),) * 10_001}, "bad_message"),
         ({"undescribed": ("../\x1b[2J",)}, "bad_message"),
         ({"installation": "x" * 1000}, "bad_message"),
+        ({"failed_environments": {"../\x1b[2J": "x"}}, "bad_message"),
+        ({"failed_environments": {f"my/e{n}": "" for n in range(10_001)}}, "bad_message"),
+        ({"failed_environments": {f"my/e{n}": "x" * 2000 for n in range(33)}}, "bad_message"),
     ],
 )
 def test_wrong_registration_is_refused(parser: RequestParser, changes: dict[str, Any], status: str) -> None:

@@ -7,6 +7,8 @@ in `info` may tell of the machine, so only those that the definition declares ar
 from __future__ import annotations
 
 import hashlib
+import os
+import sys
 from collections.abc import Mapping
 from functools import cache
 from importlib.metadata import packages_distributions, version
@@ -15,8 +17,10 @@ from pathlib import Path
 from typing import Any
 
 from evopolicy_common.catalogue import Entry
+from evopolicy_common.errors import WorkerError
 from evopolicy_worker.environments.families import miniwob
 from evopolicy_worker.environments.interface.adapters import versions
+from evopolicy_worker.environments.interface.calls import unreadable
 from evopolicy_worker.environments.interface.gymnasium_adapter import GymnasiumFamily
 
 _OF_GYMNASIUM = ("mujoco", "box2d", "pygame-ce", "ale-py")
@@ -38,6 +42,7 @@ class ForeignFamily(GymnasiumFamily):
     measures = True
 
     def __init__(self, entry: Entry) -> None:
+        self._id = entry.id
         name = entry.gymnasium_id or ""
         self._module = name.partition(":")[0] if ":" in name else ""
         self._told = frozenset(entry.info_strings)
@@ -48,6 +53,14 @@ class ForeignFamily(GymnasiumFamily):
 
     def needs(self) -> str:
         return f"the package with the module {self._module!r} (installed, or in a folder on PYTHONPATH)"
+
+    def load(self) -> None:
+        top = self._module.partition(".")[0]
+        for path in (os.path.join(folder, name) for folder in sys.path for name in (top, f"{top}.py")):
+            # Python takes such a package for an empty one.
+            if top and os.path.exists(path) and not os.access(path, os.R_OK | os.X_OK * os.path.isdir(path)):
+                raise WorkerError(f"environment {self._id}, make: it cannot read {path}{unreadable(path)}")
+        super().load()
 
     def rebuilds(self, entry: Entry) -> bool:
         return True

@@ -10,6 +10,10 @@ import os
 import re
 import resource
 import sys
+import sysconfig
+import traceback
+from collections.abc import Iterable
+from importlib.util import find_spec
 from typing import Literal
 
 import msgspec
@@ -25,6 +29,17 @@ _LONGEST_LOOK_S = 1.0
 """More time between two looks does not count: this process was not let run."""
 _MEMORY_LOOK_S = 0.5
 _PAGE = resource.getpagesize()
+_NOT_THEIRS = tuple(
+    os.path.join(folder, "")
+    for name in ("evopolicy_worker", "gymnasium")
+    if (spec := find_spec(name)) is not None
+    for folder in spec.submodule_search_locations or ()
+)
+_LIBRARIES = tuple(os.path.join(sysconfig.get_path(name), "") for name in ("stdlib", "purelib", "platlib"))
+_STACK_LINE = re.compile(r'\s+File "([^"]+)", line \d+ in ')
+"""Of a stack that `faulthandler` writes, the innermost first."""
+_SHOWN_LINES, _LONGEST_LINE = 3, 240
+"""Of a traceback: its last lines, and characters of each."""
 
 
 class Call:
@@ -126,13 +141,52 @@ def described(error: BaseException) -> str:
     return one_line(f"{type(error).__name__}: {text}{_not_shown(error, text)}")
 
 
+def traced(error: BaseException | None) -> str:
+    """The last lines of the traceback that are the environment's own, to be appended to a text; empty if there are none."""
+    if error is None:
+        return ""
+    lines = _own(
+        (each.filename, f'File "{each.filename}", line {each.lineno}, in {each.name}: {each.line}')
+        for each in traceback.extract_tb(error.__traceback__)
+    )
+    # Without any: raised by Gymnasium for an error of theirs.
+    return "".join(f"; {line}" for line in lines) or traced(error.__cause__)
+
+
+def last_words(stderr: Iterable[str]) -> str:
+    """The last lines that a process wrote to its standard error, as one text; of a crash's stack only the environment's own."""
+    said: list[str] = []
+    stack: list[tuple[str, str]] = []
+    for line in stderr:
+        if found := _STACK_LINE.match(line):
+            stack.insert(0, (found[1], line.strip()))
+        elif line and not line.startswith(("Stack (most recent", "Extension modules")):
+            said.append(line)
+    return " | ".join([*said, *_own(stack)])
+
+
+def _own(frames: Iterable[tuple[str, str]]) -> list[str]:
+    """Of pairs of file and text, the innermost last, the last texts that are the environment's own."""
+    others = [each for each in frames if not each[0].startswith((*_NOT_THEIRS, "<frozen "))]
+    own = [each for each in others if not each[0].startswith(_LIBRARIES)] or others
+    return [one_line(text)[:_LONGEST_LINE] for _, text in own[-_SHOWN_LINES:]]
+
+
+def unreadable(path: str) -> str:
+    """The cause and the remedy for a file or folder that this process may not read, to be appended to a text."""
+    return f"; environments run as user {os.getuid()}, who has no permission for it: chmod -R a+rX {path}"
+
+
 def _not_shown(error: BaseException, text: str) -> str:
+    if isinstance(error, PermissionError) and isinstance(error.filename, str):
+        return unreadable(error.filename)
     for folder in own_folders if isinstance(error, OSError | ValueError) else ():
         found = re.search(rf"{re.escape(folder)}/([^'\"\n]+)", text)
         if found is not None and not os.path.exists(found[0]):
             return f"; {found[1]} is not shown to the environment: if it exists, declare it in data of an environment file"
-    if isinstance(error, ModuleNotFoundError) and own_folders:
-        return f"; if {error.name} is a folder on PYTHONPATH, it needs an __init__.py to be shown"
+    name = getattr(error, "name", None) or getattr(error.__cause__, "name", None)
+    if isinstance(error, ModuleNotFoundError) and name and own_folders:
+        return f"; if {name} is a folder on PYTHONPATH, it needs an __init__.py to be shown"
     return ""
 
 
@@ -145,7 +199,7 @@ def raised(error: BaseException, text: str, limits: Limits) -> str:
         return f"{current}: there is no memory left for it; mend what it keeps, or raise the worker's --env-memory ({most:,} MiB)"
     if isinstance(error, EvopolicyError):
         return text
-    return f"{current}: it raised {text}; correct the environment"
+    return f"{current}: it raised {text}; correct the environment{traced(error)}"
 
 
 def resident_bytes() -> int:

@@ -276,7 +276,7 @@ class GymnasiumEnvironment(Environment):
             fault = trial.misshapen(returned, error, vector=self._rewards is not None)
             raise WorkerError(f"{call}, {fault}") from error
         if self._promises is not None:
-            self._promises.after_step(step, obs)
+            self._promises.after_step(step, obs, reward)
         call.done()
         return step
 

@@ -24,6 +24,9 @@ from evopolicy_worker.environments.interface.calls import described, note
 STEPS = 32
 SEEDS = (0, 1)
 _OF_FORM = "an array of shape"
+_WRAP = "; if it is not yours, name a wrapper that corrects it in an environment file (wrappers)"
+_ROUNDING = 1e-6
+"""By so much of a bound an observation may be beyond it, as sums and products of floating-point numbers are."""
 
 
 class Promises:
@@ -44,6 +47,7 @@ class Promises:
         self._reported = False
         self._spaces = {"observation_space": obs_space, "action_space": action_space}
         self._outside = spaces.compile_checker(obs_space)
+        self._far_outside = spaces.compile_checker(_widened(obs_space))
 
     def after_reset(self, returned: Any) -> None:
         if not (isinstance(returned, tuple) and len(returned) == 2 and isinstance(returned[1], Mapping)):
@@ -52,8 +56,10 @@ class Promises:
             )
         self._check_spaces()
 
-    def after_step(self, step: Step, raw: Any) -> None:
-        """`raw`: the observation as the environment gave it."""
+    def after_step(self, step: Step, raw: Any, reward: Any) -> None:
+        """`raw`, `reward`: as the environment gave them."""
+        if isinstance(reward, str | bytes):  # of which `float` makes a number, too
+            raise WorkerError(f"{call}, reward: it is {_shown(reward)}; a reward has to be one number")
         if not math.isfinite(step.reward):
             raise WorkerError(f"{call}, reward: it is {step.reward}; rewards have to be finite")
         self.observation(step.obs, raw)
@@ -76,11 +82,33 @@ class Promises:
         if not fault:
             return
         text = f"{call}, observation: {fault}; correct the environment, or its observation_space"
-        if self.strict or _OF_FORM in fault:
-            raise WorkerError(text)
+        far = _altered(obs, raw) or self._far_outside(obs)
+        if _OF_FORM in fault or (self.strict and far):
+            raise WorkerError(f"{text}{_WRAP}")
         if not self._reported:
             self._reported = True
             note(text)
+
+
+def _widened(schema: SpaceSchema) -> SpaceSchema:
+    """The space with bounds that rounding errors do not pass."""
+    inner = schema.get("spaces")
+    if isinstance(inner, dict):
+        return {**schema, "spaces": {key: _widened(part) for key, part in inner.items()}}
+    if inner is not None:
+        return {**schema, "spaces": [_widened(part) for part in inner]}
+    if "space" in schema:
+        return {**schema, "space": _widened(schema["space"])}
+    if schema["type"] != "Box" or not schema["dtype"].startswith("float"):
+        return schema
+    return {**schema, "low": _beyond(schema["low"], -_ROUNDING), "high": _beyond(schema["high"], _ROUNDING)}
+
+
+def _beyond(bound: Any, part: float) -> Any:
+    """Bounds as in a schema, moved outwards by a part of their size."""
+    if isinstance(bound, list):
+        return [_beyond(each, part) for each in bound]
+    return bound if isinstance(bound, str) else bound + part * max(1.0, abs(bound))
 
 
 def _altered(obs: Any, raw: Any) -> str:
