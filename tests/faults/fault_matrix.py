@@ -30,7 +30,7 @@ from pathlib import Path
 import chaos
 import pytest
 from fault_cluster import EPISODES, SUBMITS, TIMEOUT_S, TOTAL, FaultCluster, Site, fault_cluster, record
-from host_faults import enter_namespaces, full_file_system, out_of_memory
+from host_faults import enter_namespaces, full_file_system, out_of_memory, read_only_mount
 from weak_link import How
 
 from evopolicy_common.errors import RefusedError, TransportError
@@ -64,6 +64,8 @@ ONE_HOST = (
     ("coordinator", "no file may grow"),
     ("coordinator", "file system full"),
     ("run", "file system full"),
+    ("coordinator", "mounted read-only"),
+    ("run", "mounted read-only"),
     ("link", "cut"),
     ("link", "stalled past its leases"),
     ("link", "slow"),
@@ -209,6 +211,10 @@ def strike(cluster: FaultCluster, case: Case, row: Row) -> bool:
         with full_file_system(cluster.state if case.target == "coordinator" else cluster.runs):
             if case.target == "coordinator":
                 row.wrong += asyncio.run(refusals(cluster, case.name))
+            time.sleep(DISK_FULL_S)
+        return True
+    if case.fault == "mounted read-only":
+        with read_only_mount(cluster.state if case.target == "coordinator" else cluster.runs):
             time.sleep(DISK_FULL_S)
         return True
     if case.target == "everything":

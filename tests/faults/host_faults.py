@@ -52,6 +52,18 @@ def full_file_system(folder: Path) -> Iterator[None]:
 
 
 @contextlib.contextmanager
+def read_only_mount(folder: Path) -> Iterator[None]:
+    """Whatever is opened for writing below `folder` ends with EROFS. What is open already can be written: the kernel refuses to
+    remount a file system with such files."""
+    subprocess.run(["mount", "--bind", folder, folder], check=True)
+    subprocess.run(["mount", "-o", "remount,bind,ro", folder], check=True)
+    try:
+        yield
+    finally:
+        subprocess.run(["umount", "--lazy", folder], check=True)
+
+
+@contextlib.contextmanager
 def out_of_memory(pid: int, timeout_s: float = 10.0) -> Iterator[bool]:
     """The process may take no more memory, so that the kernel kills it; False when it asked for none in that time."""
     with cgroups.limited(4096) as group:

@@ -324,11 +324,14 @@ async def operator_of(coordinator: Coordinator) -> AsyncIterator[OperatorClient]
 
 
 @contextlib.asynccontextmanager
-async def gateway_of(coordinator: Coordinator, created: operator.RunCreated) -> AsyncIterator[GatewayClient]:
+async def gateway_of(
+    coordinator: Coordinator, created: operator.RunCreated, boot_id: str = "agents"
+) -> AsyncIterator[GatewayClient]:
+    """The run's gateway, whose agent may be alive on that kernel."""
     async with connect(coordinator.credentials("gateway")) as link:
         client = GatewayClient(link, created.run, created.capability)
         with contextlib.suppress(RefusedError):  # of a run that is over
-            await client.permit("agents")
+            await client.permit(boot_id)
         yield client
 
 

@@ -4,8 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import random
+import shutil
+import subprocess
+import sys
 from pathlib import Path
+from typing import Any
 
+import pytest
 from coordinator_harness import (
     Coordinator,
     InstantWorker,
@@ -17,7 +22,7 @@ from coordinator_harness import (
     working,
 )
 
-from evopolicy_common.messages.operator import RunFinished
+from evopolicy_common.messages.operator import RunCreated, RunFinished
 from evopolicy_common.wire.transport import connect
 
 SUBMITS = (((0, 1, 1, 5), "# one"), ((2, 3), "# two"), ((7, 7, 7, 7, 8, 9), "# three"))
@@ -79,6 +84,73 @@ def test_coordinator_killed_through_a_whole_run_ends_with_the_same_outcome(tmp_p
             holder[0].kill()
     assert outcomes[0]["budget_used"] == 12
     assert outcomes[1] == outcomes[0]
+
+
+@pytest.mark.slow
+def test_a_run_goes_on_from_a_backup_on_another_machine(tmp_path: Path) -> None:
+    """Another path, socket, worker and kernels; the first machine is gone with its worker's leases and its agent's permit."""
+    state, backup, moved = tmp_path / "state", tmp_path / "backup", tmp_path / "elsewhere" / "state"
+    first = Coordinator(state)
+
+    async def begun() -> RunCreated:
+        async with (
+            operator_of(first) as operator,
+            gateway_of(first, created := await operator.create()) as gateway,
+        ):
+            async with working(first, "w-1"):
+                await gateway.submit(bundle_of(SUBMITS[0][1]), SUBMITS[0][0], "submit-0")
+                await gateway.results(0)
+            async with connect(first.credentials("worker")) as link:
+                lost = InstantWorker(link, "w-2")
+                await lost.register()
+                await gateway.submit(bundle_of(SUBMITS[1][1]), SUBMITS[1][0], "submit-1")
+                assert await lost.lease(1, 10.0)
+                program = [
+                    sys.executable,
+                    "-m",
+                    "evopolicy_coordinator.cli",
+                    "backup",
+                    backup,
+                    "--state",
+                    state,
+                ]
+                await asyncio.to_thread(subprocess.run, program, check=True)
+            return created
+
+    async def went_on(second: Coordinator, created: RunCreated) -> dict[str, Any]:
+        async with operator_of(second) as operator, working(second, "w-9"):
+            assert await operator.create() == created
+            async with gateway_of(second, created, "agents elsewhere") as gateway:
+                await gateway.results(1)
+                await gateway.submit(bundle_of(SUBMITS[2][1]), SUBMITS[2][0], "submit-2")
+                await gateway.results(2)
+                await gateway.close()
+            return comparable(await operator.finished(created.run))
+
+    async def calm(third: Coordinator) -> dict[str, Any]:
+        async with working(third):
+            return comparable(await whole_run(third))
+
+    try:
+        created = asyncio.run(asyncio.wait_for(begun(), 60))
+    finally:
+        first.kill()
+    moved.parent.mkdir()
+    shutil.copytree(backup, moved)
+    shutil.rmtree(state)
+    second = Coordinator(moved)
+    try:
+        outcome = asyncio.run(asyncio.wait_for(went_on(second, created), 90))
+    finally:
+        second.kill()
+    undisturbed = tmp_path / "undisturbed"
+    undisturbed.mkdir(mode=0o700)
+    shutil.copy2(moved / "secret", undisturbed / "secret")
+    third = Coordinator(undisturbed)
+    try:
+        assert asyncio.run(asyncio.wait_for(calm(third), 60)) == outcome
+    finally:
+        third.kill()
 
 
 def test_accepted_submit_survives_kill_before_any_result(tmp_path: Path) -> None:
