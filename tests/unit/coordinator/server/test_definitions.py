@@ -97,6 +97,15 @@ def test_what_nobody_offers_is_refused_with_what_is_near() -> None:
     assert strict().pin("toy/line", "", workers()) == ""
 
 
+def test_what_failed_on_every_worker_is_refused_with_the_reason() -> None:
+    rig = Rig()
+    rig.register("w1", envs=(), failed={"acme/glider": "step 3: it raised KeyError"})
+    with pytest.raises(
+        RefusedError, match="no worker offers acme/glider; it failed on w1: step 3: it raised"
+    ):
+        strict().pin("acme/glider", "", rig.core.state.workers.values())
+
+
 def test_a_run_is_played_in_the_definition_that_it_names_alone() -> None:
     rig = Rig()
     easier = describe("toy/line", adapter="1.1+aa", max_episode_steps=1)
