@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 from evopolicy_common import catalogue
 from evopolicy_common.catalogue import installs
-from evopolicy_common.cli.conventions import USAGE_ERROR
+from evopolicy_common.cli.conventions import FAILURE, USAGE_ERROR
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.episode import Tier
 from evopolicy_common.processes.child_process import ChildProcess, last_words
@@ -150,7 +150,8 @@ async def local_cluster(
     worker replays, 0 to 1. `hidden_isolation`: the coordinator's option, None for its default. `unjailed`: agents could
     read the folder; see the coordinator's `--unjailed-agents`. `policy_packages`: those that policies may import besides numpy.
     `browser`: the workers' Chromium; None for the machine's own. `env_timeout`, `env_memory`: the workers' options (seconds,
-    MiB), None for their defaults. `workers`: workers to start at once, in parallel with the coordinator. Raises ConfigError when the coordinator does not start (the folder may be in use).
+    MiB), None for their defaults. `workers`: workers to start at once, in parallel with the coordinator. Raises
+    ConfigError when the coordinator does not start (the folder may be in use).
     """
     with contextlib.ExitStack() as folders:
         root = folders.enter_context(scratch_folder(kind)) if state is None else state
@@ -319,7 +320,7 @@ class _Processes:
             reason = last_words(child.log) or f"see {child.log}"
             if code == USAGE_ERROR:
                 raise ConfigError(reason)
-            if reason.startswith(_IN_VAIN):
+            if code == FAILURE and reason.startswith(_IN_VAIN):
                 raise ConfigError(f"{name} does not start: {reason}; see {child.log}")
             if deaths == _MAX_DEATHS:
                 raise ConfigError(f"{name} keeps ending: {reason}")

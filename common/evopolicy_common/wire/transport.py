@@ -285,11 +285,11 @@ async def _take_renewed(link: Link, read_again: Callable[[], Credentials]) -> No
             if content == used:
                 continue
             session = await asyncio.to_thread(zenoh.open, client_config(found))
+            await asyncio.to_thread(link.replace, session, found)
         except (ConfigError, OSError, zenoh.ZError) as error:
             # The folder is being copied, or the coordinator does not admit them yet.
             log.debug("renewed credentials cannot be used yet", why=str(error))
             continue
-        await asyncio.to_thread(link.replace, session, found)
         used = content
         log.info("renewed credentials are in use", user=found.user)
 

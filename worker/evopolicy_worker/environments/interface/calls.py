@@ -179,7 +179,7 @@ def unreadable(path: str) -> str:
 
 def _not_shown(error: BaseException, text: str) -> str:
     if isinstance(error, PermissionError) and isinstance(error.filename, str):
-        return unreadable(error.filename)
+        return "" if os.access(error.filename, os.R_OK) else unreadable(error.filename)
     for folder in own_folders if isinstance(error, OSError | ValueError) else ():
         found = re.search(rf"{re.escape(folder)}/([^'\"\n]+)", text)
         if found is not None and not os.path.exists(found[0]):
