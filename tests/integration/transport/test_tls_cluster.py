@@ -194,7 +194,7 @@ def test_machines_reconnect_after_an_issue_or_a_restart(
 
 
 @pytest.mark.slow  # until the certificate is over, and the leases
-def test_a_worker_whose_certificate_expires_in_a_run_goes_on_with_a_renewed_one(
+def test_a_worker_goes_on_with_a_renewed_certificate_in_a_run(
     certs: OwnCerts, coordinator: Coordinator
 ) -> None:
     boss = certs.issue("operator", "boss")

@@ -133,7 +133,7 @@ def test_a_finished_run_that_another_host_took_meanwhile_is_not_written_here(
 
 
 @pytest.mark.parametrize("ours", [False, True])
-def test_a_host_that_takes_a_claim_that_was_given_back_ends_the_other_hosts_run(
+def test_a_claim_that_was_given_back_ends_the_earlier_hosts_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ours: bool
 ) -> None:
     stage = Stage(tmp_path, HEAD + EVOLVE.format("a"), monkeypatch)
