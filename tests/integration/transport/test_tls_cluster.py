@@ -198,7 +198,7 @@ def test_a_worker_goes_on_with_a_renewed_certificate_in_a_run(
     certs: OwnCerts, coordinator: Coordinator
 ) -> None:
     boss = certs.issue("operator", "boss")
-    machine = certs.issue("worker", "w", now() - dt.timedelta(days=DAYS) + dt.timedelta(seconds=15))
+    machine = certs.issue("worker", "w")
     log = certs.root / "worker.log"
     arguments = ("--env", "toy/line", "--slots", "1", "--unsandboxed", "--credentials", str(machine))
 
@@ -209,6 +209,8 @@ def test_a_worker_goes_on_with_a_renewed_certificate_in_a_run(
                 gateway = GatewayClient(link, created.run, created.capability)
                 await gateway.submit(bundle_of(POLICY), IDS, "first")
                 await gateway.results(0)
+                soon = now() - dt.timedelta(days=DAYS) + dt.timedelta(seconds=8)
+                certs.issue("worker", "w", soon, again=True)
                 while (await operator.status()).workers[0].state != "lost":
                     assert worker.poll() is None, log.read_text()
                     await asyncio.sleep(0.2)
