@@ -16,8 +16,7 @@ from evopolicy_results.html import visible
 from evopolicy_results.html.small_timeline import small_timeline
 from evopolicy_results.reading.environments import suite_title, title_of
 from evopolicy_results.reading.records import Run, Submit
-from evopolicy_results.scan.signals import TITLES
-from evopolicy_results.simulators.look import Flag
+from evopolicy_results.scan.signals import TITLES, Signal
 from evopolicy_results.studies.palette import Look
 from evopolicy_results.studies.study import Study
 from evopolicy_results.tables.run_tables import submits_text
@@ -340,24 +339,19 @@ def trace_page(
         rows=[_trace_row(row, trace, anchors, image_links.get(row.submit.index, ()), videos.get(row.submit.index)) for row in trace.rows],
         unplaced=trace.unplaced,
         simulation_allowed=run.simulation_allowed,
-        flags=[_flag(flag) for flag in run.simulator_flags],
-        signals=[
-            {"title": TITLES[each.kind], "path": each.path, "line": each.line, "reason": each.reason, "quote": each.quote,
-             "submits": submits_text(each.submits)}
-            for each in run.signals
-        ],
+        flags=[_evidence(each) for each in run.simulator_flags],
+        signals=[_evidence(each) for each in run.signals if each not in run.simulator_flags],
         checkpoints=checkpoints,
     )  # fmt: skip
 
 
-def _flag(flag: Flag) -> dict[str, Any]:
+def _evidence(each: Signal) -> dict[str, Any]:
     return {
-        "kind": flag.kind,
-        "path": flag.path,
-        "lines": f"{flag.line}–{flag.end_line}",
-        "submits": submits_text(flag.submits),
-        "reasons": flag.reasons,
-        "quote": "\n".join(flag.quote),
+        "title": TITLES[each.kind],
+        "place": each.place,
+        "submits": submits_text(each.submits),
+        "reason": each.reason,
+        "quote": each.quote,
     }
 
 

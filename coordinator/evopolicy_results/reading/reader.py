@@ -30,9 +30,8 @@ from evopolicy_results.reading import published
 from evopolicy_results.reading.parallel import in_processes
 from evopolicy_results.reading.published import PUBLISHED, PublishedSummary
 from evopolicy_results.reading.records import LeftOut, Run, Source, Submit, checkpoint_folder
-from evopolicy_results.scan.run import feedback_actions, log_lines, policy_files, scan
+from evopolicy_results.scan.run import feedback_actions, log_lines, policy_files, scan, workspace_files
 from evopolicy_results.scan.signals import Signal
-from evopolicy_results.simulators.look import Flag, flags_of
 
 Files = Mapping[str, bytes]
 
@@ -133,8 +132,6 @@ def read_run(folder: Path) -> Run:
     if outcome.status == "completed" and selected is None:
         raise UnreadableRunError(f"the selected submit {outcome.best_submit_index} has no files")
     run = Run(path=folder, record=record, submits=submits)
-    if not run.simulation_allowed:
-        run = msgspec.structs.replace(run, simulator_flags=_simulators(run))
     run = msgspec.structs.replace(run, signals=_signals(run))
     try:
         check_plausible({"run.json": run.record, "submits": run.submits})
@@ -145,29 +142,19 @@ def read_run(folder: Path) -> Run:
 
 def _signals(run: Run) -> tuple[Signal, ...]:
     artifacts = run.record.artifacts
-    feedback = run.path / (artifacts.workspace or "workspace") / "feedback"
+    workspace = run.path / (artifacts.workspace or "workspace")
     checkpoints = (
         (submit.index, policy_files(policy_folder(run.checkpoint(submit.index)))) for submit in run.submits
     )
     log = run.path / (artifacts.logs_agent or "logs/agent.jsonl")
 
     def trajectories(index: int) -> Iterator[list[Any]]:
-        return feedback_actions(checkpoint_folder(feedback.parent, "feedback", index))
+        return feedback_actions(checkpoint_folder(workspace, "feedback", index))
 
-    return scan(checkpoints, log_lines(log), trajectories)
-
-
-def _simulators(run: Run) -> tuple[Flag, ...]:
-    def files_of(submit: Submit) -> Files:
-        try:
-            return read_python_files(policy_folder(run.checkpoint(submit.index)))
-        except OSError:
-            return {}
-
-    artifacts = run.record.artifacts
-    log = run.path / artifacts.logs_agent if artifacts.logs_agent else None
-    workspace = run.path / (artifacts.workspace or "workspace")
-    return flags_of(((submit.index, files_of(submit)) for submit in run.submits), workspace, log, run.env)
+    if run.simulation_allowed:
+        return scan(checkpoints, log_lines(log), trajectories)
+    files = workspace_files(workspace)
+    return scan(checkpoints, log_lines(log), trajectories, env=run.env, workspace=files)
 
 
 def _read_record(folder: Path) -> RunRecord:

@@ -1,4 +1,5 @@
-"""Signals in a checkpoint's Python files: network and simulator imports, and tables keyed by observation hashes or cases.
+"""Signals in Python files: network and simulator imports, numbers of the environment's dynamics, and tables keyed by
+observation hashes or cases.
 
 A table keyed by observations or cases is memory of single episodes. Two forms are found:
 - a lookup (`table[key]`, `.get(key)`) whose key is a hash or the bytes of a value (`hash`, `hashlib`, `crc32`, `tobytes`);
@@ -18,6 +19,7 @@ import msgspec
 from evopolicy_common.records.code_metrics import parse
 from evopolicy_common.simulators import SIMULATORS
 from evopolicy_results.code.sources import MAX_FILE_BYTES
+from evopolicy_results.scan.constants import dynamics_constants
 from evopolicy_results.scan.signals import Kind, Signal, signal
 
 _NETWORK = frozenset(
@@ -35,6 +37,9 @@ _NETWORK = frozenset(
         "paramiko",
     }
 )
+_SIMULATORS = frozenset(SIMULATORS) | {
+    *("brax", "gymnax", "pymunk", "jumanji", "mujoco_mjx", "envpool", "safety_gymnasium")
+}
 _HASHES = frozenset({"hash", "crc32", "adler32", "md5", "sha1", "sha256", "sha512", "blake2b", "blake2s"})
 _DIGESTS = frozenset({"hexdigest", "digest", "tobytes"})
 _HEX = re.compile(r"[0-9a-fA-F]{16,}")
@@ -43,39 +48,44 @@ _FEWEST_STEPS = 8
 """Number of values in a sequence from which it counts as the actions of an episode."""
 
 
-def code_signals(index: int, files: Mapping[str, bytes]) -> Iterator[Signal]:
-    """Signals of one checkpoint (files by path)."""
+def code_signals(index: int, files: Mapping[str, bytes], env: str = "") -> Iterator[Signal]:
+    """Signals of one checkpoint (files by path). Numbers of the dynamics are searched if `env` is given."""
     for path, source in files.items():
-        if path.endswith(".py") and len(source) <= MAX_FILE_BYTES:
-            for one in _of_file(path, source):
+        if path.endswith(".py"):
+            for one in file_signals(f"system/{path}", source, env):
                 yield msgspec.structs.replace(one, submits=(index,))
 
 
 @lru_cache(maxsize=128)
-def _of_file(path: str, source: bytes) -> tuple[Signal, ...]:
+def file_signals(path: str, source: bytes, env: str) -> tuple[Signal, ...]:
     """Cached: most files of a run's checkpoints are equal."""
-    tree = parse(source)
+    tree = parse(source) if len(source) <= MAX_FILE_BYTES else None
     if tree is None:
         return ()
     try:
-        return tuple(_module(tree, f"system/{path}", source.decode("utf-8", "replace").splitlines()))
+        return tuple(_module(tree, path, source.decode("utf-8", "replace").splitlines(), env))
     except RecursionError:
         return ()
 
 
-def _module(tree: ast.Module, path: str, lines: list[str]) -> Iterator[Signal]:
+def _module(tree: ast.Module, path: str, lines: list[str], env: str) -> Iterator[Signal]:
     def at(kind: Kind, node: ast.AST, reason: str) -> Signal:
         line = getattr(node, "lineno", 0)
         quote = lines[line - 1].strip() if 0 < line <= len(lines) else ""
         return signal(kind, path, line, reason, quote)
 
+    if constants := dynamics_constants(tree, env):
+        first = min(constants.values(), key=lambda node: node.lineno)
+        yield at(
+            "simulator", first, f"has {len(constants)} numbers of this environment's dynamics, and a loop"
+        )
     literals = _episode_literals(tree)
     hashed, numbers = _tainted(tree)
     for node in ast.walk(tree):
         for name in _imports(node):
             if name in _NETWORK:
                 yield at("network", node, f"imports {name}")
-            elif name in SIMULATORS:
+            elif name in _SIMULATORS:
                 yield at("simulator", node, f"imports {name}")
         if isinstance(node, ast.Dict):
             digests = sum(isinstance(key, ast.Constant) and _is_digest(key.value) for key in node.keys)
@@ -92,11 +102,16 @@ def _module(tree: ast.Module, path: str, lines: list[str]) -> Iterator[Signal]:
 
 
 def _imports(node: ast.AST) -> Iterator[str]:
+    """Names of imported packages. Spaces, such as `gymnasium.spaces`, count as none: they simulate nothing."""
+    names: list[str] = []
     if isinstance(node, ast.Import):
-        for alias in node.names:
-            yield alias.name.partition(".")[0]
-    elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
-        yield node.module.partition(".")[0]
+        names = [alias.name for alias in node.names]
+    elif isinstance(node, ast.ImportFrom) and node.level == 0:
+        names = [f"{node.module}.{alias.name}" for alias in node.names]
+    elif isinstance(node, ast.Call) and _name(node.func) in ("import_module", "__import__") and node.args:
+        literal = node.args[0].value if isinstance(node.args[0], ast.Constant) else None
+        names = [literal] if isinstance(literal, str) else []
+    yield from {name.split(".")[0] for name in names if name.split(".")[1:2] != ["spaces"]}
 
 
 def _is_digest(value: object) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,7 @@ import msgspec
 from evopolicy_common.errors import DECODE_ERRORS
 from evopolicy_common.processes.left_files import left_files
 from evopolicy_common.regular_files import open_regular, read_regular
-from evopolicy_results.scan.code import code_signals
+from evopolicy_results.scan.code import code_signals, file_signals
 from evopolicy_results.scan.copies import copied_actions
 from evopolicy_results.scan.log import log_signals
 from evopolicy_results.scan.signals import MAX_SIGNALS, TITLES, Files, Signal, Trajectories
@@ -20,6 +20,8 @@ _MAX_FILES, _MAX_FILE_BYTES, _MAX_LOG_BYTES = 200, 4 << 20, 64 << 20
 _MAX_RUN_BYTES = 256 << 20
 """Different files of a run's checkpoints that are searched."""
 _SEARCHED = (".py", ".json", ".npy", ".npz", ".csv", ".txt")
+_LIBRARIES = frozenset({"__pycache__", "site-packages", "dist-packages", "node_modules"})
+"""Folders that are not searched."""
 _MAX_ROWS = 20_000
 """Rows of a submit's trajectories that are read."""
 
@@ -28,21 +30,32 @@ def scan(
     checkpoints: Iterable[tuple[int, Files]],
     log: Iterable[bytes],
     trajectories: Trajectories,
+    *,
+    env: str = "",
+    workspace: Files | None = None,
 ) -> tuple[Signal, ...]:
     """All signals of a run: `checkpoints` in order (submit index, files by path), the lines of its log, and the train
-    actions of each submit. At most `MAX_SIGNALS`; equal evidence counts once."""
+    actions of each submit. At most `MAX_SIGNALS` of each kind; equal evidence counts once.
+
+    `env` and the Python files of the `workspace` are given for a run whose agent must not simulate: numbers of the
+    environment's dynamics are searched, and simulators in the workspace."""
     found: dict[tuple[str, str, str], Signal] = {}
     kept = _kept(checkpoints)
     for index, files in kept:
-        for one in code_signals(index, files):
+        for one in code_signals(index, files, env):
             key = (one.kind, one.path, one.quote)
             known = found.setdefault(key, one)
             if known is not one:
                 found[key] = msgspec.structs.replace(known, submits=(*known.submits, index))
     for one in (*copied_actions(kept, trajectories), *log_signals(log)):
         found.setdefault((one.kind, one.path.partition(":")[0], one.quote), one)
-    order = {kind: place for place, kind in enumerate(TITLES)}
-    return tuple(sorted(found.values(), key=lambda one: (order[one.kind], one.path, one.line))[:MAX_SIGNALS])
+    known_quotes = {(one.path.rpartition("/")[2], one.quote) for one in found.values()}
+    for path, source in (workspace or {}).items():
+        for one in file_signals(f"workspace/{path}", source, env):
+            if one.kind == "simulator" and (path.rpartition("/")[2], one.quote) not in known_quotes:
+                found.setdefault((one.kind, one.path, one.quote), one)
+    ordered = sorted(found.values(), key=lambda one: (one.path, one.line))
+    return tuple(one for kind in TITLES for one in [o for o in ordered if o.kind == kind][:MAX_SIGNALS])
 
 
 def _kept(checkpoints: Iterable[tuple[int, Files]]) -> list[tuple[int, Files]]:
@@ -64,12 +77,23 @@ def _kept(checkpoints: Iterable[tuple[int, Files]]) -> list[tuple[int, Files]]:
 
 def policy_files(folder: Path) -> dict[str, bytes]:
     """The files of a checkpoint's policy by path, without large ones; empty when they cannot be read."""
+    return _files(
+        folder, lambda name: name.endswith(_SEARCHED) and not name.endswith(("_meta.json", "metrics.json"))
+    )
+
+
+def workspace_files(workspace: Path) -> dict[str, bytes]:
+    """The Python files of a workspace by path, without its feedback, libraries, and large files."""
+    return _files(workspace, lambda name: name.endswith(".py") and not name.startswith("feedback/"))
+
+
+def _files(folder: Path, wanted: Callable[[str], bool]) -> dict[str, bytes]:
     found: dict[str, bytes] = {}
-    for path, size in left_files(folder, enter=lambda name: name != "__pycache__"):
-        searched = path.suffix in _SEARCHED and path.name not in ("_meta.json", "metrics.json")
-        if searched and size <= _MAX_FILE_BYTES:
+    for path, size in left_files(folder, enter=lambda name: name not in _LIBRARIES):
+        name = path.relative_to(folder).as_posix()
+        if wanted(name) and size <= _MAX_FILE_BYTES:
             try:
-                found[path.relative_to(folder).as_posix()] = read_regular(path, _MAX_FILE_BYTES)
+                found[name] = read_regular(path, _MAX_FILE_BYTES)
             except OSError:
                 continue
             if len(found) >= _MAX_FILES:

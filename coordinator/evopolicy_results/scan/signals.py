@@ -17,12 +17,12 @@ Kind = Literal["network", "outside", "simulator", "table", "copy"]
 TITLES: dict[Kind, str] = {
     "network": "attempts to reach the network",
     "outside": "reads outside the workspace",
-    "simulator": "imports or installs a simulator",
+    "simulator": "imports, installs or resembles a simulator",
     "table": "a table keyed by hashes of observations, or by case",
     "copy": "actions copied from train trajectories",
 }
 MAX_SIGNALS = 40
-"""Maximum number of kept signals per run."""
+"""Maximum number of kept signals of one kind per run."""
 _MAX_QUOTE = 300
 
 
@@ -31,14 +31,25 @@ class Signal(msgspec.Struct, frozen=True, kw_only=True):
 
     kind: Kind
     path: str
-    """`logs/agent.jsonl`, or `system/…` of a checkpoint."""
+    """`logs/agent.jsonl`, `system/…` of a checkpoint, or `workspace/…`."""
     line: int
     """1-based line in that file; 0 where it has none."""
     submits: tuple[int, ...] = ()
-    """Submits whose checkpoints contain it; empty for the log."""
+    """Submits whose checkpoints contain it; empty for the log and the workspace."""
     reason: str
     quote: str
     """The evidence as the agent wrote it, shortened."""
+
+    @property
+    def place(self) -> str:
+        """File and line. The path of a log has its line already."""
+        return (
+            self.path
+            if self.path.startswith("logs/")
+            else f"{self.path}:{self.line}"
+            if self.line
+            else self.path
+        )
 
 
 def signal(kind: Kind, path: str, line: int, reason: str, quote: str, submits: Sequence[int] = ()) -> Signal:

@@ -11,7 +11,7 @@ from evopolicy_results.behaviour.edits import demand_of
 from evopolicy_results.behaviour.trace import Trace, TraceRow
 from evopolicy_results.reading.environments import family_of, family_title, ordered_environments, title_of
 from evopolicy_results.reading.records import Run, path_text
-from evopolicy_results.scan.signals import TITLES
+from evopolicy_results.scan.signals import TITLES, Signal
 from evopolicy_results.studies.study import Study
 from evopolicy_results.tables.table import Column, Table
 
@@ -339,50 +339,35 @@ def _audit(study: Study, link_of: LinkOf) -> Table:
 
 
 def _simulators(study: Study, link_of: LinkOf) -> Table:
-    found = [(run, flag) for run in study.runs for flag in run.simulator_flags]
-    return Table(
+    return _evidence(
+        [(run, each) for run in study.runs for each in run.simulator_flags],
+        link_of,
         name="simulator_flags",
         title="Code that looks like a simulator",
-        caption="A signal to read, never a verdict: places where a state is made from the state before again and again, something decides "
-        "in between, and something of it is summed up or compared. Runs whose rules allow simulation are not looked through. "
-        "Submits: whose checkpoints have the lines; none for other files of the workspace, and for code in the agent's log.",
-        columns=(
-            ENV,
-            ENTRY,
-            RUN,
-            Column("file", "File"),
-            Column("lines", "Lines"),
-            Column("submits", "Submits"),
-            Column("kind", "Kind"),
-            Column("reasons", "Why"),
-            Column("quote", "Code"),
-        ),
-        rows=tuple(
-            {
-                "env": title_of(run.env),
-                "entry": run.entry,
-                "run": _short(run.name),
-                "file": flag.path,
-                "lines": f"{flag.line}–{flag.end_line}",
-                "submits": submits_text(flag.submits) or None,
-                "kind": flag.kind,
-                "reasons": "; ".join(flag.reasons),
-                "quote": " ⏎ ".join(line.strip() for line in flag.quote)[:_MAX_QUOTE],
-            }
-            for run, flag in found
-        ),
-        links={i: link for i, (run, _) in enumerate(found) if (link := link_of(run.name))},
+        caption="A signal to read, never a verdict: imports and installations of a simulator, and code with a loop and several numbers of the "
+        "environment's dynamics. Simulators that an agent writes itself are seldom found. Runs whose rules allow simulation are left out.",
     )
 
 
 def _signals(study: Study, link_of: LinkOf) -> Table:
-    found = [(run, each) for run in study.runs for each in run.signals]
-    return Table(
+    return _evidence(
+        [(run, each) for run in study.runs for each in run.signals],
+        link_of,
         name="signals",
         title="What deserves a look",
         caption="Signals to read, never verdicts: commands that reach for the network, for files outside the workspace or for a simulator, "
         "policies with tables keyed by hashes of observations or by case, and policies that hold recorded train actions. Honest agents can "
         "raise a signal, and an agent can hide from the search.",
+    )
+
+
+def _evidence(
+    found: list[tuple[Run, Signal]], link_of: LinkOf, *, name: str, title: str, caption: str
+) -> Table:
+    return Table(
+        name=name,
+        title=title,
+        caption=caption,
         columns=(
             ENV,
             ENTRY,
@@ -399,7 +384,7 @@ def _signals(study: Study, link_of: LinkOf) -> Table:
                 "entry": run.entry,
                 "run": _short(run.name),
                 "signal": TITLES[each.kind],
-                "file": f"{each.path}:{each.line}" if each.line and each.submits else each.path,
+                "file": each.place,
                 "submits": submits_text(each.submits) or None,
                 "reason": each.reason,
                 "quote": each.quote[:_MAX_QUOTE],

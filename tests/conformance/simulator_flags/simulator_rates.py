@@ -1,21 +1,20 @@
-"""How many disguised simulators are flagged, and how much honest code is:
+"""How many disguised simulators are flagged, and how much honest code:
 
-    python tests/conformance/simulator_flags/simulator_rates.py [--each]
+    python tests/conformance/simulator_flags/simulator_rates.py
 
-`tuned/` was at hand while the signs were made. `held_out/` was written before them and looked at once, afterwards: what it
-misses stays missed. A case is a file, or a folder whose files belong together.
+The cases of `held_out/` were written before any rule. A case is a file, or a folder whose files belong together. Each is
+searched as code of each environment whose numbers are known. The command names the cases that it misses or flags wrongly.
 """
 
 from __future__ import annotations
 
-import argparse
-import ast
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 import evopolicy_gateway.agents
-from evopolicy_results.simulators.look import look
+from evopolicy_results.scan.code import code_signals
+from evopolicy_results.scan.constants import DYNAMICS
 
 HERE = Path(__file__).parent
 EXAMPLES = HERE.parents[2] / "examples" / "policies"
@@ -37,75 +36,42 @@ class Rate(NamedTuple):
         return f"{len(self.flagged)} of {len(self.flagged) + len(self.passed)}"
 
 
-def rate(cases: Iterator[tuple[str, dict[str, bytes]]]) -> Rate:
+def rate(cases: Iterator[Path]) -> Rate:
     found = Rate([], [])
-    for name, files in cases:
-        (found.flagged if look(files, "") else found.passed).append(name)
+    for case in cases:
+        paths = [case] if case.is_file() else sorted(case.rglob("*.py"))
+        files = {path.name: path.read_bytes() for path in paths}
+        kinds = {one.kind for env in DYNAMICS for one in code_signals(0, files, env)}
+        (found.flagged if "simulator" in kinds else found.passed).append(case.name)
     return found
 
 
-def corpus(part: str, kind: str) -> Iterator[tuple[str, dict[str, bytes]]]:
-    """`part` is tuned or held_out, `kind` simulators or honest."""
-    for case in sorted((HERE / part / kind).iterdir()):
-        if case.name != "__pycache__":
-            yield case.name, _files(case)
+def held_out(kind: str) -> Rate:
+    """`kind` is `simulators` or `honest`."""
+    return rate(case for case in sorted((HERE / "held_out" / kind).iterdir()) if case.name != "__pycache__")
 
 
-def examples(*, rehearsing: bool) -> Iterator[tuple[str, dict[str, bytes]]]:
-    for case in sorted(EXAMPLES.iterdir()):
-        if case.is_dir() and (case.name in REHEARSING) == rehearsing:
-            yield case.name, _files(case)
+def examples(*, rehearsing: bool) -> Rate:
+    cases = (case for case in sorted(EXAMPLES.iterdir()) if case.is_dir())
+    return rate(case for case in cases if (case.name in REHEARSING) == rehearsing)
 
 
-def agents() -> Iterator[tuple[str, dict[str, bytes]]]:
-    """The gateway's own agents: all together, as they are, and the policy that `evolve` writes into workspaces."""
+def agents() -> Rate:
+    """The gateway's own agents: all together, and the policy that `evolve` writes into workspaces."""
     folder = Path(evopolicy_gateway.agents.__file__).parent
-    yield "agents", _files(folder)
-    yield "evolve's policy", _files(folder / "evolved")
-
-
-def library() -> Iterator[tuple[str, dict[str, bytes]]]:
-    """Gymnasium's small environments without their imports: simulators that nobody wrote for this test."""
-    import gymnasium
-
-    envs = Path(gymnasium.__file__).parent / "envs"
-    for path in sorted([*(envs / "classic_control").glob("*.py"), *(envs / "toy_text").glob("*.py")]):
-        tree = ast.parse(path.read_bytes())
-        if any(isinstance(node, ast.FunctionDef) and node.name == "step" for node in ast.walk(tree)):
-            yield path.name, {path.name: ast.unparse(_WithoutImports().visit(tree)).encode()}
-
-
-class _WithoutImports(ast.NodeTransformer):
-    def visit_Import(self, node: ast.Import) -> ast.Pass:
-        return ast.Pass()
-
-    def visit_ImportFrom(self, node: ast.ImportFrom) -> ast.Pass:
-        return ast.Pass()
-
-
-def _files(case: Path) -> dict[str, bytes]:
-    if case.is_file():
-        return {case.name: case.read_bytes()}
-    return {path.relative_to(case).as_posix(): path.read_bytes() for path in sorted(case.rglob("*.py"))}
+    return rate(iter((folder, folder / "evolve" / "evolved")))
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--each", action="store_true", help="name what was missed or flagged wrongly")
-    each = parser.parse_args().each
-    rows = [
-        ("simulators flagged, tuned", rate(corpus("tuned", "simulators")), True),
-        ("simulators flagged, held out", rate(corpus("held_out", "simulators")), True),
-        ("examples that rehearse flagged", rate(examples(rehearsing=True)), True),
-        ("Gymnasium's small environments flagged", rate(library()), True),
-        ("honest code flagged, tuned", rate(corpus("tuned", "honest")), False),
-        ("honest code flagged, held out", rate(corpus("held_out", "honest")), False),
-        ("other examples flagged", rate(examples(rehearsing=False)), False),
-        ("the gateway's agents flagged", rate(agents()), False),
-    ]
-    for title, found, should in rows:
+    for title, found, should in (
+        ("disguised simulators flagged", held_out("simulators"), True),
+        ("examples with a model flagged", examples(rehearsing=True), True),
+        ("honest code flagged", held_out("honest"), False),
+        ("other examples flagged", examples(rehearsing=False), False),
+        ("the gateway's agents flagged", agents(), False),
+    ):
         wrong = found.passed if should else found.flagged
-        print(f"{title:40} {found!s:>9}" + (f"   wrong: {', '.join(wrong)}" if each and wrong else ""))
+        print(f"{title:32} {found!s:>9}" + (f"   wrong: {', '.join(wrong)}" if wrong else ""))
 
 
 if __name__ == "__main__":

@@ -5,28 +5,26 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import pytest
 from invented.policies import Version, policy
 from invented.run_dirs import write_run
 
 from evopolicy_results.reading.reader import load_runs
 from evopolicy_results.reading.records import Run
 from evopolicy_results.report import write_report
-from evopolicy_results.simulators.look import look
 from evopolicy_results.studies.study import study
 
 SIMULATOR = """\
 def future(x, v, gain):
-    total = 0.0  # <script>alert(1)</script> =cmd()
-    for _ in range(40):
-        u = max(-1.0, min(1.0, -gain * x))
-        v = v + 0.05 * (u - 0.1 * v)
-        x = x + 0.05 * v
-        total -= x * x
-    return total
-
-
-BEST = max((0.5, 1.0, 2.0), key=lambda gain: future(1.0, 0.0, gain))
+    import importlib  # <script>alert(1)</script> =cmd()
+    model = importlib.import_module("gymnasium.envs.classic_control")  # <script>alert(2)</script>
+    return model
+"""
+CAR = """\
+import math
+x, v = -0.5, 0.0
+for u in (1.0, -1.0):
+    v = max(-0.07, min(0.07, v + 0.0015 * u - 0.0025 * math.cos(3 * x)))
+    x = max(-1.2, min(0.6, x + v))
 """
 HONEST = Version(policy(gain=1.0), (-200.0,), -180.0)
 
@@ -45,10 +43,10 @@ def load(folder: Path) -> Run:
 def test_lines_of_several_submits_are_one_flag(tmp_path: Path) -> None:
     run = load(write_run(tmp_path, [HONEST, with_simulator(2.0), with_simulator(3.0)]))
     (flag,) = run.simulator_flags
-    assert (flag.path, flag.submits, flag.kind) == ("system/policy.py", (1, 2), "rollout")
+    assert (flag.path, flag.submits, flag.kind) == ("system/policy.py", (1, 2), "simulator")
     lines = with_simulator(2.0).files["policy.py"].splitlines()
-    assert list(flag.quote) == lines[flag.line - 1 : flag.end_line]
-    assert "for _ in range(40):" in flag.quote[0]
+    assert flag.quote == lines[flag.line - 1].strip()
+    assert flag.reason == "imports gymnasium"
 
 
 def test_files_left_in_the_workspace_are_looked_through(tmp_path: Path) -> None:
@@ -60,15 +58,23 @@ def test_files_left_in_the_workspace_are_looked_through(tmp_path: Path) -> None:
     assert (flag.path, flag.submits, flag.line) == ("workspace/scratch/.notes/train.py", (), 3)
 
 
-def test_a_here_document_in_the_log_is_looked_through(tmp_path: Path) -> None:
-    folder = write_run(tmp_path, [HONEST], log="codex")
-    command = f"cd system && python3 - <<'EOF'\n{SIMULATOR}\nEOF\necho done"
-    item = {"type": "item.completed", "item": {"type": "command_execution", "command": command}}
-    log = folder / "logs" / "agent.jsonl"
-    before = len(log.read_text().splitlines())
-    log.write_text(log.read_text() + json.dumps(item) + "\n")
-    (flag,) = load(folder).simulator_flags
-    assert flag.path == f"logs/agent.jsonl:{before + 1}"
+def test_numbers_of_the_dynamics_with_a_loop_are_a_flag(tmp_path: Path) -> None:
+    honest = "def act(v):\n    return 1.0 if 0.0015 - 0.0025 * v > 0.07 * 0.45 else 1.2\n"
+    for name, source, flagged in (("car", CAR, True), ("no loop", honest, False)):
+        for env in ("gym/continuouscar", "gym/acrobot"):
+            folder = write_run(tmp_path / name, [HONEST], env=env, log="codex")
+            (folder / "workspace" / "notes.py").write_text(source)
+            found = [(flag.place, flag.quote) for flag in load(folder).simulator_flags]
+            place = [("workspace/notes.py:4", CAR.splitlines()[3].strip())]
+            assert found == (place if flagged and env == "gym/continuouscar" else [])
+
+
+def test_many_signals_of_one_kind_hide_no_flag(tmp_path: Path) -> None:
+    files = policy(gain=1.0)
+    files["policy.py"] += "".join(f"import socket as s{n}\n" for n in range(90)) + SIMULATOR
+    run = load(write_run(tmp_path, [Version(files, (-90.0,), -95.0)]))
+    assert len(run.signals) == 41
+    assert len(run.simulator_flags) == 1
 
 
 def test_a_run_that_may_simulate_is_stamped_and_not_looked_through(tmp_path: Path) -> None:
@@ -85,11 +91,7 @@ def test_a_run_that_may_simulate_is_stamped_and_not_looked_through(tmp_path: Pat
 
 
 def test_a_report_quotes_the_evidence_as_text(tmp_path: Path) -> None:
-    files = policy(gain=1.0)
-    files["policy.py"] += "\n\n" + SIMULATOR.replace(
-        "        u = max", '        note = "<script>alert(2)</script>"\n        u = max'
-    )
-    write_run(tmp_path / "runs", [Version(files, (-90.0,), -95.0)])
+    write_run(tmp_path / "runs", [with_simulator(1.0)])
     write_run(tmp_path / "runs", [HONEST], entry="Honest")
     index = write_report(study([tmp_path / "runs"]), tmp_path / "report").read_text()
     assert "1 of 2 runs have code that looks like a simulator" in index
@@ -102,24 +104,13 @@ def test_a_report_quotes_the_evidence_as_text(tmp_path: Path) -> None:
     assert "None was found in the checkpoints" in honest.read_text()
     data = json.loads((tmp_path / "report" / "report.json").read_text())
     (row,) = data["tables"]["simulator_flags"]["rows"]
-    assert (row["file"], row["submits"], row["kind"]) == ("system/policy.py", "s000", "rollout")
+    line = 1 + with_simulator(1.0).files["policy.py"].splitlines().index(SIMULATOR.splitlines()[2])
+    assert (row["file"], row["submits"], row["reason"]) == (
+        f"system/policy.py:{line}",
+        "s000",
+        "imports gymnasium",
+    )
     assert {r["entry"]: r["simulator_flags"] for r in data["tables"]["audit"]["rows"]} == {
         "Agent A": 1,
         "Honest": 0,
     }
-
-
-HOSTILE = {
-    "nested loops": "\n".join("    " * depth + f"for a{depth} in b{depth}:" for depth in range(18)) + "\n" + "    " * 18 + "x = x * a1",
-    "many loops": "def f(x, plan):\n" + "    for u in plan:\n        x = x + u * x\n" * 4000,
-    "many functions": "".join(f"def f{k}(x):\n    return f{k + 1}(x) * f{k + 1}(x + 1) + f{k + 1}(2 * x)\n" for k in range(400))
-    + "for t in range(9):\n    y = f0(y)\n",
-    "one name": "def f(x):\n    for t in range(9):\n        x = f(f(f(f(x)))) * x\n    return x\n" * 500,
-    "long sum": "x = 0\nfor t in range(9):\n    x = " + " + ".join(f"x * a{k}" for k in range(900)),
-    "many texts": "T = [" + ",".join(repr("for a in b:\n    c = 1\n\n\n" * 300) for _ in range(60)) + "]",
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("name", HOSTILE)
-def test_no_source_takes_long(name: str) -> None:
-    look({"policy.py": HOSTILE[name].encode()}, "gym/acrobot")

@@ -172,6 +172,21 @@ def test_numbers_that_no_float_can_hold_raise_nothing() -> None:
     assert [one.path for one in found] == ["system/plan.json", "system/policy.py"]
 
 
+@pytest.mark.timeout(60)
+@pytest.mark.parametrize(
+    "source",
+    [
+        f"for x in y: z = {'9' * 400} * pi / {'9' * 400}\n",
+        "for x in y: z = " + "1/" * 800 + "1\n",
+        ("z = " + "1*(" * 90 + "pi" + ")" * 90 + "\n") * 200,
+        "for x in y: z = 1e999 * pi + 1 / 0 + 1 / 0.0 + 1j * pi + True / False\n",
+    ],
+    ids=["huge numbers", "quotients", "products", "odd numbers"],
+)
+def test_no_source_is_too_much_for_the_search_of_constants(source: str) -> None:
+    assert list(code_signals(0, {"policy.py": source.encode()}, "gym/acrobot")) == []
+
+
 def test_an_archive_that_unpacks_to_gigabytes_is_not_unpacked(monkeypatch: pytest.MonkeyPatch) -> None:
     packed = io.BytesIO()
     np.savez_compressed(packed, plan=np.zeros((40, 1 << 18)))
