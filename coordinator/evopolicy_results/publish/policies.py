@@ -11,7 +11,6 @@ Rules that this module owns:
 
 from __future__ import annotations
 
-import contextlib
 import shlex
 import uuid
 from collections.abc import Collection, Sequence
@@ -19,21 +18,20 @@ from collections.abc import Collection, Sequence
 import msgspec
 import numpy as np
 
-from evopolicy_common.errors import BundleError, EvopolicyError, ProtocolError
+from evopolicy_common.errors import BundleError, ProtocolError
 from evopolicy_common.messages.episode import EpisodeOutcome
 from evopolicy_common.messages.operator import Evaluate, PlayedAs
 from evopolicy_common.processes.packages import packages_in
 from evopolicy_common.records.episodes import compare
-from evopolicy_common.records.episodes.rendered import decode
 from evopolicy_common.records.episodes.trajectory import Trajectory
 from evopolicy_common.records.journal import SubmitResult
 from evopolicy_common.records.policies import bundles
 from evopolicy_common.records.policies.bundles import Bundle
 from evopolicy_common.records.policies.declarations import declares_deterministic
-from evopolicy_common.wire.operator_client import OperatorClient
+from evopolicy_results.evaluations import Evaluations
 from evopolicy_results.publish import contents
 from evopolicy_results.publish.findings import Checked, Files, PublishedRun
-from evopolicy_results.publish.replay import Chosen, Tell, cluster_of, draw, installed, layers, unplayable
+from evopolicy_results.publish.replay import Chosen, Tell, draw, installed, play_runs
 from evopolicy_results.publish.run_rules import recording_of
 
 _KIND = "policies"
@@ -75,27 +73,24 @@ async def play_policies(
         if run.folder not in drawn and any(folder == run.folder for folder, _ in declared):
             checked.add(_KIND, "open", "no episode of its deterministic policies was drawn", run.opening.run)
     by_run = installed(chosen, checked, _KIND)
-    total, played = sum(len(each.indexes) for each in chosen), 0
-    by_packages: dict[tuple[str, ...], list[PublishedRun]] = {}
-    for parts in by_run.values():
-        run = parts[0].run
-        wanted = packages_in(run.record.versions.fingerprint)
-        if lacking := [name for name in wanted if name not in packages]:
-            checked.add(_KIND, "open", f"not played: {not_allowed(lacking)}", run.opening.run)
-        else:
-            by_packages.setdefault(wanted, []).append(run)
-    for wanted, runs in by_packages.items():
-        for layer in layers(runs):
-            try:
-                async with contextlib.AsyncExitStack() as stack:
-                    ask = await cluster_of(stack, layer, slots, wanted)
-                    for run in layer:
-                        tally = await _play_run(ask, files, run, by_run[run.folder], declared, checked)
-                        if tally is not None:
-                            played += tally.same + len(tally.differ) + tally.unknown
-                            tell(played, total)
-            except EvopolicyError as error:
-                checked.add(_KIND, "open", f"could not be played: {error}")
+    for folder, (part, *_) in list(by_run.items()):
+        if lacking := [name for name in _packages_of(part.run) if name not in packages]:
+            checked.add(_KIND, "open", f"not played: {not_allowed(lacking)}", part.run.opening.run)
+            del by_run[folder]
+
+    async def play_run(
+        evaluations: Evaluations, run: PublishedRun, parts: Sequence[Chosen], other_cpu: bool
+    ) -> None:
+        tally = _Tally()
+        for part in parts:
+            await _play(evaluations, files, part, declared[_key(part)], tally)
+        _add_findings(tally, checked, run.opening.run, other_cpu)
+
+    await play_runs(_KIND, by_run, checked, slots, tell, play_run, _packages_of)
+
+
+def _packages_of(run: PublishedRun) -> tuple[str, ...]:
+    return packages_in(run.record.versions.fingerprint)
 
 
 def not_allowed(packages: Sequence[str]) -> str:
@@ -138,22 +133,7 @@ def _submit(each: Chosen) -> SubmitResult:
     return next(one for one in each.run.result.submits if one.submit_index == each.group.submit_index)
 
 
-async def _play_run(
-    ask: OperatorClient,
-    files: Files,
-    run: PublishedRun,
-    parts: Sequence[Chosen],
-    declared: dict[tuple[str, int], Bundle],
-    checked: Checked,
-) -> _Tally | None:
-    name = run.opening.run
-    why_not, other_cpu = await unplayable(ask, run)
-    if why_not:
-        checked.add(_KIND, "open", f"not played: {why_not}", name)
-        return None
-    tally = _Tally()
-    for part in parts:
-        await _play(ask, files, part, declared[_key(part)], tally)
+def _add_findings(tally: _Tally, checked: Checked, name: str, other_cpu: bool) -> None:
     for text in tally.differ:
         if other_cpu:
             text += "; this machine's processor has other features than the run's, which can change numbers"
@@ -164,10 +144,9 @@ async def _play_run(
     if tally.same and not tally.differ:
         text = f"{tally.same} episodes of policies that declare themselves deterministic: the same actions"
         checked.add(_KIND, "ok", text, name)
-    return tally
 
 
-async def _play(ask: OperatorClient, files: Files, part: Chosen, bundle: Bundle, tally: _Tally) -> None:
+async def _play(evaluations: Evaluations, files: Files, part: Chosen, bundle: Bundle, tally: _Tally) -> None:
     run, group, submit = part.run, part.group, _submit(part)
     path = f"{run.folder}/actions/{group.name}"
     if path not in files.names:
@@ -179,7 +158,7 @@ async def _play(ask: OperatorClient, files: Files, part: Chosen, bundle: Bundle,
     used = sum(
         len(one.env_instances) for one in run.result.submits if one.submit_index <= submit.submit_index
     )
-    await ask.upload(bundle.digest, bundle.packed)
+    await evaluations.ask.upload(bundle.digest, bundle.packed)
     message = Evaluate(
         token="",
         key=uuid.uuid4().hex,
@@ -202,30 +181,26 @@ async def _play(ask: OperatorClient, files: Files, part: Chosen, bundle: Bundle,
         ),
     )
     seen: set[int] = set()
-    async with contextlib.aclosing(ask.evaluate(message)) as outcomes:
-        async for outcome, _, _ in outcomes:
-            if outcome is None:
-                continue
-            index = part.indexes[outcome.index]
-            seen.add(index)
-            data = recordings[index] if index < len(recordings) else None
-            if data is None or group.episodes[index].failure or outcome.failure is not None:
-                tally.unknown += 1
-                continue
-            fault = await _difference(ask, recording_of(data), outcome)
-            if fault is None:
-                tally.same += 1
-            else:
-                tally.differ.append(
-                    f"{group.name}, episode {index}: the policy declares itself deterministic and gave other actions: {fault}"
-                )
+    async for outcome in evaluations.outcomes(message):
+        index = part.indexes[outcome.index]
+        seen.add(index)
+        data = recordings[index] if index < len(recordings) else None
+        if data is None or group.episodes[index].failure or outcome.failure is not None:
+            tally.unknown += 1
+            continue
+        fault = await _difference(evaluations, recording_of(data), outcome)
+        if fault is None:
+            tally.same += 1
+        else:
+            text = "the policy declares itself deterministic and gave other actions"
+            tally.differ.append(f"{group.name}, episode {index}: {text}: {fault}")
     tally.unknown += len(set(part.indexes) - seen)
 
 
-async def _difference(ask: OperatorClient, recorded: Trajectory, outcome: EpisodeOutcome) -> str | None:
+async def _difference(evaluations: Evaluations, recorded: Trajectory, outcome: EpisodeOutcome) -> str | None:
     if outcome.trajectory is None:
         return "no recording came"
-    again = decode(await ask.fetch(outcome.trajectory))
+    again = await evaluations.recording(outcome)
     for step in range(min(recorded.n, again.n)):
         if not compare.same(_plain(recorded.actions[step]), _plain(again.actions[step])):
             return f"at step {step}"

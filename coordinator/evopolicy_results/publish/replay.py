@@ -12,9 +12,8 @@ from __future__ import annotations
 
 import contextlib
 import random
-import time
 import uuid
-from collections.abc import Callable, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,16 +23,13 @@ import numpy as np
 from evopolicy_common import catalogue
 from evopolicy_common.errors import BrokenEnvironmentError, EvopolicyError, ProtocolError
 from evopolicy_common.local.cluster import local_cluster
-from evopolicy_common.messages.episode import BlobRef
 from evopolicy_common.messages.operator import DescribeEnvironment, Evaluate
 from evopolicy_common.processes.scratch import scratch_folder
-from evopolicy_common.records.blobs import digest_of
 from evopolicy_common.records.episodes import compare
-from evopolicy_common.records.episodes.rendered import decode
 from evopolicy_common.records.episodes.trajectory import Trajectory
 from evopolicy_common.records.splits import FILE_STEMS, SPLITS, SplitFile, cases_hash, folder_name
 from evopolicy_common.wire import credentials, transport
-from evopolicy_common.wire.operator_client import DESCRIPTION_S, OperatorClient
+from evopolicy_results.evaluations import Evaluations
 from evopolicy_results.publish import contents
 from evopolicy_results.publish.contents import Group
 from evopolicy_results.publish.findings import Checked, Files, PublishedRun
@@ -55,23 +51,56 @@ class Chosen(msgspec.Struct, frozen=True):
     case_ids: tuple[int, ...]
 
 
+PlayRun = Callable[[Evaluations, PublishedRun, Sequence[Chosen], bool], Awaitable[None]]
+"""Plays the chosen episodes of one run, and adds findings. Last: whether this processor has other features than the run's."""
+
+
 async def replay(files: Files, checked: Checked, share: float, seed: int, slots: int, tell: Tell) -> None:
     """Plays a share of all recorded episodes, drawn by `seed`, and adds what came of it to `checked`."""
     chosen = draw(checked.runs, share, seed)
-    total, played = sum(len(each.indexes) for each in chosen), 0
     if not chosen:
         checked.add("replay", "open", "there are no episodes to play")
-    by_run = installed(chosen, checked, "replay")
-    for layer in layers([parts[0].run for parts in by_run.values()]):
-        try:
-            async with contextlib.AsyncExitStack() as stack:
-                ask = await cluster_of(stack, layer, slots)
-                for run in layer:
-                    played = await _play_run(
-                        ask, files, run, by_run[run.folder], checked, lambda n: tell(n, total), played, seed
-                    )
-        except EvopolicyError as error:
-            checked.add("replay", "open", f"could not be played: {error}")
+
+    async def play_run(
+        evaluations: Evaluations, run: PublishedRun, parts: Sequence[Chosen], other_cpu: bool
+    ) -> None:
+        await _play_run(evaluations, files, run, parts, other_cpu, checked, seed)
+
+    await play_runs("replay", installed(chosen, checked, "replay"), checked, slots, tell, play_run)
+
+
+async def play_runs(
+    kind: str,
+    by_run: dict[str, list[Chosen]],
+    checked: Checked,
+    slots: int,
+    tell: Tell,
+    play_run: PlayRun,
+    packages_of: Callable[[PublishedRun], tuple[str, ...]] = lambda run: (),
+) -> None:
+    """Plays runs on as many clusters, one after another, as their cases and packages ask for. Adds to `checked` those that cannot be."""
+    total = sum(len(each.indexes) for parts in by_run.values() for each in parts)
+    by_packages: dict[tuple[str, ...], list[PublishedRun]] = {}
+    for part, *_ in by_run.values():
+        by_packages.setdefault(packages_of(part.run), []).append(part.run)
+    played = 0
+
+    def told(count: int, waits_for: str) -> None:
+        tell(played + count, total)
+
+    for packages, runs in by_packages.items():
+        for layer in layers(runs):
+            try:
+                async with cluster_of(layer, slots, told, packages) as evaluations:
+                    for run in layer:
+                        why_not, other_cpu = await unplayable(evaluations, run)
+                        if why_not:
+                            checked.add(kind, "open", f"not played: {why_not}", run.opening.run)
+                        else:
+                            await play_run(evaluations, run, by_run[run.folder], other_cpu)
+                    played += evaluations.played
+            except EvopolicyError as error:
+                checked.add(kind, "open", f"could not be played: {error}")
 
 
 def installed(chosen: Sequence[Chosen], checked: Checked, kind: str) -> dict[str, list[Chosen]]:
@@ -108,27 +137,20 @@ def layers(runs: Sequence[PublishedRun]) -> list[list[PublishedRun]]:
 
 
 async def _play_run(
-    ask: OperatorClient,
+    evaluations: Evaluations,
     files: Files,
     run: PublishedRun,
     parts: Sequence[Chosen],
+    other_cpu: bool,
     checked: Checked,
-    tell: Callable[[int], None],
-    played: int,
     seed: int,
-) -> int:
-    """Plays the chosen episodes of one run; `played` with their number added."""
+) -> None:
     name = run.opening.run
-    why_not, other_cpu = await unplayable(ask, run)
-    if why_not:
-        checked.add("replay", "open", f"not played: {why_not}", name)
-        return played
-    before, alike = played, True
+    played, alike = 0, True
     for part in parts:
-        n, faults = await _play(ask, files, part)
+        n, faults = await _play(evaluations, files, part)
         checked.covered[part.group.part] = checked.covered.get(part.group.part, 0) + n
         played += n
-        tell(played)
         for fault, rounding in faults:
             alike = False
             if other_cpu and rounding:
@@ -142,11 +164,10 @@ async def _play_run(
     # A replay shows nothing of episodes without a recording, however many it drew.
     missing = checked.unrecorded(name)
     if alike:
-        text = f"{played - before} episodes, bit for bit (drawn by seed {seed})"
+        text = f"{played} episodes, bit for bit (drawn by seed {seed})"
         if missing:
             text += f"; only {', '.join(missing)} episodes have a recording"
         checked.add("replay", "open" if missing else "ok", text, name)
-    return played
 
 
 def draw(runs: Sequence[PublishedRun], share: float, seed: int) -> list[Chosen]:
@@ -179,55 +200,40 @@ def _case_ids(run: PublishedRun, group: Group) -> tuple[int, ...]:
     return ids if all(0 <= each < n for each in ids) else ()
 
 
+@contextlib.asynccontextmanager
 async def cluster_of(
-    stack: contextlib.AsyncExitStack,
-    runs: Sequence[PublishedRun],
-    slots: int,
-    packages: Sequence[str] = (),
-) -> OperatorClient:
+    runs: Sequence[PublishedRun], slots: int, tell: Callable[[int, str], None], packages: Sequence[str]
+) -> AsyncIterator[Evaluations]:
     """A cluster whose splits are those of the runs. `packages`: those that policies may import besides numpy."""
-    data = Path(stack.enter_context(scratch_folder("check-data")))
-    by_env = {run.opening.settings.env: run for run in runs}
-    for env, run in by_env.items():
-        folder = data / folder_name(env)
-        folder.mkdir()
-        for split in SPLITS:
-            content = SplitFile(env=env, split=FILE_STEMS[split], cases=run.cases(split), secret=False)
-            (folder / f"{FILE_STEMS[split]}.json").write_bytes(msgspec.json.encode(content))
-    cluster = await stack.enter_async_context(local_cluster("check", data=data, policy_packages=packages))
-    await cluster.start_workers(sorted(by_env), slots=slots, tiers={"bwrap"})
-    link = await stack.enter_async_context(
-        transport.connect(credentials.find("operator", (), cluster.operator_file))
-    )
-    return OperatorClient(link, own=True)
+    with scratch_folder("check-data") as data:
+        by_env = {run.opening.settings.env: run for run in runs}
+        for env, run in by_env.items():
+            folder = Path(data) / folder_name(env)
+            folder.mkdir()
+            for split in SPLITS:
+                content = SplitFile(env=env, split=FILE_STEMS[split], cases=run.cases(split), secret=False)
+                (folder / f"{FILE_STEMS[split]}.json").write_bytes(msgspec.json.encode(content))
+        async with local_cluster("check", data=Path(data), policy_packages=packages) as cluster:
+            await cluster.start_workers(sorted(by_env), slots=slots, tiers={"bwrap"})
+            async with transport.connect(credentials.find("operator", (), cluster.operator_file)) as link:
+                yield Evaluations(link, tell, own=True)
 
 
-async def unplayable(ask: OperatorClient, run: PublishedRun) -> tuple[str, bool]:
+async def unplayable(evaluations: Evaluations, run: PublishedRun) -> tuple[str, bool]:
     """Why episodes of the run cannot be compared on this machine: its environment does not repeat them, or in other versions.
     Empty where they can. And whether the processor's features differ from those in the run."""
     env, known = run.opening.settings.env, run.record.versions.fingerprint
-    # Any evaluation waits for a worker; a description does not.
-    first = Evaluate(
-        token="", key=uuid.uuid4().hex, env=env, bundle=None, split="heldout", cases=(0,), record="actions"
-    )
-    until = time.monotonic() + DESCRIPTION_S
     try:
-        async with contextlib.aclosing(ask.evaluate(first)) as outcomes:
-            async for outcome, _, _ in outcomes:
-                if outcome is not None:
-                    break
-                if time.monotonic() > until and not await _offers(ask, env):
-                    return (
-                        f"no worker of this machine offers {env}; `evopolicy-worker check-env {env}` tells why",
-                        False,
-                    )
+        state = await evaluations.versions(DescribeEnvironment(token="", env=env), wait=True)
     except BrokenEnvironmentError as error:
         return str(error), False
-    offered, *_ = await ask.environments()
+    if not state.fingerprints:
+        return f"no worker of this machine offers {env}; `evopolicy-worker check-env {env}` tells why", False
+    offered, *_ = await evaluations.ask.environments()
     if any(each.description.env == env and not each.description.deterministic for each in offered):
         return f"{env} is marked as not deterministic: the same actions can give another episode", False
     here: dict[str, str] = {}
-    for fingerprint in (await ask.describe(DescribeEnvironment(token="", env=env))).fingerprints:
+    for fingerprint in state.fingerprints:
         here |= fingerprint.flat()
     names = sorted(known.keys() & here.keys() - {"cpu", "evopolicy-worker"})
     differ = [
@@ -236,12 +242,7 @@ async def unplayable(ask: OperatorClient, run: PublishedRun) -> tuple[str, bool]
     return "; ".join(differ[:4]), here.get("cpu") != known.get("cpu")
 
 
-async def _offers(ask: OperatorClient, env: str) -> bool:
-    offered, *_ = await ask.environments()
-    return any(each.description.env == env for each in offered)
-
-
-async def _play(ask: OperatorClient, files: Files, part: Chosen) -> tuple[int, list[tuple[str, bool]]]:
+async def _play(evaluations: Evaluations, files: Files, part: Chosen) -> tuple[int, list[tuple[str, bool]]]:
     """How many of these episodes were played, and what differed, each with whether it may be a matter of rounding."""
     run, group = part.run, part.group
     path = f"{run.folder}/actions/{group.name}"
@@ -261,8 +262,7 @@ async def _play(ask: OperatorClient, files: Files, part: Chosen) -> tuple[int, l
             actions = compare.recorded_actions(recording_of(data))
         except ProtocolError:
             continue
-        await ask.upload(digest_of(actions), actions)
-        refs.append(BlobRef(digest=digest_of(actions), size=len(actions)))
+        refs.append(await evaluations.uploaded(actions))
         stored.append((index, data))
         case_ids.append(case_id)
     if not refs:
@@ -280,19 +280,18 @@ async def _play(ask: OperatorClient, files: Files, part: Chosen) -> tuple[int, l
     )
     faults: list[tuple[str, bool]] = []
     seen: set[int] = set()
-    async with contextlib.aclosing(ask.evaluate(message)) as outcomes:
-        async for outcome, _, _ in outcomes:
-            if outcome is None or outcome.trajectory is None:
-                continue
-            index, data = stored[outcome.index]
-            seen.add(index)
-            episode = group.episodes[index]
-            recorded, again = recording_of(data), decode(await ask.fetch(outcome.trajectory))
-            fault = compare.first_difference(recorded, again)
-            if fault is None and not compare.same(episode.episode_return, outcome.episode_return):
-                fault = f"return {episode.episode_return!r} is told, {outcome.episode_return!r} came"
-            if fault is not None:
-                faults.append((f"{group.name}, episode {index}: {fault}", rounded(recorded, again)))
+    async for outcome in evaluations.outcomes(message):
+        if outcome.trajectory is None:
+            continue
+        index, data = stored[outcome.index]
+        seen.add(index)
+        episode = group.episodes[index]
+        recorded, again = recording_of(data), await evaluations.recording(outcome)
+        fault = compare.first_difference(recorded, again)
+        if fault is None and not compare.same(episode.episode_return, outcome.episode_return):
+            fault = f"return {episode.episode_return!r} is told, {outcome.episode_return!r} came"
+        if fault is not None:
+            faults.append((f"{group.name}, episode {index}: {fault}", rounded(recorded, again)))
     missing = [index for index, _ in stored if index not in seen]
     faults += [(f"{group.name}, episode {index}: not played to its end", False) for index in missing]
     return len(stored), faults

@@ -11,11 +11,9 @@ Rules that this module owns:
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import hashlib
-import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
@@ -40,14 +38,11 @@ from evopolicy_common.records.run_files import RUN_JSON, read_record
 from evopolicy_common.records.run_record import RunRecord
 from evopolicy_common.records.splits import FILE_STEMS, cases_hash, folder_of, read_split_file
 from evopolicy_common.refusals import WRONG_SETTINGS, Refusal
-from evopolicy_common.wire.operator_client import DESCRIPTION_S, OperatorClient
 from evopolicy_common.wire.transport import Link
+from evopolicy_results.evaluations import Evaluations, Tell
+from evopolicy_results.reading.records import checkpoint_folder
 
 RANDOM = -1
-_WORKER_PAUSE_S = 0.3
-
-Tell = Callable[[int, str], None]
-"""Called with the number of finished episodes and what the cluster waits for (empty: nothing)."""
 
 
 class Wanted(msgspec.Struct, frozen=True, kw_only=True):
@@ -121,11 +116,9 @@ class Rescorer:
 
     def __init__(self, link: Link, wanted: Wanted, tell: Tell, *, own_workers: bool) -> None:
         """`own_workers`: the cluster's workers have just been started, so the first may still be starting."""
-        self._ask = OperatorClient(link, own=own_workers)
+        self._evaluations = Evaluations(link, tell, own=own_workers)
         self._wanted = wanted
-        self._tell = tell
         self._own_workers = own_workers
-        self._came = 0
 
     async def rescore(self, run: Finished) -> Written:
         """Plays the missing episodes of one run and writes its file. Raises ConfigError for runs, cases or versions that
@@ -146,7 +139,7 @@ class Rescorer:
             raise ConfigError(
                 f"{rescore_path(run.folder, wanted.name)} holds {known.n_cases} other cases, or another run; choose another --name"
             )
-        began = self._came
+        began = self._evaluations.played
         result = known or RescoreRecord(
             name=wanted.name,
             run=record.run,
@@ -184,23 +177,18 @@ class Rescorer:
             entry=record.agent.entry,
             score=record.outcome.score,
             rescored=selected.mean,
-            episodes=self._came - began,
+            episodes=self._evaluations.played - began,
         )
 
     async def _class(self, record: RunRecord) -> str:
         """The fingerprint class of workers with the run's versions. Raises ConfigError when there are none."""
         message = DescribeEnvironment(token="", env=record.env, run=record.run)
-        until = time.monotonic() + DESCRIPTION_S
-        while True:
-            state = await self._ask.describe(message)
-            if not state.knows_run:
-                raise ConfigError(
-                    f"this cluster's coordinator has no finished run {record.run}: it is still open there, or another one played"
-                    " it; use that one (--connect, or --local with its --state)"
-                )
-            if state.fingerprints or not self._own_workers or time.monotonic() > until:
-                break
-            await asyncio.sleep(_WORKER_PAUSE_S)
+        state = await self._evaluations.versions(message, wait=self._own_workers)
+        if not state.knows_run:
+            raise ConfigError(
+                f"this cluster's coordinator has no finished run {record.run}: it is still open there, or another one played"
+                " it; use that one (--connect, or --local with its --state)"
+            )
         if not state.fingerprints:
             remedy = (
                 f"`evopolicy-worker check-env {record.env}` tells why"
@@ -230,7 +218,7 @@ class Rescorer:
         wanted = self._wanted
         if wanted.data is None:
             assert wanted.n_cases is not None
-            found = await self._ask.further_cases(record.run, wanted.name, wanted.n_cases)
+            found = await self._evaluations.ask.further_cases(record.run, wanted.name, wanted.n_cases)
             return found.cases, True, found.epoch
         path = folder_of(wanted.data, record.env) / f"{FILE_STEMS['heldout']}.json"
         content, _ = read_split_file(path)
@@ -243,21 +231,12 @@ class Rescorer:
 
     async def _upload(self, run: Finished, index: int) -> None:
         """Uploads a checkpoint's policy, which garbage collection may have removed from the coordinator."""
-        width = max(3, len(str(run.record.experiment_dimensions.episode_budget)))
-        names = (f"submit_{index:0{width}d}", f"submit_{index:03d}")
-        folder = next(
-            (
-                run.folder / "checkpoints" / name
-                for name in names
-                if (run.folder / "checkpoints" / name).is_dir()
-            ),
-            run.folder / "checkpoints" / names[-1],
-        )
+        folder = checkpoint_folder(run.folder, "checkpoints", index)
         try:
             bundle = bundle_of(folder)
         except BundleError:
             return  # the coordinator may still have the policy; it refuses otherwise
-        await self._ask.upload(bundle.digest, bundle.packed)
+        await self._evaluations.ask.upload(bundle.digest, bundle.packed)
 
     async def _play(
         self, record: RunRecord, index: int, cases: tuple[Case, ...], digest: str, fingerprint_class: str
@@ -280,12 +259,8 @@ class Rescorer:
                 indexes=missing,
                 fingerprint_class=fingerprint_class,
             )
-            async with contextlib.aclosing(self._ask.evaluate(message)) as outcomes:
-                async for outcome, _, waits_for in outcomes:
-                    if outcome is not None:
-                        found[missing[outcome.index]] = outcome
-                        self._came += 1
-                    self._tell(self._came, waits_for)
+            async for outcome in self._evaluations.outcomes(message):
+                found[missing[outcome.index]] = outcome
             attempt += 1
         played = [found[place] for place in range(len(cases))]
         return Rescored(

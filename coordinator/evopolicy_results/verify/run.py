@@ -12,9 +12,8 @@ Rules that this module owns:
 
 from __future__ import annotations
 
-import contextlib
 import uuid
-from collections.abc import AsyncIterator, Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import msgspec
@@ -29,7 +28,6 @@ from evopolicy_common.messages.operator import (
     Evaluate,
     PlayedAs,
 )
-from evopolicy_common.records.blobs import digest_of
 from evopolicy_common.records.episodes import compare as verify_compare
 from evopolicy_common.records.episodes.rendered import decode
 from evopolicy_common.records.episodes.trajectory import Trajectory
@@ -38,15 +36,13 @@ from evopolicy_common.records.journal import Result
 from evopolicy_common.records.policies.checkpoints import bundle_of
 from evopolicy_common.records.rescores import FOLDER, rescore_names
 from evopolicy_common.records.summary import Summary
-from evopolicy_common.wire.operator_client import TIMEOUT_S, OperatorClient
+from evopolicy_common.wire.operator_client import TIMEOUT_S
 from evopolicy_common.wire.transport import Link
+from evopolicy_results.evaluations import Evaluations, Tell
 from evopolicy_results.verify import numbers as verify_numbers
 from evopolicy_results.verify.source import RANDOM, Played, RunUnderTest
 
 _SPLITS: tuple[Split, ...] = ("train", "validation", "heldout")
-
-Tell = Callable[[int, str], None]
-"""Called with the number of finished episodes and what the cluster waits for (empty: nothing)."""
 
 
 class Finding(msgspec.Struct, frozen=True, kw_only=True):
@@ -102,14 +98,12 @@ class Verifier:
     def __init__(
         self, link: Link, run: RunUnderTest, tell: Tell, tier: Tier | None = None, *, own: bool = False
     ) -> None:
-        """`own`: as for `OperatorClient`."""
-        self._ask = OperatorClient(link, own=own)
+        """`own`: as for `Evaluations`."""
+        self._evaluations = Evaluations(link, tell, own=own)
         self._run = run
-        self._tell = tell
         self._tier: Tier = tier or run.record.sandbox_tier
         self._limits = run.record.experiment_dimensions.limits or ResourceLimits()
         self._knows_run = False
-        self._came = 0
         self._kept: dict[int, _Recording] = {}
         """Recordings of the list that was replayed last, by index."""
         self.report = Report(run_directory=str(run.root), env=run.record.env)
@@ -164,16 +158,12 @@ class Verifier:
         recordings = await self._recordings(played, indexes)
         if not recordings:
             return
-        refs = []
-        for recording in recordings:
-            digest = digest_of(recording.actions)
-            await self._ask.upload(digest, recording.actions)
-            refs.append(BlobRef(digest=digest, size=len(recording.actions)))
+        refs = [await self._evaluations.uploaded(recording.actions) for recording in recordings]
         record: Record = "full" if played.split == "train" else "actions"
         by_index = dict(enumerate(recordings))
         returns: dict[int, float] = {}
         message = self._evaluate(played, [one.index for one in recordings], record, replays=tuple(refs))
-        async for outcome in self._outcomes(message):
+        async for outcome in self._evaluations.outcomes(message):
             recording = by_index.pop(outcome.index)
             returns[recording.index] = outcome.episode_return
             await self._compare(played, recording, outcome)
@@ -206,9 +196,9 @@ class Verifier:
             return  # otherwise a difference that the check of numbers has found
         if bundle.digest != played.digest:
             return  # a difference that the check of numbers has found
-        await self._ask.upload(bundle.digest, bundle.packed)
+        await self._evaluations.ask.upload(bundle.digest, bundle.packed)
         message = self._evaluate(played, indexes, "full", bundle=bundle.digest)
-        async for outcome in self._outcomes(message):
+        async for outcome in self._evaluations.outcomes(message):
             recording = self._kept.get(indexes[outcome.index])
             if recording is None:
                 continue
@@ -243,7 +233,7 @@ class Verifier:
             rows = self._rows(played, index)
             stored: bytes | None = None
             if outcome is not None and outcome.trajectory is not None:
-                stored = await self._ask.fetch(outcome.trajectory)
+                stored = await self._evaluations.ask.fetch(outcome.trajectory)
                 actions = verify_compare.recorded_actions(decode(stored))
             elif rows is not None:
                 try:
@@ -285,7 +275,7 @@ class Verifier:
 
     async def _stored(self, played: Played) -> dict[int, EpisodeOutcome]:
         """Outcomes that the coordinator stored, by index."""
-        found = self._ask.recorded(
+        found = self._evaluations.ask.recorded(
             self._run.record.run, played.split, played.submit_index, timeout_s=TIMEOUT_S
         )
         return {outcome.index: outcome async for outcome in found}
@@ -295,8 +285,7 @@ class Verifier:
     async def _compare(self, played: Played, recording: _Recording, outcome: EpisodeOutcome) -> None:
         self.report.episodes += 1
         index, name = recording.index, played.name(recording.index)
-        assert outcome.trajectory is not None
-        replayed = decode(await self._ask.fetch(outcome.trajectory))
+        replayed = await self._evaluations.recording(outcome)
         for what, difference in (
             ("the stored record", _stored_difference(recording, replayed, outcome)),
             ("the feedback files", self._files_difference(played, recording, replayed)),
@@ -328,8 +317,7 @@ class Verifier:
     ) -> str | None:
         if outcome.failure is not None and outcome.length == 0:
             return f"{outcome.failure.category}: {outcome.failure.message}"
-        assert outcome.trajectory is not None
-        again = decode(await self._ask.fetch(outcome.trajectory))
+        again = await self._evaluations.recording(outcome)
         if recording.stored is not None:
             return verify_compare.first_difference(decode(recording.stored), again)
         return _of_files(played, recording.index, again, actions=True)
@@ -346,7 +334,7 @@ class Verifier:
             n_validation=dimensions.n_validation,
             n_heldout=dimensions.n_heldout,
         )
-        return await self._ask.describe(message)
+        return await self._evaluations.ask.describe(message)
 
     def _evaluate(
         self,
@@ -382,15 +370,6 @@ class Verifier:
                 observations="arrays" if played.submit_index == RANDOM else dimensions.observations,
             ),
         )
-
-    async def _outcomes(self, message: Evaluate) -> AsyncIterator[EpisodeOutcome]:
-        """Yields outcomes as they arrive."""
-        async with contextlib.aclosing(self._ask.evaluate(message)) as outcomes:
-            async for outcome, _, waits_for in outcomes:
-                self._came += outcome is not None
-                self._tell(self._came, waits_for)
-                if outcome is not None:
-                    yield outcome
 
 
 def _summarised(

@@ -23,6 +23,7 @@ from evopolicy_common.wire.transport import IncomingQuery, Link
 from evopolicy_gateway.run.operations import Operations
 from evopolicy_gateway.submits import coordinator_client
 from evopolicy_gateway.submits.coordinator_client import CoordinatorClient
+from evopolicy_results.evaluations import Evaluations
 from evopolicy_results.verify import run as verify_run
 
 SOON_S = 0.2
@@ -102,7 +103,7 @@ def test_a_verification_gives_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 
     async def scenario(link: Link) -> None:
         verification: Any = object.__new__(verify_run.Verifier)
-        verification._ask = operator_client.OperatorClient(link)
+        verification._evaluations = Evaluations(link, lambda count, waits_for: None)
         verification._run = SimpleNamespace(record=SimpleNamespace(run="r"))
         with pytest.raises(TransportError):
             await verification._stored(SimpleNamespace(split="train", submit_index=0))
