@@ -43,10 +43,11 @@ from evopolicy_common.messages.environment import Case, EnvironmentDescription
 from evopolicy_common.messages.episode import EpisodeOutcome, Job
 from evopolicy_common.records.blobs import BlobStore
 from evopolicy_common.records.episodes import rendered
+from evopolicy_common.records.open_run import OpenedRun
 from evopolicy_common.wire import credentials, transport
 from evopolicy_coordinator.core.contract.records import train_group
 from evopolicy_coordinator.storage.store import Reader
-from evopolicy_gateway.run_folder.layout import OpenedRun, RunFolder, save
+from evopolicy_gateway.run_folder.layout import RunFolder, save
 from evopolicy_worker import environments
 from evopolicy_worker.slot_protocol import slot_messages
 from evopolicy_worker.supervisor import Options, Supervisor

@@ -41,13 +41,14 @@ from evopolicy_common.messages.run_settings import RunSettings
 from evopolicy_common.messages.worker import BlobPut, Message, Refused
 from evopolicy_common.records.blobs import digest_of
 from evopolicy_common.records.episodes.trajectory import Recorder
+from evopolicy_common.records.open_run import OpenedRun
 from evopolicy_common.records.policies import bundles
 from evopolicy_common.records.policies.bundles import BundleFile
 from evopolicy_common.wire import codec, credentials, keys, transport
 from evopolicy_common.wire.credentials import Credentials
 from evopolicy_coordinator.core.contract.settings import CoreSettings
 from evopolicy_gateway.run.gateway import Close, Gateway
-from evopolicy_gateway.run_folder.layout import OpenedRun, RunFolder, save
+from evopolicy_gateway.run_folder.layout import RunFolder, save
 from evopolicy_gateway.submits.pipeline import SubmitPipeline
 from evopolicy_gateway.workspace.agents_md import Urls
 

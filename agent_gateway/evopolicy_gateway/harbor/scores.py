@@ -21,9 +21,10 @@ from starlette.routing import Route
 
 from evopolicy_common.errors import ConfigError, EvopolicyError
 from evopolicy_common.records.blobs import write_atomically
+from evopolicy_common.records.open_run import IntendedRun
 from evopolicy_common.records.run_files import read_record
 from evopolicy_gateway.harbor.task import task_files, task_name
-from evopolicy_gateway.run_folder.layout import IntendedRun, RunFolder, folder_of, saved
+from evopolicy_gateway.run_folder.layout import RunFolder, folder_of, saved
 from evopolicy_gateway.run_folder.listener import finish
 
 _TOKEN = ".token"

@@ -25,13 +25,14 @@ import msgspec
 from evopolicy_common.errors import ConfigError, RefusedError
 from evopolicy_common.logs import structlog
 from evopolicy_common.records.blobs import BlobStore
+from evopolicy_common.records.open_run import Closed, OpenedRun
 from evopolicy_common.refusals import RUN_OVER
 from evopolicy_common.wire import credentials, transport
 from evopolicy_common.wire.http import serving
 from evopolicy_gateway.http.server import bind
 from evopolicy_gateway.http.service import make_app
-from evopolicy_gateway.run_folder.journal import Closed, Journal
-from evopolicy_gateway.run_folder.layout import OpenedRun, RunFolder, saved
+from evopolicy_gateway.run_folder.journal import Journal
+from evopolicy_gateway.run_folder.layout import RunFolder, saved
 from evopolicy_gateway.run_folder.listener import AgentPlace, agent_place, ends_unseen
 from evopolicy_gateway.submits.coordinator_client import CoordinatorClient
 from evopolicy_gateway.submits.pipeline import SubmitPipeline

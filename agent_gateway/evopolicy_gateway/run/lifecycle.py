@@ -32,6 +32,7 @@ from evopolicy_common.processes import child_process, host
 from evopolicy_common.processes.left_files import keep_to_owner
 from evopolicy_common.processes.notices import Waiting
 from evopolicy_common.processes.scratch import remove_tree
+from evopolicy_common.records.open_run import IntendedRun, OpenedRun
 from evopolicy_common.records.run_files import read_record
 from evopolicy_common.records.run_record import RunRecord
 from evopolicy_common.records.secrets import without_keys
@@ -60,7 +61,7 @@ from evopolicy_gateway.run.operations import Operations
 from evopolicy_gateway.run.plan import Plan
 from evopolicy_gateway.run.times import Stopwatch
 from evopolicy_gateway.run.watch import Watch
-from evopolicy_gateway.run_folder.layout import IntendedRun, OpenedRun, save, saved
+from evopolicy_gateway.run_folder.layout import save, saved
 from evopolicy_gateway.run_folder.listener import TOKEN_VARIABLE, agent_place, place_notice
 from evopolicy_gateway.run_folder.locks import alone
 from evopolicy_gateway.workspace import staging as workspace

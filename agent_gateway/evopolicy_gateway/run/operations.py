@@ -24,12 +24,13 @@ from evopolicy_common.messages.operator import (
 from evopolicy_common.messages.run_settings import RunSettings
 from evopolicy_common.messages.worker import Message
 from evopolicy_common.processes.notices import notify_if_slow
+from evopolicy_common.records.open_run import IntendedRun, OpenedRun
 from evopolicy_common.refusals import WRONG_SETTINGS, Refusal
 from evopolicy_common.wire import credentials
 from evopolicy_common.wire.credentials import Credentials
 from evopolicy_common.wire.operator_client import TIMEOUT_S, WAIT_S, OperatorClient
 from evopolicy_common.wire.transport import Link
-from evopolicy_gateway.run_folder.layout import IntendedRun, OpenedRun, RunFolder, saved
+from evopolicy_gateway.run_folder.layout import RunFolder, saved
 from evopolicy_gateway.run_folder.locks import until_free
 
 T = TypeVar("T")

@@ -14,12 +14,13 @@ from evopolicy_common.messages.environment import StepLimit
 from evopolicy_common.messages.run_settings import RunSettings
 from evopolicy_common.processes.preflight import check_installed, check_loopback, check_text, check_writable
 from evopolicy_common.processes.scratch import remove_tree
+from evopolicy_common.records.open_run import IntendedRun
 from evopolicy_gateway import harnesses
 from evopolicy_gateway.harnesses.interface.agent_config import AgentConfig
 from evopolicy_gateway.jail.settings import JailSettings
 from evopolicy_gateway.processes.clock import SILENCE_S
 from evopolicy_gateway.run.texts import Texts
-from evopolicy_gateway.run_folder.layout import IntendedRun, RunFolder, run_folder, saved
+from evopolicy_gateway.run_folder.layout import RunFolder, run_folder, saved
 from evopolicy_gateway.run_folder.listener import Listener, check_agent
 from evopolicy_gateway.run_folder.locks import check_free
 

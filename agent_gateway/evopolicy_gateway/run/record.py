@@ -31,6 +31,7 @@ from evopolicy_common.records.aggregates import mean, std
 from evopolicy_common.records.blobs import BlobStore, write_atomically
 from evopolicy_common.records.code_metrics import TREND, CodeMetrics
 from evopolicy_common.records.journal import GATEWAY_SIDE
+from evopolicy_common.records.open_run import Accepted, AnyEntry, Rejected, Requested
 from evopolicy_common.records.policies import bundles, checkpoints
 from evopolicy_common.records.policies.bundles import Bundle
 from evopolicy_common.records.policies.checkpoints import CheckpointMeta
@@ -58,7 +59,7 @@ from evopolicy_gateway.run.operations import Operations
 from evopolicy_gateway.run.plan import Plan
 from evopolicy_gateway.run.times import Times
 from evopolicy_gateway.run.transitions import Transitions, count_transitions
-from evopolicy_gateway.run_folder.journal import Accepted, AnyEntry, Journal, Rejected, Requested
+from evopolicy_gateway.run_folder.journal import Journal
 from evopolicy_gateway.run_folder.layout import RunFolder, Staged, saved
 from evopolicy_gateway.run_folder.names import submit_id
 

@@ -15,91 +15,8 @@ from pathlib import Path
 import msgspec
 
 from evopolicy_common.errors import DECODE_ERRORS, StorageError
-from evopolicy_common.messages.episode import PolicyFailure
 from evopolicy_common.records.blobs import fsync_directory
-
-
-class Entry(msgspec.Struct, frozen=True, kw_only=True, tag_field="what"):
-    """A line of the journal."""
-
-
-class Requested(Entry, frozen=True, kw_only=True, tag="requested"):
-    """A submit that passed the checks; written before anything of it is sent."""
-
-    key: str
-    """Idempotency key for the coordinator."""
-    client_key: str | None
-    """The agent's `Idempotency-Key`."""
-    body_digest: str
-    """SHA-256 of the request's body, hex."""
-    env_instances: tuple[int, ...]
-    bundle: str | None
-    """Digest of the snapshot; its bytes are in the blob store beside the journal."""
-    bundle_error: PolicyFailure | None
-    kept: str | None = None
-    """As in `Snapshot`."""
-
-
-class Accepted(Entry, frozen=True, kw_only=True, tag="accepted"):
-    """The coordinator has accepted it: durable and charged."""
-
-    key: str
-    submit_index: int
-    first_global_episode: int
-    remaining_budget: int
-
-
-class Settled(Entry, frozen=True, kw_only=True, tag="settled"):
-    """Its feedback is committed."""
-
-    key: str
-    status: str
-    summary: str
-    """The text of `summary.json`, byte for byte."""
-
-
-class Refused(Entry, frozen=True, kw_only=True, tag="refused"):
-    """The coordinator refused it; nothing was charged."""
-
-    key: str
-    status: str
-    message: str
-
-
-class Rejected(Entry, frozen=True, kw_only=True, tag="rejected"):
-    """A request with an invalid form or outside the bounds, refused here before the snapshot."""
-
-    status: str
-    message: str
-    at: float
-    """Unix time, seconds."""
-    after_submits: int
-    """Number of submits accepted before it."""
-
-
-class Died(Entry, frozen=True, kw_only=True, tag="died"):
-    """A gateway died while it worked on a submit, or on the feedback of some of its episodes."""
-
-    key: str
-    episodes: tuple[int, ...] = ()
-    """Request indices of these episodes; empty: the submit as a whole."""
-
-
-class SetAside(Entry, frozen=True, kw_only=True, tag="set_aside"):
-    """A submit on which the gateway failed twice: it has no feedback and is not retried."""
-
-    key: str
-    message: str
-
-
-class Closed(Entry, frozen=True, kw_only=True, tag="closed"):
-    """The coordinator has recorded that no more submits come."""
-
-    reason: str
-
-
-AnyEntry = Requested | Accepted | Settled | Refused | Rejected | Died | SetAside | Closed
-_decoder = msgspec.json.Decoder(AnyEntry)
+from evopolicy_common.records.open_run import AnyEntry, entry_decoder
 
 
 class AtWork:
@@ -190,7 +107,7 @@ class Journal:
         """Returns the entry at a file offset."""
         with self._path.open("rb") as file:
             file.seek(place)
-            entry: AnyEntry = _decoder.decode(file.readline())
+            entry: AnyEntry = entry_decoder.decode(file.readline())
             return entry
 
     def forget(self) -> None:
@@ -207,7 +124,7 @@ class Journal:
         place = 0
         for number, line in enumerate(data[:whole].splitlines(keepends=True), start=1):
             try:
-                self.entries.append(_decoder.decode(line))
+                self.entries.append(entry_decoder.decode(line))
                 self.places.append(place)
                 place += len(line)
             except DECODE_ERRORS as error:

@@ -13,7 +13,7 @@ from typing import TypeVar
 import msgspec
 
 from evopolicy_common.errors import DECODE_ERRORS, ConfigError
-from evopolicy_common.messages.run_settings import RunSettings
+from evopolicy_common.records import open_run
 from evopolicy_common.records.blobs import write_atomically
 from evopolicy_common.records.run_record import Artifacts
 from evopolicy_common.records.secrets import PASSED
@@ -95,7 +95,7 @@ class RunFolder(msgspec.Struct, frozen=True):
     @property
     def state(self) -> Path:
         """The gateway's own folder, while the run is open."""
-        return self.root / ".gateway"
+        return self.root / open_run.STATE
 
     @property
     def credentials(self) -> Path:
@@ -110,7 +110,7 @@ class RunFolder(msgspec.Struct, frozen=True):
     @property
     def listener(self) -> Path:
         """The address that serves a remote agent: `Listener`. Missing for an agent that is started here."""
-        return self.state / "door.json"
+        return self.root / open_run.LISTENER
 
     @property
     def bearer(self) -> Path:
@@ -125,22 +125,22 @@ class RunFolder(msgspec.Struct, frozen=True):
     @property
     def unwatched(self) -> Path:
         """Created by a gateway that was started by hand: only the operator knows the end of its unwatched agent."""
-        return self.state / "unwatched"
+        return self.root / open_run.UNWATCHED
 
     @property
     def journal(self) -> Path:
         """The gateway's record of requests; see `journal.py`."""
-        return self.state / "journal.jsonl"
+        return self.root / open_run.JOURNAL
 
     @property
     def blobs(self) -> Path:
         """Submitted snapshots of `system/`."""
-        return self.state / "bundles"
+        return self.root / open_run.BUNDLES
 
     @property
     def opened(self) -> Path:
         """The id of this run: `OpenedRun`."""
-        return self.state / "run.json"
+        return self.root / open_run.OPENED
 
     @property
     def lock(self) -> Path:
@@ -160,7 +160,7 @@ class RunFolder(msgspec.Struct, frozen=True):
     @property
     def intended(self) -> Path:
         """The request to open the run, written before it is sent: `IntendedRun`."""
-        return self.state / "intended.json"
+        return self.root / open_run.INTENDED
 
     @property
     def session(self) -> Path:
@@ -181,21 +181,6 @@ class RunFolder(msgspec.Struct, frozen=True):
     def staged(self) -> Path:
         """Hashes and bounds of the staged workspace: `Staged`."""
         return self.state / "staged.json"
-
-
-class OpenedRun(msgspec.Struct, frozen=True, kw_only=True):
-    """The run of the cluster that a folder belongs to."""
-
-    run: str
-    agents_md: str = ""
-    """The operator's text in place of `AGENTS.md`; empty: the standard text."""
-
-
-class IntendedRun(msgspec.Struct, frozen=True, kw_only=True):
-    """The request to open a run. A command that was killed in between repeats it unchanged and gets the same run."""
-
-    key: str
-    settings: RunSettings
 
 
 class Staged(msgspec.Struct, frozen=True, kw_only=True):

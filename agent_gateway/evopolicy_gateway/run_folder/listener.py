@@ -21,7 +21,8 @@ import msgspec
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.run_settings import ELSEWHERE
 from evopolicy_common.processes import host
-from evopolicy_gateway.run_folder.layout import IntendedRun, RunFolder, saved
+from evopolicy_common.records.open_run import IntendedRun
+from evopolicy_gateway.run_folder.layout import RunFolder, saved
 
 AGENT = "remote"
 """Value of `--agent` for an agent that is started elsewhere."""

@@ -35,11 +35,11 @@ from evopolicy_common.messages.gateway import (
     SubmitAccepted,
 )
 from evopolicy_common.messages.worker import Message
+from evopolicy_common.records.open_run import Requested
 from evopolicy_common.refusals import NOT_NOW
 from evopolicy_common.wire import codec, keys
 from evopolicy_common.wire.requests import Requester
 from evopolicy_common.wire.transport import Link
-from evopolicy_gateway.run_folder.journal import Requested
 from evopolicy_gateway.run_folder.listener import AgentPlace
 
 RESULTS_WAIT_S = 10.0

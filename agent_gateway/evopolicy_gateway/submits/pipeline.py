@@ -33,19 +33,19 @@ from evopolicy_common.messages.gateway import (
     SubmitDone,
 )
 from evopolicy_common.records.blobs import BlobStore, digest_of
-from evopolicy_common.refusals import RUN_OVER, Refusal
-from evopolicy_gateway.run_folder.journal import (
+from evopolicy_common.records.open_run import (
     Accepted,
     AnyEntry,
     Closed,
     Died,
-    Journal,
     Refused,
     Rejected,
     Requested,
     SetAside,
     Settled,
 )
+from evopolicy_common.refusals import RUN_OVER, Refusal
+from evopolicy_gateway.run_folder.journal import Journal
 from evopolicy_gateway.run_folder.names import episode_name
 from evopolicy_gateway.submits import formatting, snapshots
 from evopolicy_gateway.submits.coordinator_client import HELD_WAIT_S, RESULTS_WAIT_S, CoordinatorClient

@@ -9,7 +9,7 @@ from collections.abc import Callable
 import msgspec
 
 from evopolicy_common.errors import RequestError
-from evopolicy_gateway.run_folder.journal import Accepted, Requested
+from evopolicy_common.records.open_run import Accepted, Requested
 from evopolicy_gateway.run_folder.names import submit_id
 from evopolicy_gateway.submits.snapshots import Snapshot
 

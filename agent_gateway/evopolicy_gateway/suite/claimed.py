@@ -28,6 +28,7 @@ from evopolicy_common.errors import EvopolicyError, StorageError
 from evopolicy_common.local.cluster import unless_failed
 from evopolicy_common.messages.operator import ClaimState
 from evopolicy_common.processes.scratch import remove_tree
+from evopolicy_common.records.open_run import OpenedRun
 from evopolicy_common.records.run_files import read_record
 from evopolicy_common.records.suite_folder import FINISHED, INDEX, PAUSED, Entry, Index
 from evopolicy_common.wire.credentials import Credentials
@@ -36,7 +37,7 @@ from evopolicy_gateway.harnesses.coding_agents import session
 from evopolicy_gateway.processes.child_messages import AgentDoing
 from evopolicy_gateway.run.operations import Operations
 from evopolicy_gateway.run.plan import Plan
-from evopolicy_gateway.run_folder.layout import OpenedRun, RunFolder, saved
+from evopolicy_gateway.run_folder.layout import RunFolder, saved
 from evopolicy_gateway.suite import suite_index, sweep
 from evopolicy_gateway.suite.decisions import Decision, Found
 from evopolicy_gateway.suite.suite_file import SuiteFile

@@ -14,10 +14,11 @@ from evopolicy_common.messages.gateway import CloseRun, OpenRun, RequestPermit
 from evopolicy_common.messages.run_settings import ELSEWHERE, RunSettings
 from evopolicy_common.messages.worker import Message, Refused
 from evopolicy_common.processes import host
+from evopolicy_common.records.open_run import IntendedRun
 from evopolicy_common.refusals import Refusal
 from evopolicy_gateway.run.gateway import Close, Gateway
 from evopolicy_gateway.run_folder import listener
-from evopolicy_gateway.run_folder.layout import IntendedRun, RunFolder, save
+from evopolicy_gateway.run_folder.layout import RunFolder, save
 from evopolicy_gateway.run_folder.listener import AgentPlace, Listener
 from evopolicy_gateway.submits import coordinator_client
 

@@ -13,7 +13,8 @@ import pytest
 from gateway_double import Double, answering, gateway_on, opened, packed_episode, prepare, served
 
 from evopolicy_common.records.episodes import rendered
-from evopolicy_gateway.run_folder.journal import Died, Journal, SetAside
+from evopolicy_common.records.open_run import Died, SetAside
+from evopolicy_gateway.run_folder.journal import Journal
 from evopolicy_gateway.run_folder.layout import RunFolder
 from evopolicy_gateway.submits import formatting
 

@@ -18,9 +18,11 @@ import numpy as np
 
 from evopolicy_common.errors import DECODE_ERRORS, BundleError
 from evopolicy_common.messages.bounds import LARGEST
+from evopolicy_common.records import open_run
 from evopolicy_common.records.blobs import is_digest
 from evopolicy_common.records.episodes.npz import read_arrays
 from evopolicy_common.records.json_lines import objects
+from evopolicy_common.records.open_run import Accepted, Requested
 from evopolicy_common.records.policies import bundles
 from evopolicy_common.records.policies.checkpoints import METADATA
 from evopolicy_coordinator.web.content.confined import Confined, NotThereError
@@ -116,16 +118,20 @@ class Detail:
     def _bundle_of(self, index: int) -> str | None:
         """The digest of a submit's snapshot, by the gateway's journal."""
         try:
-            data = self.files.read(".gateway/journal.jsonl", _MAX_JOURNAL)
+            data = self.files.read(open_run.JOURNAL, _MAX_JOURNAL)
         except NotThereError:
             return None
         bundles_by_key: dict[str, str | None] = {}
-        for entry in objects(data.splitlines()):
-            if entry.get("what") == "requested":
-                bundles_by_key[str(entry.get("key"))] = entry.get("bundle") or entry.get("kept")
-            elif entry.get("what") == "accepted" and entry.get("submit_index") == index:
-                digest = bundles_by_key.get(str(entry.get("key")))
-                return digest if isinstance(digest, str) and is_digest(digest) else None
+        for line in data.splitlines():
+            try:
+                entry = open_run.entry_decoder.decode(line)
+            except DECODE_ERRORS:
+                continue
+            if isinstance(entry, Requested):
+                bundles_by_key[entry.key] = entry.bundle or entry.kept
+            elif isinstance(entry, Accepted) and entry.submit_index == index:
+                digest = bundles_by_key.get(entry.key)
+                return digest if digest is not None and is_digest(digest) else None
         return None
 
     def _checkpoint(self, index: int) -> tuple[CodeFile, ...]:
@@ -312,7 +318,7 @@ def _unpacked(files: Confined, digest: str) -> tuple[CodeFile, ...] | None:
     if digest in _unpacked_bundles:
         return _unpacked_bundles[digest]
     try:
-        packed = files.read(f".gateway/bundles/{digest[:2]}/{digest}", _MAX_BUNDLE)
+        packed = files.read(f"{open_run.BUNDLES}/{digest[:2]}/{digest}", _MAX_BUNDLE)
         bundle = bundles.load(packed, digest)
     except (NotThereError, BundleError, *DECODE_ERRORS):
         return None

@@ -22,6 +22,8 @@ import msgspec
 from evopolicy_common.errors import DECODE_ERRORS, ProtocolError
 from evopolicy_common.messages.run_settings import RunSettings
 from evopolicy_common.messages.status import RunStatus
+from evopolicy_common.records import open_run
+from evopolicy_common.records.open_run import IntendedRun, OpenedRun
 from evopolicy_common.records.run_files import RUN_JSON, read_record
 from evopolicy_common.records.run_record import RunRecord
 from evopolicy_common.records.suite_folder import INDEX, PAUSED, Entry, Index
@@ -32,14 +34,6 @@ from evopolicy_results.reading.environments import learn_names
 from evopolicy_results.reading.reader import find_run_dirs
 
 _MAX_SUMMARY_BYTES = 8 << 20
-
-
-class _Intended(msgspec.Struct, frozen=True, kw_only=True):
-    settings: RunSettings
-
-
-class _Opened(msgspec.Struct, frozen=True, kw_only=True):
-    run: str
 
 
 class SubmitFacts(msgspec.Struct, frozen=True, kw_only=True):
@@ -455,34 +449,33 @@ def _index(root: Path) -> Index | None:
 
 def _settings(folder: Path) -> RunSettings | None:
     try:
-        data = Confined(folder).read(".gateway/intended.json", _MAX_SUMMARY_BYTES)
-        return msgspec.json.decode(data, type=_Intended).settings
+        data = Confined(folder).read(open_run.INTENDED, _MAX_SUMMARY_BYTES)
+        return msgspec.json.decode(data, type=IntendedRun).settings
     except (NotThereError, *DECODE_ERRORS):
         return None
 
 
 def _opened(folder: Path) -> str:
     try:
-        data = Confined(folder).read(".gateway/run.json", _MAX_SUMMARY_BYTES)
-        return msgspec.json.decode(data, type=_Opened).run
+        data = Confined(folder).read(open_run.OPENED, _MAX_SUMMARY_BYTES)
+        return msgspec.json.decode(data, type=OpenedRun).run
     except (NotThereError, *DECODE_ERRORS):
         return ""
 
 
 def _began(folder: Path) -> float | None:
     try:
-        return (folder / ".gateway" / "intended.json").stat().st_mtime
+        return (folder / open_run.INTENDED).stat().st_mtime
     except OSError:
         return None
 
 
 def _agent_alive(folder: Path) -> bool:
     """Whether an agent of an open run may be alive: a lock of its folder is held, or no process here watches it."""
-    state = folder / ".gateway"
-    if any((state / name).exists() for name in ("door.json", "unwatched")):
+    if any((folder / path).exists() for path in (open_run.LISTENER, open_run.UNWATCHED)):
         return True
     try:
-        locks = [path for path in state.iterdir() if path.suffix == ".lock"]
+        locks = [path for path in (folder / open_run.STATE).iterdir() if path.suffix == ".lock"]
     except OSError:
         return False
     return any(_is_held(lock) for lock in locks)

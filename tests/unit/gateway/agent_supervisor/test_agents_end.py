@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 from machines.cgroups import freezer
 
+from evopolicy_common.records.open_run import OpenedRun
 from evopolicy_gateway.processes import child_messages
 from evopolicy_gateway.processes.child_messages import (
     AgentEnded,
@@ -26,7 +27,7 @@ from evopolicy_gateway.processes.child_messages import (
 )
 from evopolicy_gateway.run.operations import Operations
 from evopolicy_gateway.run_folder import locks
-from evopolicy_gateway.run_folder.layout import OpenedRun, RunFolder, save
+from evopolicy_gateway.run_folder.layout import RunFolder, save
 from evopolicy_gateway.run_folder.listener import Listener
 
 TIMEOUT_S = 60.0

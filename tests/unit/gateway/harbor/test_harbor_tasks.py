@@ -16,9 +16,10 @@ from starlette.testclient import TestClient
 
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.run_settings import RunSettings
+from evopolicy_common.records.open_run import IntendedRun
 from evopolicy_gateway.harbor import scores
 from evopolicy_gateway.harbor.scores import make_app, tasks_in, token_of, write_task
-from evopolicy_gateway.run_folder.layout import IntendedRun, RunFolder, save
+from evopolicy_gateway.run_folder.layout import RunFolder, save
 from evopolicy_gateway.run_folder.listener import Listener, finish
 
 URL = "http://10.0.0.5:8090"

@@ -21,6 +21,7 @@ from evopolicy_common.errors import ConfigError, ProtocolError
 from evopolicy_common.messages.episode import LARGEST_LIMIT, LARGEST_LIMITS, ResourceLimits
 from evopolicy_common.messages.operator import RunProgress
 from evopolicy_common.messages.run_settings import PUBLISHED, off_profile
+from evopolicy_common.records.open_run import Rejected
 from evopolicy_common.records.run_record import decode_run_record, encode_run_record
 from evopolicy_gateway.cli.play import _unjailed
 from evopolicy_gateway.cli.run_options import RunOptions
@@ -34,7 +35,6 @@ from evopolicy_gateway.run.record import run_record
 from evopolicy_gateway.run.times import Times
 from evopolicy_gateway.run.transitions import Transitions
 from evopolicy_gateway.run.watch import RunView
-from evopolicy_gateway.run_folder.journal import Rejected
 from evopolicy_gateway.run_folder.layout import Staged
 
 

@@ -9,11 +9,12 @@ import pytest
 
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.records.blobs import write_atomically
+from evopolicy_common.records.open_run import OpenedRun
 from evopolicy_common.wire import credentials
 from evopolicy_common.wire.credentials import Credentials, TlsFiles
 from evopolicy_gateway.run import gateway
 from evopolicy_gateway.run.operations import find_credentials
-from evopolicy_gateway.run_folder.layout import OpenedRun, RunFolder
+from evopolicy_gateway.run_folder.layout import RunFolder
 
 RUNS_OWN = Credentials(
     cluster="c",

@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 from evopolicy_common.errors import ConfigError
-from evopolicy_gateway.run_folder.layout import OpenedRun, RunFolder, save, saved
+from evopolicy_common.records.open_run import OpenedRun
+from evopolicy_gateway.run_folder.layout import RunFolder, save, saved
 
 
 def test_a_file_that_a_disk_has_damaged_is_reported(tmp_path: Path) -> None:

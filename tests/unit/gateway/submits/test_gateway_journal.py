@@ -10,15 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evopolicy_common.errors import StorageError
-from evopolicy_gateway.run_folder.journal import (
-    Accepted,
-    AnyEntry,
-    Closed,
-    Journal,
-    Rejected,
-    Requested,
-    Settled,
-)
+from evopolicy_common.records.open_run import Accepted, AnyEntry, Closed, Rejected, Requested, Settled
+from evopolicy_gateway.run_folder.journal import Journal
 
 REQUESTED = Requested(
     key="k", client_key=None, body_digest="d", env_instances=(1, 2), bundle="b" * 64, bundle_error=None

@@ -1,0 +1,121 @@
+"""Private files in the folder of an open run, which its gateway writes, and which the live view reads too.
+
+Paths are relative to the run's folder.
+"""
+
+from __future__ import annotations
+
+import msgspec
+
+from evopolicy_common.messages.episode import PolicyFailure
+from evopolicy_common.messages.run_settings import RunSettings
+
+STATE = ".gateway"
+"""The gateway's own folder, while the run is open."""
+INTENDED = f"{STATE}/intended.json"
+OPENED = f"{STATE}/run.json"
+LISTENER = f"{STATE}/door.json"
+"""There for a remote agent."""
+UNWATCHED = f"{STATE}/unwatched"
+"""There for an agent that was started by hand."""
+JOURNAL = f"{STATE}/journal.jsonl"
+"""One `AnyEntry` a line."""
+BUNDLES = f"{STATE}/bundles"
+
+
+class OpenedRun(msgspec.Struct, frozen=True, kw_only=True):
+    """The run of the cluster that a folder belongs to."""
+
+    run: str
+    agents_md: str = ""
+    """The operator's text in place of `AGENTS.md`; empty: the standard text."""
+
+
+class IntendedRun(msgspec.Struct, frozen=True, kw_only=True):
+    """The request to open a run. A command that was killed in between repeats it unchanged and gets the same run."""
+
+    key: str
+    settings: RunSettings
+
+
+class Entry(msgspec.Struct, frozen=True, kw_only=True, tag_field="what"):
+    """A line of the journal."""
+
+
+class Requested(Entry, frozen=True, kw_only=True, tag="requested"):
+    """A submit that passed the checks; written before anything of it is sent."""
+
+    key: str
+    """Idempotency key for the coordinator."""
+    client_key: str | None
+    """The agent's `Idempotency-Key`."""
+    body_digest: str
+    """SHA-256 of the request's body, hex."""
+    env_instances: tuple[int, ...]
+    bundle: str | None
+    """Digest of the snapshot; its bytes are in the blob store beside the journal."""
+    bundle_error: PolicyFailure | None
+    kept: str | None = None
+    """As in `Snapshot`."""
+
+
+class Accepted(Entry, frozen=True, kw_only=True, tag="accepted"):
+    """The coordinator has accepted it: durable and charged."""
+
+    key: str
+    submit_index: int
+    first_global_episode: int
+    remaining_budget: int
+
+
+class Settled(Entry, frozen=True, kw_only=True, tag="settled"):
+    """Its feedback is committed."""
+
+    key: str
+    status: str
+    summary: str
+    """The text of `summary.json`, byte for byte."""
+
+
+class Refused(Entry, frozen=True, kw_only=True, tag="refused"):
+    """The coordinator refused it; nothing was charged."""
+
+    key: str
+    status: str
+    message: str
+
+
+class Rejected(Entry, frozen=True, kw_only=True, tag="rejected"):
+    """A request with an invalid form or outside the bounds, refused here before the snapshot."""
+
+    status: str
+    message: str
+    at: float
+    """Unix time, seconds."""
+    after_submits: int
+    """Number of submits accepted before it."""
+
+
+class Died(Entry, frozen=True, kw_only=True, tag="died"):
+    """A gateway died while it worked on a submit, or on the feedback of some of its episodes."""
+
+    key: str
+    episodes: tuple[int, ...] = ()
+    """Request indices of these episodes; empty: the submit as a whole."""
+
+
+class SetAside(Entry, frozen=True, kw_only=True, tag="set_aside"):
+    """A submit on which the gateway failed twice: it has no feedback and is not retried."""
+
+    key: str
+    message: str
+
+
+class Closed(Entry, frozen=True, kw_only=True, tag="closed"):
+    """The coordinator has recorded that no more submits come."""
+
+    reason: str
+
+
+AnyEntry = Requested | Accepted | Settled | Refused | Rejected | Died | SetAside | Closed
+entry_decoder = msgspec.json.Decoder(AnyEntry)
