@@ -12,15 +12,13 @@ from typing import Annotated, Any, NoReturn, TypeVar
 
 import typer
 from typer.core import TyperCommand, TyperGroup
+from typer.exceptions import TyperException
 
 import evopolicy_common
 from evopolicy_common.cli.conventions import USAGE_ERROR, fail, fail_on_our_errors, setup_notices
 from evopolicy_common.entry import interruptible
 from evopolicy_common.processes.preflight import EXTRAS, missing
 from evopolicy_common.terminal import end_without_reader, harmless, one_line, open_streams, say, shortened
-
-# typer ships click, in newer versions under another name; only its public exceptions lead to `ClickException`.
-_ClickError: Any = next(base for base in typer.BadParameter.__mro__ if base.__name__ == "ClickException")
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -167,7 +165,7 @@ def run_app(app: typer.Typer, extra: str | None = None) -> NoReturn:
     try:
         with needed_extras(extra), fail_on_our_errors():
             code = typer.main.get_command(app).main(standalone_mode=False)
-    except _ClickError as error:
+    except TyperException as error:
         fail(_usage_text(error), USAGE_ERROR)
     except (typer.Abort, KeyboardInterrupt):
         fail("interrupted", 130)

@@ -21,8 +21,12 @@ Rules of the policy's filter, which this module owns:
 from __future__ import annotations
 
 import errno
+import fcntl
+import mmap
 import os
 import platform
+import signal
+import termios
 
 from evopolicy_common.errors import SandboxError
 from evopolicy_common.seccomp import (
@@ -45,40 +49,23 @@ PID_MARK = 0x7FFFABCD
 instruction."""
 
 _FCNTL = (
-    0,
-    1,
-    2,
-    3,
-    4,
-    1030,
-    1032,
-)  # F_DUPFD, F_GETFD, F_SETFD, F_GETFL, F_SETFL, F_DUPFD_CLOEXEC, F_GETPIPE_SZ
+    *(fcntl.F_DUPFD, fcntl.F_GETFD, fcntl.F_SETFD, fcntl.F_GETFL, fcntl.F_SETFL),
+    *(fcntl.F_DUPFD_CLOEXEC, fcntl.F_GETPIPE_SZ),
+)
 _IOCTL = (
-    0x5401,
-    0x5413,
-    0x541B,
-    0x5421,
-    0x5450,
-    0x5451,
-)  # TCGETS, TIOCGWINSZ, FIONREAD, FIONBIO, FIONCLEX, FIOCLEX
+    *(termios.TCGETS, termios.TIOCGWINSZ, termios.FIONREAD),
+    *(termios.FIONBIO, termios.FIONCLEX, termios.FIOCLEX),
+)
 _MADVISE = (
-    0,
-    1,
-    2,
-    3,
-    4,
-    8,
-    14,
-    15,
-    16,
-    17,
-)  # MADV_NORMAL, _RANDOM, _SEQUENTIAL, _WILLNEED, _DONTNEED, _FREE, _HUGEPAGE, _NOHUGEPAGE, _DONTDUMP, _DODUMP
+    *(mmap.MADV_NORMAL, mmap.MADV_RANDOM, mmap.MADV_SEQUENTIAL, mmap.MADV_WILLNEED, mmap.MADV_DONTNEED),
+    *(mmap.MADV_FREE, mmap.MADV_HUGEPAGE, mmap.MADV_NOHUGEPAGE, mmap.MADV_DONTDUMP, mmap.MADV_DODUMP),
+)
 _FUTEX_PRIVATE = 128
 _FUTEX_WAIT, _FUTEX_WAIT_BITSET = 0, 9
-_MAP_SHARED, _MAP_ANONYMOUS, _MAP_HUGETLB = 0x01, 0x20, 0x40000
+_MAP_HUGETLB = 0x40000
 _PRCTL = (3, 15, 16)  # PR_GET_DUMPABLE, PR_SET_NAME, PR_GET_NAME
 _MODES_AND_TIMES = ("chmod", "fchmod", "fchmodat", "utime", "utimes", "utimensat", "futimesat")
-_NOT_TO_ITSELF = (9, 19, 20, 21, 22)  # SIGKILL, SIGSTOP, SIGTSTP, SIGTTIN, SIGTTOU
+_NOT_TO_ITSELF = (signal.SIGKILL, signal.SIGSTOP, signal.SIGTSTP, signal.SIGTTIN, signal.SIGTTOU)
 _EXTENDED_ATTRIBUTES = ("listxattr", "llistxattr", "flistxattr", "getxattr", "lgetxattr", "fgetxattr")
 _CLONE_THREAD = 0x00010000
 _CLONE_NAMESPACES = 0x7E020000
@@ -134,8 +121,8 @@ def policy_filter(*, sees_the_machines_files: bool = False) -> bytes:
         "statx": [refuse(errno.ENOSYS)],
         "mmap": [
             (LOAD, 0, 0, argument(3)),
-            (AND, 0, 0, _MAP_SHARED | _MAP_ANONYMOUS),
-            (JUMP_EQUAL, 0, 1, _MAP_SHARED | _MAP_ANONYMOUS),
+            (AND, 0, 0, mmap.MAP_SHARED | mmap.MAP_ANONYMOUS),
+            (JUMP_EQUAL, 0, 1, mmap.MAP_SHARED | mmap.MAP_ANONYMOUS),
             refuse(errno.EPERM),
             (LOAD, 0, 0, argument(3)),
             (AND, 0, 0, _MAP_HUGETLB),
