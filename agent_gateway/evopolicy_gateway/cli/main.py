@@ -43,7 +43,7 @@ GROUPS = {
         "run": Place(_PLAY, "Play one run on a cluster."),
         "finish": Place(_PLAY, "Close the run of a remote agent."),
         "harbor": Place(
-            "evopolicy_gateway.cli.harbor:app",
+            "evopolicy_gateway.harbor.command:app",
             "Write a Harbor task for each open run of a remote agent, and serve the runs' scores to Harbor's verifiers until"
             " Ctrl-C.",
         ),
@@ -76,7 +76,7 @@ GROUPS = {
         ),
         "check": Place(f"{_RESULTS}.publish:check_app", "Check published results."),
         "leaderboard": Place(
-            f"{_RESULTS}.leaderboard:app",
+            "evopolicy_results.leaderboard.command:app",
             "Write a leaderboard of several labs' published results as a static site.",
         ),
     },

@@ -18,7 +18,9 @@ from typing import Any
 
 from evopolicy_common.errors import ConfigError
 from evopolicy_results.html.pages import table_view
-from evopolicy_results.html.site import (
+from evopolicy_results.leaderboard.bundles import LabBundle, LabRun
+from evopolicy_results.leaderboard.compare import Board, boards
+from evopolicy_results.leaderboard.pages import (
     MADE_BY,
     Cell,
     Link,
@@ -29,8 +31,6 @@ from evopolicy_results.html.site import (
     plain_view,
     section,
 )
-from evopolicy_results.leaderboard.bundles import LabBundle, LabRun
-from evopolicy_results.leaderboard.compare import Board, boards
 from evopolicy_results.publish.findings import KINDS
 from evopolicy_results.reading.environments import suite_title, title_of
 from evopolicy_results.report import slug, write_report

@@ -1,4 +1,4 @@
-"""The pages of a leaderboard site as text. Markup is in `templates/`; `evopolicy_results.leaderboard` writes the files."""
+"""The pages of a leaderboard site as text. Markup is in `html/templates/`; `write` writes the files."""
 
 from __future__ import annotations
 
