@@ -26,7 +26,7 @@ from evopolicy_common.processes.scratch import scratch_folder
 from evopolicy_common.regular_files import read_given
 from evopolicy_common.terminal import say
 from evopolicy_worker import environments
-from evopolicy_worker.environments.checks.conformance import SEEDS, Played
+from evopolicy_worker.environments.checks.conformance import SEEDS, CheckResult
 from evopolicy_worker.environments.interface.actions import compile_actions
 from evopolicy_worker.environments.interface.settings import use_browser
 from evopolicy_worker.sandbox import available_tiers
@@ -66,8 +66,8 @@ class InASlot(msgspec.Struct, frozen=True, kw_only=True):
 class Checked(msgspec.Struct, frozen=True):
     """One environment, played in two processes with different hash seeds."""
 
-    here: Played
-    there: Played
+    here: CheckResult
+    there: CheckResult
     slot: InASlot = InASlot()
 
     @property
@@ -210,12 +210,12 @@ def _literal(value: Any) -> Any:
     return value
 
 
-def _next(process: subprocess.Popen[bytes], env_id: str) -> Played:
+def _next(process: subprocess.Popen[bytes], env_id: str) -> CheckResult:
     assert process.stdout is not None
     line = process.stdout.readline()
     if not line:
         raise WorkerError(f"the process that plays {env_id} has ended with status {process.wait()}")
-    return msgspec.json.decode(line, type=Played)
+    return msgspec.json.decode(line, type=CheckResult)
 
 
 def command(

@@ -37,7 +37,7 @@ from evopolicy_common.processes.parent_death import ending_with_parent
 from evopolicy_common.processes.preflight import check_writable
 from evopolicy_common.terminal import one_line, say
 from evopolicy_worker.environments.browser import chromium
-from evopolicy_worker.environments.checks.conformance import Played
+from evopolicy_worker.environments.checks.conformance import CheckResult
 from evopolicy_worker.environments.interface.settings import BROWSER, use_browser
 
 DISTRIBUTION = "evopolicy"
@@ -308,7 +308,7 @@ def _try(made: Made, family: str) -> None:
     done = subprocess.run(program, capture_output=True, input=b"[]", check=False)
     why = last_line(done.stderr.decode(errors="replace"))
     if done.returncode == 0:
-        why = msgspec.json.decode(done.stdout.splitlines()[-1], type=Played).verdict(None)
+        why = msgspec.json.decode(done.stdout.splitlines()[-1], type=CheckResult).verdict(None)
     if why != "ok":
         raise ConfigError(
             f"{family} is installed in {made.folder}, but {env_id} cannot be played there: {why}"

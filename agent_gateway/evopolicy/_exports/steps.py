@@ -47,7 +47,7 @@ class Result:
 
 
 @dataclass(kw_only=True)
-class Step:
+class LogStep:
     """A prompt (`user`), a message of the agent with its tool calls and their results, or a note (`system`)."""
 
     source: Literal["user", "agent", "system"]
@@ -65,7 +65,7 @@ class Step:
         return "\n".join(self.texts)
 
 
-def read_steps(path: Path) -> list[Step]:
+def read_steps(path: Path) -> list[LogStep]:
     """The steps of a log in order; none when it is missing or not a regular file."""
     log = _Log()
     try:
@@ -84,16 +84,18 @@ class _Log:
     """The steps so far."""
 
     def __init__(self) -> None:
-        self.steps: list[Step] = []
-        self._calls: dict[str, tuple[Step, Call]] = {}
+        self.steps: list[LogStep] = []
+        self._calls: dict[str, tuple[LogStep, Call]] = {}
         """The latest call of each id in the log: a resumed program begins to count anew."""
         self._n_calls = 0
 
-    def step(self, source: Literal["user", "agent", "system"], key: str = "", at: str | None = None) -> Step:
+    def step(
+        self, source: Literal["user", "agent", "system"], key: str = "", at: str | None = None
+    ) -> LogStep:
         """The step that an event belongs to: the last one if it has the same key, else a new one."""
         if key and self.steps and self.steps[-1].key == key:
             return self.steps[-1]
-        self.steps.append(Step(source=source, key=key, at=at))
+        self.steps.append(LogStep(source=source, key=key, at=at))
         return self.steps[-1]
 
     def read(self, line: bytes) -> None:
@@ -127,7 +129,7 @@ class _Log:
         key = f"message {identity}" if by_agent and isinstance(identity, str) and identity else ""
         content = message.get("content")
         blocks = content if isinstance(content, list) else [{"type": "text", "text": content}]
-        step: Step | None = None
+        step: LogStep | None = None
         for block in blocks:
             if not isinstance(block, dict):
                 continue
@@ -164,7 +166,7 @@ class _Log:
             given = {name: value for name, value in item.items() if name not in ("id", "type", "item_type")}
             self.call(step, identity, kind, given)
 
-    def call(self, step: Step, identity: Any, name: Any, arguments: Any) -> None:
+    def call(self, step: LogStep, identity: Any, name: Any, arguments: Any) -> None:
         self._n_calls += 1
         known = identity if isinstance(identity, str) and identity else ""
         unique = known

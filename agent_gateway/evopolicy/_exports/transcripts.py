@@ -12,7 +12,7 @@ from typing import Any
 
 import msgspec
 
-from evopolicy._exports.steps import Step, read_steps
+from evopolicy._exports.steps import LogStep, read_steps
 from evopolicy._runs import Run, Runs
 from evopolicy_common.records import secrets
 
@@ -46,7 +46,7 @@ def write_inspect(runs: Runs, out: Path) -> list[Path]:
 
 
 def _each(
-    runs: Runs, made: Callable[[Run, list[Step]], dict[str, Any]], path_of: Callable[[Run], Path]
+    runs: Runs, made: Callable[[Run, list[LogStep]], dict[str, Any]], path_of: Callable[[Run], Path]
 ) -> Iterator[Path]:
     for run in runs:
         steps = read_steps(run.folder / "logs" / "agent.jsonl") or [_nothing()]
@@ -57,8 +57,8 @@ def _each(
         yield path
 
 
-def _nothing() -> Step:
-    return Step(source="system", texts=["The agent's log holds no messages."])
+def _nothing() -> LogStep:
+    return LogStep(source="system", texts=["The agent's log holds no messages."])
 
 
 def _name(run: Run) -> str:
@@ -89,7 +89,7 @@ def _without_none(**values: Any) -> dict[str, Any]:
     return {name: value for name, value in values.items() if value not in (None, "", [], {})}
 
 
-def _atif(run: Run, steps: list[Step]) -> dict[str, Any]:
+def _atif(run: Run, steps: list[LogStep]) -> dict[str, Any]:
     record = run._record
     tokens = record.agent.tokens
     totals: dict[str, Any] = {"total_steps": len(steps)}
@@ -114,7 +114,7 @@ def _atif(run: Run, steps: list[Step]) -> dict[str, Any]:
     }
 
 
-def _atif_step(number: int, step: Step) -> dict[str, Any]:
+def _atif_step(number: int, step: LogStep) -> dict[str, Any]:
     results = [
         _without_none(
             source_call_id=None if each.call is None else each.call.id,
@@ -136,7 +136,7 @@ def _atif_step(number: int, step: Step) -> dict[str, Any]:
     return {"step_id": number, "source": step.source, "message": step.text, **optional}
 
 
-def _inspect(run: Run, steps: list[Step]) -> dict[str, Any]:
+def _inspect(run: Run, steps: list[LogStep]) -> dict[str, Any]:
     record, summary = run._record, run.summary
     model = record.agent.model_string or record.model
     begun, ended = (_utc(text).isoformat() for text in (record.timing.start_time, record.timing.end_time))
@@ -210,7 +210,7 @@ def _inspect(run: Run, steps: list[Step]) -> dict[str, Any]:
     } | ({"error": {"message": reason, "traceback": "", "traceback_ansi": ""}} if state == "error" else {})
 
 
-def _inspect_messages(step: Step, model: str) -> Iterator[dict[str, Any]]:
+def _inspect_messages(step: LogStep, model: str) -> Iterator[dict[str, Any]]:
     """The step as messages of a chat."""
     if step.source == "user":
         yield {"role": "user", "content": step.text}

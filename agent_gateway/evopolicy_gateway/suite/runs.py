@@ -27,7 +27,7 @@ from evopolicy_gateway.suite.suite_index import entry_of
 from evopolicy_gateway.suite.sweep import Sweep
 
 
-class Played(msgspec.Struct, frozen=True):
+class PlayedRuns(msgspec.Struct, frozen=True):
     """The results of the runs."""
 
     plans: Sequence[Plan]
@@ -43,7 +43,7 @@ class _Runs(Sweep):
     stays_open = False
 
     def __init__(
-        self, played: Played, parallel: int, operations: Operations, gateway: Credentials, watch: Watch
+        self, played: PlayedRuns, parallel: int, operations: Operations, gateway: Credentials, watch: Watch
     ) -> None:
         super().__init__(Parallel(machine=parallel), played.index, operations, gateway, watch)
         self._results = played
@@ -65,12 +65,12 @@ class _Runs(Sweep):
         return why
 
 
-async def play(plans: Sequence[Plan], where: Cluster, parallel: int, console: Terminal) -> Played:
+async def play(plans: Sequence[Plan], where: Cluster, parallel: int, console: Terminal) -> PlayedRuns:
     """Plays all plans, `parallel` agents at once; a failed run does not stop the others.
 
     Raises ConfigError when an option is wrong for every run.
     """
-    played = Played(plans, Index(suite=""), {}, set())
+    played = PlayedRuns(plans, Index(suite=""), {}, set())
     decided = [Decision(run=plan, kind="resume" if plan.resume else "new", attempt=1) for plan in plans]
     with RunView(console).shown() as watch:
         settings = [plan.settings for plan in plans]
@@ -85,12 +85,12 @@ async def play(plans: Sequence[Plan], where: Cluster, parallel: int, console: Te
     return played
 
 
-def documents(played: Played) -> list[dict[str, Any]]:
+def documents(played: PlayedRuns) -> list[dict[str, Any]]:
     """The results of the runs, for scripts."""
     return [_document(run, played.index.runs[run.name], played) for run in played.plans]
 
 
-def _document(run: Plan, entry: Entry, played: Played) -> dict[str, Any]:
+def _document(run: Plan, entry: Entry, played: PlayedRuns) -> dict[str, Any]:
     record = played.records.get(run.name)
     audit = None if record is None else record.audit
     return {
@@ -110,7 +110,7 @@ def _document(run: Plan, entry: Entry, played: Played) -> dict[str, Any]:
     }
 
 
-def report(played: Played, runs: Path, console: Terminal) -> None:
+def report(played: PlayedRuns, runs: Path, console: Terminal) -> None:
     """Prints a table of the results, the run directories, and the next command for the folder `runs`."""
     headings = ("environment", "score", "random", "best submit", "budget used", "ended")
     made = table(*headings, right=("score", "random"))

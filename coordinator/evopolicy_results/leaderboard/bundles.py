@@ -231,10 +231,7 @@ def _curves(archive: Archive, run: PublishedRun) -> tuple[Curve, ...]:
     group = next((each for each in run.groups if each.split == "heldout" and each.submit_index == best), None)
     if group is None:
         return ()
-    path = f"{run.folder}/actions/{group.name}"
-    recordings: list[bytes | None] = []
-    if path in archive.names:
-        recordings = contents.unpack_recordings(archive.read(path, contents.MAX_RECORDING_BYTES))
+    recordings = run.recordings(archive, group.name)
     found = []
     for episode in group.episodes:
         data = recordings[episode.index] if episode.index < len(recordings) else None

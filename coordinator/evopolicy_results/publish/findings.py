@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any, Literal, NamedTuple, Protocol, TypeVar
 
 import msgspec
 
-from evopolicy_common.errors import DECODE_ERRORS, ProtocolError
+from evopolicy_common.errors import DECODE_ERRORS, BundleError, ProtocolError
 from evopolicy_common.messages.environment import Split
 from evopolicy_common.records import journal
 from evopolicy_common.records.journal import Opening, Result
+from evopolicy_common.records.policies import bundles
+from evopolicy_common.records.policies.bundles import Bundle
 from evopolicy_common.records.run_record import RunRecord
+from evopolicy_results.publish import contents
 from evopolicy_results.publish.contents import Group, Listed, Removed
 
 T = TypeVar("T")
@@ -83,6 +86,24 @@ class PublishedRun(msgspec.Struct, frozen=True, kw_only=True):
             "validation": self.opening.validation,
             "heldout": self.opening.heldout,
         }[split]
+
+    def recordings(self, files: Files, group: str) -> list[bytes | None]:
+        """The packed recordings of a group's episodes, by its name; empty without any. ProtocolError for damaged ones."""
+        path = f"{self.folder}/actions/{group}"
+        if path not in files.names:
+            return []
+        return contents.unpack_recordings(files.read(path, contents.MAX_RECORDING_BYTES))
+
+    def bundles(self, files: Files) -> Iterator[tuple[int, Bundle]]:
+        """The published policies by submit index. Leaves out damaged bundles, which the check of checkpoints reports."""
+        for submit in self.result.submits:
+            path = f"{self.folder}/{contents.checkpoint_path(submit.submit_index)}"
+            if submit.bundle is not None and path in files.names:
+                data = files.read(path, contents.MAX_DOCUMENT_BYTES * 2)
+                try:
+                    yield submit.submit_index, bundles.load(data, submit.bundle)
+                except BundleError:
+                    continue
 
 
 class Checked(msgspec.Struct, kw_only=True):

@@ -18,18 +18,15 @@ from collections.abc import Collection, Sequence
 import msgspec
 import numpy as np
 
-from evopolicy_common.errors import BundleError, ProtocolError
 from evopolicy_common.messages.episode import EpisodeOutcome
 from evopolicy_common.messages.operator import Evaluate, PlayedAs
 from evopolicy_common.processes.packages import packages_in
 from evopolicy_common.records.episodes import compare
 from evopolicy_common.records.episodes.trajectory import Trajectory
 from evopolicy_common.records.journal import SubmitResult
-from evopolicy_common.records.policies import bundles
 from evopolicy_common.records.policies.bundles import Bundle
 from evopolicy_common.records.policies.declarations import declares_deterministic
 from evopolicy_results.evaluations import Evaluations
-from evopolicy_results.publish import contents
 from evopolicy_results.publish.findings import Checked, Files, PublishedRun
 from evopolicy_results.publish.replay import Chosen, Tell, draw, installed, play_runs
 from evopolicy_results.publish.run_rules import recording_of
@@ -61,7 +58,11 @@ async def play_policies(
     checked.findings = [each for each in checked.findings if each.kind != _KIND]
     declared: dict[tuple[str, int], Bundle] = {}
     for run in checked.runs:
-        found = _declared(files, run)
+        found = {
+            index: bundle
+            for index, bundle in run.bundles(files)
+            if declares_deterministic({file.path: file.data for file in bundle.files})
+        }
         declared |= {(run.folder, index): bundle for index, bundle in found.items()}
         others = sum(submit.bundle is not None for submit in run.result.submits) - len(found)
         if others:
@@ -104,21 +105,6 @@ def _key(each: Chosen) -> tuple[str, int]:
     return each.run.folder, each.group.submit_index
 
 
-def _declared(files: Files, run: PublishedRun) -> dict[int, Bundle]:
-    found: dict[int, Bundle] = {}
-    for submit in run.result.submits:
-        name = f"{run.folder}/{contents.checkpoint_path(submit.submit_index)}"
-        if submit.bundle is None or name not in files.names:
-            continue
-        try:
-            bundle = bundles.load(files.read(name, contents.MAX_DOCUMENT_BYTES * 2), submit.bundle)
-        except (BundleError, ProtocolError):
-            continue  # reported by the check of checkpoints
-        if declares_deterministic({file.path: file.data for file in bundle.files}):
-            found[submit.submit_index] = bundle
-    return found
-
-
 def _whole(each: Chosen) -> Chosen:
     """With policy scope `submit` one policy plays the whole list, of which no part can be played alone."""
     if each.run.opening.settings.policy_scope != "submit":
@@ -148,11 +134,10 @@ def _add_findings(tally: _Tally, checked: Checked, name: str, other_cpu: bool) -
 
 async def _play(evaluations: Evaluations, files: Files, part: Chosen, bundle: Bundle, tally: _Tally) -> None:
     run, group, submit = part.run, part.group, _submit(part)
-    path = f"{run.folder}/actions/{group.name}"
-    if path not in files.names:
+    recordings = run.recordings(files, group.name)
+    if not recordings:
         tally.unknown += len(part.indexes)
         return
-    recordings = contents.unpack_recordings(files.read(path, contents.MAX_RECORDING_BYTES))
     settings = run.opening.settings
     ids = submit.env_instances if group.split == "train" else tuple(range(len(group.episodes)))
     used = sum(

@@ -30,7 +30,6 @@ from evopolicy_common.records.episodes.trajectory import Trajectory
 from evopolicy_common.records.splits import FILE_STEMS, SPLITS, SplitFile, cases_hash, folder_name
 from evopolicy_common.wire import credentials, transport
 from evopolicy_results.evaluations import Evaluations
-from evopolicy_results.publish import contents
 from evopolicy_results.publish.contents import Group
 from evopolicy_results.publish.findings import Checked, Files, PublishedRun
 from evopolicy_results.publish.run_rules import recording_of
@@ -245,11 +244,8 @@ async def unplayable(evaluations: Evaluations, run: PublishedRun) -> tuple[str, 
 async def _play(evaluations: Evaluations, files: Files, part: Chosen) -> tuple[int, list[tuple[str, bool]]]:
     """How many of these episodes were played, and what differed, each with whether it may be a matter of rounding."""
     run, group = part.run, part.group
-    path = f"{run.folder}/actions/{group.name}"
-    if path not in files.names:
-        return 0, []
     try:
-        recordings = contents.unpack_recordings(files.read(path, contents.MAX_RECORDING_BYTES))
+        recordings = run.recordings(files, group.name)
     except ProtocolError:
         return 0, []  # reported by the check of recordings
     stored: list[tuple[int, bytes]] = []

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from evopolicy_common.errors import BundleError, ProtocolError
-from evopolicy_common.records.policies import bundles
+from evopolicy_common.errors import ProtocolError
 from evopolicy_results.publish import contents
 from evopolicy_results.publish.findings import Checked, Files, PublishedRun
 from evopolicy_results.publish.run_rules import recording_of
@@ -39,22 +38,11 @@ def _signals(files: Files, run: PublishedRun) -> tuple[Signal, ...]:
     lines = files.read(log, contents.MAX_DOCUMENT_BYTES).splitlines() if log in files.names else ()
 
     def trajectories(index: int) -> Iterator[list[object]]:
-        path = f"{run.folder}/actions/{contents.group_name('train', index)}"
-        if path in files.names:
-            for data in contents.unpack_recordings(files.read(path, contents.MAX_RECORDING_BYTES)):
-                if data is not None:
-                    yield list(recording_of(data).actions)
+        for data in run.recordings(files, contents.group_name("train", index)):
+            if data is not None:
+                yield list(recording_of(data).actions)
 
-    return scan(_checkpoints(files, run), lines, trajectories)
-
-
-def _checkpoints(files: Files, run: PublishedRun) -> Iterator[tuple[int, dict[str, bytes]]]:
-    for submit in run.result.submits:
-        path = f"{run.folder}/{contents.checkpoint_path(submit.submit_index)}"
-        if submit.bundle is None or path not in files.names:
-            continue
-        try:
-            bundle = bundles.load(files.read(path, contents.MAX_DOCUMENT_BYTES * 2), submit.bundle)
-        except BundleError:
-            continue  # reported by the check of checkpoints
-        yield submit.submit_index, {file.path: file.data for file in bundle.files}
+    checkpoints = (
+        (index, {file.path: file.data for file in bundle.files}) for index, bundle in run.bundles(files)
+    )
+    return scan(checkpoints, lines, trajectories)

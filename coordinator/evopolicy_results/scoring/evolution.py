@@ -17,7 +17,7 @@ from evopolicy_results.reading.environments import ordered_environments
 from evopolicy_results.reading.records import Run
 
 
-class Step(msgspec.Struct, frozen=True, kw_only=True):
+class CurvePoint(msgspec.Struct, frozen=True, kw_only=True):
     """The curve after one score-bearing submit."""
 
     index: int
@@ -36,7 +36,7 @@ class Evolution(msgspec.Struct, frozen=True, kw_only=True):
     entry: str
     env: str
     budget: int
-    steps: tuple[Step, ...]
+    steps: tuple[CurvePoint, ...]
     n_improvements: int
     """Number of rises after the first score."""
     area: float | None
@@ -47,10 +47,10 @@ class Evolution(msgspec.Struct, frozen=True, kw_only=True):
     to_80: int | None
 
 
-def curve(run: Run) -> tuple[Step, ...]:
+def curve(run: Run) -> tuple[CurvePoint, ...]:
     """The run's steps, one per score-bearing submit."""
     return tuple(
-        Step(index=t.index, consumed=t.consumed, val_mean=t.val_mean, best=t.best, improved=t.hit)
+        CurvePoint(index=t.index, consumed=t.consumed, val_mean=t.val_mean, best=t.best, improved=t.hit)
         for t in classify(run.submits)
     )
 
@@ -60,7 +60,7 @@ def evolutions(runs: Iterable[Run], references: Mapping[str, float]) -> list[Evo
 
     `references`: by environment, the mean return of the random reference, if known.
     """
-    by_env: dict[str, list[tuple[Run, tuple[Step, ...]]]] = {}
+    by_env: dict[str, list[tuple[Run, tuple[CurvePoint, ...]]]] = {}
     for run in runs:
         by_env.setdefault(run.env, []).append((run, curve(run)))
     out: list[Evolution] = []
@@ -84,7 +84,9 @@ def evolutions(runs: Iterable[Run], references: Mapping[str, float]) -> list[Evo
     return out
 
 
-def scale(curves: Iterable[Sequence[Step]], reference: float | None) -> tuple[float | None, float | None]:
+def scale(
+    curves: Iterable[Sequence[CurvePoint]], reference: float | None
+) -> tuple[float | None, float | None]:
     """The returns at 0 and 1 of the environment's scale; both None when no run has a score."""
     scored = [steps for steps in curves if steps]
     if not scored:
@@ -93,7 +95,7 @@ def scale(curves: Iterable[Sequence[Step]], reference: float | None) -> tuple[fl
     return base, max(steps[-1].best for steps in scored)
 
 
-def area(steps: Sequence[Step], budget: int, base: float | None, top: float | None) -> float | None:
+def area(steps: Sequence[CurvePoint], budget: int, base: float | None, top: float | None) -> float | None:
     """Time-averaged normalised best score: the integral over episodes 0 … budget, divided by the budget."""
     if base is None or top is None or top <= base or budget <= 0:
         return None
@@ -105,7 +107,9 @@ def area(steps: Sequence[Step], budget: int, base: float | None, top: float | No
     return total / budget
 
 
-def episodes_to(steps: Sequence[Step], share: float, base: float | None, top: float | None) -> int | None:
+def episodes_to(
+    steps: Sequence[CurvePoint], share: float, base: float | None, top: float | None
+) -> int | None:
     """Episodes consumed when the best score first reaches `base + share · (top − base)`; None if it never does."""
     if base is None or top is None or top <= base:
         return None
@@ -113,7 +117,7 @@ def episodes_to(steps: Sequence[Step], share: float, base: float | None, top: fl
     return next((step.consumed for step in steps if step.best >= goal), None)
 
 
-def best_at(steps: Sequence[Step], consumed: int) -> float:
+def best_at(steps: Sequence[CurvePoint], consumed: int) -> float:
     """The curve's value at `consumed` episodes. Raises ValueError before its first score."""
     reached = [step.best for step in steps if step.consumed <= consumed]
     if not reached:

@@ -40,7 +40,7 @@ from evopolicy_common.wire.operator_client import TIMEOUT_S
 from evopolicy_common.wire.transport import Link
 from evopolicy_results.evaluations import Evaluations, Tell
 from evopolicy_results.verify import numbers as verify_numbers
-from evopolicy_results.verify.source import RANDOM, Played, RunUnderTest
+from evopolicy_results.verify.source import RANDOM, EpisodeList, RunUnderTest
 
 _SPLITS: tuple[Split, ...] = ("train", "validation", "heldout")
 
@@ -153,7 +153,7 @@ class Verifier:
             )
             self.report.not_checked.append(Finding(episode=f"{FOLDER}/{name}.json", difference=text))
 
-    async def replay(self, played: Played, indexes: Sequence[int]) -> None:
+    async def replay(self, played: EpisodeList, indexes: Sequence[int]) -> None:
         """Makes the exact check of these episodes of a list."""
         recordings = await self._recordings(played, indexes)
         if not recordings:
@@ -174,7 +174,7 @@ class Verifier:
                 f"submit {played.submit_index}, {played.split}", f"run.json tells a mean of {played.mean!r}"
             )
 
-    async def play_policy(self, played: Played, indexes: Sequence[int]) -> None:
+    async def play_policy(self, played: EpisodeList, indexes: Sequence[int]) -> None:
         """Makes the advisory check of these train episodes with their checkpoint's policy. Call it right after their
         `replay`."""
         dimensions = self._run.record.experiment_dimensions
@@ -224,7 +224,7 @@ class Verifier:
 
     # Recordings.
 
-    async def _recordings(self, played: Played, indexes: Sequence[int]) -> list[_Recording]:
+    async def _recordings(self, played: EpisodeList, indexes: Sequence[int]) -> list[_Recording]:
         known = await self._stored(played) if self._knows_run else {}
         found = []
         for index in indexes:
@@ -260,7 +260,7 @@ class Verifier:
         self._kept = {recording.index: recording for recording in found}
         return found
 
-    def _rows(self, played: Played, index: int) -> verify_compare.Rows | None:
+    def _rows(self, played: EpisodeList, index: int) -> verify_compare.Rows | None:
         if not played.folders:
             return None
         try:
@@ -273,7 +273,7 @@ class Verifier:
             return None
         return rows
 
-    async def _stored(self, played: Played) -> dict[int, EpisodeOutcome]:
+    async def _stored(self, played: EpisodeList) -> dict[int, EpisodeOutcome]:
         """Outcomes that the coordinator stored, by index."""
         found = self._evaluations.ask.recorded(
             self._run.record.run, played.split, played.submit_index, timeout_s=TIMEOUT_S
@@ -282,7 +282,7 @@ class Verifier:
 
     # Comparison.
 
-    async def _compare(self, played: Played, recording: _Recording, outcome: EpisodeOutcome) -> None:
+    async def _compare(self, played: EpisodeList, recording: _Recording, outcome: EpisodeOutcome) -> None:
         self.report.episodes += 1
         index, name = recording.index, played.name(recording.index)
         replayed = await self._evaluations.recording(outcome)
@@ -304,7 +304,9 @@ class Verifier:
             if told != came:
                 self.report.differs(name, f"{what} {told!r} is told, {came!r} came")
 
-    def _files_difference(self, played: Played, recording: _Recording, replayed: Trajectory) -> str | None:
+    def _files_difference(
+        self, played: EpisodeList, recording: _Recording, replayed: Trajectory
+    ) -> str | None:
         if not recording.files:
             return None
         known = recording.stored is not None
@@ -313,7 +315,7 @@ class Verifier:
         )
 
     async def _policy_difference(
-        self, played: Played, recording: _Recording, outcome: EpisodeOutcome
+        self, played: EpisodeList, recording: _Recording, outcome: EpisodeOutcome
     ) -> str | None:
         if outcome.failure is not None and outcome.length == 0:
             return f"{outcome.failure.category}: {outcome.failure.message}"
@@ -338,7 +340,7 @@ class Verifier:
 
     def _evaluate(
         self,
-        played: Played,
+        played: EpisodeList,
         indexes: Sequence[int],
         record: Record,
         *,
@@ -388,7 +390,7 @@ def _summarised(
             yield "success", solved[index], stored.success
 
 
-def _of_files(played: Played, index: int, episode: Trajectory, *, actions: bool) -> str | None:
+def _of_files(played: EpisodeList, index: int, episode: Trajectory, *, actions: bool) -> str | None:
     """Describes the first difference of an episode's feedback files from `episode`."""
     folder = played.folders[index]
     try:

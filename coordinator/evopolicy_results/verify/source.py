@@ -25,7 +25,7 @@ RANDOM = -1
 _MAX_DIGITS = 9
 
 
-class Played(msgspec.Struct, frozen=True, kw_only=True):
+class EpisodeList(msgspec.Struct, frozen=True, kw_only=True):
     """A list of cases that one policy played: a submit's, or a checkpoint's hidden ones."""
 
     split: Split
@@ -98,8 +98,8 @@ class RunUnderTest(msgspec.Struct, frozen=True, kw_only=True):
     record: RunRecord
     submits: tuple[SubmitFiles, ...]
     """In order of their index."""
-    train: tuple[Played, ...]
-    hidden: tuple[Played, ...]
+    train: tuple[EpisodeList, ...]
+    hidden: tuple[EpisodeList, ...]
 
 
 def read_run(root: Path) -> RunUnderTest:
@@ -141,14 +141,14 @@ def _submits(root: Path, record: RunRecord) -> tuple[SubmitFiles, ...]:
     return tuple(found)
 
 
-def _train(record: RunRecord, submit: SubmitFiles) -> Played | None:
+def _train(record: RunRecord, submit: SubmitFiles) -> EpisodeList | None:
     """The episodes of an `ok` submit; None for any other."""
     summary, folder, meta = submit.summary, submit.feedback, submit.meta
     if summary is None or summary.env_instances is None or summary.first_global_episode is None:
         return None
     width = max(3, len(str(record.experiment_dimensions.episode_budget)))
     first, n = summary.first_global_episode, len(summary.env_instances)
-    return Played(
+    return EpisodeList(
         split="train",
         submit_index=submit.index,
         env_instances=summary.env_instances,
@@ -168,11 +168,13 @@ def _train(record: RunRecord, submit: SubmitFiles) -> Played | None:
     )
 
 
-def _hidden(record: RunRecord, train: dict[int, Played]) -> list[Played]:
+def _hidden(record: RunRecord, train: dict[int, EpisodeList]) -> list[EpisodeList]:
     dimensions, outcome = record.experiment_dimensions, record.outcome
-    found: list[Played] = []
+    found: list[EpisodeList] = []
 
-    def add(split: Split, own: Played, n: int, returns: tuple[float, ...] | None, mean: float | None) -> None:
+    def add(
+        split: Split, own: EpisodeList, n: int, returns: tuple[float, ...] | None, mean: float | None
+    ) -> None:
         found.append(
             msgspec.structs.replace(
                 own,
@@ -198,7 +200,7 @@ def _hidden(record: RunRecord, train: dict[int, Played]) -> list[Played]:
     if reference is not None and reference.returns:
         n = len(reference.returns)
         found.append(
-            Played(
+            EpisodeList(
                 split="heldout",
                 submit_index=RANDOM,
                 env_instances=tuple(range(n)),
@@ -228,7 +230,7 @@ def _meta(checkpoint: Path, episode_budget: int) -> CheckpointMeta | None:
         raise ConfigError(f"{checkpoint} is damaged: {error}") from error
 
 
-def sample(lists: list[Played], n: int | None, seed: int) -> list[tuple[Played, tuple[int, ...]]]:
+def sample(lists: list[EpisodeList], n: int | None, seed: int) -> list[tuple[EpisodeList, tuple[int, ...]]]:
     """Draws `n` episodes of all lists without replacement (None: all), as indexes of each list that has some."""
     everything = [(k, index) for k, played in enumerate(lists) for index in range(len(played.env_instances))]
     chosen = everything if n is None or n >= len(everything) else random.Random(seed).sample(everything, n)

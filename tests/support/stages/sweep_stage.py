@@ -225,8 +225,8 @@ class Direct:
         monkeypatch.setattr(sweep, "RunLifecycle", Play)
         monkeypatch.setattr(runs, "connected", connected)
 
-    def play(self, parallel: int = 1) -> runs.Played:
-        async def main() -> runs.Played:
+    def play(self, parallel: int = 1) -> runs.PlayedRuns:
+        async def main() -> runs.PlayedRuns:
             async with asyncio.timeout(TIMEOUT_S):
                 return await runs.play(
                     self.plans, LocalCluster(), parallel, Terminal(file=self.output, width=200)

@@ -15,7 +15,7 @@ from evopolicy_results.behaviour.audit import audit_signals, token_use
 from evopolicy_results.behaviour.edits import classify, edit_rates
 from evopolicy_results.behaviour.structure import edit_size_bins, selected_structures, structure_means
 from evopolicy_results.reading.reader import load_runs, read_run
-from evopolicy_results.scoring.evolution import Step, area, best_at, episodes_to
+from evopolicy_results.scoring.evolution import CurvePoint, area, best_at, episodes_to
 from evopolicy_results.scoring.scores import RANDOM_ENTRY, references, score_table
 from evopolicy_results.studies.study import study_of
 
@@ -108,8 +108,8 @@ def test_evolution_without_a_scale_has_no_area(tmp_path: Path) -> None:
 
 def test_curve_is_a_step_function_of_the_consumed_budget() -> None:
     steps = (
-        Step(index=0, consumed=4, val_mean=1.0, best=1.0, improved=True),
-        Step(index=1, consumed=9, val_mean=3.0, best=3.0, improved=True),
+        CurvePoint(index=0, consumed=4, val_mean=1.0, best=1.0, improved=True),
+        CurvePoint(index=1, consumed=9, val_mean=3.0, best=3.0, improved=True),
     )
     assert [best_at(steps, consumed) for consumed in (4, 8, 9, 99)] == [1.0, 1.0, 3.0, 3.0]
     with pytest.raises(ValueError, match="no score by 3"):
@@ -228,7 +228,7 @@ def test_area_is_between_nought_and_the_final_level(levels: list[int], width: in
         improved = level > best
         best = max(best, float(level))
         steps.append(
-            Step(index=i, consumed=(i + 1) * width, val_mean=float(level), best=best, improved=improved)
+            CurvePoint(index=i, consumed=(i + 1) * width, val_mean=float(level), best=best, improved=improved)
         )
     value = area(steps, len(levels) * width, 0.0, 20.0)
     assert value is not None

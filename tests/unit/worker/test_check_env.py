@@ -14,13 +14,13 @@ import pytest
 from evopolicy_common import catalogue
 from evopolicy_worker.check_env import COLUMNS, MOST_MEMORY_MB, Checked, InASlot, page
 from evopolicy_worker.environments.checks import conformance
-from evopolicy_worker.environments.checks.conformance import Played
+from evopolicy_worker.environments.checks.conformance import CheckResult
 
 CARTPOLE, PENDULUM = "gymnasium/CartPole-v1", "gymnasium/Pendulum-v1"
 
 
 def checked(env: str, *, memory_mb: int = 100, steps: int = 7, fault: str = "") -> Checked:
-    played = Played(env=env, digest="d", fresh=True, reused=True, steps=steps)
+    played = CheckResult(env=env, digest="d", fresh=True, reused=True, steps=steps)
     return Checked(played, played, InASlot(memory_mb=memory_mb, fault=fault))
 
 
@@ -139,7 +139,7 @@ from evopolicy_worker.environments.checks import conformance
 
 def play(env_id, steps):
     resource.setrlimit(resource.RLIMIT_NOFILE, (0, 0))
-    return conformance.Played(env=env_id)
+    return conformance.CheckResult(env=env_id)
 
 conformance.play = play
 conformance.registry.load = lambda env_id: None

@@ -88,7 +88,7 @@ class Series(msgspec.Struct, frozen=True, kw_only=True):
     values: tuple[float, ...]
 
 
-class Played(msgspec.Struct, frozen=True, kw_only=True):
+class EpisodePlot(msgspec.Struct, frozen=True, kw_only=True):
     """One episode's trajectory, as far as it can be drawn."""
 
     steps: int
@@ -222,7 +222,7 @@ class Detail:
             return ""
         return data.decode("utf-8", "replace")
 
-    def played(self, folder: str) -> Played:
+    def played(self, folder: str) -> EpisodePlot:
         """An episode's columns, for plots."""
         rewards: list[float] = []
         actions: list[Any] = []
@@ -240,7 +240,7 @@ class Detail:
         observed: Any = inline if any(each is not None for each in inline) else self._arrays(folder)
         observations, note = _series(observed, len(rewards), "obs")
         acted, _ = _series(actions, len(rewards), "action")
-        return Played(
+        return EpisodePlot(
             steps=len(rewards),
             rewards=(Series(name="reward", values=tuple(rewards)),),
             observations=observations,

@@ -12,7 +12,14 @@ from evopolicy_common.records.summary import utc_text
 from evopolicy_coordinator.web.content.charts import Line, chart
 from evopolicy_coordinator.web.content.feeds import View
 from evopolicy_coordinator.web.content.rendering import duration, number, part, short, state_words
-from evopolicy_coordinator.web.content.run_detail import MAX_WORDS, CodeFile, Detail, Happened, Played, Series
+from evopolicy_coordinator.web.content.run_detail import (
+    MAX_WORDS,
+    CodeFile,
+    Detail,
+    EpisodePlot,
+    Happened,
+    Series,
+)
 from evopolicy_coordinator.web.content.run_folders import Reader, RunFacts, Runs, SubmitFacts
 from evopolicy_coordinator.web.content.tables import Words, ident
 from evopolicy_results.behaviour.trace import diff
@@ -238,7 +245,7 @@ def _diffs(before: Iterable[CodeFile], after: Iterable[CodeFile]) -> list[dict[s
     ]
 
 
-def episode_values(played: Played | None) -> dict[str, Any]:
+def episode_values(played: EpisodePlot | None) -> dict[str, Any]:
     """Charts of one episode."""
     if played is None:
         return {"charts": [], "note": "", "steps": 0}

@@ -20,7 +20,7 @@ from evopolicy_gateway.run.record import run_record
 from evopolicy_gateway.run.times import Times
 from evopolicy_gateway.suite import suite_index
 from evopolicy_gateway.suite.ends import exit_code
-from evopolicy_gateway.suite.runs import Played, documents, report
+from evopolicy_gateway.suite.runs import PlayedRuns, documents, report
 from evopolicy_gateway.suite.suite_file import expand, read
 from evopolicy_gateway.suite.suite_index import entry_of
 
@@ -110,7 +110,7 @@ def test_the_index_keeps_its_bytes(tmp_path: Path) -> None:
 
 def test_a_script_is_told_of_a_run_by_the_same_names(tmp_path: Path) -> None:
     plan, record = one_run(tmp_path)
-    played = Played(
+    played = PlayedRuns(
         [plan], Index(suite="", runs={plan.name: entry_of(plan, record)}), {plan.name: record}, set()
     )
     assert json.loads(msgspec.json.encode(documents(played))) == [
@@ -175,7 +175,7 @@ def test_exit_codes_and_the_report_tell_how_runs_ended(
         f"e: worker lost; see {tmp_path}/evolve/e/t",
     ]
     out = io.StringIO()
-    report(Played(plans, index, {}, set()), Path("my runs"), Terminal(file=out, width=200))
+    report(PlayedRuns(plans, index, {}, set()), Path("my runs"), Terminal(file=out, width=200))
     assert "next: evopolicy report 'my runs' --out report" in out.getvalue()
     for needed in ("no_ok_submit", f"run directory: {tmp_path}/evolve/a/t", "agent failed", "cancelled"):
         assert needed in out.getvalue()

@@ -1,6 +1,6 @@
 """Checks by playing whether environments follow the rules of the interface.
 
-As a program, `python -m evopolicy_worker.environments.checks.conformance STEPS ID…` prints one line of JSON, a `Played`, for
+As a program, `python -m evopolicy_worker.environments.checks.conformance STEPS ID…` prints one line of JSON, a `CheckResult`, for
 each id. It loads a family once and forks a process per id, so that a crash or hang affects only that environment.
 `evopolicy-worker check-env` runs two such programs with different hash seeds and compares the results.
 """
@@ -57,7 +57,7 @@ _RENDERED_STEPS = 30
 _NONSENSE: tuple[Any, ...] = (None, "nonsense", float("nan"), 10**400, [[[]]], {"a": 1}, np.full(3, np.inf))
 
 
-class Played(msgspec.Struct, kw_only=True):
+class CheckResult(msgspec.Struct, kw_only=True):
     """Result of playing one environment in one process."""
 
     env: str
@@ -91,7 +91,7 @@ class Played(msgspec.Struct, kw_only=True):
     success: list[str] = []
     """Keys of its info that contain "success"."""
 
-    def verdict(self, other: Played | None) -> str:
+    def verdict(self, other: CheckResult | None) -> str:
         """`ok`, or all violations. `other`: the result in another process."""
         wrong = list(self.faults)
         if not wrong:
@@ -102,10 +102,10 @@ class Played(msgspec.Struct, kw_only=True):
         return "; ".join(wrong) or "ok"
 
 
-def play(env_id: str, steps: int) -> Played:
+def play(env_id: str, steps: int) -> CheckResult:
     """Plays an environment in this process, at most `steps` steps per episode. Exceptions become faults."""
     began = time.monotonic()
-    played = Played(env=env_id)
+    played = CheckResult(env=env_id)
     try:
         _play(played, steps)
     except EvopolicyError as error:
@@ -118,7 +118,7 @@ def play(env_id: str, steps: int) -> Played:
     return played
 
 
-def _play(played: Played, steps: int) -> None:
+def _play(played: CheckResult, steps: int) -> None:
     environment = registry.make(played.env)
     description = environment.description
     played.limit = description.max_episode_steps
@@ -139,7 +139,7 @@ def _play(played: Played, steps: int) -> None:
     again.close()
 
 
-def _rendered(played: Played, plain: Environment, steps: int) -> str:
+def _rendered(played: CheckResult, plain: Environment, steps: int) -> str:
     """Plays an episode that is drawn at each step, and one that is not."""
     if find_library("EGL") is None:
         return ""
@@ -152,7 +152,7 @@ def _rendered(played: Played, plain: Environment, steps: int) -> str:
     return "differs"
 
 
-def _looked_at(played: Played, environment: Environment, steps: int) -> Iterator[tuple[Any, Step]]:
+def _looked_at(played: CheckResult, environment: Environment, steps: int) -> Iterator[tuple[Any, Step]]:
     """Plays an episode, and checks everything in it."""
     description, seed = environment.description, SEEDS[0]
     recorder = Renderer("arrays", description.obs_storage)
@@ -181,7 +181,7 @@ def _looked_at(played: Played, environment: Environment, steps: int) -> Iterator
             _loaded_without_pickle(played, name, data)
 
 
-def _loaded_without_pickle(played: Played, name: str, data: bytes) -> None:
+def _loaded_without_pickle(played: CheckResult, name: str, data: bytes) -> None:
     try:
         found = np.load(io.BytesIO(data), allow_pickle=False)
         for part in found.values() if name.endswith(".npz") else (found,):
@@ -191,7 +191,7 @@ def _loaded_without_pickle(played: Played, name: str, data: bytes) -> None:
 
 
 @contextlib.contextmanager
-def _no_pickles(played: Played) -> Iterator[None]:
+def _no_pickles(played: CheckResult) -> Iterator[None]:
     """Notes whether something is pickled meanwhile: that would be code of the environment's in what others read."""
     kept = {name: getattr(pickle, name) for name in ("dump", "dumps", "load", "loads")}
 
@@ -213,7 +213,7 @@ def _no_pickles(played: Played) -> Iterator[None]:
             setattr(pickle, name, function)
 
 
-def _look(played: Played, schema: Any, obs: Any, n: int) -> None:
+def _look(played: CheckResult, schema: Any, obs: Any, n: int) -> None:
     if len(played.faults) < 3:
         if fault := spaces.outside(obs, schema):
             played.faults.append(f"step {n}: the observation is outside its space: {fault}")
@@ -260,14 +260,14 @@ def _numbers(value: Any) -> set[float]:
     return {float(value)} if isinstance(value, int | float) and abs(value) < 2**53 else set()
 
 
-def play_all(env_ids: list[str], steps: int) -> Iterator[Played]:
+def play_all(env_ids: list[str], steps: int) -> Iterator[CheckResult]:
     """Plays each environment in a process forked for it."""
     for env_id in env_ids:
         registry.load(env_id)
         yield _in_child(env_id, steps)
 
 
-def _in_child(env_id: str, steps: int) -> Played:
+def _in_child(env_id: str, steps: int) -> CheckResult:
     temporary = Path(tempfile.mkdtemp(prefix="check-"))
     try:
         return _in_child_with(temporary, env_id, steps)
@@ -280,7 +280,7 @@ def _in_child(env_id: str, steps: int) -> Played:
             time.sleep(_REMOVAL_S)
 
 
-def _in_child_with(temporary: Path, env_id: str, steps: int) -> Played:
+def _in_child_with(temporary: Path, env_id: str, steps: int) -> CheckResult:
     reading, writing = os.pipe()
     pid = os.fork()
     if pid == 0:
@@ -312,8 +312,8 @@ def _in_child_with(temporary: Path, env_id: str, steps: int) -> Played:
         data = b""
     status = os.waitpid(pid, 0)[1]
     if data:
-        return msgspec.json.decode(data, type=Played)
-    return Played(env=env_id, faults=[why or f"its process ended with status {status}"])
+        return msgspec.json.decode(data, type=CheckResult)
+    return CheckResult(env=env_id, faults=[why or f"its process ended with status {status}"])
 
 
 class _Limit:
