@@ -13,6 +13,7 @@ import msgspec
 
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.processes import distribution
+from evopolicy_common.records.open_run import STATE
 from evopolicy_gateway.jail.syscalls import GIVE_UP, filter_program
 
 Mode = Literal["bwrap", "open-network", "none"]
@@ -23,7 +24,7 @@ HTTPS = 443
 _HOST = re.compile(r"(?P<name>[A-Za-z0-9](?:[A-Za-z0-9.-]*[A-Za-z0-9])?)(?::(?P<port>[0-9]{1,5}))?")
 _VARIABLE = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 _TIMEOUT_S = 30.0
-_STATE_FOLDERS = (".gateway", "*/.gateway", "*/*/.gateway", "*/*/*/.gateway")
+_STATE_FOLDERS = tuple("*/" * depth + STATE for depth in range(4))
 
 
 class JailSettings(msgspec.Struct, frozen=True, kw_only=True):
@@ -117,7 +118,7 @@ def _check_path(option: str, path: Path) -> None:
     real = path.resolve()
     if real == Path("/"):
         raise ConfigError(f"{option} /: this would bind the whole machine; use --jail none instead")
-    if ".gateway" in real.parts or any(next(real.glob(pattern), None) for pattern in _STATE_FOLDERS):
+    if STATE in real.parts or any(next(real.glob(pattern), None) for pattern in _STATE_FOLDERS):
         raise ConfigError(f"{option} {path}: it holds the credentials of a run that is open")
 
 

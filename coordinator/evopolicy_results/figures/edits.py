@@ -9,8 +9,7 @@ import matplotlib
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from evopolicy_results.behaviour.edits import EditRates
-from evopolicy_results.behaviour.phases import events_of, phases
+from evopolicy_results.behaviour.edits import EditRates, events_of, phases
 from evopolicy_results.behaviour.structure import BINS, DATA_ONLY, UNCHANGED
 from evopolicy_results.figures.style import INK, MUTED, RC, Plot, new_figure
 from evopolicy_results.reading.environments import title_of

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from html import escape
 
-from evopolicy_results.behaviour.edits import Transition
-from evopolicy_results.behaviour.phases import events_of, phases
+from evopolicy_results.behaviour.edits import Transition, events_of, phases
 from evopolicy_results.reading.records import Submit
 from evopolicy_results.studies.palette import EDIT_COLOURS
 

@@ -12,8 +12,7 @@ from invented.policies import Version, png, policy
 from invented.run_dirs import write_run
 from invented.small_table import TABLE
 
-from evopolicy_results.behaviour.edits import classify
-from evopolicy_results.behaviour.phases import events_of, phases
+from evopolicy_results.behaviour.edits import classify, events_of, phases
 from evopolicy_results.behaviour.trace import diff, trace
 from evopolicy_results.figures.edits import wilson
 from evopolicy_results.figures.style import inline_svg, new_figure, svg_text
