@@ -1,7 +1,8 @@
 """Intervals of rank scores and ranks, and tie groups, by drawing the whole suite again.
 
 A rank score depends only on the order of noisy means. Its interval is for the entry's average score over repetitions
-of the experiment with as many new runs and cases, on the same environments against the same entries. Each draw moves
+of the experiment with as many new runs and cases, on the same environments against the same entries. The observed score
+is an estimate of that average too, so the interval includes it. Each draw moves
 the entries' means by Student's t noise of their runs and of their cases (the same cases for all entries, as they are
 shared), ranks all entries again, and averages. Resampled runs would vary too little: three runs have few resamples. Two
 entries are distinguished if the drawn differences of their scores are significant at 5 % after Holm's correction over
@@ -34,7 +35,7 @@ class RankEstimate(msgspec.Struct, frozen=True, kw_only=True):
     entry: str
     score_low: float
     score_high: float
-    """95 % interval of the rank score."""
+    """95 % interval of the rank score; it includes the observed one."""
     rank_low: int
     rank_high: int
     """Best and worst rank consistent with the comparisons, at 95 % for all pairs together."""
@@ -91,11 +92,12 @@ def standings(
     rows: list[RankEstimate] = []
     for place, i in enumerate(sure):
         low, high = np.quantile(drawn[i], [ALPHA / 2.0, 1.0 - ALPHA / 2.0])
+        observed = scores[entries[i]] or 0.0
         rows.append(
             RankEstimate(
                 entry=entries[i],
-                score_low=float(low),
-                score_high=float(high),
+                score_low=min(float(low), observed),
+                score_high=max(float(high), observed),
                 rank_low=1 + sum(worse == place for _, worse in apart),
                 rank_high=len(entries) - sum(better == place for better, _ in apart),
                 ties=letters[i],
