@@ -14,7 +14,7 @@ from browser import Page
 from screenshots import shoot
 
 MOST_SUBMITS = """[...document.querySelectorAll('#run-rows tr')].sort((a, b) =>
-  b.children[5].textContent - a.children[5].textContent)[0].querySelector('a').href"""
+  b.children[6].textContent - a.children[6].textContent)[0].querySelector('a').href"""
 
 
 def main() -> None:

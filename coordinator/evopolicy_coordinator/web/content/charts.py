@@ -8,7 +8,7 @@ from html import escape
 
 from evopolicy_results.studies.palette import COLOURS, REFERENCE
 
-_WIDTH, _LEFT, _RIGHT, _TOP, _BOTTOM = 760.0, 62.0, 14.0, 12.0, 30.0
+_WIDTH, _LEFT, _RIGHT, _TOP, _BOTTOM = 760.0, 62.0, 14.0, 26.0, 30.0
 _DASHES = ("", "6 3", "2 3", "8 3 2 3")
 _MAX_POINTS = 600
 """Of one line: more than that a screen cannot show."""
@@ -55,6 +55,7 @@ def chart(
     out = [
         f'<svg role="img" aria-label="{escape(title, quote=True)}" viewBox="0 0 {_WIDTH:g} {height:g}" '
         'font-family="system-ui, sans-serif" font-size="11">'
+        f'<text x="{_LEFT}" y="14" font-weight="600" class="ink">{escape(title)}</text>'
     ]
     for tick in _ticks(low, high):
         out.append(
@@ -139,7 +140,7 @@ def _thinned(points: list[tuple[float, float]]) -> list[tuple[float, float]]:
 
 def _padded(low: float, high: float) -> tuple[float, float]:
     room = (high - low) * 0.06 or max(1.0, abs(high) * 0.1)
-    return low - room, high + room
+    return low - room if low < 0 else max(0.0, low - room), high + room
 
 
 def _ticks(low: float, high: float) -> list[float]:

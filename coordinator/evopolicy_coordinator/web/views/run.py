@@ -54,7 +54,7 @@ def run_view(
             "figure",
             ident="curve",
             svg=Markup(_curve(submits, run, reference)),
-            empty="No submit has a verdict yet.",
+            empty="No submit was ok." if run.finished else "No submit has a verdict yet.",
             title="Train returns over budget",
             caption="Mean visible train return of every ok submit, and the best so far.",
         ),

@@ -84,10 +84,14 @@ def _sweep_facts(every: Sequence[RunFacts]) -> list[tuple[str, str]]:
     if walls and waiting:
         rest += sum(walls) / len(walls) * waiting / max(1, len(open_runs))
     facts = [
-        ("runs done", f"{sum(run.state == 'completed' for run in done)} of {len(every)}"),
+        ("completed", f"{sum(run.state == 'completed' for run in every)} of {len(every)}"),
+        *(
+            (state_words(state), str(n))
+            for state in _TROUBLED
+            if (n := sum(run.state == state for run in every))
+        ),
         ("open", str(len(open_runs))),
-        ("waiting", str(waiting)),
-        ("failed", str(sum(run.state in ("error", "unreadable") for run in every))),
+        ("waiting", str(sum(run.state == "pending" for run in every))),
         ("episodes used", short(sum(run.used for run in every))),
         ("tokens", short(sum(run.tokens for run in every))),
     ]
@@ -172,9 +176,15 @@ def _matrix(sweep: Sweep, runs: Runs, agents: Mapping[str, Look], left: int) -> 
         }
         for entry in entries
     ]
+    by_state = {run.state: run for run in shown}
     view = {
         "name": sweep.name,
         "folder": "" if sweep.root is None else str(sweep.root),
+        "legend": [
+            {"symbol": symbol, "kind": _kind(by_state[state]), "words": words}
+            for state, (symbol, words) in STATES.items()
+            if state in by_state
+        ],
         "envs": [(env, title_of(env)) for env in envs],
         "rows": rows,
         "left_out": len(sweep.runs) - len(shown),
@@ -199,13 +209,10 @@ def _chip(run: RunFacts, may_show: bool) -> dict[str, Any]:
         value = number(run.best)
     if run.error:
         facts.append(run.error[:200])
-    kind = (
-        "bad"
-        if run.state in _TROUBLED
-        else "done"
-        if run.finished
-        else "idle"
-        if run.state == "pending"
-        else "live"
-    )
-    return {"key": run.key, "symbol": symbol, "value": value, "kind": kind, "title": "; ".join(facts)}
+    return {"key": run.key, "symbol": symbol, "value": value, "kind": _kind(run), "title": "; ".join(facts)}
+
+
+def _kind(run: RunFacts) -> str:
+    if run.state in _TROUBLED:
+        return "bad"
+    return "done" if run.finished else "idle" if run.state == "pending" else "live"

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
+from invented.policies import Version
+from invented.run_dirs import write_run
 from invented.web_site import client, finished_run, open_run, open_status, site_of, status
 
 from evopolicy_common.messages.status import (
@@ -13,6 +16,7 @@ from evopolicy_common.messages.status import (
     RetriedJobs,
     WorkerStatus,
 )
+from evopolicy_coordinator.web.content.charts import Line, chart
 from evopolicy_coordinator.web.content.cluster import _RETRIES_OF_A_RUN
 from evopolicy_coordinator.web.content.run_folders import key_of
 
@@ -111,3 +115,49 @@ def test_a_run_can_be_repinned_to_barred_classes_only(tmp_path: Path) -> None:
     assert "/act/run/r-open/repin?class=class-new" in page
     assert "class-own" not in page
     assert "class-gone" not in page
+
+
+def test_every_end_has_a_counter_and_a_place_in_the_legend(tmp_path: Path) -> None:
+    for number, (end, error) in enumerate(
+        [
+            ("completed", None),
+            ("cancelled", "stopped by its operator"),
+            ("error", "no such model"),
+            ("error", "401"),
+            ("no_ok_submit", None),
+        ]
+    ):
+        folder = finished_run(tmp_path, exp_id=f"e{number}")
+        record = json.loads((folder / "run.json").read_text())
+        record["outcome"] |= {"status": end, "error": error}
+        (folder / "run.json").write_text(json.dumps(record))
+    with client(site_of(tmp_path)) as browser:
+        page = browser.get("/").text
+    facts = re.findall(r"<li><span>([a-z ]+)</span><b>([^<]*)</b>", page)
+    assert facts[:4] == [("completed", "1 of 5"), ("failed", "2"), ("no ok submit", "1"), ("cancelled", "1")]
+    legend = page.partition('<ul class="legend"')[2].partition("</ul>")[0]
+    assert re.findall(r"</span>([a-z ]+)</li>", legend) == [
+        "completed",
+        "no ok submit",
+        "failed",
+        "cancelled",
+    ]
+    (row,) = [row for row in page.split("<tr") if "stopped by its operator</td>" in row]
+    assert row.index("cancelled") < row.index("stopped by its operator") < row.index("episodes used")
+
+
+def test_finished_run_without_ok_submit_waits_for_no_verdict(tmp_path: Path) -> None:
+    bad = Version(files={"policy.py": "import nope\n"}, returns=(0.0,), val=None, status="import_error")
+    folder = write_run(tmp_path, [bad])
+    with client(site_of(tmp_path)) as browser:
+        page = browser.get(f"/run/{key(folder)}").text
+    assert "No submit was ok." in page
+    assert "No submit has a verdict yet." not in page
+
+
+def test_charts_of_values_from_nought_have_no_negative_axis_and_a_title() -> None:
+    made = chart("Episodes a second", "hours", [Line("rate", [(-1.0, 0.0), (0.0, 0.0)])])
+    assert ">Episodes a second</text>" in made
+    assert [
+        text for text in re.findall(r'text-anchor="end" class="ink">([^<]*)<', made) if text.startswith("-")
+    ] == []
