@@ -2,7 +2,7 @@
 
     index.html                self-contained: includes figures, styles and scripts
     report.json               every table and every figure's data
-    figures/*.svg, *.png      tables/*.csv, *.md, *.tex
+    figures/*.svg             tables/*.csv, *.md, *.tex
     traces/*.html             one page per run, images beside it
     replays/*.html            one page per environment with recordings, videos beside it
 
@@ -14,7 +14,8 @@ from __future__ import annotations
 import hashlib
 import re
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +23,10 @@ import msgspec
 
 from evopolicy_common.errors import ConfigError
 from evopolicy_results.behaviour.trace import Trace, trace
+from evopolicy_results.figures import drawings_of, timelines_of
+from evopolicy_results.figures.plot import Plot
 from evopolicy_results.html.pages import (
     FORMS,
-    FigureView,
     PlayedEpisode,
     default_title,
     failed_page,
@@ -32,7 +34,8 @@ from evopolicy_results.html.pages import (
     replays_page,
     trace_page,
 )
-from evopolicy_results.reading.environments import ordered_environments
+from evopolicy_results.reading.environments import learnt_names, ordered_environments, take_names
+from evopolicy_results.reading.parallel import in_processes
 from evopolicy_results.reading.records import Run, path_text
 from evopolicy_results.studies.palette import Look, looks
 from evopolicy_results.studies.study import Study
@@ -43,9 +46,6 @@ from evopolicy_results.tables.table import Table, to_csv, to_markdown
 
 REPORT_SCHEMA_VERSION = 1
 _OURS = frozenset({"index.html", "report.json", "figures", "tables", "traces", "replays"})
-_POINTS_PER_REM = 11.0
-"""Points per rem of the page: figures are shown slightly larger than printed."""
-
 _WRITTEN = {"csv": to_csv, "md": to_markdown, "tex": to_latex}
 
 Progress = Callable[[str, int, int], None]
@@ -58,51 +58,52 @@ def write_report(
     *,
     title: str | None = None,
     traces: bool = True,
+    jobs: int = 1,
     progress: Progress | None = None,
 ) -> Path:
     """Writes the report of `study` into the folder `out` (created if missing) and returns its `index.html`.
 
     Raises ConfigError when `out` exists and is neither empty nor an earlier report. Without `traces` the pages of
-    single runs are left out, which saves most of the time and space of a large report.
+    single runs are left out, which saves most of the time and space of a large report. `jobs` processes draw figures
+    and write the pages of runs; call it on the main thread.
     """
     tell = progress if progress is not None else lambda what, done, total: None
     _prepare(out)
     look = looks(study.entries, study.reference)
     trace_links = {run.name: f"traces/{slug(run)}.html" for run in study.runs} if traces else {}
     tables = tables_of(study, lambda run: trace_links.get(run, ""))
-    figures, figure_data = _write_figures(study, out, tell)
+    plots: list[Plot] = []
+    submits: list[dict[str, Any]] = []
+    drawings = drawings_of(study)
+    pages = _pages(study, out, look) if traces else []
+    for done, made in enumerate(_all_made([*drawings, *pages], jobs), start=1):
+        if done <= len(drawings):
+            plots += [made] if made is not None else []
+            tell("figures", done, len(drawings))
+        else:
+            submits += made
+            tell("run pages", done - len(drawings), len(pages))
+    plots += timelines_of(study)
+    for plot in plots:
+        (out / "figures" / f"{plot.name}.svg").write_text(plot.svg, encoding="utf-8")
     if traces:
-        submits: list[dict[str, Any]] = []
-        by_env: dict[str, list[Run]] = {}
-        for run in study.runs:
-            by_env.setdefault(run.env, []).append(run)
-        for done, run in enumerate(study.runs, start=1):
-            try:
-                found = trace(run)
-                _write_trace(found, out, look, _beside(run, by_env[run.env]))
-                submits += submits_of(found)
-            except Exception as error:
-                # A bad log or source that an agent wrote must spoil at most its own page.
-                page = failed_page(run, f"{type(error).__name__}: {error}")
-                path = out / "traces" / f"{slug(run)}.html"
-                path.write_text(page, encoding="utf-8", errors="replace")
-            tell("run pages", done, len(study.runs))
         tables.append(feedback_use(submits))
-    for table in tables:
+    for done, table in enumerate(tables, start=1):
         for _, suffix in FORMS:
             text = _WRITTEN[suffix](table)
             (out / "tables" / f"{table.name}.{suffix}").write_text(text, encoding="utf-8", errors="replace")
+        tell("tables", done, len(tables))
     replay_links = _write_replays(study, out, look)
     page = index_page(
         study,
         title=title or default_title(study),
         looks=look,
         tables=tables,
-        figures=figures,
+        figures=plots,
         trace_links=trace_links,
         replay_links=replay_links,
     )
-    (out / "report.json").write_bytes(_report_json(study, tables, figure_data))
+    (out / "report.json").write_bytes(_report_json(study, tables, plots))
     index = out / "index.html"
     index.write_text(page, encoding="utf-8", errors="replace")
     return index
@@ -129,39 +130,77 @@ def _prepare(out: Path) -> None:
         (out / name).mkdir(parents=True, exist_ok=True)
 
 
-def _write_figures(study: Study, out: Path, tell: Progress) -> tuple[list[FigureView], dict[str, Any]]:
-    from evopolicy_results.figures import figures_of  # imports matplotlib
-    from evopolicy_results.figures.style import inline_svg, png_bytes, svg_text
-
-    views: list[FigureView] = []
-    data: dict[str, Any] = {}
-    for plot in figures_of(study):
-        svg = svg_text(plot.figure, plot.name)
-        (out / "figures" / f"{plot.name}.svg").write_text(svg, encoding="utf-8")
-        (out / "figures" / f"{plot.name}.png").write_bytes(png_bytes(plot.figure))
-        data[plot.name] = {"title": plot.title, "caption": plot.caption, "data": plot.data}
-        views.append(
-            FigureView(
-                name=plot.name,
-                title=plot.title,
-                caption=plot.caption,
-                group=plot.group,
-                svg=_Html(inline_svg(svg, plot.name, plot.alt)),
-                width=round(plot.figure.get_figwidth() * 72.0 / _POINTS_PER_REM, 1),
-                timeline=plot.data[0]["env"] if plot.group == "timelines" else "",
-            )
+def _all_made(work: Sequence[partial[Any]], jobs: int) -> Iterator[Any]:
+    """The results of `work`, in order."""
+    if jobs <= 1:
+        yield from map(_made, work)
+    else:
+        found = in_processes(
+            _made_elsewhere, [(learnt_names(), each) for each in work], jobs, _lost, at_once=1
         )
-        tell("figures", len(views), len(views))
-    return views, data
+        yield from found
 
 
-class _Html(str):
-    """Markup that is already escaped: the SVG of our own figures."""
+def _made_elsewhere(item: tuple[dict[str, set[tuple[str, str]]], partial[Any]]) -> Any:
+    take_names(item[0])
+    return _made(item[1])
 
-    __slots__ = ()
 
-    def __html__(self) -> str:
-        return str(self)
+def _made(work: partial[Any]) -> Any:
+    made = work()
+    if isinstance(made, Plot):
+        from evopolicy_results.figures.style import drawn  # imports matplotlib
+
+        made = drawn(made)
+    return made
+
+
+def _lost(item: tuple[Any, partial[Any]], why: str) -> Any:
+    """Replaces a run's page whose process ended; a figure has nothing of an agent's that could end its process."""
+    if item[1].func is not _page:
+        raise ChildProcessError(why)
+    run, out, *_ = item[1].args
+    _write_failed(run, out, why)
+    return []
+
+
+def _pages(study: Study, out: Path, look: Mapping[str, Look]) -> list[partial[list[dict[str, Any]]]]:
+    """Writes the page of each run and returns its submits."""
+    (out / "traces").mkdir(exist_ok=True)
+    by_env: dict[str, list[Run]] = {}
+    for run in study.runs:
+        by_env.setdefault(run.env, []).append(run)
+    return [
+        partial(
+            _page,
+            run,
+            out,
+            look.get(run.entry),
+            [
+                (other.entry, look.get(other.entry), f"{slug(other)}.html")
+                for other in _beside(run, by_env[run.env])
+            ],
+        )
+        for run in study.runs
+    ]
+
+
+def _page(
+    run: Run, out: Path, look: Look | None, beside: Sequence[tuple[str, Look | None, str]]
+) -> list[dict[str, Any]]:
+    try:
+        found = trace(run)
+        _write_trace(found, out, look, beside)
+        return submits_of(found)
+    except Exception as error:
+        # A bad log or source that an agent wrote must spoil at most its own page.
+        _write_failed(run, out, f"{type(error).__name__}: {error}")
+        return []
+
+
+def _write_failed(run: Run, out: Path, why: str) -> None:
+    page = failed_page(run, why)
+    (out / "traces" / f"{slug(run)}.html").write_text(page, encoding="utf-8", errors="replace")
 
 
 def _beside(run: Run, runs: Sequence[Run]) -> list[Run]:
@@ -175,9 +214,10 @@ def _beside(run: Run, runs: Sequence[Run]) -> list[Run]:
     return list(found.values())
 
 
-def _write_trace(found: Trace, out: Path, looks: Mapping[str, Look], beside: Sequence[Run]) -> None:
+def _write_trace(
+    found: Trace, out: Path, look: Look | None, beside: Sequence[tuple[str, Look | None, str]]
+) -> None:
     folder = out / "traces"
-    folder.mkdir(exist_ok=True)
     name = slug(found.run)
     image_links: dict[int, list[tuple[str, str]]] = {}
     videos: dict[int, str] = {}
@@ -190,10 +230,10 @@ def _write_trace(found: Trace, out: Path, looks: Mapping[str, Look], beside: Seq
             videos[row.submit.index] = f"{name}/{row.submit.label}.mp4"
     page = trace_page(
         found,
-        look=looks.get(found.run.entry),
+        look=look,
         image_links=image_links,
         videos=videos,
-        beside=[(other.entry, looks.get(other.entry), f"{slug(other)}.html") for other in beside],
+        beside=beside,
     )
     (folder / f"{name}.html").write_text(page, encoding="utf-8", errors="replace")
 
@@ -249,7 +289,7 @@ def _copied(run: Run, path: str, folder: Path, stem: str) -> str | None:
     return f"{stem}{source.suffix.lower()}" if _copy(source, target) else None
 
 
-def _report_json(study: Study, tables: list[Table], figures: dict[str, Any]) -> bytes:
+def _report_json(study: Study, tables: list[Table], plots: list[Plot]) -> bytes:
     content = {
         "schema_version": REPORT_SCHEMA_VERSION,
         "runs": [
@@ -276,6 +316,8 @@ def _report_json(study: Study, tables: list[Table], figures: dict[str, Any]) -> 
             }
             for table in tables
         },
-        "figures": figures,
+        "figures": {
+            plot.name: {"title": plot.title, "caption": plot.caption, "data": plot.data} for plot in plots
+        },
     }
     return msgspec.json.format(msgspec.json.encode(content, enc_hook=str), indent=1) + b"\n"

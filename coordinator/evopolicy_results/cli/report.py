@@ -91,17 +91,18 @@ def report(
     ] = False,
 ) -> None:
     """Write a report on finished runs: leaderboard, figures and diagnostics."""
-    # Here, not above: it needs jinja2 and matplotlib, and `evopolicy` loads this module to list its commands.
+    # Here, not above: it needs jinja2, and `evopolicy` loads this module to list its commands.
     from evopolicy_results.report import write_report
 
     try:
         check_writable(out, "--out")
         with _progress() as tell:
-            study = _study(runs, scores, allow_mixed, allow_unknown, jobs or os.cpu_count() or 1, tell)
+            jobs = jobs or os.cpu_count() or 1
+            study = _study(runs, scores, allow_mixed, allow_unknown, jobs, tell)
             if not study.suites:
                 index = None
             else:
-                index = write_report(study, out, title=title, traces=pages, progress=tell)
+                index = write_report(study, out, title=title, traces=pages, jobs=jobs, progress=tell)
     except MixedRunsError as error:
         options = sorted(
             {
@@ -165,13 +166,16 @@ def _study(
             f"--scores {rescore!r} cannot be the name of a re-score: use letters, digits, '.', '_' and '-'"
         )
     scores = _read_table(tables[0]) if tables else None
-    return study_of(
+    tell("statistics", 0, 1)
+    study = study_of(
         rescored(loaded.runs, rescore) if rescore else loaded.runs,
         left_out=loaded.left_out,
         allow_mixed=allow_mixed,
         allow_unknown=allow_unknown,
         scores=scores,
     )
+    tell("statistics", 1, 1)
+    return study
 
 
 def _read_table(path: Path) -> ScoreTable:

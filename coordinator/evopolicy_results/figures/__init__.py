@@ -1,14 +1,58 @@
-"""Every figure of a report, drawn with matplotlib, which is imported only here."""
+"""Every figure of a report. Matplotlib is imported by the first figure that it draws."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
+from importlib import import_module
+from typing import Any
 
-from evopolicy_results.figures import cost, edits, profiles, scores
-from evopolicy_results.figures.style import Plot
+import msgspec
+
+from evopolicy_results.figures.plot import Plot
+from evopolicy_results.figures.timelines import timeline_of
 from evopolicy_results.reading.environments import ordered_environments
 from evopolicy_results.studies.palette import looks
 from evopolicy_results.studies.study import Study
+
+_OF_SUITE = (
+    "scores.rank_scores",
+    "scores.score_evolution",
+    "profiles.performance_profiles",
+    "scores.normalised_performance",
+)
+"""All but the second average over environments."""
+_OF_STUDY = ("edits.hit_rates", "edits.edit_size", "cost.structure", "cost.tokens", "cost.wall_time")
+
+Drawing = partial[Plot | None]
+"""Draws one figure; None if it has no data. Can be sent to another process."""
+
+
+def drawings_of(study: Study) -> list[Drawing]:
+    """The figures that matplotlib draws, in order."""
+    look = looks(study.entries, study.reference)
+    sent = msgspec.structs.replace(study, runs=(), timelines=())  # figures need no more
+    found = [
+        partial(_draw, name, suite, sent, look)
+        for suite in study.suites
+        for name in (_OF_SUITE if suite.is_ranked else _OF_SUITE[1:2])
+    ]
+    return found + [partial(_draw, name, sent, look) for name in _OF_STUDY]
+
+
+def _draw(function: str, *args: Any) -> Plot | None:
+    module, _, name = function.partition(".")
+    plot: Plot | None = getattr(import_module(f"{__name__}.{module}"), name)(*args)
+    return plot
+
+
+def timelines_of(study: Study) -> Iterator[Plot]:
+    """The code phases of each environment's runs, as SVG."""
+    look = looks(study.entries, study.reference)
+    for env in ordered_environments(line.env for line in study.timelines):
+        plot = timeline_of(env, [line for line in study.timelines if line.env == env], look)
+        if plot is not None:
+            yield plot
 
 
 def figures_of(study: Study) -> Iterator[Plot]:
@@ -16,21 +60,7 @@ def figures_of(study: Study) -> Iterator[Plot]:
 
     Each keeps its drawing in memory until it is dropped: write it before taking the next.
     """
-    look = looks(study.entries, study.reference)
-    for suite in study.suites:
-        for plot in (
-            scores.rank_scores(suite, look),
-            scores.score_evolution(suite, study, look),
-            profiles.performance_profiles(suite, look),
-            scores.normalised_performance(suite, look),
-        ):
-            if plot is not None:
-                yield plot
-    for draw in (edits.hit_rates, edits.edit_size, cost.structure, cost.tokens, cost.wall_time):
-        plot = draw(study, look)
-        if plot is not None:
+    for draw in drawings_of(study):
+        if (plot := draw()) is not None:
             yield plot
-    for env in ordered_environments(line.env for line in study.timelines):
-        plot = edits.timeline(env, [line for line in study.timelines if line.env == env], look)
-        if plot is not None:
-            yield plot
+    yield from timelines_of(study)

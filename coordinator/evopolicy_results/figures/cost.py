@@ -10,7 +10,8 @@ import matplotlib
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from evopolicy_results.behaviour.structure import FEATURES
-from evopolicy_results.figures.style import INK, RC, Plot, new_figure
+from evopolicy_results.figures.plot import INK, Plot
+from evopolicy_results.figures.style import RC, new_figure
 from evopolicy_results.reading.records import rows
 from evopolicy_results.studies.palette import Look
 from evopolicy_results.studies.study import Study

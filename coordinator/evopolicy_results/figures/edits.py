@@ -1,129 +1,20 @@
-"""Figures of how policies evolved: code-phase timelines, hit rates by edit type, edit size against improvement."""
+"""Figures of how policies evolved: hit rates by edit type, edit size against improvement."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import matplotlib
 from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
 
-from evopolicy_results.behaviour.edits import EditRates, events_of, phases
+from evopolicy_results.behaviour.edits import EditRates
 from evopolicy_results.behaviour.structure import BINS, DATA_ONLY, UNCHANGED
-from evopolicy_results.figures.style import INK, MUTED, RC, Plot, new_figure
-from evopolicy_results.reading.environments import title_of
+from evopolicy_results.figures.plot import MUTED, Plot
+from evopolicy_results.figures.style import RC, new_figure
 from evopolicy_results.reading.records import rows
-from evopolicy_results.studies.palette import EDIT_COLOURS, Look
-from evopolicy_results.studies.study import Study, Timeline
-
-MAX_ROWS = 24
-"""Maximum number of runs in one timeline figure; every run's own page has its own timeline."""
-
-_HATCHES = {"parametric": "////", "data": "|||"}
-_EVENTS = {
-    "hit": ("*", "raises the validation best", 8.0),
-    "miss": ("o", "does not", 3.4),
-    "rollback": ("v", "rollback", 5.0),
-    "retest": ("x", "retest", 5.0),
-}
-
-
-def timeline(env: str, lines: Sequence[Timeline], looks: Mapping[str, Look]) -> Plot | None:
-    """One environment's runs, one row each: phase bands over the budget, and a mark for each submit's outcome."""
-    found = [line for line in lines if line.transitions]
-    if not found:
-        return None
-    cut = sorted(found, key=lambda line: (line.repeat, line.entry.casefold()))[:MAX_ROWS]
-    cut.sort(key=lambda line: (line.entry.casefold(), line.repeat))
-    figure, axes = new_figure(7.6, 1.25 + 0.52 * len(cut))
-    panel = axes[0][0]
-    budget = max(line.budget for line in cut)
-    with matplotlib.rc_context(RC):
-        for place, line in enumerate(cut):
-            _timeline_row(panel, place, line)
-            best = line.transitions[-1].best
-            panel.annotate(
-                f"best {best:.4g}", (1.0, place), xycoords=("axes fraction", "data"), xytext=(6, 0),
-                textcoords="offset points", va="center", fontsize=8,
-            )  # fmt: skip
-        panel.set_yticks(range(len(cut)), [_row_label(line) for line in cut])
-        panel.tick_params(axis="y", length=0, pad=12)
-        for place, line in enumerate(cut):
-            look = looks[line.entry]
-            panel.plot(
-                -0.013, place, look.marker, color=look.colour, markersize=6, clip_on=False,
-                transform=panel.get_yaxis_transform(),
-            )  # fmt: skip
-        panel.set_ylim(len(cut) - 0.4, -0.6)
-        panel.set_xlim(0, budget)
-        panel.locator_params(axis="x", integer=True)
-        panel.set_xlabel("Train episodes consumed")
-        panel.grid(axis="y", visible=False)
-        figure.legend(handles=_timeline_handles(cut), loc="outside upper center", ncols=4)
-    dropped = (
-        f" {len(found) - len(cut)} more runs have their timelines on their own pages."
-        if len(found) > len(cut)
-        else ""
-    )
-    return Plot(
-        name="timeline_" + env.replace("/", "_"),
-        title=f"{title_of(env)} code phases",
-        caption="Phases by edit type over the budget; a mark stands where its submit's episodes end. Rollbacks and retests are "
-        "events within a phase. A filled star raises the best validation mean so far." + dropped,
-        alt=f"Timelines of {len(cut)} runs on {title_of(env)}: bands of synthesis and parametric edits with outcome marks.",
-        data=rows(cut),
-        figure=figure,
-        group="timelines",
-    )
-
-
-def _row_label(line: Timeline) -> str:
-    return f"{line.entry} #{line.repeat}" if line.repeat else line.entry
-
-
-def _timeline_row(panel: matplotlib.axes.Axes, place: int, line: Timeline) -> None:
-    for start, end, edit in phases(line.transitions):
-        panel.barh(
-            place, end - start, left=start, height=0.62, color=EDIT_COLOURS[edit], alpha=0.55, linewidth=0,
-            hatch=_HATCHES.get(edit), edgecolor="white",
-        )  # fmt: skip
-    for transition in line.transitions:
-        for kind in events_of(transition):
-            marker, _, size = _EVENTS[kind]
-            lift = -0.2 if kind in ("rollback", "retest") else 0.08
-            panel.plot(
-                transition.consumed, place + lift, marker, color=INK, markersize=size, clip_on=False, zorder=3,
-                markerfacecolor="none" if kind == "miss" else INK, markeredgewidth=1.0,
-            )  # fmt: skip
-
-
-def _timeline_handles(lines: Sequence[Timeline]) -> list[Patch | Line2D]:
-    bands = {edit for line in lines for _, _, edit in phases(line.transitions)}
-    kinds = {kind for line in lines for t in line.transitions for kind in events_of(t)}
-    titles = {
-        "first": "first policy",
-        "synthesis": "synthesis edits",
-        "parametric": "parametric edits",
-        "data": "data files only",
-    }
-    out: list[Patch | Line2D] = [
-        Patch(
-            facecolor=EDIT_COLOURS[edit], alpha=0.55, label=titles[edit], edgecolor="white", linewidth=0,
-            hatch=_HATCHES.get(edit),
-        )
-        for edit in EDIT_COLOURS
-        if edit in bands
-    ]  # fmt: skip
-    out += [
-        Line2D(
-            [], [], linestyle="", marker=marker, color=INK, markersize=min(size, 7), label=label,
-            markerfacecolor="none" if kind == "miss" else INK,
-        )
-        for kind, (marker, label, size) in _EVENTS.items()
-        if kind in kinds
-    ]  # fmt: skip
-    return out
+from evopolicy_results.studies.palette import Look
+from evopolicy_results.studies.study import Study
 
 
 def wilson(hits: int, n: int) -> tuple[float, float]:

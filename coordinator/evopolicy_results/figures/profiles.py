@@ -6,15 +6,15 @@ from collections.abc import Mapping
 
 import matplotlib
 
-from evopolicy_results.figures.style import RC, Plot, new_figure
-from evopolicy_results.reading.environments import suite_title
+from evopolicy_results.figures.plot import Plot
+from evopolicy_results.figures.style import RC, new_figure
 from evopolicy_results.reading.records import rows
 from evopolicy_results.statistics.aggregates import TAUS
 from evopolicy_results.studies.palette import Look
-from evopolicy_results.studies.study import Suite
+from evopolicy_results.studies.study import Study, Suite
 
 
-def performance_profiles(suite: Suite, looks: Mapping[str, Look]) -> Plot | None:
+def performance_profiles(suite: Suite, study: Study, looks: Mapping[str, Look]) -> Plot | None:
     """One curve per agent, with its pointwise 95 % band."""
     found = suite.statistics.aggregates
     if not found:
@@ -43,7 +43,7 @@ def performance_profiles(suite: Suite, looks: Mapping[str, Look]) -> Plot | None
         figure.legend(loc="outside upper center", ncols=min(4, len(found)))
     return Plot(
         name=f"profiles_{suite.name}",
-        title=f"{suite_title(suite.name)} performance profiles",
+        title=f"{suite.title} performance profiles",
         caption="Share of an agent's runs whose normalised score is above each value, over all environments with a scale; higher is better. "
         "Bands: pointwise 95 % intervals of a stratified bootstrap over runs and their cases, or over the cases of single runs; none where resamples show no spread.",
         alt=f"Performance profiles of {len(found)} agents.",

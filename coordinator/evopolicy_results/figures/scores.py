@@ -10,8 +10,9 @@ import matplotlib
 from matplotlib.lines import Line2D
 
 from evopolicy_results.behaviour.edits import demand_of
-from evopolicy_results.figures.style import GRID, MUTED, RC, Plot, new_figure
-from evopolicy_results.reading.environments import family_of, family_title, suite_title, title_of
+from evopolicy_results.figures.plot import GRID, INK, Plot
+from evopolicy_results.figures.style import RC, new_figure
+from evopolicy_results.reading.environments import family_of, family_title, title_of
 from evopolicy_results.reading.records import rows
 from evopolicy_results.scoring.evolution import Evolution, best_at
 from evopolicy_results.scoring.normalised import DEMANDS
@@ -19,7 +20,7 @@ from evopolicy_results.studies.palette import REFERENCE, Look
 from evopolicy_results.studies.study import Study, Suite
 
 
-def rank_scores(suite: Suite, looks: Mapping[str, Look]) -> Plot | None:
+def rank_scores(suite: Suite, study: Study, looks: Mapping[str, Look]) -> Plot | None:
     """Suite and family rank scores, one panel each, agents from best to worst."""
     standings = suite.board.standings
     if not any(row.score is not None for row in standings):
@@ -31,7 +32,7 @@ def rank_scores(suite: Suite, looks: Mapping[str, Look]) -> Plot | None:
     )
     with matplotlib.rc_context(RC):
         for panel, family in zip(axes[0], panels, strict=True):
-            panel.set_title(suite_title(suite.name) if not family else family_title(family))
+            panel.set_title(suite.title if not family else family_title(family))
             for place, row in enumerate(standings):
                 value = row.families.get(family) if family else row.score
                 if value is None:
@@ -40,17 +41,14 @@ def rank_scores(suite: Suite, looks: Mapping[str, Look]) -> Plot | None:
                 panel.hlines(place, 0.0, value, color=look.colour, linewidth=2.2, alpha=0.55)
                 panel.plot(value, place, look.marker, color=look.colour, markersize=6.5)
                 sure = suite.statistics.standings.of(row.entry)
+                end = value
                 if not family and sure is not None:
-                    panel.hlines(
-                        place + 0.22,
-                        sure.score_low,
-                        sure.score_high,
-                        color=MUTED,
-                        linewidth=1.0,
-                    )
+                    ends = [sure.score_low, sure.score_high]
+                    panel.plot(ends, [place, place], "|-", color=INK, markersize=9, linewidth=1.2, zorder=1.9)
+                    end = sure.score_high
                 panel.annotate(
                     f"{value:.3f}",
-                    (value, place),
+                    (end, place),
                     xytext=(6, 0),
                     textcoords="offset points",
                     va="center",
@@ -66,9 +64,9 @@ def rank_scores(suite: Suite, looks: Mapping[str, Look]) -> Plot | None:
     resampled = suite.statistics.standings
     return Plot(
         name=f"rank_scores_{suite.name}",
-        title=f"{suite_title(suite.name)} rank scores",
+        title=f"{suite.title} rank scores",
         caption="Mean rank score over the suite and over each family of environments."
-        + (f" Thin bars: 95 % interval over {resampled.over}." if resampled.rows else ""),
+        + (f" Bars with ends: 95 % interval over {resampled.over}." if resampled.rows else ""),
         alt=f"Dot plot of rank scores, suite and {len(families)} families. Best: {first.entry}"
         + (f" at {first.score:.2f}." if first.score is not None else "."),
         data=rows(standings),
@@ -105,7 +103,7 @@ def score_evolution(suite: Suite, study: Study, looks: Mapping[str, Look]) -> Pl
         figure.legend(handles=handles, loc="outside upper center", ncols=min(5, len(handles)))
     return Plot(
         name=f"score_evolution_{suite.name}",
-        title=f"{suite_title(suite.name)} score evolution",
+        title=f"{suite.title} score evolution",
         caption="Best hidden-validation mean so far over the consumed train budget, one curve a run, rises marked; where an agent "
         f"has more than {MAX_CURVES} runs, their mean and range from where all have a score. Reconstructed after the run: agents "
         "never see it. Dotted: random reference on the held-out cases.",
@@ -182,7 +180,7 @@ def _handle(entry: str, looks: Mapping[str, Look]) -> Line2D:
     )
 
 
-def normalised_performance(suite: Suite, looks: Mapping[str, Look]) -> Plot | None:
+def normalised_performance(suite: Suite, study: Study, looks: Mapping[str, Look]) -> Plot | None:
     """Two panels, one per demand group: each agent's mean as a bar, its environments as dots."""
     agents = suite.table.agents
     groups = {(g.demand, g.entry): g for g in suite.normalised.groups if g.value is not None}
@@ -231,7 +229,7 @@ def normalised_performance(suite: Suite, looks: Mapping[str, Look]) -> Plot | No
         figure.supxlabel("Normalised held-out return (0 = random, 1 = best agent)", fontsize=9)
     return Plot(
         name=f"normalised_{suite.name}",
-        title=f"{suite_title(suite.name)} performance by task demand",
+        title=f"{suite.title} performance by task demand",
         caption="Held-out return between the random reference (0) and the best agent (1), clipped. Bars: mean over the "
         "environments of a demand group, given at the right. Symbols: single environments.",
         alt=f"Bars of normalised performance for {len(agents)} agents in {len(demands)} demand groups.",

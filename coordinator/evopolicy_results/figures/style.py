@@ -1,28 +1,20 @@
-"""Drawing and writing of all figures: rcParams, SVG and PNG. Agents' looks are in `palette`.
-
-On a page, the ink, muted text and grid follow its light or dark theme: `inline_svg` replaces their three colours,
-which nothing else uses, by CSS variables.
-"""
+"""How matplotlib draws all figures: rcParams, layout, SVG. Agents' looks are in `palette`."""
 
 from __future__ import annotations
 
-import hashlib
 import io
-import re
-from dataclasses import dataclass
 from typing import Any
 
 import matplotlib
+import msgspec
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from evopolicy_common.terminal import harmless
+from evopolicy_results.figures.plot import GRID, INK, MUTED, Plot
 
-INK = "#15181d"
-MUTED = "#5c6773"
-GRID = "#d5dae1"
-PNG_DPI = 160
+_POINTS_PER_REM = 11.0
+"""Points per rem of the page: figures are shown slightly larger than printed."""
 
 RC: dict[str, Any] = {
     "font.family": "sans-serif",
@@ -63,23 +55,6 @@ RC: dict[str, Any] = {
 }
 
 
-@dataclass(slots=True, kw_only=True)
-class Plot:
-    """A drawn figure with its texts and data."""
-
-    name: str
-    """File name without suffix."""
-    title: str
-    caption: str
-    alt: str
-    """Alternative text that describes the figure."""
-    data: Any
-    """JSON-able: the numbers drawn."""
-    figure: Figure
-    group: str
-    """Section of the report."""
-
-
 def new_figure(width: float, height: float, **subplots: Any) -> tuple[Figure, Any]:
     """A figure of that size in inches with constrained layout, and its axes as `Figure.subplots` returns them."""
     with matplotlib.rc_context(RC):
@@ -88,51 +63,22 @@ def new_figure(width: float, height: float, **subplots: Any) -> tuple[Figure, An
         return figure, figure.subplots(squeeze=False, **subplots)
 
 
-def _settle(figure: Figure) -> None:
-    """Freezes the layout: every layout pass moves it slightly, and both files must show the same."""
-    engine = figure.get_layout_engine()
-    if isinstance(engine, ConstrainedLayoutEngine):
-        for _ in range(2):
-            engine.execute(figure)
-        # With "none", a placeholder stays, for which `savefig` draws everything twice.
-        figure.set_layout_engine(None)
+def drawn(plot: Plot) -> Plot:
+    """The plot as SVG, without its figure."""
+    if plot.figure is None:
+        return plot
+    width = round(plot.figure.get_figwidth() * 72.0 / _POINTS_PER_REM, 1)
+    return msgspec.structs.replace(plot, svg=svg_text(plot.figure, plot.name), width=width, figure=None)
 
 
 def svg_text(figure: Figure, name: str) -> str:
     """The figure as a stand-alone SVG: text as text, transparent background, deterministic bytes."""
     out = io.StringIO()
     with matplotlib.rc_context({**RC, "svg.hashsalt": name}):
-        _settle(figure)
+        engine = figure.get_layout_engine()
+        if engine is not None:
+            engine.execute(figure)
+            # Every pass moves the layout slightly. With "none", a placeholder stays, for which `savefig` draws twice.
+            figure.set_layout_engine(None)
         figure.savefig(out, format="svg", metadata={"Date": None, "Creator": None})
     return harmless(out.getvalue())  # XML has no control characters
-
-
-def png_bytes(figure: Figure) -> bytes:
-    """The figure as PNG on white."""
-    out = io.BytesIO()
-    with matplotlib.rc_context(RC):
-        _settle(figure)
-        figure.savefig(out, format="png", dpi=PNG_DPI, facecolor="white")
-    return out.getvalue()
-
-
-_PROLOGUE = re.compile(r"^.*?(?=<svg)", re.DOTALL)
-_METADATA = re.compile(r"<metadata>.*?</metadata>\s*", re.DOTALL)
-_SIZE = re.compile(r'(<svg[^>]*?) width="[^"]*"')
-_HEIGHT = re.compile(r'(<svg[^>]*?) height="[^"]*"')
-_IDS = re.compile(r'(\bid="|xlink:href="#|url\(#)')
-_THEME = {INK: "var(--ink)", MUTED: "var(--muted)", GRID: "var(--grid)"}
-
-
-def inline_svg(svg: str, name: str, alt: str) -> str:
-    """The SVG for use inside a page: themed, scaling with its container, labelled for assistive technology, ids
-    unique."""
-    prefix = "f" + hashlib.sha256(name.encode()).hexdigest()[:8] + "-"
-    body = _METADATA.sub("", _PROLOGUE.sub("", svg, count=1))
-    body = _IDS.sub(lambda match: match.group(1) + prefix, body)
-    for colour, variable in _THEME.items():
-        body = body.replace(colour, variable)
-    body = _HEIGHT.sub(r"\1", _SIZE.sub(r"\1", body, count=1), count=1)
-    label = harmless(alt).replace("&", "&amp;").replace('"', "&quot;").replace("<", "&lt;")
-    body = body.replace("<svg", f'<svg role="img" aria-label="{label}"', 1)
-    return body.replace("'DejaVu Sans'", "system-ui, 'DejaVu Sans'")

@@ -1,92 +1,171 @@
-"""One run's code-phase timeline as a small hand-written SVG: a thousand pages should not need a drawing library."""
+"""Code-phase timelines as hand-written SVG: a report has one for each environment and run, too many for a drawing
+library."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from html import escape
 
+import msgspec
+
+from evopolicy_common.terminal import one_line
 from evopolicy_results.behaviour.edits import Transition, events_of, phases
-from evopolicy_results.reading.records import Submit
-from evopolicy_results.studies.palette import EDIT_COLOURS
+from evopolicy_results.figures.plot import INK, MUTED, Plot
+from evopolicy_results.reading.environments import title_of
+from evopolicy_results.reading.records import Submit, rows
+from evopolicy_results.studies.palette import EDIT_COLOURS, Look
+from evopolicy_results.studies.study import Timeline
 
-_WIDTH, _LEFT, _RIGHT = 900.0, 14.0, 20.0
-_BAND_TOP, _BAND_HEIGHT, _MARKS, _AXIS, _HEIGHT = 16.0, 30.0, 62.0, 78.0, 112.0
+MAX_ROWS = 24
+"""Maximum number of runs in one environment's figure; every run's own page has its own timeline."""
+_MAX_LABEL = 32
+_WIDTH, _ROW, _BAND, _AXIS = 900.0, 48.0, 24.0, 38.0
+_LETTER = 6.6
+"""Assumed mean width of a letter of 11 px."""
+_BANDS = {
+    "first": "first policy",
+    "synthesis": "synthesis edits",
+    "parametric": "parametric edits",
+    "data": "data files only",
+}
+_MARKS = {
+    "hit": ("raises the validation best", f'<path id="hit" fill="{INK}" d="M0-7 1.7-2.2 6.7-2.2 2.7.9 4.1 5.7 0 2.8-4.1 5.7-2.7.9-6.7-2.2-1.7-2.2z"/>'),
+    "miss": ("does not", f'<circle id="miss" r="4" fill="none" stroke="{INK}" stroke-width="1.4"/>'),
+    "rollback": ("rollback", f'<path id="rollback" d="M-5-4h10L0 5z" fill="{INK}"/>'),
+    "retest": ("retest", f'<path id="retest" d="M-4-4 4 4M4-4-4 4" stroke="{INK}" stroke-width="1.8"/>'),
+    "bad": ("not ok", f'<path id="bad" d="M0-6V2M0 4V6" stroke="{INK}" stroke-width="2.4"/>'),
+}  # fmt: skip
+"""By mark: its meaning and its shape."""
+_HATCH = (
+    '<pattern id="parametric" width="6" height="6" patternUnits="userSpaceOnUse" patternTransform="rotate(45)">'
+    f'<rect width="6" height="6" fill="{EDIT_COLOURS["parametric"]}"/><path d="M0 0v6" stroke="#fff" stroke-width="2" opacity=".6"/>'
+    "</pattern>"
+)
 
 
-def small_timeline(
-    transitions: Sequence[Transition], submits: Sequence[Submit], budget: int, prefix: str
-) -> str:
-    """Bands, a mark and label for every submit, and the budget axis. `prefix` makes its ids unique."""
-    last = max([budget, *(submit.consumed for submit in submits), 1])
-    scale = (_WIDTH - _LEFT - _RIGHT) / last
+class Row(msgspec.Struct, frozen=True, kw_only=True):
+    """One run's band and marks."""
 
-    def x(consumed: float) -> float:
-        return _LEFT + consumed * scale
+    transitions: Sequence[Transition]
+    budget: int
+    label: str = ""
+    look: Look | None = None
+    submits: Sequence[Submit] = ()
+    """All submits: they are named above the band, and those without a score are marked too."""
 
-    hatch = escape(f"{prefix}hatch", quote=True)
-    label = f"Code phases of {len(submits)} submits over {budget} episodes"
+
+def timeline_of(env: str, lines: Sequence[Timeline], looks: Mapping[str, Look]) -> Plot | None:
+    """One environment's runs, one row each."""
+    found = [line for line in lines if line.transitions]
+    if not found:
+        return None
+    cut = sorted(found, key=lambda line: (line.repeat, line.entry.casefold()))[:MAX_ROWS]
+    cut.sort(key=lambda line: (line.entry.casefold(), line.repeat))
+    dropped = len(found) - len(cut)
+    return Plot(
+        name="timeline_" + env.replace("/", "_"),
+        title=f"{title_of(env)} code phases",
+        caption="Phases by edit type over the budget; a mark stands where its submit's episodes end. Rollbacks and retests are "
+        "events within a phase. A filled star raises the best validation mean so far."
+        + (f" {dropped} more runs have their timelines on their own pages." if dropped else ""),
+        alt=f"Timelines of {len(cut)} runs on {title_of(env)}: bands of synthesis and parametric edits with outcome marks.",
+        data=rows(cut),
+        svg=timeline_svg(
+            [
+                Row(
+                    transitions=line.transitions,
+                    budget=line.budget,
+                    label=f"{line.entry} #{line.repeat}" if line.repeat else line.entry,
+                    look=looks[line.entry],
+                )
+                for line in cut
+            ]
+        ),
+        group="timelines",
+    )
+
+
+def timeline_svg(runs: Sequence[Row]) -> str:
+    """A legend, a row for each run, and the axis of the budget."""
+    labels = [one_line(run.label)[:_MAX_LABEL] for run in runs]
+    left = 14.0 + max((_LETTER * len(label) + 20.0 for label in labels if label), default=0.0)
+    right = 90.0 if any(labels) else 20.0
+    last = max([1, *(end for run in runs for end in (run.budget, *(s.consumed for s in run.submits)))])
+    scale = (_WIDTH - left - right) / last
+    height = 42.0 + _ROW * len(runs) + _AXIS
     out = [
-        f'<svg role="img" aria-label="{label}" viewBox="0 0 {_WIDTH:g} {_HEIGHT:g}" style="font: 12px system-ui, sans-serif">',
-        f'<defs><pattern id="{hatch}" width="6" height="6" patternUnits="userSpaceOnUse" patternTransform="rotate(45)">'
-        f'<rect width="6" height="6" fill="{EDIT_COLOURS["parametric"]}"/><path d="M0 0v6" stroke="#fff" stroke-width="2" opacity=".6"/>'
-        "</pattern></defs>",
+        f'<svg xmlns="http://www.w3.org/2000/svg" width="{_WIDTH:g}" height="{height:g}" viewBox="0 0 {_WIDTH:g} {height:g}" '
+        f'font-family="\'DejaVu Sans\', sans-serif" font-size="11" fill="{INK}"><defs>{_HATCH}'
+        + "".join(shape for _, shape in _MARKS.values())
+        + "</defs>",
+        _legend(runs),
     ]
-    for start, end, edit in phases(transitions):
-        fill = f"url(#{hatch})" if edit == "parametric" else EDIT_COLOURS[edit]
-        out.append(
-            f'<rect x="{x(start):.1f}" y="{_BAND_TOP}" width="{max(1.0, (end - start) * scale):.1f}" '
-            f'height="{_BAND_HEIGHT}" fill="{fill}" opacity=".7"><title>{edit}: {start} to {end} episodes</title></rect>'
-        )
-    out.append(_axis(last, x))
-    by_index = {transition.index: transition for transition in transitions}
-    previous = -100.0
-    for submit in submits:
-        at = x(submit.consumed)
-        out.append(_mark(by_index.get(submit.index), at, submit))
-        if at - previous > 34.0:
-            anchor = "end" if at > _WIDTH - 30 else "middle"
+    for place, (run, label) in enumerate(zip(runs, labels, strict=True)):
+        top = 42.0 + _ROW * place
+        if run.look is not None:
             out.append(
-                f'<text x="{at:.1f}" y="11" text-anchor="{anchor}" fill="var(--muted)" font-size="10">{submit.label}</text>'
+                f'<path transform="translate({left - 22:.1f} {top + 6})scale(.75)" fill="{run.look.colour}" d="{run.look.path}"/>'
+                f'<text x="{left - 28:.1f}" y="{top + 16}" text-anchor="end">{escape(label)}</text>'
+                f'<text x="{_WIDTH - right + 12:.1f}" y="{top + 16}">best {run.transitions[-1].best:.4g}</text>'
             )
-            previous = at
-    out.append("</svg>")
+        out += _row(run, top, left, scale)
+    bottom = 42.0 + _ROW * len(runs)
+    out.append(f'<path d="M{left:.1f} {bottom}H{_WIDTH - right}" stroke="{MUTED}"/>')
+    step = next((s for s in (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000) if last / s <= 8), max(1, last // 8))
+    out += [
+        f'<path d="M{left + tick * scale:.1f} {bottom}v4" stroke="{MUTED}"/>'
+        f'<text x="{left + tick * scale:.1f}" y="{bottom + 16}" text-anchor="middle">{tick}</text>'
+        for tick in range(0, last + 1, step)
+    ]
+    middle = (left + _WIDTH - right) / 2
+    out.append(
+        f'<text x="{middle:.1f}" y="{height - 5}" text-anchor="middle">Train episodes consumed</text></svg>'
+    )
     return "".join(out)
 
 
-def _axis(last: int, x: Callable[[float], float]) -> str:
-    step = next((s for s in (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000) if last / s <= 8), max(1, last // 8))
-    ticks = "".join(
-        f'<path d="M{x(tick):.1f} {_AXIS}v4" stroke="var(--muted)"/>'
-        f'<text x="{x(tick):.1f}" y="{_AXIS + 16}" text-anchor="middle" fill="var(--ink)" font-size="11">{tick}</text>'
-        for tick in range(0, last + 1, step)
-    )
-    title = (
-        f'<text x="{_WIDTH / 2}" y="{_HEIGHT - 5}" text-anchor="middle" fill="var(--ink)" font-size="11">'
-        "Train episodes consumed</text>"
-    )
-    return f'<path d="M{_LEFT} {_AXIS}H{_WIDTH - _RIGHT}" stroke="var(--muted)" fill="none"/>{ticks}{title}'
+def _row(run: Row, top: float, left: float, scale: float) -> list[str]:
+    out: list[str] = []
+    for start, end, edit in phases(run.transitions):
+        fill = "url(#parametric)" if edit == "parametric" else EDIT_COLOURS[edit]
+        out.append(
+            f'<rect x="{left + start * scale:.1f}" y="{top}" width="{max(1.0, (end - start) * scale):.1f}" '
+            f'height="{_BAND:g}" fill="{fill}" opacity=".7"/>'
+        )
+    for transition in run.transitions:
+        title = f"<title>{transition.edit}, validation mean {transition.val_mean:.4g}</title>"
+        out += [_mark(kind, left + transition.consumed * scale, top, title) for kind in events_of(transition)]
+    scored = {transition.index for transition in run.transitions}
+    previous = -100.0
+    for submit in run.submits:
+        at = left + submit.consumed * scale
+        if submit.index not in scored:
+            out.append(_mark("bad", at, top, f"<title>{submit.label}: {submit.status}</title>"))
+        if at - previous > 34.0:
+            anchor = "end" if at > _WIDTH - 30 else "middle"
+            out.append(
+                f'<text x="{at:.1f}" y="{top - 4}" text-anchor="{anchor}" fill="{MUTED}" font-size="10">{submit.label}</text>'
+            )
+            previous = at
+    return out
 
 
-def _mark(transition: Transition | None, at: float, submit: Submit) -> str:
-    title = f"<title>{submit.label}: {submit.status}</title>"
-    if transition is None:
-        return f'<text x="{at:.1f}" y="{_MARKS + 4}" text-anchor="middle" fill="var(--ink)" font-weight="700">!{title}</text>'
-    title = f"<title>{submit.label}: {transition.edit}, validation mean {transition.val_mean:.4g}</title>"
-    parts: list[str] = []
-    for kind in events_of(transition):
-        if kind == "hit":
-            parts.append(
-                f'<path transform="translate({at:.1f} {_MARKS})" fill="var(--ink)" '
-                f'd="M0-7 1.7-2.2 6.7-2.2 2.7.9 4.1 5.7 0 2.8-4.1 5.7-2.7.9-6.7-2.2-1.7-2.2z">{title}</path>'
-            )
-        elif kind == "miss":
-            parts.append(
-                f'<circle cx="{at:.1f}" cy="{_MARKS}" r="4" fill="none" stroke="var(--ink)" stroke-width="1.4">{title}</circle>'
-            )
-        else:
-            shape = "M-5-4h10L0 5z" if kind == "rollback" else "M-4-4 4 4M4-4-4 4"
-            parts.append(
-                f'<path transform="translate({at:.1f} {_BAND_TOP + _BAND_HEIGHT / 2})" d="{shape}" fill="none" '
-                f'stroke="#15181d" stroke-width="1.8">{title}</path>'
-            )
-    return "".join(parts)
+def _mark(kind: str, x: float, top: float, title: str) -> str:
+    y = top + (_BAND / 2 if kind in ("rollback", "retest") else _BAND + 11)
+    return f'<use href="#{kind}" x="{x:.1f}" y="{y:g}">{title}</use>'
+
+
+def _legend(runs: Sequence[Row]) -> str:
+    edits = {edit for run in runs for _, _, edit in phases(run.transitions)}
+    kinds = {kind for run in runs for transition in run.transitions for kind in events_of(transition)}
+    if any(len(run.submits) > len(run.transitions) for run in runs):
+        kinds.add("bad")
+    items = [
+        (f'<rect x="-8" y="-5" width="16" height="10" opacity=".7" fill="{"url(#parametric)" if edit == "parametric" else EDIT_COLOURS[edit]}"/>', text)
+        for edit, text in _BANDS.items() if edit in edits
+    ] + [(f'<use href="#{kind}"/>', text) for kind, (text, _) in _MARKS.items() if kind in kinds]  # fmt: skip
+    out, x = [], 22.0
+    for shape, text in items:
+        out.append(f'<g transform="translate({x:.1f} 10)">{shape}<text x="14" y="4">{text}</text></g>')
+        x += 28.0 + 5.6 * len(text)
+    return "".join(out)

@@ -9,12 +9,13 @@ from typing import Any
 
 import msgspec
 from jinja2 import DictLoader, Environment, StrictUndefined
-from markupsafe import Markup
+from markupsafe import Markup, escape
 
 from evopolicy_results.behaviour.trace import Trace, TraceRow, diff, sources
+from evopolicy_results.figures.plot import Plot, inline_svg
+from evopolicy_results.figures.timelines import Row, timeline_svg
 from evopolicy_results.html import visible
-from evopolicy_results.html.small_timeline import small_timeline
-from evopolicy_results.reading.environments import suite_title, title_of
+from evopolicy_results.reading.environments import title_of
 from evopolicy_results.reading.records import Run, Submit
 from evopolicy_results.scan.signals import TITLES, Signal
 from evopolicy_results.studies.palette import Look
@@ -24,23 +25,12 @@ from evopolicy_results.tables.table import Column, Table, shown
 
 _FILTER_FROM = 9
 """Number of rows from which a table has a filter."""
+_RANKS_FROM = 4
+"""Number of environments from which a report begins with rank scores; with fewer, returns say more."""
 _LONG = 60
 """Number of characters from which a cell's text is broken into lines."""
 FORMS = (("CSV", "csv"), ("Markdown", "md"), ("LaTeX", "tex"))
 """File forms of a table, with their suffixes."""
-
-
-class FigureView(msgspec.Struct, frozen=True, kw_only=True):
-    """A figure as the index page shows it; its SVG is inlined."""
-
-    name: str
-    title: str
-    caption: str
-    group: str
-    svg: str
-    width: float
-    """Maximum displayed width, rem."""
-    timeline: str = ""
 
 
 class PlayedEpisode(msgspec.Struct, frozen=True, kw_only=True):
@@ -74,6 +64,7 @@ def environment() -> Environment:
         lstrip_blocks=True,
         finalize=visible,
     )
+    made.globals["inline"] = lambda plot: Markup(inline_svg(plot.svg, plot.name, plot.alt))
     for name in ("report.css", "report.js"):
         made.globals[name.split(".")[1]] = Markup(folder.joinpath(name).read_text(encoding="utf-8"))
     return made
@@ -85,29 +76,33 @@ def index_page(
     title: str,
     looks: Mapping[str, Look],
     tables: Sequence[Table],
-    figures: Sequence[FigureView],
+    figures: Sequence[Plot],
     trace_links: Mapping[str, str],
     replay_links: Mapping[str, str],
 ) -> str:
     """`index.html`: every section with content, and what was left out."""
     views = {table.name: table_view(table) for table in tables}
     suites = [suite.name for suite in study.suites]
+    ranked = [suite.name for suite in study.suites if suite.is_ranked]
+    n_envs = len({env for suite in study.suites for env in suite.table.environments})
     named = {figure.name: figure for figure in figures}
 
-    def shown_figures(*names: str) -> list[FigureView]:
+    def shown_figures(*names: str) -> list[Plot]:
         return [named[name] for name in names if name in named]
 
     def shown_tables(*names: str) -> list[dict[str, Any]]:
         return [views[name] for name in names if name in views]
 
-    timelines = [figure for figure in figures if figure.timeline]
+    returns = [v for s in suites for v in shown_tables(f"heldout_{s}")]
+    returns += [{**v, "folded": n_envs >= _RANKS_FROM} for s in suites for v in shown_tables(f"cells_{s}")]
+    timelines = [figure for figure in figures if figure.group == "timelines"]
     sections: list[dict[str, Any]] = [
         _section(
             "leaderboard",
             "Leaderboard",
-            figures=shown_figures(*(f"rank_scores_{s}" for s in suites)),
-            tables=[v for s in suites for v in shown_tables(f"leaderboard_{s}", f"incomplete_{s}", f"heldout_{s}")]
-            + [{**v, "folded": True} for s in suites for v in shown_tables(f"cells_{s}")],
+            figures=shown_figures(*(f"rank_scores_{s}" for s in ranked)),
+            tables=[v for s in ranked for v in shown_tables(f"leaderboard_{s}", f"incomplete_{s}")]
+            + (returns if n_envs >= _RANKS_FROM else []),
         ),
         _section(
             "statistics",
@@ -116,7 +111,8 @@ def index_page(
             texts=["Intervals are at 95 %. Each table says over what: the cases of one run, or runs and cases. No verdict contradicts the interval "
                    "beside it; the correction for many pairs can only withhold one."],
             figures=shown_figures(*(f"profiles_{s}" for s in suites)),
-            tables=[v for s in suites for v in shown_tables(f"resolution_{s}", f"aggregates_{s}", f"improvement_{s}")]
+            tables=[v for s in suites for v in shown_tables(f"resolution_{s}")]
+            + [v for s in ranked for v in shown_tables(f"aggregates_{s}", f"improvement_{s}")]
             + [{**v, "folded": True} for s in suites for v in shown_tables(f"pairs_{s}", f"generalisation_{s}")],
         ),
         _section(
@@ -132,7 +128,7 @@ def index_page(
             texts=["Synthesis-dominant tasks need machinery (perception, memory, planning); tuning-dominant ones mostly need the "
                    "right constants. A lens, not a taxonomy."],
             figures=shown_figures(*(f"normalised_{s}" for s in suites)),
-            tables=shown_tables(*(f"normalised_{s}" for s in suites)),
+            tables=shown_tables(*(f"normalised_{s}" for s in ranked)),
         ),
         _section(
             "edits", "Edits", title="What edits do",
@@ -140,7 +136,7 @@ def index_page(
         ),
         _section(
             "timelines", "Timelines", title="Code-phase timelines", figures=timelines,
-            picker=[(figure.timeline, title_of(figure.timeline)) for figure in timelines],
+            picker=[(figure.data[0]["env"], title_of(figure.data[0]["env"])) for figure in timelines],
         ),
         _section("structure", "Structure", title="Realised structure", figures=shown_figures("structure"),
                  tables=shown_tables("structure")),
@@ -170,10 +166,12 @@ def index_page(
             texts=[] if study.left_out else ["Nothing: every run folder that was found is in this report."],
         ),
     ]  # fmt: skip
+    if n_envs < _RANKS_FROM:
+        evolution = sections.pop(2)
+        sections[:0] = [_section("returns", "Returns", title="Held-out returns", tables=returns), evolution]
     kept = [
         s for s in sections if s["figures"] or s["tables"] or s["links"] or s["id"] in ("replays", "left-out")
     ]
-    n_envs = len({env for suite in study.suites for env in suite.table.environments})
     return environment().get_template("index.html.j2").render(
         title=title,
         lead="Agents evolve an executable policy under a budget of train episodes; the checkpoint that hidden validation selects is "
@@ -255,6 +253,10 @@ def _notices(study: Study) -> list[dict[str, Any]]:
 
 
 def table_view(table: Table) -> dict[str, Any]:
+    """The table for a page, without columns that have no value in any row."""
+    columns = [
+        c for c in table.columns if not table.rows or any(row.get(c.key) is not None for row in table.rows)
+    ]
     return {
         "id": table.name.replace("_", "-") + "-table",
         "title": table.title,
@@ -264,14 +266,16 @@ def table_view(table: Table) -> dict[str, Any]:
         "folded": False,
         "columns": [
             {
-                "title": column.title.replace(" /", "\u00a0/").replace("-", "\u2011"),
+                "title": escape(visible(column.title))
+                .replace(" /", Markup("&nbsp;/"))
+                .replace("-", "\u2011"),
                 "numeric": column.kind != "text",
                 "note": column.note,
             }
-            for column in table.columns
+            for column in columns
         ],
         "rows": [
-            [_cell(table, number, column, row.get(column.key)) for column in table.columns]
+            [_cell(table, number, column, row.get(column.key)) for column in columns]
             for number, row in enumerate(table.rows)
         ],
     }
@@ -322,7 +326,9 @@ def trace_page(
         ("episodes used", f"{run.submits[-1].consumed if run.submits else 0} of {run.budget}"),
         ("rejected requests", "–" if run.is_published else len(run.record.rejected_submits)),
     ]
-    svg = small_timeline(transitions, run.submits, run.budget, "t-") if transitions else ""
+    phases = Row(transitions=transitions, budget=run.budget, submits=run.submits)
+    label = f"Code phases of {len(run.submits)} submits over {run.budget} episodes"
+    svg = inline_svg(timeline_svg([phases]), "phases", label) if transitions else ""
     closed = outcome.closed_reason.replace("_", " ")
     return environment().get_template("trace.html.j2").render(
         title=f"{run.entry} on {title_of(run.env)}, {run.record.exp_id}",
@@ -497,5 +503,5 @@ def replays_page(env: str, episodes: Sequence[PlayedEpisode], looks: Mapping[str
 
 
 def default_title(study: Study) -> str:
-    """`Core16, Toy: policy evolution report`."""
-    return ", ".join(suite_title(suite.name) for suite in study.suites) + ": policy evolution report"
+    """`Core16 (3 of 16), Toy: policy evolution report`."""
+    return ", ".join(suite.title for suite in study.suites) + ": policy evolution report"

@@ -86,7 +86,7 @@ def leaderboard(
     for path in files:
         if not path.is_file():
             fail(f"{path}: there is no such file")
-    # Here, not above: they need jinja2 and matplotlib, and `evopolicy` loads this module to list its commands.
+    # Here, not above: they need jinja2, and `evopolicy` loads this module to list its commands.
     from evopolicy_results.leaderboard.bundles import read_bundles
     from evopolicy_results.leaderboard.write import write_site
 

@@ -32,7 +32,7 @@ from evopolicy_results.leaderboard.pages import (
     section,
 )
 from evopolicy_results.publish.findings import KINDS
-from evopolicy_results.reading.environments import suite_title, title_of
+from evopolicy_results.reading.environments import title_of
 from evopolicy_results.report import slug, write_report
 from evopolicy_results.studies.palette import looks
 from evopolicy_results.studies.study import Study, study_of
@@ -163,7 +163,7 @@ def _board(board: Board, study: Study, number: int, folder: str) -> dict[str, An
             view = table_view(table)
             files = [(label, f"{folder}/{href}") for label, href in view["files"]]
             views.append({**view, "id": f"{view['id']}-{number}", "files": files, "folded": kind in _FOLDED})
-    suites = ", ".join(suite_title(suite.name) for suite in study.suites)
+    suites = ", ".join(suite.title for suite in study.suites)
     name = "Leaderboard" if number == 1 else f"Board {number}"
     reasons_title = ""
     if board.unrecorded:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from functools import cache
 
 from evopolicy_common import catalogue
@@ -33,6 +33,16 @@ def learn_names(records: Iterable[RunRecord]) -> None:
             names = _names_in_runs.setdefault(record.env, set())
             if len(names) < 2:
                 names.add((record.env_title, record.env_family))
+
+
+def learnt_names() -> dict[str, set[tuple[str, str]]]:
+    """All names that `learn_names` took; another process takes them by `take_names`."""
+    return _names_in_runs
+
+
+def take_names(names: dict[str, set[tuple[str, str]]]) -> None:
+    """Takes the names that another process has learnt."""
+    _names_in_runs.update(names)
 
 
 def _name(env: str) -> tuple[str, str]:
@@ -77,13 +87,21 @@ def suites_of(environments: Iterable[str]) -> dict[str, list[str]]:
     return found
 
 
-def suite_title(suite: str) -> str:
-    """Displayed title of a suite."""
-    known = catalogue.suites().get(suite)
-    return known.title if known is not None else suite.capitalize()
-
-
 def suite_size(suite: str) -> int:
     """Number of environments in the whole suite; 0 if it has no definition."""
     known = catalogue.suites().get(suite)
     return len(known.environments) if known is not None else 0
+
+
+def suite_title(suite: str, environments: Collection[str]) -> str:
+    """Displayed title of these environments of a suite: `Core16`, `Core16 (3 of 16)`, or the only environment's."""
+    known = catalogue.suites().get(suite)
+    if known is not None and len(environments) == len(known.environments):
+        return known.title
+    if len(environments) == 1:
+        return title_of(next(iter(environments)))
+    return (
+        f"{len(environments)} other environments"
+        if known is None
+        else f"{known.title} ({len(environments)} of {len(known.environments)})"
+    )

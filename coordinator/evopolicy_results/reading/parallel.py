@@ -21,18 +21,17 @@ from evopolicy_common.processes.parent_death import ending_with_parent
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
-_AT_ONCE = 8
-"""Number of items that a process receives at a time."""
-
 
 def in_processes(
     function: Callable[[Item], Result],
     items: Sequence[Item],
     jobs: int,
     when_lost: Callable[[Item, str], Result],
+    *,
+    at_once: int = 8,
 ) -> Iterator[Result]:
     """Yields `function` of each item, in order; for an item whose process ended, `when_lost` of the item and the
-    reason.
+    reason. A process receives `at_once` items at a time.
 
     The children import `function` by its name; items and results are pickled. Call it on the main thread.
     """
@@ -50,7 +49,7 @@ def in_processes(
 
     pool = ThreadPoolExecutor(jobs)
     try:
-        for results in pool.map(work, [items[i : i + _AT_ONCE] for i in range(0, len(items), _AT_ONCE)]):
+        for results in pool.map(work, [items[i : i + at_once] for i in range(0, len(items), at_once)]):
             yield from results
     finally:
         for each in children:

@@ -11,7 +11,7 @@ from evopolicy_results.behaviour.audit import AuditSignals, TokenUse, audit_sign
 from evopolicy_results.behaviour.edits import EditRates, Transition, classify, edit_rates
 from evopolicy_results.behaviour.structure import EditSizeBin, StructureMean, edit_size_bins, structure_means
 from evopolicy_results.reading.comparability import UNKNOWN_ISOLATION, MixedRunsError, Mixture, mixtures
-from evopolicy_results.reading.environments import learn_names, ordered_environments, suites_of
+from evopolicy_results.reading.environments import learn_names, ordered_environments, suite_title, suites_of
 from evopolicy_results.reading.reader import load_runs
 from evopolicy_results.reading.records import LeftOut, Run
 from evopolicy_results.reading.rescored import rescored
@@ -31,6 +31,16 @@ class Suite(msgspec.Struct, frozen=True, kw_only=True):
     board: Leaderboard
     normalised: Normalised
     statistics: SuiteStatistics
+
+    @property
+    def title(self) -> str:
+        """Displayed title; it tells how much of the suite was played."""
+        return suite_title(self.name, self.table.environments)
+
+    @property
+    def is_ranked(self) -> bool:
+        """Whether means over environments tell more than the returns: not with a single environment."""
+        return len(self.table.environments) > 1
 
 
 class Timeline(msgspec.Struct, frozen=True, kw_only=True):

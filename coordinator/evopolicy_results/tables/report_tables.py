@@ -9,7 +9,7 @@ import msgspec
 from evopolicy_common import catalogue
 from evopolicy_results.behaviour import structure
 from evopolicy_results.behaviour.edits import demand_of
-from evopolicy_results.reading.environments import family_of, family_title, suite_size, suite_title, title_of
+from evopolicy_results.reading.environments import family_of, family_title, suite_size, title_of
 from evopolicy_results.scoring.normalised import DEMANDS
 from evopolicy_results.statistics.intervals import Estimate
 from evopolicy_results.statistics.standings import RankEstimate
@@ -81,7 +81,7 @@ def _aggregate(suite: Suite, study: Study) -> Table:
     ]
     columns = [ENTRY, HARNESS]
     columns += [Column(_key(family), family_title(family), "number") for family in families]
-    columns.append(Column("score", suite_title(suite.name), "number"))
+    columns.append(Column("score", suite.title, "number"))
     standings = suite.statistics.standings
     if standings.rows:
         columns.append(Column("score_interval", "95 % interval"))
@@ -112,7 +112,7 @@ def _aggregate(suite: Suite, study: Study) -> Table:
             caption += f" {CHECKPOINTS}"
     return Table(
         name=f"leaderboard_{suite.name}",
-        title=f"{suite_title(suite.name)} leaderboard",
+        title=f"{suite.title} leaderboard",
         caption=caption,
         columns=tuple(columns),
         rows=tuple(rows),
@@ -124,7 +124,7 @@ def _incomplete(suite: Suite) -> Table:
     n = len(suite.board.environments)
     return Table(
         name=f"incomplete_{suite.name}",
-        title=f"{suite_title(suite.name)} incomplete entries",
+        title=f"{suite.title} incomplete entries",
         caption="Entries that have not played every environment of this report are not ranked and have no mean over environments: "
         "it would not be comparable. Their returns are in the tables of single environments and of differences.",
         columns=(
@@ -189,7 +189,7 @@ def _heldout(suite: Suite) -> Table:
     columns = [Column(env, title_of(env), "number") for env in suite.board.environments]
     return Table(
         name=f"heldout_{suite.name}",
-        title=f"{suite_title(suite.name)} held-out returns",
+        title=f"{suite.title} held-out returns",
         caption="Mean return of the validation-selected policy on the held-out cases, in each environment's own units: compare "
         "within a column only. Best and second-best are marked. The random reference plays the same cases. A dash is a cell "
         "that was not run, or a run with no ok submit. Incomplete entries come last, without marks.",
@@ -220,7 +220,7 @@ def _cells(suite: Suite) -> Table:
     ]
     return Table(
         name=f"cells_{suite.name}",
-        title=f"{suite_title(suite.name)} cells",
+        title=f"{suite.title} cells",
         caption="Every entry on every environment: mean over its runs, 95 % interval of the mean over what the column Over names, rank "
         "and rank score (of entries that played every environment). Entries share their cases, so two of these intervals may overlap where the difference is sure: compare by the "
         "table of differences.",
@@ -233,7 +233,7 @@ def _cells(suite: Suite) -> Table:
             Column("over", "Over", note="What a repetition would draw anew: cases, runs, or runs and cases."),
             Column("runs", "Runs", "integer"),
             Column("rank", "Rank", "integer"),
-            Column("score", "Rank score", "number"),
+            *([Column("score", "Rank score", "number")] if suite.is_ranked else []),
         ),
         rows=tuple(rows),
     )
@@ -260,7 +260,7 @@ def _normalised(suite: Suite) -> Table:
             rows.append({"demand": demand, "env": f"{demand.capitalize()} mean", **means})
     return Table(
         name=f"normalised_{suite.name}",
-        title=f"{suite_title(suite.name)} normalised performance",
+        title=f"{suite.title} normalised performance",
         caption="Held-out return on the random-to-best scale, clipped to 0 … 1, by dominant task demand: 0 is the random reference "
         "on the same cases, 1 the best agent on that environment. Bold: means of a group's environments. A dash: no agent beats random, no "
         "reference, or no score; for a mean, no score on one of the group's environments.",

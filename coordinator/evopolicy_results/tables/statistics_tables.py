@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from evopolicy_results.reading.environments import suite_title, title_of
+from evopolicy_results.reading.environments import title_of
 from evopolicy_results.statistics.aggregates import LEAST_RUNS, TAUS, Bounded
 from evopolicy_results.statistics.distributions import ALPHA
 from evopolicy_results.statistics.intervals import Estimate
@@ -61,7 +61,7 @@ def _pairs(suite: Suite) -> Table:
     left_out = sum(pair.n_left_out > 0 for pair in found)
     return Table(
         name=f"pairs_{suite.name}",
-        title=f"{suite_title(suite.name)} differences",
+        title=f"{suite.title} differences",
         caption="Every two entries on every environment: first minus second, in held-out returns of the cases that both have. Interval: "
         "95 %, for one environment and pair alone, over what the column Over names. p: of no difference, two-sided, from the "
         "interval's own distribution; it is at most 0.05 exactly if the interval excludes 0. Corrected p: Holm, over all rows of this "
@@ -143,7 +143,7 @@ def _resolution(suite: Suite) -> Table:
     gap = suite.statistics.standings.gap
     return Table(
         name=f"resolution_{suite.name}",
-        title=f"{suite_title(suite.name)} resolution",
+        title=f"{suite.title} resolution",
         caption="The smallest difference between two agents that these cases and runs resolve: the half width of its 95 % interval, median "
         "over pairs, in returns and as a share of the random-to-best scale. A true difference of that size is resolved every second "
         "time. Repeats: runs of each agent that a difference of that share of the scale would need; `more cases` where more "
@@ -207,7 +207,7 @@ def _aggregates(suite: Suite) -> Table:
     ]
     return Table(
         name=f"aggregates_{suite.name}",
-        title=f"{suite_title(suite.name)} aggregates",
+        title=f"{suite.title} aggregates",
         caption="Over the normalised scores of single runs, not clipped, on the environments that have a random-to-best scale (Agarwal et al. "
         "2021). IQM: mean of the middle half. Above: share of the runs whose normalised score is above it (the performance "
         "profile). Intervals: 95 %, percentiles of a bootstrap stratified by environment, over what the column Over names; the scale is "
@@ -246,7 +246,7 @@ def _share(tau: float, share: Bounded) -> dict[str, Any]:
 def _improvements(suite: Suite) -> Table:
     return Table(
         name=f"improvement_{suite.name}",
-        title=f"{suite_title(suite.name)} probability of improvement",
+        title=f"{suite.title} probability of improvement",
         caption="How probably a run of the first agent scores above a run of the second, ties counting half, mean over the environments that "
         "have a scale (Agarwal et al. 2021). Interval: 95 %, stratified bootstrap over runs and their cases, or over the cases of single "
         "runs." + (f" {CHECKPOINTS}" if has_single_runs(suite) else ""),
@@ -296,7 +296,7 @@ def _generalisation(suite: Suite) -> Table:
     ]
     return Table(
         name=f"generalisation_{suite.name}",
-        title=f"{suite_title(suite.name)} generalisation",
+        title=f"{suite.title} generalisation",
         caption="Mean return of the selected checkpoint on its own submit's train episodes, on validation, and on held-out cases; means over "
         "completed runs. Optimism: validation minus held-out. Selection takes the best of many validation scores, so it is above 0 on average "
         "even where an agent fits nothing. Normalised: as a share of the random-to-best scale; its last rows are means over environments "

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import struct
 from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
@@ -109,6 +111,27 @@ def test_timeline_picker_shows_one_environment_or_all(index: Page) -> None:
     assert index.run(shown) == ["gym/ant5"]
     index.run(choose.format(""))
     assert len(index.run(shown)) == 3
+
+
+def test_figure_is_saved_as_png(index: Page, tmp_path: Path) -> None:
+    saved = index.run("""new Promise((done) => {
+      HTMLAnchorElement.prototype.click = function () { done([this.download, this.href]); };
+      document.querySelector('#figure-edit_hits button.png').click();
+    })""")
+    head, _, data = saved[1].partition(",")
+    assert (saved[0], head) == ("edit_hits.png", "data:image/png;base64")
+    picture = base64.b64decode(data)
+    assert struct.unpack(">II", picture[16:24])[0] > 1000
+    assert len(picture) > 10_000, "more than white"
+
+
+def test_menu_is_whole_and_lines_of_the_first_column_meet_the_others(index: Page) -> None:
+    menu = "document.querySelector('nav.bar ul')"
+    assert index.run(f"{menu}.scrollWidth <= {menu}.clientWidth")
+    heights = index.run(
+        "[...document.querySelectorAll('table.data tbody tr')].map((row) => row.getBoundingClientRect().height)"
+    )
+    assert {height % 1 for height in heights} == {0}
 
 
 def test_dark_theme_follows_the_system_and_the_button(index: Page) -> None:

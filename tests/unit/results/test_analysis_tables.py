@@ -6,18 +6,23 @@ import csv
 import io
 import json
 from pathlib import Path
+from xml.etree import ElementTree
 
 import pytest
 from invented.policies import Version, png, policy
 from invented.run_dirs import write_run
 from invented.small_table import TABLE
 
+from evopolicy_common import catalogue
 from evopolicy_results.behaviour.edits import classify, events_of, phases
 from evopolicy_results.behaviour.trace import diff, trace
 from evopolicy_results.figures.edits import wilson
-from evopolicy_results.figures.style import inline_svg, new_figure, svg_text
+from evopolicy_results.figures.plot import inline_svg
+from evopolicy_results.figures.style import new_figure, svg_text
+from evopolicy_results.figures.timelines import MAX_ROWS
 from evopolicy_results.notebook import figures_of
 from evopolicy_results.reading.agent_log import read_agent_log
+from evopolicy_results.reading.environments import suite_title
 from evopolicy_results.reading.reader import read_run
 from evopolicy_results.studies.palette import looks
 from evopolicy_results.studies.study import study
@@ -138,6 +143,41 @@ def test_inline_svg_is_themed_named_and_has_ids_of_its_own() -> None:
     ids = [{part.split('"')[0] for part in text.split(' id="')[1:]} for text in (one, two)]
     assert ids[0]
     assert not ids[0] & ids[1]
+
+
+def test_timelines_have_a_row_for_each_run_up_to_their_limit(tmp_path: Path) -> None:
+    versions = [Version(policy(gain=float(i)), (0.0,) * 4, 1.0 + i % 2) for i in range(3)]
+    for repeat in range(MAX_ROWS + 2):
+        write_run(tmp_path, versions, entry="<A & B>", repeat=repeat, budget=16)
+    (plot,) = [each for each in figures_of(study([tmp_path])) if each.group == "timelines"]
+    svg = ElementTree.fromstring(plot.svg)
+    texts = [element.text or "" for element in svg.iter("{http://www.w3.org/2000/svg}text")]
+    assert (
+        sum(text.startswith("<A & B>") for text in texts)
+        == sum(text == "best 2" for text in texts)
+        == MAX_ROWS
+    )
+    marks = [
+        element.get("href") for element in svg.iter("{http://www.w3.org/2000/svg}use") if element.get("x")
+    ]
+    assert (marks.count("#hit"), marks.count("#miss")) == (2 * MAX_ROWS, MAX_ROWS)
+    assert {"first policy", "parametric edits", "does not"} <= set(texts)
+    assert "rollback" not in texts
+    assert "2 more runs have their timelines on their own pages." in plot.caption
+
+
+@pytest.mark.parametrize(
+    ("suite", "environments", "title"),
+    [
+        ("core16", catalogue.suites()["core16"].environments, "Core16"),
+        ("core16", ["gym/acrobot", "gym/ant5", "gym/racing"], "Core16 (3 of 16)"),
+        ("core16", ["gym/acrobot"], "Acrobot"),
+        ("other", ["my/kite"], "my/kite"),
+        ("other", ["my/glider", "my/kite"], "2 other environments"),
+    ],
+)
+def test_title_of_a_suite_tells_how_much_was_played(suite: str, environments: list[str], title: str) -> None:
+    assert suite_title(suite, environments) == title
 
 
 VERSIONS = [

@@ -72,6 +72,26 @@
   }
   for (const tools of document.querySelectorAll(".tools[hidden]")) tools.hidden = false;
 
+  // A figure as PNG, drawn by the browser on white in the light theme.
+  for (const button of document.querySelectorAll("button.png")) {
+    button.hidden = false;
+    button.addEventListener("click", async () => {
+      const svg = button.closest("figure").querySelector("svg").cloneNode(true);
+      const [, , width, height] = svg.getAttribute("viewBox").split(/\s+/).map(Number);
+      const sizes = { xmlns: "http://www.w3.org/2000/svg", width: 3 * width, height: 3 * height, style: "--ink: #15181d; --muted: #5c6773; --grid: #d5dae1" };
+      for (const [name, value] of Object.entries(sizes)) svg.setAttribute(name, value);
+      const image = new Image();
+      image.src = "data:image/svg+xml," + encodeURIComponent(new XMLSerializer().serializeToString(svg));
+      await image.decode();
+      const canvas = Object.assign(document.createElement("canvas"), { width: image.width, height: image.height });
+      const context = canvas.getContext("2d");
+      context.fillStyle = "white";
+      context.fillRect(0, 0, canvas.width, canvas.height);
+      context.drawImage(image, 0, 0);
+      Object.assign(document.createElement("a"), { href: canvas.toDataURL(), download: button.dataset.name + ".png" }).click();
+    });
+  }
+
   // One timeline at a time; without scripts all of them show.
   const picker = document.getElementById("timeline-picker");
   if (picker) {
