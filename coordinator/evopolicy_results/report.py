@@ -34,7 +34,7 @@ from evopolicy_results.html.pages import (
     replays_page,
     trace_page,
 )
-from evopolicy_results.reading.environments import learnt_names, ordered_environments, take_names
+from evopolicy_results.reading.environments import names_in_runs, ordered_environments
 from evopolicy_results.reading.parallel import in_processes
 from evopolicy_results.reading.records import Run, path_text
 from evopolicy_results.studies.palette import Look, looks
@@ -132,22 +132,15 @@ def _prepare(out: Path) -> None:
 
 def _all_made(work: Sequence[partial[Any]], jobs: int) -> Iterator[Any]:
     """The results of `work`, in order."""
+    items = [(names_in_runs, each) for each in work]
     if jobs <= 1:
-        yield from map(_made, work)
-    else:
-        found = in_processes(
-            _made_elsewhere, [(learnt_names(), each) for each in work], jobs, _lost, at_once=1
-        )
-        yield from found
+        return map(_made, items)
+    return in_processes(_made, items, jobs, _lost, at_once=1)
 
 
-def _made_elsewhere(item: tuple[dict[str, set[tuple[str, str]]], partial[Any]]) -> Any:
-    take_names(item[0])
-    return _made(item[1])
-
-
-def _made(work: partial[Any]) -> Any:
-    made = work()
+def _made(item: tuple[dict[str, set[tuple[str, str]]], partial[Any]]) -> Any:
+    names_in_runs.update(item[0])  # those of another process
+    made = item[1]()
     if isinstance(made, Plot):
         from evopolicy_results.figures.style import drawn  # imports matplotlib
 

@@ -17,8 +17,8 @@ def ordered_environments(envs: Iterable[str]) -> list[str]:
     return sorted(set(envs), key=lambda env: (order.get(env, len(order)), env))
 
 
-_names_in_runs: dict[str, set[tuple[str, str]]] = {}
-"""Titles and families that runs tell of environments which do not ship, by id."""
+names_in_runs: dict[str, set[tuple[str, str]]] = {}
+"""Titles and families that runs tell of environments which do not ship, by id, for this process."""
 _MAX_TITLE = 60
 _FAMILY = re.compile(r"[a-z0-9_]{1,40}")
 
@@ -30,19 +30,9 @@ def learn_names(records: Iterable[RunRecord]) -> None:
     """
     for record in records:
         if record.env not in catalogue.entries() and (record.env_title or record.env_family):
-            names = _names_in_runs.setdefault(record.env, set())
+            names = names_in_runs.setdefault(record.env, set())
             if len(names) < 2:
                 names.add((record.env_title, record.env_family))
-
-
-def learnt_names() -> dict[str, set[tuple[str, str]]]:
-    """All names that `learn_names` took; another process takes them by `take_names`."""
-    return _names_in_runs
-
-
-def take_names(names: dict[str, set[tuple[str, str]]]) -> None:
-    """Takes the names that another process has learnt."""
-    _names_in_runs.update(names)
 
 
 def _name(env: str) -> tuple[str, str]:
@@ -50,7 +40,7 @@ def _name(env: str) -> tuple[str, str]:
     found = catalogue.entries().get(env)
     if found is not None:
         return found.title, found.family
-    names = _names_in_runs.get(env, set())
+    names = names_in_runs.get(env, set())
     return next(iter(names)) if len(names) == 1 else ("", "")
 
 

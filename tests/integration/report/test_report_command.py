@@ -160,9 +160,11 @@ def test_index_is_self_contained(report: Path) -> None:
 def test_progress_of_each_stage_has_a_total_that_stays(runs: Path, tmp_path: Path) -> None:
     told: dict[str, list[tuple[int, int]]] = {}
     found = study([runs])
-    write_report(
-        found, tmp_path / "report", progress=lambda what, *n: told.setdefault(what, []).append(n), jobs=2
-    )  # type: ignore[arg-type]
+
+    def tell(what: str, done: int, total: int) -> None:
+        told.setdefault(what, []).append((done, total))
+
+    write(found, tmp_path / "report", progress=tell, jobs=2)
     assert list(told) == ["figures", "run pages", "tables"]
     for steps in told.values():
         assert [done for done, _ in steps] == list(range(1, len(steps) + 1))
