@@ -173,7 +173,7 @@ def test_progress_of_each_stage_has_a_total_that_stays(runs: Path, tmp_path: Pat
 
 def test_few_environments_begin_with_returns_and_learning_curves(report: Path) -> None:
     text = (report / "index.html").read_text()
-    assert "<h1>Core16 (2 of 16), Line: policy evolution report</h1>" in text
+    assert "<h1>Core16 (2 of 16), Toy line: policy evolution report</h1>" in text
     assert re.findall(r'<section id="([a-z-]+)"', text)[:3] == ["returns", "evolution", "leaderboard"]
     assert "\ufffd" not in text
     # Means over environments are shown of the suite with two, not of the one with a single environment.
