@@ -33,7 +33,7 @@ from evopolicy_results.tables.report_tables import tables_of
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from evopolicy_results.figures.style import Plot
+    from evopolicy_results.figures.plot import Plot
 
 __all__ = [
     "MixedRunsError",
