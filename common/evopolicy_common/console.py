@@ -15,6 +15,7 @@ from rich.segment import Segment
 from rich.table import Column, Table
 from rich.text import Text
 
+from evopolicy_common.installation import as_called
 from evopolicy_common.terminal import harmless
 
 WIDTH = 200
@@ -32,7 +33,7 @@ class Terminal(rich.console.Console):
         super().__init__(markup=False, emoji=False, highlight=False, **options)
 
     def render_str(self, text: str, **options: Any) -> Text:
-        return super().render_str(harmless(text), **options)
+        return super().render_str(harmless(as_called(text)), **options)
 
     def on_broken_pipe(self) -> None:
         # Concerns stderr: results are on stdout, which ends the program by itself.

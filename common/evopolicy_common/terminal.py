@@ -16,6 +16,8 @@ import sys
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
+from evopolicy_common.installation import as_called
+
 if TYPE_CHECKING:
     import logging
 
@@ -69,9 +71,12 @@ def _shown(found: re.Match[str]) -> str:
 
 
 def say(text: str, *, err: bool = False) -> None:
-    """Prints `text` and a newline on stdout, or on stderr, where the output is dropped when the reader is gone."""
+    """Prints `text` and a newline on stdout, or on stderr, where the output is dropped when the reader is gone.
+
+    Commands of ours in it are printed `as_called`.
+    """
     with contextlib.suppress(BrokenPipeError) if err else contextlib.nullcontext():
-        print(harmless(text), file=sys.stderr if err else sys.stdout, flush=True)
+        print(harmless(as_called(text)), file=sys.stderr if err else sys.stdout, flush=True)
 
 
 def say_lines(lines: Iterable[str], *, err: bool = False) -> None:

@@ -13,6 +13,7 @@ import typer
 from evopolicy_common.cli.conventions import fail_on_our_errors
 from evopolicy_common.cli.frame import App
 from evopolicy_common.errors import ConfigError, EvopolicyError
+from evopolicy_common.installation import add_extra
 from evopolicy_common.processes.preflight import check_writable
 from evopolicy_common.terminal import say, say_lines
 
@@ -74,7 +75,7 @@ def export(
         except ModuleNotFoundError as error:
             extra = to if to in ("mlflow", "wandb") else "export"
             raise ConfigError(
-                f"--to {to} needs {error.name}, which is not installed: pip install 'evopolicy[{extra}]'"
+                f"--to {to} needs {error.name}, which is not installed: {add_extra(extra)}"
             ) from error
         except (EvopolicyError, OSError):
             raise

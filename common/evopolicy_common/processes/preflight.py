@@ -11,6 +11,7 @@ import os
 from pathlib import Path
 
 from evopolicy_common.errors import ConfigError, EvopolicyError, MachineError
+from evopolicy_common.installation import add_extra
 
 LOOPBACK = "127.0.0.1"
 LEAST_BYTES = 1 << 20
@@ -189,8 +190,8 @@ def check_installed(extra: str) -> None:
 def missing(extra: str, module: str) -> str:
     """The error text for a missing module of an extra, with the remedy."""
     if extra == LOCAL:
-        return f"nothing can be played on this machine alone (no module {module!r}): pip install 'evopolicy[{LOCAL}]'"
+        return f"nothing can be played on this machine alone (no module {module!r}): {add_extra(LOCAL)}"
     return (
         f"the {extra} part of evopolicy is not installed here (no module {module!r}):"
-        f" pip install 'evopolicy[{extra}]', or 'evopolicy[{LOCAL}]' for a cluster on this machine"
+        f" {add_extra(extra)}; for a cluster on this machine, the extra is {LOCAL}"
     )

@@ -10,7 +10,7 @@ from evopolicy_worker.sandbox.doctor import Check
 
 
 @pytest.mark.parametrize(
-    ("verdict", "told"), [("ok", "next: evopolicy demo"), ("missing", "--tier landlock --jail none")]
+    ("verdict", "told"), [("ok", "evopolicy demo"), ("missing", "--tier landlock --jail none")]
 )
 def test_the_demo_is_advised_only_where_its_jail_starts(
     monkeypatch: pytest.MonkeyPatch, verdict: str, told: str

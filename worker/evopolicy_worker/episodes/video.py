@@ -22,6 +22,7 @@ import numpy as np
 
 from evopolicy_common.catalogue import Entry
 from evopolicy_common.errors import WorkerError
+from evopolicy_common.installation import add_extra
 from evopolicy_common.messages.environment import Case
 from evopolicy_common.records.episodes.trajectory import decode
 from evopolicy_worker import environments
@@ -63,7 +64,7 @@ class Encoder:
             import av
         except ImportError as error:
             raise WorkerError(
-                f"videos are encoded with PyAV: install the extra `evopolicy[worker]` ({error})"
+                f"videos are encoded with PyAV, which is not installed ({error}): {add_extra('worker')}"
             ) from error
         self._from_ndarray = av.VideoFrame.from_ndarray
         self._file = io.BytesIO()

@@ -12,6 +12,7 @@ from ctypes.util import find_library
 from pathlib import Path
 
 from evopolicy_common.errors import ConfigError
+from evopolicy_common.installation import add_extra
 from evopolicy_common.processes import distribution
 from evopolicy_common.processes.preflight import EXTRAS, check_loopback, check_scratch
 from evopolicy_common.wire.credentials import local_state_dir
@@ -57,7 +58,7 @@ def _extras() -> list[Check]:
                 verdict="missing" if missing else "ok",
                 found=f"no module {', '.join(missing)}" if missing else ", ".join(modules),
                 without=lost,
-                advice=f"pip install 'evopolicy[{extra}]'" if missing else "",
+                advice=add_extra(extra) if missing else "",
             )
         )
     return rows

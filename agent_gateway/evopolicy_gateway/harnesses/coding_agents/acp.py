@@ -17,6 +17,7 @@ from typing import Any
 import orjson
 
 from evopolicy_common.errors import ConfigError
+from evopolicy_common.installation import add_extra
 from evopolicy_gateway.harnesses.coding_agents.acp_stream import (
     MODE_THAT_ASKS,
     Acp,
@@ -54,7 +55,7 @@ class AcpAgent(CliAgent):
         super().__init__(dialect)
         if importlib.util.find_spec("acp") is None:
             raise ConfigError(
-                "agents that speak the Agent Client Protocol need its library: pip install 'evopolicy[acp]'"
+                f"agents that speak the Agent Client Protocol need its library: {add_extra('acp')}"
             )
         self._acp = dialect
         self._link: _Link | None = None

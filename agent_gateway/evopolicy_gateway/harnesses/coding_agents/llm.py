@@ -14,6 +14,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from evopolicy_common.errors import ConfigError
+from evopolicy_common.installation import add_extra
 from evopolicy_gateway.harnesses.coding_agents.claude_code import ClaudeReader
 from evopolicy_gateway.harnesses.coding_agents.dialect import Dialect
 from evopolicy_gateway.harnesses.interface.agent_config import AgentConfig, LlmApi
@@ -45,9 +46,7 @@ class Llm(Dialect):
             raise ConfigError("harness llm starts no MCP servers; leave out [mcp], or use another harness")
         self._api: LlmApi = config.api
         if importlib.util.find_spec(self._api.protocol) is None:
-            raise ConfigError(
-                f"the agent llm needs the package {self._api.protocol}: pip install 'evopolicy[llm]'"
-            )
+            raise ConfigError(f"the agent llm needs the package {self._api.protocol}: {add_extra('llm')}")
 
     @property
     def packages(self) -> tuple[str, ...]:

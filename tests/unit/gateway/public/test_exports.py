@@ -403,4 +403,4 @@ def test_a_missing_library_is_named_with_its_extra(runs: Path, tmp_path: Path) -
     )
     done = export(runs, "--to", "parquet", "--out", tmp_path / "t", PYTHONPATH=str(tmp_path))
     assert done.returncode == 2
-    assert "pip install 'evopolicy[export]'" in done.stderr
+    assert "[export]'" in done.stderr

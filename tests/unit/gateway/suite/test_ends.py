@@ -176,7 +176,7 @@ def test_exit_codes_and_the_report_tell_how_runs_ended(
     ]
     out = io.StringIO()
     report(PlayedRuns(plans, index, {}, set()), Path("my runs"), Terminal(file=out, width=200))
-    assert "next: evopolicy report 'my runs' --out report" in out.getvalue()
+    assert "evopolicy report 'my runs' --out report" in out.getvalue()
     for needed in ("no_ok_submit", f"run directory: {tmp_path}/evolve/a/t", "agent failed", "cancelled"):
         assert needed in out.getvalue()
     assert exit_code(plans[:1], Index(suite="")) == 1

@@ -68,7 +68,7 @@ class NetHackFamily(GymnasiumFamily):
         return f"{entry.gymnasium_id} ({packages})"
 
     def needs(self) -> str:
-        return f"{super().needs()} and pip install --no-deps {' '.join(installs.apart((self.extra,)))}"
+        return f"{super().needs()} and then pip install --no-deps {' '.join(installs.apart((self.extra,)))}"
 
     def words(self, entry: Entry, env: gymnasium.Env[Any, Any]) -> dict[str, str]:
         common = _words("nethack_words.toml")

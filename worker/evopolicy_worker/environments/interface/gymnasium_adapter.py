@@ -20,6 +20,7 @@ import numpy as np
 
 from evopolicy_common.catalogue import USUAL_STEPS, Entry, is_shipped
 from evopolicy_common.errors import EvopolicyError, WorkerError
+from evopolicy_common.installation import add_extra
 from evopolicy_common.messages.environment import Case, EnvironmentDescription, SpaceSchema
 from evopolicy_worker.environments.accelerations import accelerate
 from evopolicy_worker.environments.interface import rewards, settings, spaces, trial
@@ -72,7 +73,7 @@ class GymnasiumFamily:
 
     def needs(self) -> str:
         """The packages to install, in words."""
-        return f"{' and '.join(self.distributions)}: pip install 'evopolicy[{self.extra}]'"
+        return f"{' and '.join(self.distributions)}: {add_extra(self.extra)}"
 
     def load(self) -> None:
         """Import the packages and register their environments."""
