@@ -5,8 +5,9 @@
 # make test-families  those that play every family of environments
 # make paper-worker  installs a worker with the paper's library versions into .venv-paper
 # make check  ruff and mypy
+# make release  builds wheel and sdist in dist/, checks them, and installs them in clean environments
 # make docs   the documentation as a site in build/site
-# make check-envs  plays every environment of every family, and writes the table in docs/reference/environments.md
+# make check-envs  plays every environment of every family, and writes the tables in docs/reference/environments/
 # make bench  what an episode costs, beside a bare loop
 # make bench-start        what one waits for before anything is played
 # make bench-peers        the same episodes through Gymnasium's vectors, Ray and Dask, where they are installed
@@ -29,7 +30,7 @@ FAMILIES := $(VENV)/.families
 STAMP := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help install families paper-worker demo test test-system test-families check check-envs docs bench bench-start bench-peers bench-throughput bench-scale bench-channels bench-report bench-coverage bench-isolation bench-web bench-web-live faults sim clean
+.PHONY: help install families paper-worker demo test test-system test-families check check-envs docs release bench bench-start bench-peers bench-throughput bench-scale bench-channels bench-report bench-coverage bench-isolation bench-web bench-web-live faults sim clean
 
 help:
 	@sed -n 's/^# make/make/p' Makefile
@@ -101,11 +102,15 @@ check: install
 check-envs: install
 	@mkdir -p build
 	@$(BIN)/evopolicy-worker check-env --results build/check-envs.jsonl $(if $(ARGS),$(ARGS),--steps 600 "*"); status=$$?; \
-	$(BIN)/python docs/_site/environments.py build/check-envs.jsonl docs/reference/environments.md && exit $$status
+	$(BIN)/python docs/_site/environments.py build/check-envs.jsonl && exit $$status
 
 docs: install
 	@test -x $(BIN)/mkdocs || $(BIN)/python -m pip install -q --disable-pip-version-check -c constraints.txt -e '.[docs]'
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build && echo "the site is in build/site/index.html"
+
+release: install
+	@$(BIN)/python -c 'import twine' 2>/dev/null || $(BIN)/python -m pip install -q --disable-pip-version-check -c constraints.txt twine
+	@deploy/release.sh $(abspath $(BIN)/python)
 
 # Ratios to a bare loop; another size: make bench ARGS="--seconds 20 --json bench.json"
 # Only the second small submits: make bench ARGS=--small-only

@@ -3,4 +3,4 @@
 It imports none of the other rooms and no simulator, so that an agent's host can install it alone.
 """
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"

@@ -1,6 +1,7 @@
-"""Writes the table of played environments: `python docs/_site/environments.py RESULTS docs/reference/environments.md`.
+"""Writes the tables of played environments, a page for each family: `python docs/_site/environments.py RESULTS`.
 
-RESULTS is what `evopolicy-worker check-env --results` keeps. Rows of environments that it lacks stay as they are.
+RESULTS is what `evopolicy-worker check-env --results` keeps. Rows of environments that it lacks stay as they are, and so does
+the text above the table, which is written by hand. A family without a page gets one.
 """
 
 from __future__ import annotations
@@ -8,16 +9,40 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+from evopolicy_common import catalogue
 from evopolicy_worker.check_env import page
 
+FOLDER = Path(__file__).parents[1] / "reference" / "environments"
 MARK = "<!-- What follows is written by `make check-envs`. -->"
+HEAD = """# {title}
+
+`--env {name}` plays all environments of this page. [Environments](../environments.md#played-environments) explains the columns.
+
+{mark}
+"""
 
 
-def main(results: Path, document: Path) -> None:
-    text, mark, earlier = document.read_text("utf-8").partition(MARK)
-    assert mark, f"{document} has no line {MARK!r}"
-    document.write_text(f"{text}{MARK}\n\n{page(results, earlier)}", encoding="utf-8")
+def shown() -> list[catalogue.Suite]:
+    """Core16, and the suites that are families, in the order of the catalogue."""
+    families = catalogue.families()
+    return [each for name, each in catalogue.suites().items() if name == "core16" or name in families]
+
+
+def earlier() -> str:
+    """The text of all pages."""
+    return "\n".join(path.read_text("utf-8") for path in sorted(FOLDER.glob("*.md")))
+
+
+def written(suite: catalogue.Suite, results: Path, rows: str) -> str:
+    """A family's page; `rows` has the rows of environments that are not in the results."""
+    path = FOLDER / f"{suite.name}.md"
+    usual = HEAD.format(title=suite.title, name=suite.name, mark=MARK)
+    text, mark, _ = (path.read_text("utf-8") if path.exists() else usual).partition(MARK)
+    assert mark, f"{path} has no line {MARK!r}"
+    return f"{text}{MARK}\n\n{page(results, rows, suite.environments)}"
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), Path(sys.argv[2]))
+    pages = {each.name: written(each, Path(sys.argv[1]), earlier()) for each in shown()}
+    for name, text in pages.items():
+        (FOLDER / f"{name}.md").write_text(text, encoding="utf-8")

@@ -14,11 +14,11 @@ from evopolicy_common import catalogue
 from evopolicy_common.catalogue import installs
 
 TOP = Path(__file__).parents[2]
-PLAYED = TOP / "docs" / "reference" / "environments.md"
-DOCUMENTS = (TOP / "README.md", PLAYED)
+LIST = TOP / "docs" / "reference" / "environments.md"
+DOCUMENTS = (TOP / "README.md", LIST)
 END = "<!-- End of what it writes. -->"
 
-WEB_PAGES = "In web pages a drag or a scroll takes 60 to 200 ms,\nand most other actions 3 to 10 ms; the means are of both."
+WEB_PAGES = "In web pages a drag or a scroll takes 60 to 200 ms,\nand most other actions take 3 to 10 ms; the time in the table is the mean of all actions."
 
 
 def table() -> str:
@@ -34,9 +34,9 @@ def table() -> str:
         deterministic, found = _deterministic(suite), [costs[each] for each in ids if each in costs]
         family = installs.family_of(ids[0])
         row = installs.installs()[family]
-        how = f"`evopolicy-worker setup {family}`" if row.pins or row.apart else f"`evopolicy[{row.extra}]`"
+        how = f"`evopolicy-worker setup {family}`" if row.pins or row.apart else f"extra `{row.extra}`"
         cells = (
-            f"`{suite.name}`",
+            f"[`{suite.name}`](environments/{suite.name}.md)",
             f"{len(ids):,}",
             named.get(suite.name, "-"),
             "all" if deterministic == len(ids) else f"{deterministic:,}",
@@ -48,8 +48,8 @@ def table() -> str:
     lines += [
         "",
         f"The {len(families)} suites hold {_total(families):,} environments; the suite `paper13` holds the {len(named)} families that the paper",
-        f"names. The paper validates its protocol on {original['paper']['validated']} tasks. The newest version of the original has about",
-        f"{newest['profiles']} profiles in {newest['ecosystems']} ecosystems, each a project with its own lock file. *Deterministic*: ids whose episodes depend",
+        f"names. The paper validates its protocol on {original['paper']['validated']} tasks. The newest version of the original software has",
+        f"about {newest['profiles']} environment profiles in {newest['ecosystems']} ecosystems, each with its own lock file. *Deterministic*: ids whose episodes depend",
         "only on seed and actions. *Played*: ids that `check-env` has played. *ms a step*: median of a bare step over the played ids,",
         f"on a busy machine. {WEB_PAGES}",
     ]
@@ -59,7 +59,7 @@ def table() -> str:
 def short() -> str:
     """The table of README.md, two suites to a row, and the lines beneath it."""
     original, families, costs = _original(), _families(), _costs()
-    named, newest = original["paper"]["families"], original["newest"]
+    named = original["paper"]["families"]
     cells = [
         f"{f'**`{suite.name}`**' if suite.name in named else f'`{suite.name}`'} | {len(suite.environments):,} | {_cost(suite, costs)}"
         for suite in families
@@ -79,9 +79,10 @@ def short() -> str:
             "|---|--:|--:|---|--:|--:|",
             *(f"| {left} | {right} |" for left, right in rows),
             "",
-            f"The {len(families)} suites hold {total:,} environments; the paper names the families in bold (together `paper13`). The newest version of",
-            f"the original has about {newest['profiles']} profiles in {newest['ecosystems']} ecosystems. {every} deterministic: seed and actions determine the",
-            f"episode. `check-env` has confirmed this for {'all' if played == total else f'{played:,}'} of them. {WEB_PAGES}",
+            f"The {len(families)} suites hold {total:,} environments; the paper names the families in bold (together `paper13`). {every}",
+            "deterministic: seed and actions determine the episode. `evopolicy-worker check-env ID` plays an environment in two processes",
+            f"and compares the episodes; it has confirmed {'all' if played == total else f'{played:,}'} ids. The column *ms a step* is the time of one step of the environment",
+            f"alone. {WEB_PAGES}",
         ]
     )
 
@@ -115,10 +116,11 @@ def _cost(suite: catalogue.Suite, costs: dict[str, float]) -> str:
 
 
 def _costs() -> dict[str, float]:
-    """By id, microseconds of a bare step, from the table of played environments."""
+    """By id, microseconds of a bare step, from the tables of played environments."""
     found: dict[str, float] = {}
     column = 0
-    for line in PLAYED.read_text("utf-8").splitlines():
+    pages = sorted(LIST.with_suffix("").glob("*.md"))
+    for line in (line for path in pages for line in path.read_text("utf-8").splitlines()):
         cells = [each.strip() for each in line.strip("|").split("|")]
         if cells[0] == "environment" and "µs a step" in cells:
             column = cells.index("µs a step")

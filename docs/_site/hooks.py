@@ -17,6 +17,8 @@ ROOT_PAGES = {
     "examples/policies/README.md": "reference/example-policies.md",
 }
 """Where a document of the repository stands in the site."""
+FILES = {"examples/notebooks/tutorial.ipynb": "notebooks/tutorial.ipynb"}
+"""Where a file that is no page stands in the site."""
 LINK = re.compile(r"(!?)\[([^\]]*)\]\(([^)\s#]+)(#[^)\s]*)?\)")
 
 
@@ -26,6 +28,8 @@ def on_files(files: Files, config: Any) -> Files:
     for source, page in ROOT_PAGES.items():
         with open(posixpath.join(root, source), encoding="utf-8") as text:
             files.append(File.generated(config, page, content=text.read()))
+    for source, place in FILES.items():
+        files.append(File.generated(config, place, abs_src_path=posixpath.join(root, source)))
     return files
 
 
@@ -40,7 +44,9 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str
         if "://" in target:
             return match.group(0)
         source = posixpath.normpath(posixpath.join(posixpath.dirname(place), target))
-        uri = ROOT_PAGES.get(source) or (source.removeprefix("docs/") if source.startswith("docs/") else None)
+        uri = (ROOT_PAGES | FILES).get(source) or (
+            source.removeprefix("docs/") if source.startswith("docs/") else None
+        )
         if uri is None and posixpath.exists(posixpath.join(posixpath.dirname(config["docs_dir"]), source)):
             return label
         if uri is None or files.get_file_from_path(uri) is None:

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import ast
 import re
 import runpy
 import subprocess
 import sys
+from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
 import pytest
 from documents import blocks_of_commands, commands, parse
 
+from evopolicy_common import catalogue
 from evopolicy_coordinator.server.request_parser import REQUESTS
-from evopolicy_worker import check_env
 
 ROOT = Path(__file__).parents[2]
 DOCUMENTS = [
@@ -171,10 +173,43 @@ def test_the_table_of_families_is_the_catalogue_s() -> None:
 
 
 def test_rows_of_played_environments_stay_when_others_are_played(tmp_path: Path) -> None:
-    earlier = text_of("docs/reference/environments.md").partition("written by `make check-envs`. -->")[2]
+    pages = runpy.run_path(str(ROOT / "docs" / "_site" / "environments.py"))
     (tmp_path / "none.jsonl").touch()
-    assert check_env.page(tmp_path / "none.jsonl", earlier).split() == earlier.split()
-    assert earlier.count("\n| `") > 300
+    rows, suites = pages["earlier"](), pages["shown"]()
+    for suite in suites:
+        page = (pages["FOLDER"] / f"{suite.name}.md").read_text()
+        assert pages["written"](suite, tmp_path / "none.jsonl", rows) == page, "make check-envs"
+    assert {f"{suite.name}.md" for suite in suites} == {path.name for path in pages["FOLDER"].iterdir()}
+    shown = set(re.findall(r"^\| `(\S+)` \|", rows, re.MULTILINE))
+    assert shown == set(catalogue.entries())
+
+
+def texts_in_code() -> Iterator[str]:
+    """Every text in the product's code, with `…` for values; texts that are written one after another are one."""
+    for room in ROOMS.values():
+        for path in (ROOT / room).parent.rglob("*.py"):
+            for node in ast.walk(ast.parse(path.read_text())):
+                if isinstance(node, ast.Constant) and isinstance(node.value, str):
+                    yield node.value
+                elif isinstance(node, ast.JoinedStr):
+                    yield "".join(
+                        str(part.value) if isinstance(part, ast.Constant) else "…" for part in node.values
+                    )
+
+
+def test_messages_on_the_page_about_trouble_are_in_the_code() -> None:
+    page = text_of("docs/how-to/troubleshooting.md")
+    messages = set(re.findall(r"^\| `([^`]+)` \|", page, re.MULTILINE))
+    assert len(messages) > 20
+    code = "\n".join(texts_in_code())
+    assert {message for message in messages if message not in code} == set()
+    assert "no message of ours says this" not in code
+
+
+def test_every_page_is_in_the_site_s_menu() -> None:
+    menu = text_of("mkdocs.yml")
+    pages = [str(path.relative_to(ROOT / "docs")) for path in (ROOT / "docs").rglob("*.md")]
+    assert [page for page in pages if f": {page}\n" not in menu] == []
 
 
 def test_the_list_of_commands_is_that_of_the_commands() -> None:

@@ -294,15 +294,15 @@ def read(results: Path) -> dict[str, Checked]:
     return found
 
 
-def page(results: Path, earlier: str = "") -> str:
-    """A Markdown table of the results in a file, in catalogue order, with the number of environments played. `earlier`: a
-    page whose rows stay where the file has none."""
+def page(results: Path, earlier: str = "", ids: Sequence[str] | None = None) -> str:
+    """A Markdown table of the results in a file, with the number of environments played. `earlier`: a text whose rows stay
+    where the file has none. `ids`: the environments, in order; by default the catalogue's."""
     rows = {
         row[0].strip("`"): row for line in earlier.splitlines() if len(row := _cells(line)) == len(COLUMNS)
     }
     rows |= {env: each.cells() for env, each in read(results).items()}
     head = [f"| {' | '.join(COLUMNS)} |", "|---|--:|--:|---|---|---|--:|--:|--:|--:|---|"]
-    ids = list(catalogue.entries())
+    ids = list(catalogue.entries()) if ids is None else ids
     body = [f"| `{each}` | {' | '.join(rows[each][1:])} |" for each in ids if each in rows]
     summary = f"{len(body):,} of {len(ids):,} environments have been played."
     return "\n".join([summary, "", *head, *body]) + "\n"

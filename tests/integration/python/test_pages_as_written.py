@@ -117,14 +117,19 @@ def stand_ins(folder: Path) -> Path:
 def test_the_page_about_coding_agents_runs_its_agents(tmp_path: Path) -> None:
     """Its commands with the shortest runs on the smallest environment. Codex and Gemini CLI are stand-ins here, the built-in
     agent is itself; `test_real_clis.py` plays the real ones."""
-    page = "how-to/coding-agents.md"
+    pages = [
+        f"how-to/{name}.md" for name in ("coding-agents", "agents-prompts", "agents-api-key", "agents-clis")
+    ]
     lines = [
         line
+        for page in pages
         for block in blocks(page, "")
         for line in block.replace("\\\n", " ").splitlines()
         if line.startswith(("evopolicy texts", "evopolicy run")) and "remote" not in line
     ]
-    (endpoint,) = [block for block in blocks(page, "toml") if "EXAMPLE_API_KEY" in block]
+    (endpoint,) = [
+        block for block in blocks("how-to/agents-api-key.md", "toml") if "EXAMPLE_API_KEY" in block
+    ]
     (tmp_path / "c").mkdir()
     with toy_cluster(tmp_path / "c") as operator, ModelApi([Step(command=SUBMIT)]) as api:
         (tmp_path / "operator-me").symlink_to(operator.parent if operator.is_file() else operator)

@@ -272,7 +272,7 @@ def test_the_example_file_of_kimi_speaks_its_documented_stream(
 def test_the_example_files_of_other_clis_are_whole(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("GEMINI_API_KEY", "OPENAI_API_KEY", "KIMI_MODEL_API_KEY"):
         monkeypatch.setenv(name, "set")
-    docs = (EXAMPLES.parents[1] / "docs" / "how-to" / "coding-agents.md").read_text()
+    docs = (EXAMPLES.parents[1] / "docs" / "how-to" / "agents-clis.md").read_text()
     files = sorted(EXAMPLES.glob("*.toml"))
     assert [path.stem for path in files] == ["gemini", "kimi", "qwen"]
     for path in files:
