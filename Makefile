@@ -110,7 +110,7 @@ docs: install
 
 release: install
 	@$(BIN)/python -c 'import twine' 2>/dev/null || $(BIN)/python -m pip install -q --disable-pip-version-check -c constraints.txt twine
-	@deploy/release.sh $(abspath $(BIN)/python)
+	@.ci/release $(abspath $(BIN)/python)
 
 # Ratios to a bare loop; another size: make bench ARGS="--seconds 20 --json bench.json"
 # Only the second small submits: make bench ARGS=--small-only
