@@ -18,7 +18,7 @@ import pytest
 from commands import command, record_in, run_dir
 from coordinator_harness import Coordinator
 
-from evopolicy_common.catalogue import installs
+from evopolicy_common.catalogue import installs, suites
 from evopolicy_common.catalogue.installs import Made
 from evopolicy_common.records.run_record import decode_run_record
 from evopolicy_results.statistics.intervals import over_cases
@@ -133,6 +133,16 @@ def test_check_env_finds_nothing_in_a_few_of_its_environments(made: Made) -> Non
     assert done.returncode == 0, done.stdout + done.stderr
     for each in ids:
         assert f"{each}: ok" in done.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_every_text_is_whole_and_has_nothing_of_a_library(made: Made) -> None:
+    checks = ROOT / "tests" / "conformance" / "environments" / "text_checks.py"
+    program = [made.python, str(checks), *suites()[FAMILY].environments]
+    done = subprocess.run(program, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout.splitlines()[-1]) == {}
 
 
 @pytest.mark.slow

@@ -71,11 +71,14 @@ def components(schema: SpaceSchema) -> set[tuple[str, tuple[int, ...]]]:
             shape = np.shape(leaf["nvec"])
         elif leaf["type"] == "MultiBinary":
             shape = tuple(np.atleast_1d(leaf["n"]).tolist())
-        found.update((path, index) for index in itertools.product(*map(range, shape)))
+        # The parts of a tuple are told by a first index, and a lone number is component 0.
+        name, first = ("", (int(path),)) if path.isdigit() else (path, ())
+        shape = shape or ((1,) if not path else ())
+        found.update((name, (*first, *index)) for index in itertools.product(*map(range, shape)))
     return found
 
 
-_SELECTOR = re.compile(r"^(?:(?P<path>[A-Za-z_][\w.]*)(?:\[(?P<inner>[^\]]*)\])?|(?P<bare>[\d–, ]+))$")
+_SELECTOR = re.compile(r"^(?:(?P<path>[A-Za-z_][\w. ]*)(?:\[(?P<inner>[^\]]*)\])?|(?P<bare>[\d–, ]+))$")
 
 
 def selected(selector: str) -> Iterator[tuple[str, tuple[int, ...]]]:

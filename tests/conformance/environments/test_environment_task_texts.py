@@ -2,44 +2,71 @@
 
 from __future__ import annotations
 
+import fnmatch
 import re
 from collections.abc import Callable
 from importlib.resources import files
 
 import pytest
-from environment_checks import IDS, components, selected, table
+from environment_checks import IDS
+from text_checks import borrowed, flags, marks, uncovered
 
-from evopolicy_common.catalogue import families, suites
+from evopolicy_common.catalogue import entries, families, suites
 from evopolicy_worker.environments import Environment
-from evopolicy_worker.environments.tasks import written
+from evopolicy_worker.environments.tasks import template, written
 
 Warm = Callable[[str], Environment]
 
 
 @pytest.mark.parametrize("env_id", IDS)
-def test_every_observation_component_has_exactly_one_row(env_id: str, warm: Warm) -> None:
+def test_every_component_of_core16_has_exactly_one_row(env_id: str, warm: Warm) -> None:
     description = warm(env_id).description
-    rows = table(description.task_text, "Observation")
-    named = [component for row in rows for component in selected(row[0])]
-    assert len(named) == len(set(named)), "a component has two rows"
-    assert set(named) == components(description.obs_space)
-    assert all(len(row) == 4 and all(row) for row in rows), "a row lacks meaning, unit or range"
+    assert uncovered(description.task_text, "Observation", description.obs_space) == []
+    assert uncovered(description.task_text, "Action", description.action_space) == []
 
 
-@pytest.mark.parametrize("env_id", IDS)
-def test_every_action_has_exactly_one_row(env_id: str, warm: Warm) -> None:
-    description = warm(env_id).description
-    rows = table(description.task_text, "Action")
-    named = [component for row in rows for component in selected(row[0])]
-    space = description.action_space
-    if space["type"] == "Discrete":
-        start = space.get("start", 0)
-        assert named == [("", (choice,)) for choice in range(start, start + space["n"])]
-        assert all(len(row) == 2 and all(row) for row in rows)
-    else:
-        assert len(named) == len(set(named))
-        assert set(named) == components(space)
-        assert all(len(row) == 4 and all(row) for row in rows)
+TEXT = """# A\n\n## Observation\n\n| Component | Meaning | Unit | Range |\n|---|---|---|---|\n| 0 | x | m | 0 to 1 |\n| 1–2 | speeds | m/s | about ±1 |
+\n## Action\n\n| Choice | Meaning |\n|---|---|\n| 0 | left |\n| 1 | right |\n\n## Reward\n"""
+
+
+@pytest.mark.parametrize(
+    ("shape", "n", "text", "fault"),
+    [
+        (3, 2, TEXT, ""),
+        (4, 2, TEXT, "Observation without"),
+        (2, 2, TEXT, "Observation beyond"),
+        (3, 3, TEXT, "Action without"),
+        (3, 1, TEXT, "Action beyond"),
+        (3, 2, TEXT.replace("1–2", "0–2"), "several rows"),
+        (3, 2, TEXT.replace("| m |", "| |"), "empty cell"),
+        (3, 2, "# A\n\n## Observation\n\nA state.\n\n## Action\n\n| 0 | left |\n", "widths under"),
+    ],
+)
+def test_a_table_that_lacks_a_component_is_found(shape: int, n: int, text: str, fault: str) -> None:
+    found = uncovered(text, "Observation", {"type": "Box", "shape": [shape]})
+    found += uncovered(text, "Action", {"type": "Discrete", "n": n})
+    assert any(fault in each for each in found) if fault else found == []
+
+
+class _Base:
+    """Superclass for all robots of this world."""
+
+    def __init__(self, reset_noise_scale: float = 0.1) -> None: ...
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "Superclass for all robots of this world.",
+        "It may be moved by `reset_noise_scale`.",
+        "The goal is :attr:`goal`, of ``GoalEnv``.",
+        "See Gymnasium's env for more information.",
+        "From [a paper](https://example.org).",
+    ],
+)
+def test_words_of_a_library_in_a_text_are_found(text: str) -> None:
+    assert marks(text) + borrowed(text, _Base())
+    assert not marks("See-saws move.") + borrowed("A robot walks.", _Base())
 
 
 @pytest.mark.parametrize("env_id", IDS)
@@ -52,40 +79,6 @@ def test_a_text_has_objective_sections_and_step_limit(env_id: str, warm: Warm) -
     for name in description.reward_components:
         assert f"`{name}`" in text
     assert "include:" not in text
-
-
-EQUATIONS = {
-    "an assignment": r"←|:=",
-    "a difference, sum or root": r"[ΔΣ√∫]|\w′|\w''",
-    "a power": r"[\w)]\s?(²|³|\^)",
-    "a function of a variable": r"\b(cos|sin|tan|atan|exp|sqrt)\b ?[(\w]",
-    "a weight before a variable": r"\d\.\d+ ?[·*×]|\d\.\d+ (?![msN]\b)[a-zA-Zθωφ][ᵢⱼ\d]?\b",
-}
-"""Signs that a text gives equations of motion or a reward's formula."""
-IN_CODE = {"arithmetic": r"[\w)\]] [+*/×÷−<>] [\w(]|\w[*/+]\w", "a norm": r"\|.+ − .+\|"}
-"""The same within backticks."""
-CONSTANTS = {
-    "mass, inertia, damping or gravity": r"\bkg\b|N m s|\bg = |inertia \d|damping \d|gravity \d|m/s²",
-    "an integrator or its time step": r"Runge|Euler(?! angles)|\d\.\d+ s\)|\d+ × \d\.\d+ s|\d/\d+ s",
-    "a distribution of the start": r"standard deviation|[Nn]ormal(ly)? with|uniform (in|over)",
-}
-
-
-def flags(text: str) -> list[str]:
-    """Which signs of equations and constants stand in a text, tables of observations aside: they give units and scales."""
-    head, _, rest = text.partition("## Observation")
-    observation, _, rest = rest.partition("## Action")
-    prose = "\n".join(line for line in observation.splitlines() if not line.startswith("|"))
-    parts = (head, prose, rest)
-    code = [span for part in parts for span in re.findall(r"`([^`\n]+)`", part)]
-    searches = [(EQUATIONS | CONSTANTS, parts), (IN_CODE, code)]
-    return [
-        f"{kind}: {found[0]!r}"
-        for signs, texts in searches
-        for kind, sign in signs.items()
-        for text in texts
-        if (found := re.search(sign, text))
-    ]
 
 
 @pytest.mark.parametrize("env_id", IDS)
@@ -118,21 +111,24 @@ def test_equation_or_constant_in_a_text_is_found(text: str) -> None:
 
 def test_no_text_is_left_without_an_environment() -> None:
     known = {env_id.replace("/", "_") + ".md" for env_id in IDS} | {
-        f"family_{name}.md" for name in families()
+        f"family_{name}.{kind}" for name in families() for kind in ("md", "toml")
     }
-    folder = files("evopolicy_worker.environments.tasks")
-    there = {item.name for item in folder.iterdir() if item.name.endswith(".md")}
-    included = {name for env_id in IDS for name in _includes(env_id)}
-    assert there <= known | included
+    there = {
+        item.name: item.read_text("utf-8")
+        for item in files("evopolicy_worker.environments.tasks").iterdir()
+        if item.name.endswith((".md", ".toml"))
+    }
+    taken = set(re.findall(r"<!-- include: (\S+) -->", "".join(there.values())))
+    read_by_families = {
+        name for name in there if re.fullmatch(r"[a-z_]+_(games|tasks|words|rooms|scenarios)\.toml", name)
+    }
+    assert there.keys() <= known | taken | read_by_families
 
 
-def _includes(env_id: str) -> list[str]:
-    raw = (
-        files("evopolicy_worker.environments.tasks")
-        .joinpath(env_id.replace("/", "_") + ".md")
-        .read_text("utf-8")
-    )
-    return re.findall(r"<!-- include: (\S+) -->", raw)
+def test_every_pattern_of_a_family_matches_one_of_its_ids_or_of_mo_gymnasiums() -> None:
+    ids = {str(each.gymnasium_id) for each in entries().values()}
+    patterns = {pattern for name in families() for group in template.groups(name) for pattern in group["ids"]}
+    assert [each for each in sorted(patterns) if not fnmatch.filter(ids, each)] == []
 
 
 def test_core16_and_the_toys_have_texts_that_are_written_for_them() -> None:

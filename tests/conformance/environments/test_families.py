@@ -1,21 +1,19 @@
-"""A few environments of each family: they are played as they say, and their texts tell no equations."""
+"""A few environments of each family are played as they say."""
 
 from __future__ import annotations
 
-import re
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from test_environment_task_texts import flags
+from text_checks import faults
 from typer.testing import CliRunner
 
 from evopolicy_common import catalogue
 from evopolicy_worker import check_env, cli
 from evopolicy_worker.environments import Environment, make, missing
 from evopolicy_worker.environments.checks import conformance
-from evopolicy_worker.environments.tasks import template
 
 pytestmark = pytest.mark.families
 
@@ -113,45 +111,17 @@ def test_an_environment_keeps_what_the_interface_promises(env_id: str) -> None:
     assert played.limit == catalogue.entry(env_id).max_episode_steps
 
 
-@pytest.mark.parametrize("env_id", SAMPLE)
-def test_a_text_made_by_the_template_has_all_sections_and_no_equations(env_id: str, warm: Warm) -> None:
-    description = warm(env_id).description
-    text = description.task_text
-    assert re.findall(r"^## (.+)$", text, re.MULTILINE) == ["Observation", "Action", "Reward", "Start", "End"]
-    assert re.search(rf"runcated after\s+{description.max_episode_steps} steps", text)
-    assert flags(text) == []
+SUITES = sorted(catalogue.suites().keys() & catalogue.families().keys() - {"toy"})
 
 
-def test_documentation_is_put_in_words() -> None:
-    text = template.in_words(
-        "The pole stands on a cart. The velocity is `v = v + 0.1 * a` each step (default is `2`). Links: see [a page](x.md).\n\n"
-        "```python\nenv.step(0)\n```\n\n| Num | Meaning |\n|---|---|\n| 0 | position |\n| 1 | `a * sin(b)` |"
-    )
-    assert "The pole stands on a cart." in text
-    assert "see a page." in text
-    assert "| 0 | position |" in text
-    for gone in ("0.1", "default", "env.step", "sin"):
-        assert gone not in text
-
-
-@pytest.mark.parametrize(
-    ("env_id", "last"),
-    [
-        ("gymnasium/Humanoid-v5", 44),
-        ("gymnasium/FetchSlide-v4", 24),
-        ("gymnasium/Pendulum-v1", 2),
-        ("gymnasium/InvertedDoublePendulum-v5", 8),
-    ],
-)
-def test_a_long_table_of_an_observation_is_shown_whole(env_id: str, last: int, warm: Warm) -> None:
-    observation = warm(env_id).description.task_text.partition("## Action")[0]
-    first = re.search(r"(?:^\| *\d+ *\|.*\n)+", observation, re.MULTILINE)
-    assert first is not None
-    assert re.findall(r"^\| *(\d+)", first[0], re.MULTILINE) == [str(k) for k in range(last + 1)]
-
-
-def test_no_text_announces_a_program_that_is_left_out() -> None:
-    assert template.in_words("It lands.\n\nTo see it, run:\n```\npython it.py\n```\n") == "It lands."
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+@pytest.mark.parametrize("suite", SUITES)
+def test_every_text_of_a_family_is_whole_and_has_nothing_of_a_library(suite: str) -> None:
+    ids = [each for each in catalogue.suites()[suite].environments if not missing(each)]
+    if not ids:
+        pytest.skip(f"{suite} needs {missing(catalogue.suites()[suite].environments[0])}")
+    assert {each: found for each in ids if (found := faults(each))} == {}
 
 
 def test_one_environment_under_two_ids_has_one_written_text(warm: Warm) -> None:

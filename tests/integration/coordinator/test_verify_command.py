@@ -202,14 +202,15 @@ def test_without_the_coordinator_a_tampered_action_shows_in_its_results(
     run = tampered(played.run("toy/line"), tmp_path / "run", 0, action=[0.9])
     record = json.loads((run / "run.json").read_text())
     record["run"] = "r-unknown"
-    record["versions"]["fingerprint"]["numpy"] = "1.0"
+    record["versions"]["fingerprint"] |= {"numpy": "1.0", "definition": "of another text"}
     (run / "run.json").write_text(json.dumps(record))
     done = played.verify(run)
     assert done.returncode == 1, done.stdout + done.stderr
     report = json.loads(done.stdout)
     assert {found["episode"] for found in report["differences"]} == {"submit 0, ep_000"}
     assert report["from_files"] == report["episodes"] == 3
-    assert any(text.startswith("numpy: 1.0 in the run") for text in report["fingerprint_differences"])
+    for first in ("numpy: 1.0 in the run", "definition: of another text in the run"):
+        assert any(text.startswith(first) for text in report["fingerprint_differences"])
 
 
 def test_a_cluster_with_other_cases_says_so_and_stops(played: Played) -> None:

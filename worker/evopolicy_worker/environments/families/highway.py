@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from evopolicy_common.catalogue import Entry
 from evopolicy_worker.environments.interface.gymnasium_adapter import GymnasiumFamily
 from evopolicy_worker.environments.interface.info import plain_info
+from evopolicy_worker.environments.tasks import highway
+
+if TYPE_CHECKING:
+    import gymnasium
 
 
 class HighwayFamily(GymnasiumFamily):
@@ -37,6 +41,9 @@ class HighwayFamily(GymnasiumFamily):
         if "rewards" in plain:
             plain["rewards"] = {name: float(value) for name, value in plain["rewards"].items()}
         return plain
+
+    def words(self, entry: Entry, env: gymnasium.Env[Any, Any]) -> dict[str, str]:
+        return highway.words(env.unwrapped)
 
 
 FAMILY = HighwayFamily()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -44,12 +45,26 @@ class MiniWoBFamily(GymnasiumFamily):
 
     def make(self, entry: Entry, *, render: bool) -> gymnasium.Env[Any, Any]:
         """The page that the id names."""
-        name = str(entry.gymnasium_id).removeprefix(self.prefix).removesuffix(self.suffix)
-        documented = type("Documented", (self.environment(),), {"__doc__": _documentation(name)})
-        made: gymnasium.Env[Any, Any] = documented(
+        name = self._page(entry)
+        made: gymnasium.Env[Any, Any] = self.environment()(
             name, **entry.kwargs, render_mode="rgb_array" if render else None
         )
         return made
+
+    def words(self, entry: Entry, env: gymnasium.Env[Any, Any]) -> dict[str, str]:
+        """The package's documentation of the page, without a reward's formula, and examples of its instructions."""
+        page = miniwob_pages.texts().get(self._page(entry), miniwob_pages.PageText())
+        examples = "\n".join(f"* {each}" for each in page.examples)
+        parts = [
+            page.description,
+            "" if "%" in page.notes else page.notes,
+            f"The page's instruction is such as:\n\n{examples}" if examples else "",
+        ]
+        text = "\n\n".join(filter(None, parts))
+        return {"": re.sub(r" +", " ", re.sub(r"^ +", "", text, flags=re.MULTILINE))}
+
+    def _page(self, entry: Entry) -> str:
+        return str(entry.gymnasium_id).removeprefix(self.prefix).removesuffix(self.suffix)
 
     def environment(self) -> type[PageEnv]:
         """The class of its environments."""
@@ -69,18 +84,6 @@ class MiniWoBFamily(GymnasiumFamily):
     def version(self, entry: Entry) -> str:
         """As others, with the browser."""
         return f"{super().version(entry)[:-1]}, Chromium {shared().identity()['chromium']})"
-
-
-def _documentation(name: str) -> str:
-    """The package's documentation of a page, with examples of its instructions, for the task text."""
-    page = miniwob_pages.texts().get(name, miniwob_pages.PageText())
-    examples = "\n".join(f"* {each}" for each in page.examples)
-    parts = [
-        page.description,
-        page.notes,
-        f"The page's instruction is such as:\n\n{examples}" if examples else "",
-    ]
-    return "\n\n".join(["## Description", *filter(None, parts)])
 
 
 FAMILY = MiniWoBFamily()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, cast
 
@@ -10,22 +9,10 @@ import numpy as np
 
 from evopolicy_common.catalogue import Entry
 from evopolicy_worker.environments.families.mujoco import MujocoFamily
-from evopolicy_worker.environments.interface import rewards
-from evopolicy_worker.environments.tasks import template
+from evopolicy_worker.environments.tasks import highway, template
 
 if TYPE_CHECKING:
     import gymnasium
-
-_DOCUMENTED = ("mo_gymnasium.", "gymnasium.envs.")
-_HIGHWAY = {
-    "": "A car on a motorway with other cars. Drive fast, on the right, and without a collision.",
-    "Observation": "One row for each of the five nearest vehicles, the own car first; in a row: 1 where there is one, then x (along the"
-    " road), y (across, positive to the right), and the speeds along them. All but the first row are relative to the own car. Positions and"
-    " speeds are scaled to about -1 to 1.",
-    "Action": "0 change to the lane on the left, 1 go on as now, 2 change to the lane on the right, 3 faster, 4 slower.",
-    "End": "An episode ends with a collision.",
-}
-_ABOUT = "Several objectives at once; the reward is a vector, of which the weighted sum counts."
 
 
 class MoGymnasiumFamily(MujocoFamily):
@@ -53,18 +40,11 @@ class MoGymnasiumFamily(MujocoFamily):
         return cast("gymnasium.Env[Any, Any]", _MadeFromSeed(usual))
 
     def words(self, entry: Entry, env: gymnasium.Env[Any, Any]) -> dict[str, str]:
-        """The class's documentation, completed by that of the environment from which it is made."""
-        found: dict[str, str] = {}
-        for each in reversed(type(env.unwrapped).__mro__):
-            docstring = vars(each).get("__doc__") or ""
-            if each.__module__.startswith(_DOCUMENTED):
-                found |= template.documented(inspect.cleandoc(docstring))
-        if "highway" in str(entry.gymnasium_id):
-            found |= _HIGHWAY
         scalarisation = rewards.Scalarisation.of(entry, env)
         assert scalarisation is not None
-        table = template.reward_table(scalarisation.texts(entry.reward_components), vector=True)
-        return found | {"": f"{found.get('', '')}\n\n{_ABOUT}".strip(), "Reward": table}
+        found = highway.words(env.unwrapped) if "highway" in str(entry.gymnasium_id) else {}
+        components = scalarisation.texts(entry.reward_components)
+        return found | {"Reward": template.reward_table(components, vector=True)}
 
 
 class _MadeFromSeed:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from evopolicy_common.catalogue import Entry
 from evopolicy_worker.environments.families.mujoco import MujocoFamily
+from evopolicy_worker.environments.tasks import hands
 
 if TYPE_CHECKING:
     import gymnasium
@@ -34,6 +35,9 @@ class RoboticsFamily(MujocoFamily):
     def rebuilds(self, entry: Entry) -> bool:
         # Fetch and the Shadow Hand have been seen to repeat.
         return not str(entry.gymnasium_id).startswith(("Fetch", "Hand"))
+
+    def words(self, entry: Entry, env: gymnasium.Env[Any, Any]) -> dict[str, str]:
+        return hands.words(str(entry.gymnasium_id), env.unwrapped)
 
     def render(self, env: gymnasium.Env[Any, Any]) -> Any:
         """A picture; the callback that moves the target's marker also runs the forward dynamics, so both are put back.

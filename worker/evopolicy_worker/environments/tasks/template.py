@@ -4,10 +4,13 @@ what is known about its rewards and its end.
 
 from __future__ import annotations
 
+import fnmatch
 import inspect
 import math
 import re
-from collections.abc import Mapping
+import tomllib
+from collections.abc import Iterable, Mapping
+from functools import cache
 from importlib.resources import files
 from typing import TYPE_CHECKING, Any
 
@@ -19,40 +22,12 @@ if TYPE_CHECKING:
 
 MAX_DOCUMENTATION = 12_000
 """Maximum characters of an environment's documentation that are shown."""
-MAX_SECTION = 12_500
-"""The same for one of its sections, for shipped environments."""
-_WIDE = 6_000
-"""In a longer section, tables lose the spaces that align their columns."""
 _MAX_ROWS = 64
-_HEADING = re.compile(r"^\s*(#+)\s+(.+?)\s*$")
-_PLACES = {
-    "Observation": ("observation",),
-    "Action": ("action",),
-    "Reward": ("reward",),
-    "Start": ("starting state", "start"),
-    "End": ("terminat", "episode end", "truncat"),
-    "": ("description", "mission", "goal", "task", "map"),
-}
-"""Words in a documentation's headings that select a section, by the name of our section."""
+_HEADINGS = ("Observation", "Action", "Reward", "Start", "End")
 _REWARD = "What each step gave is in the feedback of submits."
-_SIGNS = re.compile(
-    "|".join(
-        (
-            r"←|:=|[ΔΣ√∫≤≥]|\w′|\w''|[\w)]\s?(²|³|\^)|\*\*2|\|\||_\{",
-            r"\b(cos|sin|tan|atan|exp|sqrt|log|norm)\b ?[(\w]|\\\w",
-            r"\d\.\d+ ?[·*×]|\d\.\d+ (?![msN]\b)[a-zA-Zθωφ][ᵢⱼ\d]?\b|\w \* \w|\w = -?[\d.(\w]",
-            r"\bkg\b|N m s|\bg = |inertia \d|damping \d|gravity \d|m/s²|weight.{0,40}\d",
-            r"Runge|Euler(?! angles| frame)|\d\.\d+ s\)|\d+ × \d\.\d+ s|\d/\d+ s|frame_skip|\bdt\b|time ?step of|Hz",
-            r"standard deviation|[Nn]ormal(ly)? with|uniform (in|over)",
-            r"^To (see|play|run)\b.*:$|is defined as:$",
-            r"gymnasium\.make|kwarg|arXiv|arxiv|http|[Ss]eed|reward threshold|initialized as|must be specified|argument|`options`|_reward=|naming convention|[Ii]f `",
-        )
-    )
-)
-"""Matches sentences with equations of motion, reward formulas or constants, about options, or before a program to run."""
-_OF_AN_ANGLE = re.compile(r"(?:\b\w = )?\b(cos|sin)\((\w+)\)")
-"""Matches what an element of an observation is, in a table: the sine or cosine of an angle."""
-_IN_CODE = re.compile(r"[\w)\]] [+*/×÷−<>-] [\w(]|\w[*/+]\w|\|.+ − .+\||=")
+_HEADS = {2: "| Choice | Meaning |", 4: "| Dimension | Meaning | Unit | Range |"}
+"""The head of a table of actions, by the cells of a row."""
+_COMPONENTS = "| Component | Meaning | Unit | Range |"
 _INCLUDE = re.compile(r"^<!-- include: ([\w.-]+) -->$", re.MULTILINE)
 _UNSEEN = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff]")
 
@@ -99,40 +74,116 @@ def _in_sections(
     limit: int,
     own: Mapping[str, str],
 ) -> str:
-    """The documentation sorted into our sections. A section that is written for the whole family, or by it, replaces
-    it."""
-    documented = _sections(clean(inspect.getdoc(type(env.unwrapped)) or ""))
-    family = {**_sections(_family_text(entry.family)), **own}
-
-    def section(ours: str, *facts: str) -> str:
-        shown = [family[ours]] if ours in family else [in_words(documented.get(ours, "")), *facts]
-        return "\n\n".join(part for part in shown if part)
-
+    """The sections that are written for the family, its groups of environments, and by it."""
+    found = {**_sections(_family_text(entry.family)), **own}
+    grouped = _of_groups(entry, own)
+    if grouped:
+        found |= grouped
+        actions, end = "", f"{found.get('End', '')} Truncated after {limit} steps.".strip()
+        success = _success(entry) if entry.success else ""
+        if not success and "uccess" not in end + found.get("Reward", ""):
+            success = " Nothing but the return tells success."
+    else:
+        actions = "\n\n" + _space(action_space)
+        end = "An episode ends when the environment ends it (`terminated`), and is truncated after {limit} steps."
+        end = "\n\n".join(part for part in (found.get("End"), end.format(limit=limit)) if part)
+        success = _success(entry)
     rewards = reward_table(
         components, vector=bool(entry.reward_vector) or hasattr(env.unwrapped, "reward_space")
-    )
-    end = (
-        f"An episode ends when the environment ends it (`terminated`), and is truncated after {limit} steps."
-        + _success(entry)
     )
     parts = [
         f"# {entry.label}",
         "Maximise the sum of the rewards of an episode.",
-        own.get("") or in_words(documented.get("", "")),
-        "## Observation\n\n" + section("Observation", _space(obs_space)) + _maze(env),
-        "## Action\n\n" + section("Action") + "\n\n" + _space(action_space),
-        "## Reward\n\n" + section("Reward", *([rewards] if components else [_REWARD])),
-        "## Start\n\n" + section("Start", "The start of an episode is drawn from its seed."),
-        "## End\n\n"
-        + "\n\n".join(part for part in (own.get("End") or in_words(documented.get("End", "")), end) if part),
+        found.get("", ""),
+        f"## Observation\n\n{_form(obs_space, grouped)}"
+        + found.get("Observation", _space(obs_space))
+        + _maze(env),
+        f"## Action\n\n{_form(action_space, grouped)}" + found.get("Action", "") + actions,
+        "## Reward\n\n" + found.get("Reward", rewards if components else _REWARD),
+        "## Start\n\n" + found.get("Start", "The start of an episode is drawn from its seed."),
+        "## End\n\n" + end + success,
     ]
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
-def documented(documentation: str) -> dict[str, str]:
-    """A documentation's sections in words, by our headings."""
-    found = {name: in_words(text) for name, text in _sections(clean(documentation)).items()}
-    return {name: text for name, text in found.items() if text}
+def _form(space: SpaceSchema, grouped: Mapping[str, str]) -> str:
+    """The kind of a space, with shapes and dtypes, for texts of groups."""
+    if not grouped:
+        return ""
+    named = [(name, _kind(leaf)) for name, leaf in _leaves(space, "")]
+    if space["type"] in ("Dict", "Tuple"):
+        return f"`{space['type']}` of {', '.join(f'`{name}` ({kind})' for name, kind in named)}.\n\n"
+    return f"{named[0][1]}.\n\n"
+
+
+def _kind(leaf: SpaceSchema) -> str:
+    if leaf["type"] in ("Box", "Image"):
+        return f"`Box`, shape {tuple(leaf['shape'])}, {leaf.get('dtype', 'uint8')}"
+    return f"`{leaf['type']}`" + (f", {leaf['n']} choices" if leaf["type"] == "Discrete" else "")
+
+
+@cache
+def groups(family: str) -> tuple[dict[str, Any], ...]:
+    """The groups of a family's file, below those of the files that it extends."""
+    name = f"family_{family}.toml"
+    found = tomllib.loads(read(name)) if files(__package__).joinpath(name).is_file() else {}
+    extended = [group for each in found.get("extends", ()) for group in groups(each)]
+    return (*extended, *found.get("text", ()))
+
+
+def _of_groups(entry: Entry, own: Mapping[str, str]) -> dict[str, str]:
+    """The sections of all groups of the family's file to which the environment belongs, in order and below `own`. Rows of
+    tables come together below what is written before the first of each, and get their head.
+
+    A group has `ids` (patterns of Gymnasium's ids) and `except` (of those left out), `about`, and sections by their headings; `like` takes the sections of
+    another text, `within` puts the rows' components into a part of the observation.
+    """
+    chosen = [
+        each
+        for each in groups(entry.family)
+        if _fits(entry, each["ids"]) and not _fits(entry, each.get("except", ()))
+    ]
+    found: dict[str, list[str]] = {name: [text] for name, text in own.items()} if chosen else {}
+    for group in chosen:
+        whole = _sections(read(f"{group['like']}.md")) if "like" in group else {}
+        left_out = ("End", *group.get("without", ()))
+        sections = {name: text for name, text in whole.items() if name not in left_out}
+        for name, text in (*sections.items(), ("", group.get("about", "")), *group.items()):
+            if isinstance(text, str) and text and name in ("", *_HEADINGS):
+                found.setdefault(name, []).append(_placed(text, group.get("within", "")))
+    return {name: _joined(texts, name) for name, texts in found.items()}
+
+
+def _fits(entry: Entry, patterns: Iterable[str]) -> bool:
+    return any(fnmatch.fnmatchcase(str(entry.gymnasium_id), pattern) for pattern in patterns)
+
+
+def _placed(text: str, part: str) -> str:
+    text = re.sub(r"^# .+\n|^`\w+`(, shape [^.]*|, \d+ choices)?\. ?", "", text.strip()).strip()
+    return re.sub(r"^\| (\d[^|]*?) \|", rf"| {part}[\1] |", text, flags=re.MULTILINE) if part else text
+
+
+def _joined(texts: list[str], section: str) -> str:
+    """The texts as one, those of observation and action with one table."""
+    if section not in ("Observation", "Action"):
+        return "\n\n".join(each.strip() for each in texts)
+    before, rows, after = [], [], []
+    for text in texts:
+        head, bar, rest = f"\n{text.strip()}".partition("\n|")
+        before.append(head.strip())
+        lines = f"|{rest}".splitlines() if bar else []
+        rows += [
+            each for each in lines if each.startswith("|") and each not in (_COMPONENTS, *_HEADS.values())
+        ]
+        after.append("\n".join(each for each in lines if not each.startswith("|")).strip())
+    rows = [each for each in rows if not each.startswith("|---")]
+    table = ""
+    if rows:
+        width = rows[0].count("|") - 1
+        head = _COMPONENTS if section == "Observation" else _HEADS[width]
+        table = "\n".join((head, "|---" * width + "|", *rows))
+    prose = [*before, *after] if not rows else [*before, table, *after]
+    return "\n\n".join(each for each in prose if each)
 
 
 def _family_text(family: str) -> str:
@@ -160,73 +211,10 @@ def _maze(env: gymnasium.Env[Any, Any]) -> str:
     return "\n\n" + legend + "\n\n```\n" + "\n".join(drawn) + "\n```"
 
 
-def _sections(documentation: str) -> dict[str, str]:
-    """A documentation's text by our section names, the description under "". Other sections, such as arguments and
-    versions, are left out."""
-    found: dict[str, list[str]] = {}
-    ours: str | None = ""
-    level = 9
-    fenced = False
-    for line in documentation.splitlines():
-        fenced ^= line.lstrip().startswith("```")
-        heading = None if fenced else _HEADING.match(line)
-        if heading is None:
-            if ours is not None:
-                found.setdefault(ours, []).append(line)
-        elif ours is not None or len(heading[1]) <= level:
-            ours, level = _place(heading[2]), len(heading[1])
-    return {name: "\n".join(lines).strip() for name, lines in found.items()}
-
-
-def _place(heading: str) -> str | None:
-    low = heading.lower()
-    return next((ours for ours, names in _PLACES.items() if any(name in low for name in names)), None)
-
-
-def in_words(documentation: str) -> str:
-    """A documentation without code blocks and link targets. Leaves out sentences and table rows with formulas or
-    constants. At most `MAX_SECTION` characters."""
-    text = re.sub(r"^\s*```.*?^\s*```", "", documentation, flags=re.MULTILINE | re.DOTALL)
-    text = re.sub(r" ?\([^()$]*default[^()]*\)", "", text)
-    text = re.sub(r"\$\$?[^$]+\$\$?", "∫", text)
-    text = re.sub(r"!?\[([^\]\n]+)\]\([^)]*\)", r"\1", text)
-    text = re.sub(r"</?[a-z][^>\n]*>", "", text)
-    text = re.sub(r",? by default,?", "", text)
-    blocks = [_block_in_words(block) for block in re.split(r"\n\s*\n", text)]
-    found = "\n\n".join(block for block in blocks if block)
-    if len(found) > _WIDE:
-        found = re.sub(r"-{4,}", "---", re.sub(r" {2,}", " ", found))
-    if len(found) > MAX_SECTION:
-        found = found[:MAX_SECTION].rpartition("\n")[0]
-    return found
-
-
-def _block_in_words(block: str) -> str:
-    lines = block.strip("\n").splitlines()
-    if any(line.lstrip().startswith("|") for line in lines):
-        rows = [line.strip() for line in lines if line.lstrip().startswith("|")]
-        widths = {row.count("|") for row in rows}
-        rows = [_OF_AN_ANGLE.sub(_in_a_word, row) for row in rows]
-        return "\n".join(row for row in rows if not _is_formula(row)) if len(widths) == 1 else ""
-    items = re.split(r"\n(?=\s*(?:[-*]|\d+\.) )", "\n".join(lines))
-    kept = []
-    for item in items:
-        sentences = re.split(r"(?<=[.!?:;])\s+(?=[A-Z*`_\"(])", " ".join(item.split()))
-        kept.append(" ".join(each for each in sentences if not _is_formula(each)))
-    return "\n".join(
-        item for item in kept if re.search(r"[A-Za-z]{2}", item) and not re.fullmatch(r"[-*] \*.+\*:", item)
-    )
-
-
-def _in_a_word(found: re.Match[str]) -> str:
-    return f"{'cosine' if found[1] == 'cos' else 'sine'} of {found[2]}"
-
-
-def _is_formula(text: str) -> bool:
-    code = re.findall(r"`([^`\n]+)`", text)
-    return (
-        bool(_SIGNS.search(text)) or any(_IN_CODE.search(span) for span in code) or text.count("`") % 2 == 1
-    )
+def _sections(text: str) -> dict[str, str]:
+    """A text's sections by heading, those above the first heading under ""."""
+    found = re.split(r"^## (.+)\n", f"\n{text}", flags=re.MULTILINE)
+    return {name: part.strip() for name, part in zip(("", *found[1::2]), found[::2], strict=True)}
 
 
 def clean(given: str) -> str:
@@ -252,12 +240,16 @@ def _space(space: SpaceSchema) -> str:
 
 
 def _rows(space: SpaceSchema, name: str) -> list[tuple[str, str]]:
+    return [(path or "all", words(leaf)) for path, leaf in _leaves(space, name)]
+
+
+def _leaves(space: SpaceSchema, name: str) -> list[tuple[str, SpaceSchema]]:
     if space["type"] == "Dict":
         named = [(f"{name}.{key}" if name else str(key), part) for key, part in space["spaces"].items()]
-        return [row for key, part in named for row in _rows(part, key)]
+        return [leaf for key, part in named for leaf in _leaves(part, key)]
     if space["type"] == "Tuple":
-        return [row for k, part in enumerate(space["spaces"]) for row in _rows(part, f"{name}[{k}]")]
-    return [(name or "all", words(space))]
+        return [leaf for k, part in enumerate(space["spaces"]) for leaf in _leaves(part, f"{name}[{k}]")]
+    return [(name, space)]
 
 
 def words(space: SpaceSchema) -> str:
