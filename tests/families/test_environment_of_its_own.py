@@ -140,7 +140,8 @@ def test_check_env_finds_nothing_in_a_few_of_its_environments(made: Made) -> Non
 def test_every_text_is_whole_and_has_nothing_of_a_library(made: Made) -> None:
     checks = ROOT / "tests" / "conformance" / "environments" / "text_checks.py"
     program = [made.python, str(checks), *suites()[FAMILY].environments]
-    done = subprocess.run(program, capture_output=True, text=True, check=False)
+    helpers = dict(os.environ, PYTHONPATH=str(ROOT / "tests" / "support"))
+    done = subprocess.run(program, capture_output=True, text=True, check=False, env=helpers)
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout.splitlines()[-1]) == {}
 

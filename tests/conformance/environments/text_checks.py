@@ -10,7 +10,7 @@ import re
 import sys
 from typing import Any
 
-from environment_checks import components, leaves, selected, table
+from task_tables import components, leaves, selected, table
 
 from evopolicy_common.catalogue import entry, suites
 from evopolicy_common.messages.environment import SpaceSchema
