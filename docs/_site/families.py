@@ -52,6 +52,10 @@ def table() -> str:
         f"about {newest['profiles']} environment profiles in {newest['ecosystems']} ecosystems, each with its own lock file. *Deterministic*: ids whose episodes depend",
         "only on seed and actions. *Played*: ids that `check-env` has played. *ms a step*: median of a bare step over the played ids,",
         f"on a busy machine. {WEB_PAGES}",
+        "",
+        "The newest version of the original also has, and we do not offer:",
+        "",
+        *(f"- {name}: {why}" for name, why in newest["left_out"].items()),
     ]
     return "\n".join(lines)
 

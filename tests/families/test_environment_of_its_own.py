@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from commands import command, record_in, run_dir
 from coordinator_harness import Coordinator
+from test_parity import differences, named
 
 from evopolicy_common.catalogue import installs, suites
 from evopolicy_common.catalogue.installs import Made
@@ -144,6 +145,13 @@ def test_every_text_is_whole_and_has_nothing_of_a_library(made: Made) -> None:
     done = subprocess.run(program, capture_output=True, text=True, check=False, env=helpers)
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout.splitlines()[-1]) == {}
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_a_sample_is_played_as_its_library_plays_it(made: Made, tmp_path: Path) -> None:
+    found = differences(made.python, FAMILY, tmp_path)
+    assert found == dict.fromkeys(named(FAMILY), "")
 
 
 @pytest.mark.slow
