@@ -14,7 +14,6 @@ import pytest
 from task_tables import selected, table
 
 from evopolicy_common.messages.environment import Case, SpaceSchema
-from evopolicy_coordinator.analysis.statistics.intervals import over_cases
 from evopolicy_worker.environments import Environment, make
 
 FOLDER = Path(__file__).parent / "cited"
@@ -91,11 +90,10 @@ def test_a_policy_from_the_text_alone_beats_random_on_cases_drawn_by_its_name(en
         np.array([play(environment, seed, each) for seed in seeds]) for each in (policy(env_id), None)
     )
     environment.close()
-    better = over_cases(ours - random, (ours, random))
-    told = f"{env_id}: {ours.mean():.4g} beside {random.mean():.4g}, better by {better.low} to {better.high}"
+    told = f"{env_id}: {ours.mean():.4g} beside {random.mean():.4g}, better on {(ours > random).sum()} of {N_CASES}"
     print(told)
-    assert better.low is not None
-    assert better.low > 0, told
+    # Returns of random actions can have long tails: signs count. A policy no better than random gets there once in 478 times.
+    assert (ours > random).sum() >= 14, told
 
 
 def test_there_are_ten_of_them() -> None:

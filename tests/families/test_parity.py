@@ -13,7 +13,8 @@ import parity_loops
 import pytest
 
 from evopolicy_common import catalogue
-from evopolicy_worker.environments import missing, settings
+from evopolicy_worker.environments import missing
+from evopolicy_worker.environments.interface import settings
 
 PROGRAM = Path(__file__).with_name("parity_loops.py")
 SUITES = sorted(parity_loops.TABLE["family"])

@@ -9,6 +9,7 @@ import numpy as np
 
 from evopolicy_common.catalogue import Entry
 from evopolicy_worker.environments.families.mujoco import MujocoFamily
+from evopolicy_worker.environments.interface import rewards
 from evopolicy_worker.environments.tasks import highway, template
 
 if TYPE_CHECKING:
