@@ -9,7 +9,7 @@ import msgspec
 import typer
 
 from evopolicy_common.errors import ConfigError
-from evopolicy_common.messages.environment import ObservationForm, PolicyScope, StepLimit
+from evopolicy_common.messages.environment import FailedEpisodes, ObservationForm, PolicyScope, StepLimit
 from evopolicy_common.messages.gateway import FeedbackDetail, FinishRule, SimulationRule, VideoOption
 from evopolicy_common.messages.run_settings import RunSettings
 from evopolicy_gateway import harnesses
@@ -123,6 +123,15 @@ class RunOptions(msgspec.Struct, frozen=True, kw_only=True):
         StepLimit | None,
         typer.Option(
             help="published: the step limits of the published software (default); natural: those of the environment.",
+            rich_help_panel=POLICY,
+            show_default=False,
+        ),
+    ] = None
+    failed_episodes: Annotated[
+        FailedEpisodes | None,
+        typer.Option(
+            help="An episode in which the policy fails: play-on with random actions (default), or end-submit, as published: it ends,"
+            " and the submit is not eligible.",
             rich_help_panel=POLICY,
             show_default=False,
         ),

@@ -96,16 +96,29 @@ def _scope(run: RunOpened) -> str:
     else:
         text = (
             "Policy scope `submit`: one `Policy` plays all episodes of a submit one after another, in the order asked for,\n"
-            "in one process. Hidden cases are played with a new `Policy` every `n_episodes_this_submit` cases."
+            "in one process. "
         )
+        if run.hidden_evaluation == "submit":
+            text += "Hidden cases are played with a new `Policy` every `n_episodes_this_submit` cases."
+        else:
+            text += "One new `Policy` plays all validation cases, another one all held-out cases."
     return f"## Policy scope\n\n{text}"
 
 
-def _failures(run: RunOpened) -> str:
-    return """## A policy that fails
+_FAILS = {
+    "play-on": """uniform random actions play the rest of that
+episode; the episode's `error.txt` tells step, category and message, and later rows carry `info.policy_failed = true`.""",
+    "end-submit": """the episode ends: after
+one random action, whose row carries `info.policy_failed = true`, or at once if `act` was not called yet. The episode's
+`error.txt` tells step, category and message. The submit's other episodes are played, its status is `rollout_timeout`, it
+has no mean return, and it cannot be selected. The same holds for a submit whose policy fails on a hidden case.""",
+}
 
-If `reset` or `act` raises, a limit is exceeded, or the process dies, uniform random actions play the rest of that
-episode; the episode's `error.txt` tells step, category and message, and later rows carry `info.policy_failed = true`.
+
+def _failures(run: RunOpened) -> str:
+    return f"""## A policy that fails
+
+If `reset` or `act` raises, a limit is exceeded, or the process dies, {_FAILS[run.failed_episodes]}
 If the code yields no `Policy` at all (missing file, import error, `__init__` raises), the submit's status says so and its
 episodes are charged."""
 

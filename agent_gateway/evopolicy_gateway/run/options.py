@@ -27,6 +27,8 @@ OWN = {
     "step_limit": "published",
     "hidden_cases": "shared",
     "feedback": "pictures",
+    "failed_episodes": "play-on",
+    "hidden_evaluation": "submit",
 }
 """Defaults of settings that neither an option nor a profile gives."""
 
@@ -49,7 +51,15 @@ def settings_of(profile: str | None, **given: str | None) -> dict[str, str]:
 def run_settings(given: Any, limits: ResourceLimits, **named: Any) -> RunSettings:
     """The settings of one run. `given`: the options of `run`, or a table of a suite, which have the same names; None
     for options that were not given. Raises ConfigError that names the invalid option."""
-    names = ("policy_scope", "observations", "simulation", "finish", "step_limit", "feedback")
+    names = (
+        "policy_scope",
+        "observations",
+        "simulation",
+        "finish",
+        "step_limit",
+        "feedback",
+        "failed_episodes",
+    )
     chosen: dict[str, Any] = settings_of(
         given.profile,
         hidden_cases=hidden_cases_of(given.hidden_cases),

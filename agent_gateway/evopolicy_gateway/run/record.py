@@ -194,6 +194,8 @@ def run_record(
             feedback=settings.feedback,
             agents_md=sha256_text(settings.agents_md) if settings.agents_md else "",
             step_limit=settings.step_limit,
+            failed_episodes=settings.failed_episodes,
+            hidden_evaluation=settings.hidden_evaluation,
             profile=settings.profile,
             hidden_cases=settings.hidden_cases,
         ),

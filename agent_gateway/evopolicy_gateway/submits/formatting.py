@@ -116,12 +116,14 @@ def _summary(
     messages: bool,
 ) -> Summary:
     ok = done.status == "ok"
+    # A submit of `end-submit` in which the policy failed is played to its end too.
+    played = ok or (done.status == "rollout_timeout" and done.n_kept == done.n_episodes)
     ordered = sorted(scores, key=lambda score: score.index)
-    if ok and [score.index for score in ordered] != list(range(done.n_episodes)):
+    if played and [score.index for score in ordered] != list(range(done.n_episodes)):
         raise ValueError(f"submit {submit_index} has {len(ordered)} of {done.n_episodes} episodes")
     returns = tuple(score.episode_return for score in ordered)
     components = tuple(score.reward_components for score in ordered)
-    with_components = ok and any(components)
+    with_components = played and any(components)
     lengths = tuple(score.length for score in ordered)
     solved = tuple(score.success for score in ordered)
     return Summary(
@@ -130,31 +132,36 @@ def _summary(
         env=env,
         status=done.status,
         n_episodes=done.n_episodes,
-        first_global_episode=done.first_global_episode if ok else None,
+        first_global_episode=done.first_global_episode if played else None,
         env_instances=done.env_instances,
         remaining_budget=done.remaining_budget,
         submit_started_at=utc_text(done.started_at),
         submit_completed_at=utc_text(done.completed_at),
         wall_time_seconds=round(max(0.0, done.completed_at - done.started_at), 6),
-        returns=returns if ok else None,
+        returns=returns if played else None,
         mean_return=mean(returns) if ok else None,
         std_return=std(returns) if ok else None,
-        min_return=min(returns) if ok else None,
-        max_return=max(returns) if ok else None,
-        episode_lengths=lengths if ok else None,
-        mean_episode_length=mean(lengths) if ok else None,
-        timeouts=_where(ordered, TIME_LIMITS) if ok else None,
-        errors=_where(ordered, None) if ok else None,
+        min_return=min(returns) if played else None,
+        max_return=max(returns) if played else None,
+        episode_lengths=lengths if played else None,
+        mean_episode_length=mean(lengths) if played else None,
+        timeouts=_where(ordered, TIME_LIMITS) if played else None,
+        errors=_where(ordered, None) if played else None,
         reward_components_mean=_component_means(components) if with_components else None,
         reward_components_per_episode=components if with_components else None,
-        successes=solved if ok and None not in solved and solved else None,
-        policy_failures=len(_where(ordered, None)) if ok else None,
-        warning=_warning(ordered, observations, messages=messages) if ok else None,
+        successes=solved if played and None not in solved and solved else None,
+        policy_failures=len(_where(ordered, None)) if played else None,
+        warning=_warning(ordered, observations, ends=played and not ok, messages=messages)
+        if played
+        else None,
     )
 
 
-def _warning(scores: Sequence[EpisodeScore], observations: ObservationForm, *, messages: bool) -> str | None:
-    """The warning to the agent about policy failures in an ok submit; None when no episode failed."""
+def _warning(
+    scores: Sequence[EpisodeScore], observations: ObservationForm, *, ends: bool, messages: bool
+) -> str | None:
+    """The warning to the agent about policy failures in a played submit; None when no episode failed. `ends`: whether
+    such an episode ended."""
     failures = [score.failure for score in scores if score.failure is not None]
     if not failures:
         return None
@@ -163,7 +170,9 @@ def _warning(scores: Sequence[EpisodeScore], observations: ObservationForm, *, m
     which = f"ALL {n} episodes" if len(failures) == n else f"{len(failures)} of {n} episodes"
     message = f": {first.message[:_MAX_WARNED]}" if messages else ""
     text = f"the policy failed in {which} (first {where}, {first.category}{message})."
-    if len(failures) == n:
+    if ends:
+        text += " These episodes ended there, `errors` lists them, and the submit has no mean return."
+    elif len(failures) == n:
         text += " Random actions played the rest, so these returns say nothing about your policy."
     else:
         text += " Random actions played the rest of these episodes, which `errors` lists."

@@ -17,7 +17,7 @@ from msgspec import Meta
 
 from evopolicy_common import catalogue
 from evopolicy_common.errors import ConfigError
-from evopolicy_common.messages.environment import ObservationForm, PolicyScope, StepLimit
+from evopolicy_common.messages.environment import FailedEpisodes, ObservationForm, PolicyScope, StepLimit
 from evopolicy_common.messages.episode import Tier
 from evopolicy_common.messages.gateway import (
     FeedbackDetail,
@@ -55,6 +55,7 @@ class RunTable(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     finish: FinishRule | None = None
     step_limit: StepLimit | None = None
     feedback: FeedbackDetail | None = None
+    failed_episodes: FailedEpisodes | None = None
     agents_md: str | None = None
     """File with the text in place of `AGENTS.md`."""
     prompts: str | None = None

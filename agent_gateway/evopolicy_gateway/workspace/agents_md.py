@@ -53,6 +53,10 @@ def urls_below(base: str, token: str, *, bearer: bool = False) -> Urls:
     return Urls(info=f"{root}/info", task=f"{root}/task", submit=f"{root}/submit", bearer=bearer)
 
 
+_FAILS = {
+    "play-on": "random actions play the rest of that episode.",
+    "end-submit": "that episode ends, and the submit has no mean return and cannot\nbe selected.",
+}
 _ASK = 'SUBMIT_URL + "/" + str(answer["submit_id"])'
 _WITHOUT_BEARER = {
     "auth": "",
@@ -153,7 +157,7 @@ print(answer["feedback"], answer["status"], answer["summary"]["mean_return"], an
 |---|---|
 | 200, status `ok` | played. `policy_failures` counts the episodes in which your policy failed, and `warning` says how: look at both before the returns |
 | 200, `missing_policy`, `denied_import`, `import_error`, `init_error` | `system/` gives no `Policy`: charged, see `errors.txt` |
-| 200, `rollout_timeout` | it took too long: charged |
+| 200, `rollout_timeout` | it took too long$or_failed: charged |
 | 400, `budget_invalid`, `invalid_env_instance` | the request is wrong: nothing charged, the message says why |
 | 200 or 409, `cancelled` | the operator has ended the run: nothing charged, nothing more is taken |
 | 409, `run_closed` | the budget is spent: no more submits are taken |
@@ -172,7 +176,7 @@ class Policy:
 ```
 
 $scope Observations arrive as $observations.
-If it raises or exceeds a limit, random actions play the rest of that episode. An action that cannot be read counts as zeros (the
+If it raises or exceeds a limit, $fails An action that cannot be read counts as zeros (the
 lowest choice where there are choices).
 
 It runs in a sandbox. It may import Python's standard library, its own modules in `system/` and $imports, and nothing else; use up to
@@ -307,6 +311,8 @@ def agents_md(run: RunOpened, urls: Urls, text: str = "") -> str:
         "rule": _RULE[run.simulation],
         "finish": _FINISH[run.finish],
         "observations": _OBSERVATIONS[run.observations],
+        "fails": _FAILS[run.failed_episodes],
+        "or_failed": ", or the policy failed in an episode" if run.failed_episodes == "end-submit" else "",
         "imports": ", ".join(f"`{name}`" for name in run.allowed_imports) or "no package",
         "threads": str(run.limits.processes),
         "first_submit": submit_id(0, run.episode_budget),

@@ -20,6 +20,12 @@ PolicyScope = Literal["episode", "submit"]
 ObservationForm = Literal["arrays", "lists"]
 StepLimit = Literal["published", "natural"]
 """Whether an episode is cut where the published software cuts it, or ends by its environment's own limit."""
+FailedEpisodes = Literal["play-on", "end-submit"]
+"""An episode in which the policy failed. `play-on`: random actions play it to its end, and its return counts.
+`end-submit`: it ends with one random action, the submit has no mean return, and its checkpoint is not eligible."""
+HiddenEvaluation = Literal["submit", "pool"]
+"""`submit`: a policy on hidden cases gets the `env_meta` and the episode indices of its own submit. `pool`: it gets
+those of one list of all cases, with no budget left, and with policy scope `submit` one instance plays all of them."""
 ObsStorage = Literal["inline", "npy", "npz"]
 
 

@@ -7,7 +7,7 @@ from typing import Literal
 import msgspec
 
 from evopolicy_common.messages.bounds import Bytes, Int, Many, Named, Number, Plain, Text, Word
-from evopolicy_common.messages.environment import Case, ObservationForm, PolicyScope
+from evopolicy_common.messages.environment import Case, FailedEpisodes, ObservationForm, PolicyScope
 
 FailureCategory = Literal[
     # The bundle does not yield a Policy; decided by the episode at request index 0.
@@ -137,6 +137,7 @@ class Job(msgspec.Struct, frozen=True, kw_only=True):
     limits: ResourceLimits = ResourceLimits()
     max_steps: Int = 0
     """An episode is cut after this many steps; 0: only its environment ends it."""
+    failed_episodes: FailedEpisodes = "play-on"
     begun: BlobRef | None = None
     """The policy's actions of an earlier attempt, which remain valid (`JobResult.begun`); None for a first attempt."""
     environment_faults: Int = 0

@@ -13,6 +13,8 @@ import msgspec
 from evopolicy_common.messages.bounds import Bytes, Int, Many, Named, Number, Plain, Text, Word
 from evopolicy_common.messages.environment import (
     EnvironmentDescription,
+    FailedEpisodes,
+    HiddenEvaluation,
     ObservationForm,
     PolicyScope,
 )
@@ -42,8 +44,9 @@ FinishRule = Literal["early", "budget"]
 FeedbackDetail = Literal["scores", "trajectories", "pictures"]
 """Feedback level: `scores` is the summary alone, `trajectories` adds text, and `pictures` adds observations that are
 stored outside the rows, and recorded videos."""
-Profile = Literal["own", "published"]
-"""`published`: all choices of the published protocol together (`operator.off_profile`)."""
+Profile = Literal["own", "published", "published-data"]
+"""All choices of the published protocol together (`run_settings.off_profile`): `published` with the number of hidden
+cases in the paper, `published-data` with that of the published case files."""
 
 
 class OpenRun(Message, frozen=True, kw_only=True, tag="open_run"):
@@ -133,6 +136,9 @@ class RunOpened(Message, frozen=True, kw_only=True, tag="run_opened"):
     simulation: SimulationRule = "forbidden"
     finish: FinishRule = "early"
     feedback: FeedbackDetail = "pictures"
+    failed_episodes: FailedEpisodes = "play-on"
+    hidden_evaluation: HiddenEvaluation = "submit"
+    profile: Profile = "own"
     max_steps: Int = 0
     """Steps after which an episode is cut, reported to agents as the limit; 0: the environment's own limit."""
 

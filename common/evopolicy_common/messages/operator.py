@@ -11,6 +11,7 @@ from evopolicy_common.messages.bounds import Bytes, Int, Many, Named, Number, Nu
 from evopolicy_common.messages.environment import (
     Case,
     EnvironmentDescription,
+    FailedEpisodes,
     ObservationForm,
     PolicyScope,
     Split,
@@ -70,7 +71,7 @@ class RunFinished(msgspec.Struct, frozen=True, kw_only=True):
     val_scores: Numbered[Number]
     heldout_returns: Many[Number]
     validation_ineligible: Numbered[Text]
-    """Checkpoints quarantined during hidden episodes, with the reason."""
+    """`ok` checkpoints that cannot be selected, with the reason."""
     policy_failures: Named[Int]
     """Hidden episodes in which the selected policy failed, by split."""
     random_heldout_returns: Many[Number]
@@ -166,6 +167,7 @@ class PlayedAs(msgspec.Struct, frozen=True, kw_only=True):
     policy_scope: PolicyScope = "episode"
     """With `submit`, `indexes` must cover the whole list."""
     observations: ObservationForm = "arrays"
+    failed_episodes: FailedEpisodes = "play-on"
 
 
 class Evaluate(Message, frozen=True, kw_only=True, tag="evaluate"):

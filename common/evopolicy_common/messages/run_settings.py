@@ -9,7 +9,13 @@ import msgspec
 from evopolicy_common.catalogue import Suite
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.bounds import Int, Named, Text, Word
-from evopolicy_common.messages.environment import ObservationForm, PolicyScope, StepLimit
+from evopolicy_common.messages.environment import (
+    FailedEpisodes,
+    HiddenEvaluation,
+    ObservationForm,
+    PolicyScope,
+    StepLimit,
+)
 from evopolicy_common.messages.episode import ResourceLimits, Tier
 from evopolicy_common.messages.gateway import FeedbackDetail, FinishRule, Profile, SimulationRule, VideoOption
 
@@ -58,6 +64,8 @@ class RunSettings(msgspec.Struct, frozen=True, kw_only=True):
     finish: FinishRule = "early"
     step_limit: StepLimit = "natural"
     """Missing in rows and messages of earlier versions."""
+    failed_episodes: FailedEpisodes = "play-on"
+    hidden_evaluation: HiddenEvaluation = "submit"
     profile: Profile = "own"
     feedback: FeedbackDetail = "pictures"
     agents_md: Word = ""
@@ -85,8 +93,10 @@ PUBLISHED: dict[str, str] = {
     "step_limit": "published",
     "hidden_cases": "shared",
     "feedback": "pictures",
+    "failed_episodes": "end-submit",
+    "hidden_evaluation": "pool",
 }
-"""The settings of the profile `published`, by their names in `RunSettings`. Its cases are the published files."""
+"""The settings of the published profiles, by their names in `RunSettings`. Its cases are the published files."""
 PUBLISHED_TRAIN = 1024
 """Number of train ids in the published case files."""
 

@@ -18,7 +18,14 @@ import msgspec
 from evopolicy_common.errors import DECODE_ERRORS, ProtocolError
 from evopolicy_common.messages.audit import AuditRecord
 from evopolicy_common.messages.bounds import check_plausible
-from evopolicy_common.messages.environment import ObservationForm, PolicyScope, Split, StepLimit
+from evopolicy_common.messages.environment import (
+    FailedEpisodes,
+    HiddenEvaluation,
+    ObservationForm,
+    PolicyScope,
+    Split,
+    StepLimit,
+)
 from evopolicy_common.messages.episode import FailureCategory, ResourceLimits, Tier
 from evopolicy_common.messages.gateway import FeedbackDetail, FinishRule, Profile, SimulationRule, VideoOption
 from evopolicy_common.messages.journal import Committed
@@ -113,6 +120,11 @@ class ExperimentDimensions(msgspec.Struct, frozen=True, kw_only=True):
     step_limit: StepLimit = "natural"
     """Step limit: that of the published software, or only the environment's own limit, as in all runs from before
     this field existed."""
+    failed_episodes: FailedEpisodes = "play-on"
+    """Whether random actions play an episode on in which the policy failed (`play-on`), or it ends, and the submit has no
+    mean return and its checkpoint is not eligible (`end-submit`)."""
+    hidden_evaluation: HiddenEvaluation = "submit"
+    """Arguments of a policy on hidden cases: those of its own submit, or those of one list of all cases (`pool`)."""
     profile: Profile = "own"
     """`published`: all choices of the published protocol together, including its public case files."""
     feedback: FeedbackDetail = "pictures"
@@ -192,7 +204,8 @@ class Outcome(msgspec.Struct, frozen=True, kw_only=True):
     """Whether each of these episodes solved the task, as the environment reports it; empty where it reports nothing."""
     policy_failures: tuple[PolicyFailureRecord, ...] = ()
     quarantined_submits: tuple[int, ...] = ()
-    """`ok` checkpoints that made their slot fail in hidden evaluation: not eligible."""
+    """`ok` checkpoints that are not eligible: their policy failed in validation with `failed_episodes` = "end-submit", or,
+    in runs of earlier versions, made its slot fail there."""
     random_reference: ReferenceScore | None = None
     closed_reason: str = ""
     """Why submits ended: `budget_spent`, `agent_stopped`, `agent_failed`, `silent`, `wall_limit`, `cancelled`."""

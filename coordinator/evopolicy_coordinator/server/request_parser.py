@@ -444,6 +444,7 @@ class RequestParser:
             remaining_budget_after=0 if submit is None else submit.remaining_budget,
             policy_scope="episode" if is_random else settings.policy_scope,
             observations="arrays" if is_random else settings.observations,
+            failed_episodes=settings.failed_episodes,
         )
         if place.policy_scope == "submit" and m.indexes != tuple(range(n)):
             raise RefusedError(Refusal.BAD_REQUEST, "with policy scope submit all cases are played at once")

@@ -39,6 +39,7 @@ _RUN: dict[Cover, str] = {
         experiment_dimensions.video experiment_dimensions.simulation {_all("experiment_dimensions.limits", ResourceLimits)}
         experiment_dimensions.finish experiment_dimensions.step_limit experiment_dimensions.profile
         experiment_dimensions.feedback experiment_dimensions.agents_md experiment_dimensions.hidden_cases
+        experiment_dimensions.failed_episodes experiment_dimensions.hidden_evaluation
         timing.start_time timing.end_time timing.wall_time_seconds
         outcome.status outcome.final_score outcome.best_submit_index outcome.val_scores.* outcome.heldout_mean_return
         outcome.heldout_std_return outcome.heldout_returns.* outcome.heldout_successes.* outcome.quarantined_submits.*

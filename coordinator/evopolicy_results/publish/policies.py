@@ -163,6 +163,7 @@ async def _play(evaluations: Evaluations, files: Files, part: Chosen, bundle: Bu
             remaining_budget_after=run.opening.budget - used,
             policy_scope=settings.policy_scope,
             observations=settings.observations,
+            failed_episodes=settings.failed_episodes,
         ),
     )
     seen: set[int] = set()

@@ -11,7 +11,7 @@ import msgspec
 from evopolicy_common import catalogue
 from evopolicy_common.errors import BundleError, ProtocolError
 from evopolicy_common.records import journal
-from evopolicy_common.records.aggregates import mean
+from evopolicy_common.records.aggregates import best_validated, mean
 from evopolicy_common.records.code_metrics import TREND, code_metrics
 from evopolicy_common.records.episodes.compare import same
 from evopolicy_common.records.episodes.trajectory import Trajectory, decode
@@ -195,6 +195,8 @@ def _record(run: PublishedRun, history: History) -> Iterator[Fault]:
         "step_limit",
         "profile",
         "feedback",
+        "failed_episodes",
+        "hidden_evaluation",
     ):
         pairs.append((name, getattr(dimensions, name), getattr(settings, name)))
     pairs.append(("hidden_cases", dimensions.hidden_cases, settings.hidden_cases))
@@ -267,15 +269,14 @@ def _budget(run: PublishedRun) -> Iterator[Fault]:
 
 def _selection(run: PublishedRun) -> Iterator[Fault]:
     result = run.result
-    eligible = [
-        submit
+    eligible = {
+        submit.submit_index: submit.val_mean
         for submit in result.submits
         if submit.status == "ok"
         and submit.val_mean is not None
         and submit.submit_index not in result.validation_ineligible
-    ]
-    best = max(eligible, key=lambda submit: (submit.val_mean, submit.submit_index), default=None)
-    wanted = None if best is None or result.status != "completed" else best.submit_index
+    }
+    wanted = best_validated(eligible, run.opening.settings.profile)
     if result.status == "completed" and result.best_submit_index != wanted:
         yield Fault(
             "selection",

@@ -3,7 +3,7 @@ confinement, and whether hidden episodes and agents shared a kernel. Results tha
 with others.
 
 These must agree over all runs of a suite: budget, scope, observation form, simulation rule, finish rule, detail of
-the feedback, text of `AGENTS.md`, profile, jail, hidden isolation and hidden cases. The prompts must agree over the runs
+the feedback, text of `AGENTS.md`, failed episodes, hidden evaluation, profile, jail, hidden isolation and hidden cases. The prompts must agree over the runs
 of one entry. These must agree over the runs of one environment, since environments differ
 in them anyway: splits (by hash), library fingerprint, environment version, bounds of a submit, a policy's limits,
 step limit, and videos in feedback. Runs with hidden cases of their own differ in these splits by design.
@@ -84,6 +84,8 @@ _BY_SUITE: dict[str, Callable[[Run], str]] = {
     "finish rule": lambda run: run.record.experiment_dimensions.finish,
     "feedback detail": lambda run: run.record.experiment_dimensions.feedback,
     "text of AGENTS.md": lambda run: _text(run.record.experiment_dimensions.agents_md),
+    "failed episodes": lambda run: run.record.experiment_dimensions.failed_episodes,
+    "hidden evaluation": lambda run: run.record.experiment_dimensions.hidden_evaluation,
     "profile": lambda run: run.record.experiment_dimensions.profile,
     "jail": lambda run: run.record.jail,
     "hidden cases": lambda run: run.record.experiment_dimensions.hidden_cases,
@@ -115,6 +117,8 @@ REMEDIES = {
     "text of AGENTS.md": "the same --agents-md",
     "prompts": "the same --prompts, or another --entry for each",
     "skills and MCP servers": "the same `skills` and `[mcp]` in the agent's file, or another --entry for each",
+    "failed episodes": "the same --failed-episodes",
+    "hidden evaluation": "the same --profile",
     "profile": "the same --profile",
     "jail": "the same --jail",
     "hidden cases": "the same --hidden-cases",

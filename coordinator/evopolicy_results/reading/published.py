@@ -110,6 +110,8 @@ def read_record(folder: Path, record: dict[str, Any]) -> RunRecord:
                 simulation="forbidden",
                 finish="budget",
                 step_limit="published",
+                failed_episodes="end-submit",
+                hidden_evaluation="pool",
                 profile="published",
             ),
             timing=msgspec.convert(timing, Timing),

@@ -14,7 +14,7 @@ from typing import Any
 
 from evopolicy_common.errors import BundleError, ProtocolError
 from evopolicy_common.messages.gateway import CANCELLED
-from evopolicy_common.records.aggregates import mean, std
+from evopolicy_common.records.aggregates import best_validated, mean, std
 from evopolicy_common.records.journal import Result, SubmitResult
 from evopolicy_common.records.policies.checkpoints import bundle_of
 from evopolicy_common.records.rescores import FOLDER, RescoreRecord, read_rescore, rescore_names
@@ -118,8 +118,8 @@ def _outcome(run: RunUnderTest, spent: int) -> Told:
     quarantined = set(map(str, outcome.quarantined_submits))
     played = {str(submit.index) for submit in run.submits if submit.status == "ok"}
     yield "submits of val_scores", sorted(scores), sorted((played - quarantined) | (played & scores.keys()))
-    eligible = [(mean_, int(name)) for name, mean_ in scores.items() if name in played - quarantined]
-    yield "best_submit_index", outcome.best_submit_index, max(eligible)[1] if eligible else None
+    eligible = {int(name): mean_ for name, mean_ in scores.items() if name in played - quarantined}
+    yield "best_submit_index", outcome.best_submit_index, best_validated(eligible, dimensions.profile)
 
 
 def _summary(run: RunUnderTest, submit: SubmitFiles, spent: int) -> Told:

@@ -268,7 +268,7 @@ class Verifier:
         except (OSError, ValueError) as error:
             self.report.differs(played.name(index), f"trajectory.jsonl cannot be read: {error}")
             return None
-        if not rows:
+        if not rows and (played.lengths is None or played.lengths[index]):
             self.report.differs(played.name(index), "trajectory.jsonl has no step")
             return None
         return rows
@@ -317,7 +317,7 @@ class Verifier:
     async def _policy_difference(
         self, played: EpisodeList, recording: _Recording, outcome: EpisodeOutcome
     ) -> str | None:
-        if outcome.failure is not None and outcome.length == 0:
+        if outcome.failure is not None and outcome.trajectory is None:
             return f"{outcome.failure.category}: {outcome.failure.message}"
         again = await self._evaluations.recording(outcome)
         if recording.stored is not None:
@@ -370,6 +370,7 @@ class Verifier:
                 policy_scope=dimensions.policy_scope,
                 # Random actions had no policy that could receive lists, and are recorded as arrays.
                 observations="arrays" if played.submit_index == RANDOM else dimensions.observations,
+                failed_episodes=dimensions.failed_episodes,
             ),
         )
 

@@ -4,6 +4,8 @@ Rules:
 - The policy receives observations, and `Policy.__init__` the spaces and `env_meta`; never a seed, a reward, or an info.
 - After a policy fails, uniform random actions keyed by the policy seed replace its own to the end of the episode, and
   every row with such an action has `policy_failed`. An action outside the space is repaired, and its row marked.
+- With `failed_episodes` = "end-submit", the episode ends after one such action, or has no step if the policy failed
+  before its first `act`.
 - When a recording is replayed, its actions replace the policy's, up to its last step. The episode then stops, even if
   the environment did not end it.
 - Between a policy's calls the same work is done in every split, since a policy can measure the time: each step goes to
@@ -361,8 +363,14 @@ class _Episode:
         last = (self._job.max_steps or sys.maxsize) - 1
         rng = None if policy is not None or recorded is not None else random_actions(self._spec.policy_seed)
         failed = False
+        ends = self._job.failed_episodes == "end-submit"
         names = environment.description.reward_components
         sums = dict.fromkeys(names, 0.0)
+        unplayed = (
+            ends and not self._begun.taken and self.failure is not None and self.failure.step_index is None
+        )
+        if unplayed or recorded == []:
+            return 0.0, sums, 0, False, False, None
         solves = environment.description.success or environment.solved_by
         ever = environment.description.success_at == "any"
         success: bool | None = None
@@ -414,7 +422,7 @@ class _Episode:
             total += reward
             t += 1
             progress.steps += 1
-            if terminated or truncated or (recorded is not None and t == len(recorded)):
+            if terminated or truncated or (recorded is not None and t == len(recorded)) or (ends and failed):
                 break
             if progress.cancelled:
                 raise CancelledJobError
@@ -438,15 +446,12 @@ def random_actions(policy_seed: bytes) -> np.random.Generator:
 
 
 def _recorded_actions(spec: EpisodeSpec) -> list[Any] | None:
-    """The actions that are played again, at least one; None where a policy acts."""
+    """The actions that are played again; None where a policy acts."""
     if spec.replay is None:
         return None
     if spec.replay.inline is None:
         raise WorkerError(f"episode {spec.index} came without the recording that it plays")
-    actions = [row.action for row in decode(spec.replay.inline).rows()]
-    if not actions:
-        raise WorkerError(f"episode {spec.index}: its recording has no step")
-    return actions
+    return [row.action for row in decode(spec.replay.inline).rows()]
 
 
 def _verdict_of_submit(job: Job, spec: EpisodeSpec, failure: PolicyFailure) -> bool:

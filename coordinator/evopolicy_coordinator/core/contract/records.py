@@ -125,7 +125,7 @@ class SubmitRow(msgspec.Struct, frozen=True, kw_only=True, tag="submit"):
     val_mean: float | None = None
     """Hidden validation mean; None until every validation case is done."""
     ineligible: str | None = None
-    """Why the checkpoint cannot be selected, as stored by an earlier version; None otherwise."""
+    """Why the checkpoint cannot be selected; None if it can."""
     held_s: float = 0.0
     """Seconds for which none of its episodes ran because hidden jobs occupied the machines."""
     refunded: bool = False

@@ -54,6 +54,7 @@ def build(job: JobState, description: EnvironmentDescription) -> Job:
         tier=template.tier,
         limits=template.limits,
         max_steps=template.max_steps,
+        failed_episodes=template.failed_episodes,
         begun=job.begun,
         environment_faults=job.faults.n,
     )

@@ -6,6 +6,8 @@ Rules that this module owns:
   env_meta, case, scope and policy seed, in a run that is pinned to one fingerprint class.
 - Selection waits until every ok checkpoint is validated or ineligible. The highest mean wins, a tie goes to the later
   submit.
+- With `failed_episodes` = "end-submit", a checkpoint whose policy fails in a validation episode is not eligible, and a
+  run whose selected policy fails in a held-out episode ends as an error.
 - A checkpoint that an earlier version found ineligible stays so; only the finished run's result reports it.
 - The selected checkpoint plays all held-out cases; uniform random actions play the same ones. Those actions follow from
   split and case (`seeds.reference_seed`), except in runs of earlier versions, where they follow from the run's secret.
@@ -48,6 +50,9 @@ from evopolicy_coordinator.core.tables.step import (
     SubmitEnded,
 )
 
+FAILED_VALIDATION = "its policy failed in a validation episode"
+"""`SubmitRow.ineligible` of a checkpoint with "end-submit"."""
+
 # ---- hidden groups ----
 
 
@@ -69,7 +74,9 @@ def progressed(state: State, news: EpisodesDone, step: Step) -> None:
         return
     run = state.runs[group.run]
     run.hidden_failures[group.id] = group.failed()
-    if group.kind == "validation":
+    if group.kind == "validation" and finished.fails(run, group.failed()):
+        step.change_submit(run, group.submit_index, ineligible=FAILED_VALIDATION)
+    elif group.kind == "validation":
         step.change_submit(run, group.submit_index, val_mean=group.mean_return())
     else:
         run.hidden_returns[group.id] = group.returns()

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Literal
 
 from evopolicy_common.messages import operator
-from evopolicy_common.records.aggregates import mean
+from evopolicy_common.records.aggregates import best_validated, mean
 from evopolicy_common.refusals import Refusal
 from evopolicy_coordinator.core.contract import events
 from evopolicy_coordinator.core.contract.reasons import Reason, because
@@ -35,18 +35,20 @@ def ok_submits(run: Run) -> list[SubmitRow]:
     return [row for row in run.submits if row.status == "ok"]
 
 
+def fails(run: Run, n_failed: int) -> bool:
+    """Whether hidden episodes with that many failures of the policy have no mean return."""
+    return n_failed > 0 and run.row.settings.failed_episodes == "end-submit"
+
+
 def select(run: Run) -> SubmitRow | None:
-    """The eligible checkpoint with the highest validation mean, the later one on a tie; None when none is eligible."""
-    best: SubmitRow | None = None
-    best_mean = 0.0
-    for row in ok_submits(run):
-        if (
-            row.ineligible is None
-            and row.val_mean is not None
-            and (best is None or row.val_mean >= best_mean)
-        ):
-            best, best_mean = row, row.val_mean
-    return best
+    """The eligible checkpoint with the best validation (`best_validated`); None when none is eligible."""
+    means = {
+        row.submit_index: row.val_mean
+        for row in ok_submits(run)
+        if row.ineligible is None and row.val_mean is not None
+    }
+    best = best_validated(means, run.row.settings.profile)
+    return None if best is None else run.submits[best]
 
 
 def result(
@@ -64,10 +66,16 @@ def result(
             f"the run ended ({stored.close_reason.replace('_', ' ')}) with {left} of its {row.budget} episodes left, and"
             " must spend them (finish = budget)"
         )
-    elif not ok:
+    elif not ok or (best is None and row.settings.failed_episodes == "end-submit"):
         status = "no_ok_submit"
     elif best is None:
         status, error = "error", "no ok checkpoint is eligible: each brought its slots down while hidden"
+    elif fails(run, failed := run.hidden_failures.get(heldout_group(run.id, best.submit_index), 0)):
+        status = "error"
+        error = (
+            f"the selected policy failed in {failed} of {len(row.heldout)} held-out episodes, so the run has no score"
+            " (failed_episodes = end-submit)"
+        )
     heldout: tuple[float, ...] = ()
     successes: tuple[bool, ...] = ()
     failures: dict[str, int] = {}
@@ -76,7 +84,7 @@ def result(
         index = best.submit_index
         heldout = run.hidden_returns[heldout_group(run.id, index)]
         successes = run.hidden_successes.get(heldout_group(run.id, index), ())
-        final_score = mean(heldout)
+        final_score = mean(heldout) if status == "completed" else None
         failures = {
             "validation": run.hidden_failures.get(validation_group(run.id, index), 0),
             "heldout": run.hidden_failures.get(heldout_group(run.id, index), 0),

@@ -135,9 +135,23 @@ def progressed(state: State, news: EpisodesDone, step: Step) -> None:
             end(state, run, group, cast(SubmitStatus, failure.category), failure, step)
             return
     if group.done == group.n:
-        end(state, run, group, "ok", None, step)
+        _all_done(state, run, group, step)
     elif 0 in group.digests:
         step.grown[group] = None
+
+
+def _all_done(state: State, run: Run, group: JobGroup, step: Step) -> None:
+    """End a submit whose episodes are all done."""
+    failed = group.first_failed()
+    if failed is None or run.row.settings.failed_episodes == "play-on":
+        end(state, run, group, "ok", None, step)
+        return
+    index, category = failed
+    text = (
+        f"the policy failed in {group.failed()} of {group.n} episodes, first in number {index} of the submit"
+    )
+    failure = PolicyFailure(category=category, step_index=None, message=text)
+    end(state, run, group, "rollout_timeout", failure, step)
 
 
 def limit_passed(state: State, name: str, step: Step) -> None:

@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
-from evopolicy_common.messages.environment import Case, ObservationForm, PolicyScope
+from evopolicy_common.messages.environment import Case, FailedEpisodes, ObservationForm, PolicyScope
 from evopolicy_common.messages.episode import BlobRef, Record, ResourceLimits, Tier
 from evopolicy_common.messages.gateway import VideoOption
 from evopolicy_common.messages.operator import PlayedAs
@@ -92,6 +92,7 @@ class _Common(NamedTuple):
     tier: Tier
     limits: ResourceLimits
     max_steps: int
+    failed_episodes: FailedEpisodes
 
 
 def env_meta(run: Run, row: SubmitRow) -> dict[str, object]:
@@ -275,6 +276,7 @@ def build(
         tier=common.tier,
         limits=common.limits,
         max_steps=common.max_steps,
+        failed_episodes=common.failed_episodes,
         replays=parts.replays,
         indexes=parts.indexes,
     )
@@ -304,13 +306,16 @@ def _common(owner: Run | Evaluation) -> _Common:
             tier=settings.sandbox_tier,
             limits=settings.limits,
             max_steps=run.max_steps,
+            failed_episodes=settings.failed_episodes,
         )
     row = owner.row
+    place = row.as_in or _alone(row)
     return _Common(
         env=row.env,
         secret=row.secret,
-        observations=(row.as_in or _alone(row)).observations,
+        observations=place.observations,
         tier=row.tier,
         limits=row.limits,
         max_steps=row.max_steps,
+        failed_episodes=place.failed_episodes,
     )

@@ -13,7 +13,13 @@ from typing import Any, Literal, NamedTuple, TypeVar
 
 import msgspec
 
-from evopolicy_common.messages.environment import Case, EnvironmentDescription, ObservationForm, PolicyScope
+from evopolicy_common.messages.environment import (
+    Case,
+    EnvironmentDescription,
+    FailedEpisodes,
+    ObservationForm,
+    PolicyScope,
+)
 from evopolicy_common.messages.episode import (
     BlobRef,
     EpisodeOutcome,
@@ -106,6 +112,7 @@ class Template:
     limits: ResourceLimits
     max_steps: int
     """As in `Job`."""
+    failed_episodes: FailedEpisodes = "play-on"
     replays: tuple[BlobRef, ...] = ()
     """Recorded actions for each index, in place of a policy; empty for none."""
     indexes: tuple[int, ...] = ()
@@ -260,6 +267,13 @@ class JobGroup:
     def failed(self) -> int:
         """Episodes in which the policy failed."""
         return sum(digest.failure is not None for digest in self.digests.values())
+
+    def first_failed(self) -> tuple[int, FailureCategory] | None:
+        """Smallest index whose policy failed, and how; None if there is none."""
+        failed = (
+            (index, digest.failure) for index, digest in self.digests.items() if digest.failure is not None
+        )
+        return min(failed, default=None)
 
     def first_unfinished(self) -> int:
         """Smallest index without an outcome; `n` when all are done."""

@@ -7,6 +7,7 @@ import json
 import math
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given
@@ -351,3 +352,17 @@ def test_what_does_not_fit_an_episodes_share_is_left_out_in_order(share: int, le
 def test_every_episode_of_a_run_has_the_same_share_of_its_feedback() -> None:
     assert episode_share(ResourceLimits(feedback_bytes=1000), 3) == 333
     assert 128 * episode_share(ResourceLimits(), 128) == 16 << 30
+
+
+def test_a_played_submit_with_failed_episodes_has_all_but_mean_and_deviation() -> None:
+    failure = PolicyFailure(category="act_error", step_index=2, message="no")
+    played = scores([1.0, 3.0])
+    played[1] = msgspec.structs.replace(played[1], failure=failure)
+    summary = decode_summary(
+        summary_bytes("toy/line", 0, done(2, "rollout_timeout", failure=failure), played)
+    )
+    assert (summary.status, summary.mean_return, summary.std_return) == ("rollout_timeout", None, None)
+    assert (summary.returns, summary.min_return, summary.max_return) == ((1.0, 3.0), 1.0, 3.0)
+    assert (summary.errors, summary.policy_failures, summary.first_global_episode) == ((1,), 1, 4)
+    assert "ended there" in (summary.warning or "")
+    assert "Random actions" not in (summary.warning or "")

@@ -440,3 +440,37 @@ def test_an_episode_ends_at_the_jobs_or_the_environments_limit(slots: Slots) -> 
         played = rows(outcome)
         assert (outcome.length, outcome.truncated) == (length, True)
         assert [row.truncated for row in played] == [False] * (length - 1) + [True]
+
+
+FAILS_AT_TWO = """
+    class Policy:
+        def __init__(self, *spaces):
+            self.t = 0
+        def reset(self, episode_index):
+            if episode_index == 3:
+                raise ValueError("no episode three")
+        def act(self, obs):
+            self.t += 1
+            if self.t == 3:
+                raise ValueError("no step two")
+            return [0.5]
+"""
+
+
+def test_a_failed_episode_that_ends_has_one_random_action_after_the_failure(slots: Slots) -> None:
+    ended, other = slots.play_all(FAILS_AT_TWO, n=2, policy_scope="submit", failed_episodes="end-submit")
+    assert ended.failure is not None
+    assert (ended.failure.category, ended.failure.step_index, ended.length) == ("act_error", 2, 3)
+    assert [row.action for row in rows(ended)][:2] == [[0.5], [0.5]]
+    assert [row.info.get("policy_failed", False) for row in rows(ended)] == [False, False, True]
+    assert ended.episode_return == sum(row.reward for row in rows(ended))
+    assert (other.failure, other.length) == (None, 60)
+    on = slots.play(FAILS_AT_TWO)
+    assert (on.length, rows(on)[2].action) == (60, rows(ended)[2].action)
+
+
+def test_an_episode_that_fails_in_reset_has_no_step(slots: Slots) -> None:
+    (ended,) = slots.play_all(FAILS_AT_TWO, first=3, failed_episodes="end-submit")
+    assert ended.failure is not None
+    assert (ended.failure.category, ended.length, ended.episode_return) == ("reset_error", 0, 0.0)
+    assert rows(ended) == []
