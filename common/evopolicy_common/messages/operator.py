@@ -12,6 +12,7 @@ from evopolicy_common.messages.environment import (
     Case,
     EnvironmentDescription,
     FailedEpisodes,
+    HiddenEvaluation,
     ObservationForm,
     PolicyScope,
     Split,
@@ -168,6 +169,7 @@ class PlayedAs(msgspec.Struct, frozen=True, kw_only=True):
     """With `submit`, `indexes` must cover the whole list."""
     observations: ObservationForm = "arrays"
     failed_episodes: FailedEpisodes = "play-on"
+    hidden_evaluation: HiddenEvaluation = "submit"
 
 
 class Evaluate(Message, frozen=True, kw_only=True, tag="evaluate"):

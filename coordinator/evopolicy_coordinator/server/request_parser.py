@@ -310,7 +310,10 @@ class RequestParser:
         if wanted.profile == "published":
             self._check_published(len(cases.train))
         if wanted.policy_scope == "submit":
-            check_job((*cases.train, *cases.validation, *cases.heldout), most)
+            largest = most
+            if wanted.hidden_evaluation == "pool":
+                largest = max(most, len(cases.validation), len(cases.heldout))
+            check_job((*cases.train, *cases.validation, *cases.heldout), largest)
         row = RunRow(
             run=f"r-{secrets.token_hex(8)}",
             key=m.key,
@@ -445,9 +448,12 @@ class RequestParser:
             policy_scope="episode" if is_random else settings.policy_scope,
             observations="arrays" if is_random else settings.observations,
             failed_episodes=settings.failed_episodes,
+            hidden_evaluation=settings.hidden_evaluation,
         )
         if place.policy_scope == "submit" and m.indexes != tuple(range(n)):
             raise RefusedError(Refusal.BAD_REQUEST, "with policy scope submit all cases are played at once")
+        if place.policy_scope == "submit" and place.hidden_evaluation == "pool":
+            check_job(m.cases, n)
         row = EvaluationRow(
             evaluation=f"e-{secrets.token_hex(8)}",
             key=m.key,

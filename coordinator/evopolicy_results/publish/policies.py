@@ -164,6 +164,7 @@ async def _play(evaluations: Evaluations, files: Files, part: Chosen, bundle: Bu
             policy_scope=settings.policy_scope,
             observations=settings.observations,
             failed_episodes=settings.failed_episodes,
+            hidden_evaluation=settings.hidden_evaluation,
         ),
     )
     seen: set[int] = set()

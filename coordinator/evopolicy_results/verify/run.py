@@ -371,6 +371,7 @@ class Verifier:
                 # Random actions had no policy that could receive lists, and are recorded as arrays.
                 observations="arrays" if played.submit_index == RANDOM else dimensions.observations,
                 failed_episodes=dimensions.failed_episodes,
+                hidden_evaluation=dimensions.hidden_evaluation,
             ),
         )
 

@@ -96,7 +96,7 @@ class _Common(NamedTuple):
 
 
 def env_meta(run: Run, row: SubmitRow) -> dict[str, object]:
-    """Metadata that a submit's policies receive, in every split; the worker adds the spaces."""
+    """Metadata that a submit's policies receive; the worker adds the spaces."""
     return {
         "env": run.row.settings.env,
         "submit_index": row.submit_index,
@@ -133,15 +133,16 @@ def _train(run: Run, row: SubmitRow, _stimulus_id: str) -> _Parts:
 
 
 def _validation(run: Run, row: SubmitRow, _stimulus_id: str) -> _Parts:
+    pool = run.row.settings.hidden_evaluation == "pool"
     return _Parts(
         id=validation_group(run.id, row.submit_index),
         submit_index=row.submit_index,
         cases=run.row.validation,
         priority=EARLY_VALIDATION if run.state.phase == "open" else HELDOUT,
         stimulus_id=row.stimulus_id,
-        env_meta=env_meta(run, row),
+        env_meta=env_meta(run, row) | ({"remaining_budget_after": 0} if pool else {}),
         bundle=row.bundle,
-        modulo=len(row.env_instances),
+        modulo=None if pool else len(row.env_instances),
         scope=run.row.settings.policy_scope,
     )
 
@@ -172,6 +173,7 @@ def _evaluation(evaluation: Evaluation, row: EvaluationRow, _stimulus_id: str) -
     # A replayed list keeps its position in its run; any other is a list of its own.
     place = row.as_in or _alone(row)
     counts = occurrences(place.env_instances)
+    pool = row.split in HIDDEN_SPLITS and place.hidden_evaluation == "pool"
     return _Parts(
         id=evaluation_group(row.evaluation),
         submit_index=place.submit_index,
@@ -182,14 +184,14 @@ def _evaluation(evaluation: Evaluation, row: EvaluationRow, _stimulus_id: str) -
             "env": row.env,
             "submit_index": max(0, place.submit_index),
             "n_episodes_this_submit": place.modulo,
-            "remaining_budget_after": place.remaining_budget_after,
+            "remaining_budget_after": 0 if pool else place.remaining_budget_after,
         },
         bundle=row.bundle,
         split=row.split,
         keyed=row.bundle is not None,
         case_ids=row.case_ids,
         occurrences=tuple(counts[index] for index in place.indexes),
-        modulo=place.modulo,
+        modulo=len(place.env_instances) if pool else place.modulo,
         scope=place.policy_scope if row.bundle is not None else "episode",
         record=row.record,
         replays=row.replays,

@@ -16,6 +16,7 @@ from evopolicy_common.messages import gateway, operator
 from evopolicy_common.messages.environment import Case
 from evopolicy_common.messages.episode import Job, ResourceLimits
 from evopolicy_common.messages.operator import EvaluationStarted, RunProgress
+from evopolicy_common.messages.run_settings import PUBLISHED
 from evopolicy_coordinator.core.contract.effects import ReadEvaluation
 from evopolicy_coordinator.core.contract.records import EvaluationRow, RunRow, SubmitRow
 from evopolicy_coordinator.core.leasing.seeds import policy_seed
@@ -411,3 +412,35 @@ def test_held_out_success_is_in_the_result_after_a_restart(reload: bool) -> None
             rig.pass_time(5.0)
     finished = rig.finished()
     assert (len(finished.heldout_returns), finished.heldout_successes) == (3, (True, False, True))
+
+
+@pytest.mark.parametrize("settings_", [{"policy_scope": "submit"}, {**PUBLISHED, "profile": "published"}])
+def test_a_policy_can_tell_hidden_cases_by_its_arguments_in_published_profiles_only(
+    settings_: dict[str, str],
+) -> None:
+    rig = Rig()
+    session = rig.register()
+    rig.create(budget=4, n_valid=5, n_held=7, **settings_)
+    seen: dict[str, list[Job]] = {}
+
+    def value(job: Job) -> float:
+        seen.setdefault(split_of(job), []).append(job)
+        return 1.0
+
+    rig.submit(3, 1)
+    rig.work_off(session, value)
+    rig.submit(2, 0, key="k1")
+    rig.work_off(session, value)
+    rig.close()
+    rig.work_off(session, value)
+    (first, _), hidden = seen["train"], [*seen["validation"], *seen["heldout"]]
+    assert (first.env_meta["remaining_budget_after"], first.env_meta["n_episodes_this_submit"]) == (2, 2)
+    indices = [[spec.episode_index for spec in job.episodes] for job in hidden]
+    budgets = {(job.env_meta["submit_index"], job.env_meta["remaining_budget_after"]) for job in hidden}
+    assert {job.env_meta["n_episodes_this_submit"] for job in hidden} == {2}
+    if "profile" in settings_:
+        assert indices == [[*range(5)], [*range(5)], [*range(7)]]
+        assert budgets == {(0, 0), (1, 0)}
+    else:
+        assert {tuple(each) for each in indices} == {(0, 1), (0,)}
+        assert budgets == {(0, 2), (1, 0)}
