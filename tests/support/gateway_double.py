@@ -37,7 +37,7 @@ from evopolicy_common.messages.gateway import (
     Submit,
     SubmitAccepted,
 )
-from evopolicy_common.messages.run_settings import RunSettings
+from evopolicy_common.messages.run_settings import PUBLISHED, RunSettings
 from evopolicy_common.messages.worker import BlobPut, Message, Refused
 from evopolicy_common.records.blobs import digest_of
 from evopolicy_common.records.episodes.trajectory import Recorder
@@ -57,6 +57,8 @@ WORKER = "w-1"
 HIDDEN_FROM = 1_000_000
 """Seeds of hidden cases. A train case's seed is its id."""
 SUBMIT_WALL_S = 1800.0
+N_HIDDEN = (16, 32)
+"""Validation and held-out cases in the files, of which only runs of the published profile use all."""
 
 LINE = EnvironmentDescription(
     env="toy/line",
@@ -262,6 +264,9 @@ class Double:
             sandbox_tier=run.sandbox_tier,
             limits=msgspec.structs.replace(run.limits, submit_wall_s=SUBMIT_WALL_S),
         )
+        if run.profile == "published":
+            counts = {"n_validation": N_HIDDEN[0], "n_heldout": N_HIDDEN[1]}
+            settings = msgspec.structs.replace(settings, **PUBLISHED, profile="published", **counts)
         message = operator.CreateRun(token="operate", key=key, settings=settings)
         created = await self._ask(keys.operator_key(CLUSTER, "create"), message)
         assert isinstance(created, operator.RunCreated), created
@@ -382,7 +387,9 @@ class Double:
         """Hands a submit's episodes in, one after another."""
         order = self.order(len(found))
         for index in order:
-            await self._report_results([found[index]])
+            # With policy scope `submit`, one lease has all episodes.
+            if found[index].lease_id in self._held:
+                await self._report_results([found[index]])
         if len(order) < len(found):
             self.world.service.host._unix_offset += SUBMIT_WALL_S + 1.0
             self.world.service.host._on_timer()
@@ -427,7 +434,12 @@ def _case_of(lease: worker.Lease, index: int) -> int:
 
 
 def _write_cases(folder: Path, n_train: int) -> Path:
-    for stem, seeds in (("train", range(n_train)), ("valid", [HIDDEN_FROM]), ("heldout", [HIDDEN_FROM + 1])):
+    first = [HIDDEN_FROM + n for n in (0, N_HIDDEN[0], sum(N_HIDDEN))]
+    for stem, seeds in (
+        ("train", range(n_train)),
+        ("valid", range(*first[:2])),
+        ("heldout", range(*first[1:])),
+    ):
         path = folder / "toy_line" / f"{stem}.json"
         path.parent.mkdir(parents=True, exist_ok=True)
         cases = [{"seed": seed} for seed in seeds]

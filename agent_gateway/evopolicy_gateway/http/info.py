@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import msgspec
@@ -35,6 +36,7 @@ def info_document(
             name: env.reward_texts.get(name, "") for name in env.reward_components
         }
     limits = msgspec.to_builtins(run.limits)
+    rollout_wall_s = min(run.limits.episode_wall_s, run.limits.submit_wall_s or math.inf)
     return {
         "protocol_version": PROTOCOL_VERSION,
         "state": {
@@ -47,7 +49,7 @@ def info_document(
         "episode_budget": run.episode_budget,
         "min_episodes_per_submit": run.min_episodes_per_submit,
         "max_episodes_per_submit": run.max_episodes_per_submit,
-        "resource_limits": {"rollout_wall_s": run.limits.episode_wall_s} | limits,
+        "resource_limits": {"rollout_wall_s": rollout_wall_s} | limits,
         "allowed_imports": list(run.allowed_imports),
         "denied_imports": list(run.denied_imports),
         "policy_scope": run.policy_scope,

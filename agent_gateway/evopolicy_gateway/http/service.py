@@ -25,6 +25,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from evopolicy_common.errors import RequestError
 from evopolicy_common.logs import structlog
 from evopolicy_common.messages.gateway import CANCELLED
+from evopolicy_gateway.http import published
 from evopolicy_gateway.http.info import info_document, progress_document
 from evopolicy_gateway.http.task import task_markdown
 from evopolicy_gateway.submits.pipeline import RUN_CLOSED, SubmitPipeline
@@ -104,7 +105,30 @@ def make_app(pipeline: SubmitPipeline, token: str, bearer: str = "") -> ASGIApp:
         },
     )
     app.router.redirect_slashes = False
-    return _TokenGate(app, token, bearer)
+    if pipeline.run.profile == "own":
+        return _TokenGate(app, token, bearer)
+    app.add_exception_handler(HTTPException, _published_http_error)
+    return _TokenGate(_PublishedMethods(app), token, bearer)
+
+
+async def _published_http_error(request: Request, error: Exception) -> Response:
+    code, status, message = published.ODD_URLS.get((request.method, request.url.path), published.UNKNOWN_URL)
+    return _json(code, {"status": status, "error": {"message": message}})
+
+
+class _PublishedMethods:
+    """Answers methods that the published service does not have."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["method"] in published.METHODS:
+            await self._app(scope, receive, send)
+            return
+        page, content_type = published.unsupported(scope["method"])
+        answer = Response(page, 501, headers={"Content-Type": content_type, "Connection": "close"})
+        await answer(scope, receive, send)
 
 
 def _of_ticket(ticket: Ticket, pipeline: SubmitPipeline) -> Response:
@@ -114,7 +138,11 @@ def _of_ticket(ticket: Ticket, pipeline: SubmitPipeline) -> Response:
     summary = ticket.summary()
     if summary is None:
         return _json(202, progress_document(ticket))
-    last = pipeline.spent and ticket is pipeline.tickets[-1]
+    if ticket.request.rejected is not None:
+        head = orjson.dumps({"submit_id": ticket.index, "status": ticket.status})
+        return Response(head[:-1] + b',"summary":' + summary + b"}", 400, media_type="application/json")
+    played = (each for each in reversed(pipeline.tickets) if each.request.rejected is None)
+    last = pipeline.spent and ticket is next(played)
     head = orjson.dumps(
         {
             "submit_id": ticket.index,

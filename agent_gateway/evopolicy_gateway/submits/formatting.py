@@ -64,13 +64,16 @@ def failure_line(failure: PolicyFailure, at: float, *, with_step: bool) -> bytes
     return _fitting(line)
 
 
-def verdict_line(status: str, failure: PolicyFailure | None, at: float) -> bytes:
+def verdict_line(
+    status: str, failure: PolicyFailure | None, at: float, *, message: str = "", traceback: bool = True
+) -> bytes:
     """The line of `errors.txt` with the reason why a submit is not ok; its category is the submit's status.
 
-    The failure's own category precedes the message when the two differ.
+    The failure's own category precedes the message when the two differ. `message`: of a rejected request. `traceback`:
+    False writes null for it, as published.
     """
     if failure is None:
-        message = {
+        message = message or {
             "rollout_timeout": "the submit's wall-time limit was reached before all episodes were played",
             "quarantined": "the policy brought its slot down three times; it is not played again",
             "cancelled": "the operator cancelled the run before all episodes were played; nothing is charged",
@@ -80,6 +83,8 @@ def verdict_line(status: str, failure: PolicyFailure | None, at: float) -> bytes
         same = failure.category == status or failure.category in NO_POLICY
         message = failure.message if same else f"{failure.category}: {failure.message}"
         failure_fields = {"message": message, "traceback": failure.traceback}
+    if not traceback:
+        failure_fields["traceback"] = None
     return _fitting(
         {"schema_version": SCHEMA_VERSION, "timestamp": utc_text(at), "category": status} | failure_fields
     )
@@ -93,16 +98,23 @@ def summary_bytes(
     observations: ObservationForm = "arrays",
     *,
     messages: bool = True,
+    echoed: Sequence[int] | None = None,
+    every_key: bool = False,
 ) -> bytes:
-    """The bytes of `summary.json`. `scores` hold every episode of an ok submit, in any order.
+    """The bytes of `summary.json`. `scores` hold every episode of a played submit, in any order.
 
-    `messages`: whether the warning quotes the policy's own messages.
+    `messages`: whether the warning quotes the policy's own messages. `echoed`: train ids to be shown in place of those
+    that were played. `every_key`: the parts of the reward are null and not left out, as published.
 
     Raises ValueError when an ok submit lacks an episode.
     """
     fields = plain(
         msgspec.to_builtins(_summary(env, submit_index, done, scores, observations, messages=messages))
     )
+    if echoed is not None:
+        fields["env_instances"] = list(echoed)
+    if every_key:
+        fields |= dict.fromkeys(("reward_components_mean", "reward_components_per_episode"))
     return msgspec.json.format(msgspec.json.encode(fields), indent=2) + b"\n"
 
 
@@ -198,7 +210,7 @@ def _component_means(components: Sequence[dict[str, float]]) -> dict[str, float]
 def _fitting(line: dict[str, Any]) -> bytes:
     """The line, its traceback and then its message cut to fit 64 KiB. A traceback keeps its end, which tells most."""
     for field in ("traceback", "message"):
-        text = str(line[field])
+        text = line[field] or ""
         keep = len(text)
         while keep and len(json_bytes(line)) >= MAX_TEXT_BYTES:
             keep = keep * 3 // 4

@@ -40,6 +40,7 @@ from evopolicy_common.records.open_run import (
     Died,
     Refused,
     Rejected,
+    Rejection,
     Requested,
     SetAside,
     Settled,
@@ -47,7 +48,7 @@ from evopolicy_common.records.open_run import (
 from evopolicy_common.refusals import RUN_OVER, Refusal
 from evopolicy_gateway.run_folder.journal import Journal
 from evopolicy_gateway.run_folder.names import episode_name
-from evopolicy_gateway.submits import formatting, snapshots
+from evopolicy_gateway.submits import formatting, published_requests, snapshots
 from evopolicy_gateway.submits.coordinator_client import HELD_WAIT_S, RESULTS_WAIT_S, CoordinatorClient
 from evopolicy_gateway.submits.episode_files import (
     episode_files,
@@ -58,6 +59,7 @@ from evopolicy_gateway.submits.episode_files import (
 )
 from evopolicy_gateway.submits.feedback import SubmitTree
 from evopolicy_gateway.submits.formatting import EpisodeScore
+from evopolicy_gateway.submits.published_requests import OddRequestError
 from evopolicy_gateway.submits.submit_request import Bounds, parse
 from evopolicy_gateway.submits.tickets import ConflictError, Ticket
 
@@ -120,6 +122,12 @@ def _is_whole(episode: EpisodeFeedback) -> bool:
     """Whether the result page contains the episode's bytes."""
     refs = (episode.trajectory, episode.video)
     return all(ref is None or ref.inline is not None for ref in refs)
+
+
+def _rejection(odd: OddRequestError) -> Rejection:
+    status = odd.answer.status
+    assert status != "bad_request"
+    return Rejection(status=status, message=odd.message, folder=odd.answer.folder)
 
 
 class SubmitPipeline:
@@ -220,27 +228,39 @@ class SubmitPipeline:
                     self.in_flight.index,
                     f"{self.in_flight.submit_id} is running; wait for it, or ask GET /submit/{self.in_flight.index}",
                 )
-            if self.spent:
-                raise self._refusal()
-            env_instances = parse(body, self.bounds())
+            ids = self._ids(body)
+            odd = None
         except RequestError as error:
-            await self.note_rejected(error)
-            raise
+            if not (isinstance(error, OddRequestError) and error.answer.counts):
+                await self.note_rejected(error)
+                raise
+            ids, odd = error.ids, error
         ticket = Ticket(
             Requested(
                 key=uuid.uuid4().hex,
                 client_key=client_key,
                 body_digest=body_digest,
-                env_instances=env_instances,
+                env_instances=() if odd is not None else tuple(map(int, ids)),
                 bundle=None,
                 bundle_error=None,
+                echoed=ids if odd is not None or any(type(each) is bool for each in ids) else None,
+                rejected=None if odd is None else _rejection(odd),
             ),
             len(self.tickets),
             self.run.episode_budget,
         )
         # No await between the checks above and this call: two requests cannot both pass.
         self._start(ticket, fresh=True)
+        if odd is not None:
+            await self.note_rejected(odd)
         return ticket
+
+    def _ids(self, body: bytes) -> tuple[int, ...]:
+        """The train ids of a request to be played. Raises RequestError for any other."""
+        asked = None if self.run.profile == "own" else published_requests.read(body)
+        if self.spent:
+            raise self._refusal()
+        return parse(body, self.bounds()) if asked is None else published_requests.check(asked, self.bounds())
 
     def find(self, name: str) -> Ticket | None:
         """Returns the submit with that index or folder name; None when there is none."""
@@ -310,7 +330,7 @@ class SubmitPipeline:
             elif isinstance(entry, Accepted):
                 by_key[entry.key].accept(entry)
             elif isinstance(entry, Settled):
-                by_key[entry.key].settle(entry.status, entry.summary.encode(), self._summary_at(place))
+                self._settle(by_key[entry.key], entry, place)
             elif isinstance(entry, Refused):
                 self.tickets.remove(by_key.pop(entry.key))
             elif isinstance(entry, Rejected):
@@ -342,7 +362,10 @@ class SubmitPipeline:
             if fresh:
                 await self._snapshot(ticket)
             await self._send(ticket)
-            await self._collect(ticket)
+            if ticket.request.rejected is None or ticket.request.rejected.folder:
+                await self._collect(ticket)
+            else:
+                await self._settled(ticket, ticket.request.rejected.status, b"")
         except RequestError as error:
             self.tickets.remove(ticket)
             ticket.fail(error)
@@ -378,15 +401,20 @@ class SubmitPipeline:
         return True
 
     async def _snapshot(self, ticket: Ticket) -> None:
-        """Takes the bundle of the current `system/` and journals the request."""
-        while True:
+        """Takes the bundle of the current `system/`, unless nothing is to be played, and journals the request."""
+        while ticket.request.rejected is None:
             try:
-                taken = await asyncio.to_thread(snapshots.take, self._workspace / "system", self._blobs)
+                taken = await asyncio.to_thread(
+                    snapshots.take,
+                    self._workspace / "system",
+                    self._blobs,
+                    published=self.run.profile != "own",
+                )
+                ticket.attach(taken)
                 break
             except StorageError as error:
                 log.error("cannot store the snapshot; trying again", error=str(error))
                 await asyncio.sleep(DISK_PAUSE_S)
-        ticket.attach(taken)
         await self._note(ticket.request)
 
     async def _send(self, ticket: Ticket) -> None:
@@ -456,9 +484,20 @@ class SubmitPipeline:
                 log.error("cannot write feedback; trying again", submit=ticket.submit_id, error=str(error))
                 self._on_change()
                 await asyncio.sleep(DISK_PAUSE_S)
-        place = await self._note(Settled(key=ticket.request.key, status=status, summary=summary.decode()))
-        ticket.settle(status, summary, self._summary_at(place))
+        await self._settled(ticket, status, summary)
+
+    async def _settled(self, ticket: Ticket, status: str, summary: bytes) -> None:
+        """Journals a submit's end, and tells those who wait for it."""
+        entry = Settled(key=ticket.request.key, status=status, summary=summary.decode())
+        self._settle(ticket, entry, await self._note(entry))
         log.info("submit committed", submit=ticket.submit_id, status=status)
+
+    def _settle(self, ticket: Ticket, entry: Settled, place: int) -> None:
+        if entry.summary:
+            ticket.settle(entry.status, entry.summary.encode(), self._summary_at(place))
+        else:
+            assert ticket.request.rejected is not None
+            ticket.fail(RequestError(entry.status, ticket.request.rejected.message))
 
     async def _write_feedback(self, ticket: Ticket) -> tuple[str, bytes]:
         """Returns status and summary of the committed folder."""
@@ -483,7 +522,7 @@ class SubmitPipeline:
             if done is None and not page.more:
                 await asyncio.sleep(linger.pause_s(len(scores), time.monotonic()))
         last_result = time.monotonic()
-        committed = await asyncio.to_thread(self._commit, tree, index, done, scores)
+        committed = await asyncio.to_thread(self._commit, tree, ticket, done, scores)
         if done.status == CANCELLED:
             self.state = msgspec.structs.replace(self.state, remaining_budget=done.remaining_budget)
             self._close(True, True)
@@ -580,20 +619,28 @@ class SubmitPipeline:
         return set_aside_files(episode, why, at=at, texts=self._texts)
 
     def _commit(
-        self, tree: SubmitTree, index: int, done: SubmitDone, scores: dict[int, EpisodeScore]
+        self, tree: SubmitTree, ticket: Ticket, done: SubmitDone, scores: dict[int, EpisodeScore]
     ) -> tuple[str, bytes]:
-        errors = None
+        errors, rejected, own = None, ticket.request.rejected, self.run.profile == "own"
         if done.status != "ok":
-            errors = formatting.verdict_line(done.status, done.failure, done.completed_at)
+            errors = formatting.verdict_line(
+                done.status,
+                done.failure,
+                done.completed_at,
+                message="" if rejected is None else rejected.message,
+                traceback=own,
+            )
             for late in [i for i in scores if i >= done.n_kept]:
                 tree.drop_episode(episode_name(done.first_global_episode + late, self.run.episode_budget))
         summary = formatting.summary_bytes(
             self.run.env.env,
-            index,
+            ticket.index,
             done,
             list(scores.values()),
             self.run.observations,
             messages=self._texts,
+            echoed=ticket.request.echoed,
+            every_key=not own,
         )
         tree.commit(summary, errors)
         return done.status, summary

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import stat
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import msgspec
 from evopolicy_common.errors import BundleError
 from evopolicy_common.messages.episode import FailureCategory, PolicyFailure
 from evopolicy_common.records.blobs import BlobStore
+from evopolicy_common.records.code_metrics import MAX_PARSED_BYTES, parse
 from evopolicy_common.records.policies import bundles
 
 POLICY_FILE = "policy.py"
@@ -24,12 +26,12 @@ class Snapshot(msgspec.Struct, frozen=True, kw_only=True):
     """Digest of a bundle without a policy: stored for the run's checkpoint, and not sent."""
 
 
-def take(system: Path, blobs: BlobStore) -> Snapshot:
+def take(system: Path, blobs: BlobStore, *, published: bool = False) -> Snapshot:
     """Snapshots the current `system` and stores the bundle.
 
     A folder that cannot be a bundle is the policy's failure and is charged: `missing_policy` when `policy.py` is
-    missing or no regular file, else `import_error`; the message names file, value and limit. Raises StorageError when
-    the store refuses.
+    missing or no regular file, else `import_error`; the message names file, value and limit. `published`: the source decides
+    too, as in the published software. Raises StorageError when the store refuses.
     """
     try:
         bundle = bundles.snapshot(system)
@@ -40,7 +42,36 @@ def take(system: Path, blobs: BlobStore) -> Snapshot:
     if all(file.path != POLICY_FILE for file in bundle.files):
         failed = _failed(system, "system/policy.py is missing; write a class Policy there")
         return msgspec.structs.replace(failed, kept=blobs.put(bundle.packed))
-    return Snapshot(digest=blobs.put(bundle.packed), error=None)
+    failure = _fault_of_source({file.path: file.data for file in bundle.files}) if published else None
+    digest = blobs.put(bundle.packed)
+    return Snapshot(
+        digest=digest if failure is None else None, error=failure, kept=digest if failure else None
+    )
+
+
+def _fault_of_source(files: dict[str, bytes]) -> PolicyFailure | None:
+    """The verdict of the published software on sources that it does not run: `import_error` for a Python file that cannot
+    be parsed, `missing_policy` for a `policy.py` without a class statement `Policy` at its top level."""
+    category: FailureCategory = "import_error"
+    left = MAX_PARSED_BYTES
+    for path in sorted(path for path in files if path.endswith(".py")):
+        left -= len(files[path])
+        if left < 0:
+            break
+        tree = parse(files[path])
+        if tree is None:
+            message = f"system/{path} cannot be parsed as Python"
+        elif path == POLICY_FILE and not any(
+            isinstance(node, ast.ClassDef) and node.name == "Policy" for node in tree.body
+        ):
+            category, message = (
+                "missing_policy",
+                "system/policy.py has no class statement Policy at its top level",
+            )
+        else:
+            continue
+        return PolicyFailure(category=category, step_index=None, message=message)
+    return None
 
 
 def _failed(system: Path, message: str) -> Snapshot:

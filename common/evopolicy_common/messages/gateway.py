@@ -6,7 +6,7 @@ from its gateway what the gateway never receives. A test walks every type in `Ga
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, get_args
 
 import msgspec
 
@@ -21,7 +21,12 @@ from evopolicy_common.messages.environment import (
 from evopolicy_common.messages.episode import BlobRef, PolicyFailure, ResourceLimits, Tier
 from evopolicy_common.messages.worker import BlobAck, BlobChunk, BlobGet, BlobPut, Message, Refused
 
+RejectedStatus = Literal["budget_invalid", "invalid_env_instance"]
+"""Verdicts of requests that took a submit's index and play nothing, in the published profiles."""
+REJECTED: frozenset[str] = frozenset(get_args(RejectedStatus))
 SubmitStatus = Literal[
+    "budget_invalid",
+    "invalid_env_instance",
     "ok",
     "missing_policy",
     "denied_import",
@@ -31,7 +36,7 @@ SubmitStatus = Literal[
     "quarantined",
     "cancelled",
 ]
-"""All verdicts except `cancelled` are charged. `cancelled`: the operator ended the run in the meantime.
+"""All verdicts are charged, except `cancelled` and the first two (`RejectedStatus`). `cancelled`: the operator ended the run in the meantime.
 `quarantined`: only of submits that a coordinator of an earlier version ended."""
 
 CANCELLED = "cancelled"
@@ -173,6 +178,9 @@ class Submit(Message, frozen=True, kw_only=True, tag="submit"):
     """Digest of the snapshot, uploaded beforehand; None when no snapshot of `system/` could be made."""
     bundle_error: PolicyFailure | None = None
     """Why there is no bundle: becomes the verdict, charged as `protocol.md` describes for a bundle without a Policy."""
+    rejected: RejectedStatus | None = None
+    """In the published profiles: the request takes an index, plays nothing, and has this verdict. It has no cases, bundle
+    or `bundle_error` then."""
 
 
 class SubmitAccepted(Message, frozen=True, kw_only=True, tag="submit_accepted"):

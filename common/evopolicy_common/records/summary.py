@@ -34,8 +34,8 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     """Episodes charged; 0 when `cancelled`."""
     first_global_episode: int | None
     """Number of its first episode among the run's attempted episodes, from 0; null when not ok."""
-    env_instances: tuple[int, ...] | None
-    """Train ids in request order, repeats kept."""
+    env_instances: tuple[int | bool, ...] | None
+    """Train ids in request order, repeats kept. In the published profiles `true` and `false` stand for 1 and 0."""
     remaining_budget: int
     """Episodes left after this submit."""
     submit_started_at: str

@@ -89,6 +89,8 @@ def _run(state: State, run: Run, rows: list[SubmitRow], loading: Loading, step: 
     for row in sorted(rows, key=lambda row: row.submit_index):
         run.submits.append(row)
         run.keys[row.key] = row.submit_index
+        if not row.env_instances:
+            continue
         run.ledger.reserve(row.submit_index, len(row.env_instances))
         if row.refunded:
             run.ledger.refund(row.submit_index)

@@ -276,7 +276,8 @@ class RequestParser:
     def _checked_submit(self, m: gateway.Submit) -> gateway.Submit:
         check_idempotency_key(m.key)
         self._check_bundle(m.bundle, m.run)
-        if (m.bundle is None) == (m.bundle_error is None):
+        whole = m.rejected is None or bool(m.env_instances)
+        if whole and (m.bundle is None) == (m.bundle_error is None):
             raise RefusedError(Refusal.BAD_MESSAGE, "a submit has either a bundle or a bundle_error")
         return m
 

@@ -18,6 +18,7 @@ import msgspec
 
 from evopolicy_common.errors import ProtocolError
 from evopolicy_common.messages.bounds import check_plausible
+from evopolicy_common.messages.gateway import REJECTED
 from evopolicy_common.records.policies.checkpoints import policy_folder, read_meta
 from evopolicy_common.records.run_files import RUN_JSON, check_places, run_folders, submit_folders
 from evopolicy_common.records.run_record import RunRecord, decode_run_record
@@ -205,6 +206,8 @@ def _read_submits(folder: Path, record: RunRecord) -> tuple[Submit, ...]:
             after = meta.remaining_budget_after
         else:
             raise UnreadableRunError(f"submit {index} has neither summary.json nor _meta.json")
+        if status in REJECTED:
+            continue
         before, consumed = consumed, budget - after
         files, source = _read_source(checkpoint) if status == "ok" else (None, None)
         changed = None if files is None or previous is None else count_changed_lines(previous, files)

@@ -13,6 +13,7 @@ import msgspec
 
 from evopolicy_common.errors import ConfigError, ProtocolError
 from evopolicy_common.messages.environment import Split
+from evopolicy_common.messages.gateway import REJECTED
 from evopolicy_common.records.aggregates import mean
 from evopolicy_common.records.policies.checkpoints import CheckpointMeta, read_meta
 from evopolicy_common.records.run_files import RUN_JSON, read_record, submit_folders
@@ -138,7 +139,7 @@ def _submits(root: Path, record: RunRecord) -> tuple[SubmitFiles, ...]:
                 checkpoint=checkpoint,
             )
         )
-    return tuple(found)
+    return tuple(submit for submit in found if submit.status not in REJECTED)
 
 
 def _train(record: RunRecord, submit: SubmitFiles) -> EpisodeList | None:

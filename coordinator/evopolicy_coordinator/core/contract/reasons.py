@@ -29,6 +29,7 @@ Code = Literal[
     "unknown_case",
     "too_few",
     "too_many",
+    "too_many_rejected",
     "over_budget",
     "no_worker_yet",
     "may_not_start",

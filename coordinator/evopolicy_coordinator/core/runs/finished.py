@@ -121,7 +121,9 @@ def result(
         created_at=row.created_at,
         closed_at=closed_at,
         finished_at=now,
-        submits=tuple(_submit_record(each) for each in run.submits if not each.refunded),
+        submits=tuple(
+            _submit_record(each) for each in run.submits if each.env_instances and not each.refunded
+        ),
         wall_s={"queue": run.queue_s, "rollout": run.rollout_s, "finalise": max(0.0, now - closed_at)},
         infrastructure_retries=stored.infrastructure_retries,
         nondeterministic_results=stored.nondeterministic_results,

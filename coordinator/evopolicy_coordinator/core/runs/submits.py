@@ -5,6 +5,7 @@ Rules that this module owns:
   changes nothing.
 - The episode at index 0 is a gate: no episode is released until its outcome shows that the bundle yields a Policy. If
   the outcome shows that it does not, that is the whole submit's verdict.
+- In the published profiles a request that plays nothing may take an index; nothing is reserved for it.
 - A submit's end settles its reservation once, whatever the verdict (`end`). Only a cancelled run's open submit is
   refunded.
 - A fault of ours (a worker, an environment) ends no submit: its limit on wall time begins again.
@@ -30,6 +31,9 @@ from evopolicy_coordinator.core.tables.model import JobGroup, Run
 from evopolicy_coordinator.core.tables.state import State
 from evopolicy_coordinator.core.tables.step import EpisodesDone, Step, SubmitEnded
 
+MAX_REJECTED = 1000
+"""Requests of a run beyond its budget that take an index and play nothing; an agent could send any number."""
+
 
 def submit(state: State, event: events.Requested[gateway.Submit], step: Step) -> None:
     """Accept a submit, or refuse it for the first cause in the protocol's order; a known key
@@ -47,6 +51,13 @@ def submit(state: State, event: events.Requested[gateway.Submit], step: Step) ->
         return
     if run.open is not None:
         step.refuse(event.request, Refusal.BUSY, because("busy", submit=run.open))
+        return
+    if message.rejected is not None and run.row.settings.profile != "own":
+        if len(run.submits) >= run.row.budget + MAX_REJECTED:
+            reason = because("too_many_rejected", n=len(run.submits))
+            step.refuse(event.request, Refusal.BUDGET_INVALID, reason)
+        elif not requests.without_permit(state, event.request, run, step):
+            _accept(state, run, event, step)
         return
     refused = refusal(
         message.env_instances,
@@ -86,14 +97,15 @@ def _accepted(row: SubmitRow) -> gateway.SubmitAccepted:
 
 def _accept(state: State, run: Run, event: events.Requested[gateway.Submit], step: Step) -> None:
     message = event.message
-    index, n = len(run.submits), len(message.env_instances)
+    index, n = len(run.submits), 0 if message.rejected else len(message.env_instances)
     first_global_episode = run.ledger.spent
-    run.ledger.reserve(index, n)
+    if n:
+        run.ledger.reserve(index, n)
     row = SubmitRow(
         run=run.id,
         submit_index=index,
         key=message.key,
-        env_instances=message.env_instances,
+        env_instances=message.env_instances[:n],
         bundle=message.bundle,
         first_global_episode=first_global_episode,
         remaining_budget=run.ledger.available,
@@ -105,6 +117,9 @@ def _accept(state: State, run: Run, event: events.Requested[gateway.Submit], ste
     step.reply(event.request, _accepted(row))
     step.log("info", "submit_accepted", run=run.id, submit=index, episodes=n, remaining=row.remaining_budget)
     failure = message.bundle_error
+    if message.rejected is not None:
+        step.change_submit(run, index, status=message.rejected, completed_at=step.now)
+        return
     if failure is not None:
         run.ledger.settle(index)
         status: SubmitStatus = "import_error"
