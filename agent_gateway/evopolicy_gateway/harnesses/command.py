@@ -1,7 +1,8 @@
 """Any program as an agent: started in the workspace with the published variables.
 
 It may also use the published turn protocol, JSON lines: it receives `{"type": "prompt", "turn": N, "message": …}` on
-stdin and answers each with one object on stdout, until it sends stop or exits. `turn`, `text` and `stop` are optional
+stdin and answers each with one object on stdout, until it sends stop or exits. Once the budget is spent, it gets no more
+prompts, and its stdin is closed. `turn`, `text` and `stop` are optional
 in an answer; an answer that names an earlier turn is ignored. A program that never reads its stdin runs until it exits,
 whatever it prints. An inactive program is ended (`clock.Activity`).
 """
@@ -150,27 +151,34 @@ class _Talk:
             await asyncio.gather(prompting, return_exceptions=True)
 
     async def _prompt(self) -> None:
-        while True:
-            self._answered.clear()
-            await _prompt(self._process, self._stage, self.turn)
+        while await _prompt(self._process, self._stage, self.turn):
             await self._answered.wait()
+            self._answered.clear()
             if self._idle > IDLE_TURNS:
                 await self._stage.sleep(_IDLE_PAUSE_S)
+        self._process.hang_up()
 
 
-async def _prompt(process: AgentProcess, stage: Stage, turn: int) -> None:
+async def _prompt(process: AgentProcess, stage: Stage, turn: int) -> bool:
+    """Sends the turn's prompt; False, and none is sent, if the budget is spent."""
     message = await _message(stage, turn)
+    if message is None:
+        return False
     prompt = {"type": "prompt", "turn": turn, "message": message}
     stage.log.note(prompt)
     await process.say(orjson.dumps(prompt))
+    return True
 
 
-async def _message(stage: Stage, turn: int) -> str:
+async def _message(stage: Stage, turn: int) -> str | None:
+    """The turn's prompt; None if the budget is spent."""
     if turn == 0:
         return stage.prompts.begin()
     try:
         info = await stage.info()
         left = info["state"]["remaining_budget"]
+        if not left or info["state"]["is_finalized"]:
+            return None
     except (OSError, ValueError, KeyError):
         return "Go on. Ask /info for the budget that is left."
     return stage.prompts.stopped(left, prompts.NEXT_TURN) + prompts.warned(info.get("last_warning"))

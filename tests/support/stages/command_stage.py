@@ -22,7 +22,7 @@ TIMEOUT_S = 30.0
 
 
 def play(
-    tmp_path: Path, code: str, silence_s: float | None = None
+    tmp_path: Path, code: str, silence_s: float | None = None, info: str = "http://127.0.0.1:9/nobody"
 ) -> tuple[AgentEnded, list[dict[str, Any]], list[tuple[int, str]]]:
     """How a Python program with that code ended, its log, and what it said."""
     turns: list[tuple[int, str]] = []
@@ -30,7 +30,7 @@ def play(
     log = AgentLog(log_file)
     stage = Stage(
         workspace=tmp_path,
-        urls={"EVOPOLICYGYM_INFO_URL": "http://127.0.0.1:9/nobody"},
+        urls={"EVOPOLICYGYM_INFO_URL": info},
         environment=environment_of({"EVOPOLICYGYM_INFO_URL": "u"}),
         log=log,
         activity=None if silence_s is None else Activity(silence_s, tmp_path),

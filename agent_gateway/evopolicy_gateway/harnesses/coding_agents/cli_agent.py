@@ -75,17 +75,15 @@ class CliAgent(Harness):
         stage = stage.with_environment(self._dialect.environment() | self._config.environment)
         await self._probe(stage)
         self._state = session.load(stage.session_file)
-        prompt = await self._prompt_after_failure(stage)
-        while True:
-            reader = await self._turn(stage, prompt)
+        then = await self._prompt_after_failure(stage)
+        while not isinstance(then, AgentEnded):
+            reader = await self._turn(stage, then)
             if stage.over.is_set():
                 return self._ending()
-            ending = await (self._done(stage, reader) if reader.done else self._failed(stage, reader))
-            if isinstance(ending, AgentEnded):
-                return ending
-            if stage.over.is_set():
+            then = await (self._done(stage, reader) if reader.done else self._failed(stage, reader))
+            if stage.over.is_set() and not isinstance(then, AgentEnded):
                 return self._ending()
-            prompt = ending
+        return then
 
     async def _turn(self, stage: Stage, prompt: str) -> TurnReader:
         """Runs one turn and records its usage."""
@@ -192,11 +190,14 @@ class CliAgent(Harness):
         state.paused_s += wait_s
         stage.on_doing(AgentDoing(action="tries again", provider=config.provider_name))
 
-    async def _prompt_after_failure(self, stage: Stage) -> str:
-        """The first prompt of a session, or the prompt that resumes an interrupted one."""
+    async def _prompt_after_failure(self, stage: Stage) -> AgentEnded | str:
+        """The first prompt of a session, or the prompt that resumes an interrupted one; the end if the budget is spent."""
+        left = await left_of(stage)
+        if left == 0:
+            return self._ending()
         if self._state.session is None or not self._dialect.resumes:
             return stage.prompts.begin()
-        return stage.prompts.resumed(await left_of(stage))
+        return stage.prompts.resumed(left)
 
     def _keep(self, stage: Stage) -> None:
         session.save(stage.session_file, self._state)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import asyncio
 import json
 import sys
+import threading
+from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 
 import pytest
@@ -52,6 +54,8 @@ for line in sys.stdin:
 def test_every_field_of_an_answer_is_optional(tmp_path: Path) -> None:
     code = """
 import sys
+import threading
+from http.server import BaseHTTPRequestHandler, HTTPServer
 for number, line in enumerate(sys.stdin):
     print(['{}', '{"text": "two"}', '{"turn": 2}', '{"stop": false, "other": 1}', '{"stop": true}'][number], flush=True)
 """
@@ -223,3 +227,29 @@ def test_entries_are_named_after_their_agents(tmp_path: Path) -> None:
     assert entry_name("random") == "random"
     assert entry_name(f"replay:{tmp_path}/gaits/") == "replay-gaits"
     assert entry_name("command:/opt/agents/run.sh --fast") == "command-run.sh"
+
+
+@pytest.mark.parametrize(
+    "state", [{"remaining_budget": 0, "is_finalized": False}, {"remaining_budget": 3, "is_finalized": True}]
+)
+def test_a_program_gets_no_prompt_after_its_budget_is_spent(tmp_path: Path, state: dict[str, object]) -> None:
+    states = iter([{"remaining_budget": 4, "is_finalized": False}])
+
+    class Info(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            body = json.dumps({"state": next(states, state)}).encode()
+            self.send_response(200)
+            self.send_header("Content-Length", str(len(body)))
+            self.end_headers()
+            self.wfile.write(body)
+
+    server = HTTPServer(("127.0.0.1", 0), Info)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    try:
+        ending, log, turns = play(tmp_path, ANSWERS_ONLY, info=f"http://127.0.0.1:{server.server_port}/info")
+    finally:
+        server.shutdown()
+        server.server_close()
+    prompts = [line["message"] for line in log if line.get("type") == "prompt"]
+    assert (ending.reason, len(turns), len(prompts)) == ("agent_stopped", 2, 2)
+    assert "4 episodes of the budget are left" in prompts[1]
