@@ -122,7 +122,7 @@ RULES: dict[str, Rule] = {
     "overwrite": Rule(_flag, "True or False"),
     "policy": _FOLDER,
     "policy_packages": Rule(_names, "a sequence of names, such as ('scipy',)"),
-    "profile": _or_none(Rule(_text, "'published'")),
+    "profile": _or_none(Rule(_text, "'published' or 'published-data'")),
     "progress": Rule(_flag, "True or False"),
     "prompts": _or_none(_FILE),
     "repeat": Rule(_whole(0), "a whole number of at least 0"),

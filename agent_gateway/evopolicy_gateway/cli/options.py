@@ -148,9 +148,10 @@ HiddenCasesOption = Annotated[
 
 
 ProfileOption = Annotated[
-    Literal["published"] | None,
+    Literal["published", "published-data"] | None,
     typer.Option(
-        help="published: all settings of the published protocol (docs/reference/protocol.md), with its case files in --data.",
+        help="published: all settings of the published protocol (docs/reference/protocol.md), with its case files in --data and the"
+        " paper's 16 validation and 32 held-out cases; published-data: with all 64 and 256 of the files.",
         rich_help_panel=RUN,
         show_default=False,
     ),

@@ -57,11 +57,7 @@ class Cluster(msgspec.Struct, frozen=True, kw_only=True):
 
     def check_cases(self, runs: Iterable[RunSettings]) -> None:
         """Raises ConfigError when a local cluster lacks the case files that a run plays."""
-        if (
-            self.local_slots is not None
-            and self.data is None
-            and any(run.profile == "published" for run in runs)
-        ):
+        if self.local_slots is not None and self.data is None and any(run.profile != "own" for run in runs):
             raise ConfigError(
                 "--profile published plays the published case files: give --data FOLDER, the folder data/main-128 of the"
                 " published software, which holds gym/acrobot/train.json and so on"

@@ -14,7 +14,7 @@ from evopolicy_common import catalogue
 from evopolicy_common.errors import ConfigError, ProtocolError, RequestError
 from evopolicy_common.messages.episode import LARGEST_LIMIT, LARGEST_LIMITS, ResourceLimits
 from evopolicy_common.messages.gateway import Profile
-from evopolicy_common.messages.run_settings import PUBLISHED, RunSettings, episode_counts
+from evopolicy_common.messages.run_settings import HIDDEN_COUNTS, PUBLISHED, RunSettings, episode_counts
 from evopolicy_common.processes.packages import checked_names, packages_in, policy_versions
 from evopolicy_common.records.run_files import read_record
 from evopolicy_gateway.submits.submit_request import Bounds, ids_in
@@ -39,11 +39,11 @@ def settings_of(profile: str | None, **given: str | None) -> dict[str, str]:
     ConfigError for a profile that there is not, or that sets otherwise what was given.
     """
     chosen = one_of("--profile", profile or "own", Profile)
-    usual = PUBLISHED if chosen == "published" else OWN
+    usual = OWN if chosen == "own" else PUBLISHED
     for name, value in given.items():
-        if chosen == "published" and value not in (None, usual[name]):
+        if chosen != "own" and value not in (None, usual[name]):
             raise ConfigError(
-                f"profile published has {name} = {usual[name]}, but {value} was given: drop one of them"
+                f"profile {chosen} has {name} = {usual[name]}, but {value} was given: drop one of them"
             )
     return usual | {name: value for name, value in given.items() if value is not None} | {"profile": chosen}
 
@@ -69,12 +69,18 @@ def run_settings(given: Any, limits: ResourceLimits, **named: Any) -> RunSetting
         raise ConfigError(
             f"feedback {chosen['feedback']} shows no videos, and video {given.video} is asked for: leave out one of them"
         )
+    counts = {"n_validation": given.validation, "n_heldout": given.heldout}
+    for (name, n), fixed in zip(counts.items(), HIDDEN_COUNTS.get(chosen["profile"], ()), strict=False):
+        if n not in (None, fixed):
+            raise ConfigError(
+                f"profile {chosen['profile']} has {name} = {fixed}, but {n} was given: drop one of them"
+            )
+        counts[name] = fixed
     settings = RunSettings(
         budget=given.budget,
         min_episodes_per_submit=given.min_episodes,
         max_episodes_per_submit=given.max_episodes,
-        n_validation=given.validation,
-        n_heldout=given.heldout,
+        **counts,
         sandbox_tier=given.tier or "bwrap",
         video=given.video or "off",
         replays=given.replays,

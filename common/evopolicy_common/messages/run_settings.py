@@ -97,17 +97,21 @@ PUBLISHED: dict[str, str] = {
     "hidden_evaluation": "pool",
 }
 """The settings of the published profiles, by their names in `RunSettings`. Its cases are the published files."""
+HIDDEN_COUNTS: dict[str, tuple[int, int]] = {"published": (16, 32), "published-data": (64, 256)}
+"""Validation and held-out cases by published profile: those of the paper, and those of the published case files."""
 PUBLISHED_TRAIN = 1024
 """Number of train ids in the published case files."""
 
 
 def off_profile(settings: RunSettings) -> str:
-    """The settings in which a run of profile `published` differs from the profile, in words; empty when none does."""
+    """The settings in which a run of a published profile differs from the profile, in words; empty when none does."""
     if settings.profile == "own":
         return ""
-    values = {name: getattr(settings, name) for name in PUBLISHED}
+    n_validation, n_heldout = HIDDEN_COUNTS[settings.profile]
+    fixed = {**PUBLISHED, "n_validation": n_validation, "n_heldout": n_heldout}
+    values = {name: getattr(settings, name) for name in fixed}
     return ", ".join(
-        f"{name} {values[name]} (not {value})" for name, value in PUBLISHED.items() if values[name] != value
+        f"{name} {values[name]} (not {value})" for name, value in fixed.items() if values[name] != value
     )
 
 

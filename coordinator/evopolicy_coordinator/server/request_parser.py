@@ -308,7 +308,7 @@ class RequestParser:
             )
         except ConfigError as error:
             raise RefusedError(Refusal.INVALID_SETTINGS, str(error)) from error
-        if wanted.profile == "published":
+        if wanted.profile != "own":
             self._check_published(len(cases.train))
         if wanted.policy_scope == "submit":
             largest = most
@@ -478,14 +478,14 @@ class RequestParser:
         return events.EvaluationRequested(stimulus_id=stimulus, request=request, message=m, row=row)
 
     def _check_profile(self, wanted: RunSettings) -> None:
-        """Raises ConfigError when a run of profile `published` has other settings, or would not play case files."""
+        """Raises ConfigError when a run of a published profile has other settings, or would not play case files."""
         if wanted.profile == "own":
             return
         if differences := off_profile(wanted):
-            raise ConfigError(f"profile published excludes {differences}")
+            raise ConfigError(f"profile {wanted.profile} excludes {differences}")
         if not self._source.from_files:
             raise ConfigError(
-                "profile published plays the published case files, and this coordinator derives its cases from a secret:"
+                f"profile {wanted.profile} plays the published case files, and this coordinator derives its cases from a secret:"
                 " start it with --data FOLDER, the folder data/main-128 of the published software"
             )
 

@@ -16,6 +16,7 @@ import msgspec
 
 from evopolicy_common import catalogue
 from evopolicy_common.errors import DECODE_ERRORS, ProtocolError
+from evopolicy_common.messages.run_settings import HIDDEN_COUNTS
 from evopolicy_common.records.code_metrics import PUBLISHED_SCHEMA
 from evopolicy_common.records.policies.checkpoints import read_meta
 from evopolicy_common.records.run_record import (
@@ -112,7 +113,9 @@ def read_record(folder: Path, record: dict[str, Any]) -> RunRecord:
                 step_limit="published",
                 failed_episodes="end-submit",
                 hidden_evaluation="pool",
-                profile="published",
+                profile="published-data"
+                if len(heldout) == HIDDEN_COUNTS["published-data"][1]
+                else "published",
             ),
             timing=msgspec.convert(timing, Timing),
             outcome=msgspec.convert(

@@ -67,15 +67,14 @@ def published_tree(root: Path, n_train: int = 1024) -> Path:
     return root
 
 
-def suite_of(folder: Path, table: dict[str, Agent]) -> Path:
-    """A suite's file with these agents."""
+def suite_of(folder: Path, table: dict[str, Agent], counts: str) -> Path:
+    """A suite's file with these agents; `counts`: lines with the numbers of hidden cases."""
     text = f"""
 name = "t"
 environments = ["toy/line"]
 [defaults]
 budget = {BUDGET}
-validation = 2
-heldout = 2
+{counts}
 [parallel]
 machine = 4
 """
@@ -96,7 +95,8 @@ def play(root: Path, table: dict[str, Agent], data: Path, *more: str) -> Played:
     """The run directories of a sweep over these agents, by name, and its exit code as a run of its own."""
     folder = root / "sweep"
     folder.mkdir()
-    file = suite_of(folder, table)
+    # The published profile fixes them.
+    file = suite_of(folder, table, "" if more else "validation = 2\nheldout = 2")
     # The rule is not under test, and would have each run's scoring wait for all other agents.
     with toy_cluster(root, "--data", str(data), "--hidden-isolation", "off") as operator:
         arguments = [

@@ -403,9 +403,9 @@ def test_profile_published_plays_published_files_or_not_at_all(blobs: BlobStore,
         source = SplitSource(data=data, secret=b"s" * 32)
         return RequestParser(IDENTITY, blobs, source, Uploads(), allowed_imports=(), denied_imports=())
 
-    published = {**PUBLISHED, "profile": "published"}
+    published = {**PUBLISHED, "profile": "published", "n_validation": 16, "n_heldout": 32}
     whole = at(published_tree(tmp_path / "whole", 1024))
-    made = event(whole, OPS, create(**published, n_validation=16, n_heldout=32))
+    made = event(whole, OPS, create(**published))
     assert (len(made.row.train), len(made.row.validation), len(made.row.heldout)) == (1024, 16, 32)
     assert not made.row.split_secret
     assert "start it with --data" in refused(at(None), OPS, create(**published)).message
@@ -413,6 +413,10 @@ def test_profile_published_plays_published_files_or_not_at_all(blobs: BlobStore,
     assert "1,024 cases each" in refused(short, OPS, create(**published)).message
     for name, value in (("observations", "arrays"), ("finish", "early"), ("simulation", "allowed")):
         assert f"{name} {value} (not" in refused(whole, OPS, create(**(published | {name: value}))).message
+    data = published | {"profile": "published-data"}
+    assert "n_validation 16 (not 64), n_heldout 32 (not 256)" in refused(whole, OPS, create(**data)).message
+    made = event(whole, OPS, create(**(data | {"n_validation": 64, "n_heldout": 256})))
+    assert (len(made.row.validation), len(made.row.heldout)) == (64, 256)
 
 
 def finished_pair(parser: RequestParser, **settings: Any) -> tuple[RunRow, operator.RunFinished]:

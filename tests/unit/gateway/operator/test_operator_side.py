@@ -199,6 +199,11 @@ def test_profile_published_makes_every_published_choice_and_takes_no_other() -> 
     for name, value in (("observations", "arrays"), ("policy_scope", "episode"), ("hidden_cases", "per-run")):
         with pytest.raises(ConfigError, match=f"profile published has {name} = "):
             RunOptions(agent="evolve", profile="published", **{name: value}).settings("toy/line", "t")
+    assert (published.n_validation, published.n_heldout) == (16, 32)
+    data = RunOptions(agent="evolve", profile="published-data", heldout=256).settings("toy/line", "t")
+    assert (data.n_validation, data.n_heldout, off_profile(data)) == (64, 256, "")
+    with pytest.raises(ConfigError, match="profile published has n_heldout = 32, but 256 was given"):
+        RunOptions(agent="evolve", profile="published", heldout=256).settings("toy/line", "t")
     with pytest.raises(ConfigError, match="give --data FOLDER"):
         Cluster(local_slots=1).check_cases([published])
     Cluster(local_slots=1).check_cases([own])
