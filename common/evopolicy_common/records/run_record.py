@@ -32,6 +32,7 @@ from evopolicy_common.messages.journal import Committed
 from evopolicy_common.messages.operator import RunEnd
 from evopolicy_common.messages.run_settings import HiddenCases, HiddenIsolation
 from evopolicy_common.records.code_metrics import PUBLISHED_SCHEMA
+from evopolicy_common.records.newest import described_data
 
 RECORD_VERSION = 2
 """Version of our own fields. Incremented only when older readers would misunderstand a file, not for added fields."""
@@ -307,12 +308,16 @@ class Versions(msgspec.Struct, frozen=True, kw_only=True):
 
     def cases_hash(self, split: Split) -> str:
         """The hash that identifies a split's cases: `cases_hashes`, or the file's hash if that is missing."""
+        return self.cases_hashes.get(split, self.file_hash(split))
+
+    def file_hash(self, split: Split) -> str:
+        """The hash of a split's case file; of its cases if there is none."""
         files: dict[Split, str] = {
             "train": self.data_train_hash,
             "validation": self.data_valid_hash,
             "heldout": self.data_heldout_hash,
         }
-        return self.cases_hashes.get(split, files[split])
+        return files[split]
 
 
 class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
@@ -373,6 +378,8 @@ def encode_run_record(record: RunRecord) -> bytes:
 
 def decode_run_record(data: bytes) -> RunRecord:
     """The record in `data`. Raises ProtocolError when this version cannot read it, such as the published software's."""
+    if newest := described_data(data):
+        raise ProtocolError(f"this is {newest}")
     try:
         header = _headers.decode(data)
         if header.schema_version == 1:

@@ -18,6 +18,7 @@ from evopolicy_common.cli.frame import App
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.processes.preflight import check_writable
 from evopolicy_common.processes.scratch import scratch_folder
+from evopolicy_common.records.newest import described
 from evopolicy_common.terminal import one_line, say, say_json
 from evopolicy_results.publish.archive import Archive
 from evopolicy_results.publish.findings import Checked
@@ -84,6 +85,8 @@ def leaderboard(
         except ValueError:
             fail(f"--replay {replay!r}: say a share such as 5%, or all")
     for path in files:
+        if text := described(path):
+            fail(f"{path} is {text}")
         if not path.is_file():
             fail(f"{path}: there is no such file")
     # Here, not above: they need jinja2, and `evopolicy` loads this module to list its commands.

@@ -19,6 +19,7 @@ import msgspec
 from evopolicy_common.errors import ProtocolError
 from evopolicy_common.messages.bounds import check_plausible
 from evopolicy_common.messages.gateway import REJECTED
+from evopolicy_common.records.newest import described
 from evopolicy_common.records.policies.checkpoints import policy_folder, read_meta
 from evopolicy_common.records.run_files import RUN_JSON, check_places, run_folders, submit_folders
 from evopolicy_common.records.run_record import RunRecord, decode_run_record
@@ -31,6 +32,7 @@ from evopolicy_results.reading import published
 from evopolicy_results.reading.parallel import in_processes
 from evopolicy_results.reading.published import PUBLISHED, PublishedSummary
 from evopolicy_results.reading.records import LeftOut, Run, Source, Submit, checkpoint_folder
+from evopolicy_results.reading.softwares import reconciled
 from evopolicy_results.scan.run import feedback_actions, log_lines, policy_files, scan, workspace_files
 from evopolicy_results.scan.signals import Signal
 
@@ -58,7 +60,9 @@ def find_run_dirs(paths: Iterable[Path]) -> tuple[list[Path], list[LeftOut]]:
     return found, [
         LeftOut(
             path=path,
-            reason="no run directory here"
+            reason=f"this is {text}"
+            if (text := described(path))
+            else "no run directory here"
             if path.is_dir()
             else "a file, not a run directory"
             if path.exists()
@@ -74,24 +78,24 @@ def load_runs(
     """Reads all complete runs at or under `paths`, and lists what is left out with the reason.
 
     `jobs` processes read in parallel once there are enough runs; `progress` is called with (done, total). A run with
-    the entry, environment, experiment id and repeat of an earlier one is left out as its duplicate.
+    the software, entry, environment, experiment id and repeat of an earlier one is left out as its duplicate.
     """
     folders, left_out = find_run_dirs(paths)
     runs: list[Run] = []
-    seen: dict[tuple[str, str, str, int], Path] = {}
+    seen: dict[tuple[bool, str, str, str, int], Path] = {}
     for done, result in enumerate(_read_all(folders, jobs), start=1):
         if progress is not None:
             progress(done, len(folders))
         if isinstance(result, LeftOut):
             left_out.append(result)
             continue
-        key = (result.entry, result.env, result.record.exp_id, result.record.repeat)
+        key = (result.is_published, result.entry, result.env, result.record.exp_id, result.record.repeat)
         if key in seen:
             left_out.append(LeftOut(path=result.path, reason=f"repeats the run in {seen[key]}"))
             continue
         seen[key] = result.path
         runs.append(result)
-    return Loaded(runs=tuple(runs), left_out=tuple(left_out))
+    return Loaded(runs=reconciled(runs), left_out=tuple(left_out))
 
 
 def _read_all(folders: list[Path], jobs: int) -> Iterable[Run | LeftOut]:

@@ -15,6 +15,7 @@ from evopolicy_common.errors import ConfigError, ProtocolError
 from evopolicy_common.messages.environment import Split
 from evopolicy_common.messages.gateway import REJECTED
 from evopolicy_common.records.aggregates import mean
+from evopolicy_common.records.newest import described
 from evopolicy_common.records.policies.checkpoints import CheckpointMeta, read_meta
 from evopolicy_common.records.run_files import RUN_JSON, read_record, submit_folders
 from evopolicy_common.records.run_record import RunRecord
@@ -109,6 +110,8 @@ def read_run(root: Path) -> RunUnderTest:
     try:
         record = read_record(root)
     except OSError as error:
+        if text := described(root):
+            raise ConfigError(f"{root} is {text}") from error
         raise ConfigError(
             f"{root} is not the directory of a finished run: {RUN_JSON}: {error.strerror}"
         ) from error

@@ -133,3 +133,48 @@ def test_a_damaged_published_run_is_left_out_with_its_reason(tmp_path: Path, dam
     found = read_or_explain(folder)
     assert isinstance(found, LeftOut)
     assert found.reason
+
+
+def edited(folder: Path, **parts: dict[str, Any]) -> None:
+    """Changes fields of parts of a `run.json`."""
+    path = folder / "run.json"
+    record = json.loads(path.read_text())
+    for name, fields in parts.items():
+        record[name] |= fields
+    path.write_text(json.dumps(record))
+
+
+def both_softwares(runs: Path, n_ours: int = 3) -> None:
+    """A run of each software of the same name on the same case files, of which ours has used `n_ours` held-out cases."""
+    published = write_published_run(runs / "published")
+    edited(published, outcome={"heldout_returns": [-90.0, -95.0, -100.0], "final_score": -95.0})
+    hashes = json.loads((published / "run.json").read_text())["versions"]
+    ours = write_run(
+        runs / "ours",
+        [Version(policy(), (0.0,) * 8, -200.0)],
+        entry="model-a",
+        exp_id="exp-1",
+        heldout=[-80.0, -86.0, -92.0][:n_ours],
+    )
+    cases = {split: f"sha256:{split}{n_ours}" for split in ("train", "validation", "heldout")}
+    files = {name: hashes[name] for name in hashes if name.startswith("data_")}
+    edited(ours, versions={**files, "cases_hashes": cases}, experiment_dimensions={"n_heldout": n_ours})
+
+
+def test_runs_of_both_softwares_are_paired_by_the_cases_of_their_files(tmp_path: Path) -> None:
+    both_softwares(tmp_path / "runs")
+    result = CliRunner().invoke(app, [str(tmp_path / "runs"), "--out", str(tmp_path / "report")])
+    assert result.exit_code != 0
+    assert "failed episodes" in result.output
+    assert "split on" not in result.output
+    tables = report(tmp_path, str(tmp_path / "runs"), "--allow-mixed", "--allow-unknown")
+    assert tables["left_out"]["rows"] == []
+    names = {"model-a", "model-a (published software)"}
+    (pair,) = (row for row in tables["pairs_core16"]["rows"] if {row["first"], row["second"]} == names)
+    assert (pair["cases"], pair["left_out"], abs(pair["gap"])) == (3, 0, 9.0)
+
+
+def test_runs_of_both_softwares_on_other_numbers_of_cases_are_not_paired(tmp_path: Path) -> None:
+    both_softwares(tmp_path / "runs", n_ours=2)
+    result = CliRunner().invoke(app, [str(tmp_path / "runs"), "--out", str(tmp_path / "report")])
+    assert "held-out split on gym/acrobot" in result.output

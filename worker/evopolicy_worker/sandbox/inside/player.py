@@ -52,6 +52,8 @@ action_bytes = 16 << 10
 """Maximum size of one action, bytes; received with the policy."""
 home = ""
 """The policy's own folder; received with the policy."""
+programs: Any = None
+"""The module `programs`, which the zygote loads."""
 
 copy_words = ctypes.memmove
 numpy_key = 0
@@ -91,10 +93,15 @@ def play(init: dict[str, Any]) -> NoReturn:
     stage = "import"
     try:
         module = imported_policy(path, code)
-        if not isinstance(getattr(module, "Policy", None), type):
+        program = programs.is_program(module)
+        if not program and not isinstance(getattr(module, "Policy", None), type):
             raise ImportError("policy.py has no top-level class named Policy")
         stage = "init"
-        policy = module.Policy(init["obs_space"], init["action_space"], init["env_meta"])
+        spaces = init["obs_space"], init["action_space"]
+        if program:
+            policy = programs.Program(module, spaces, init["env_meta"], bytes.fromhex(init["seed"]))
+        else:
+            policy = module.Policy(*spaces, init["env_meta"])
     except BaseException as error:
         reply_failure(stage, error)
         flush_output()
@@ -565,7 +572,8 @@ def reply_failure(stage: str, error: BaseException) -> None:
     # A hostile exception may raise when it is read; then the parts read so far are reported.
     with contextlib.suppress(BaseException):
         frames = error.__traceback__
-        while frames is not None and frames.tb_frame.f_code.co_filename == __file__:
+        own = (__file__, programs.__file__)
+        while frames is not None and frames.tb_frame.f_code.co_filename in own:
             frames = frames.tb_next
         kind = kind_of(error)
         message = "".join(traceback.format_exception_only(type(error), error)).strip().rpartition("\n")[2]

@@ -151,6 +151,7 @@ def warm(modules: list[str]) -> None:
     """Imports what every policy may use, so that children share it."""
     global player
     player = module("player")
+    player.programs = module("programs")
     np = player.np
     for name in ("numpy.random", "numpy.linalg", "numpy.fft", *modules):
         importlib.import_module(name)

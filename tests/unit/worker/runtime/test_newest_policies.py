@@ -1,0 +1,124 @@
+"""Policies of the newest published form, `make_policy(context)`, play unchanged in a slot."""
+
+from __future__ import annotations
+
+import json
+import textwrap
+
+import pytest
+from slots import Slots, rows
+
+NEWEST = """
+    import json
+    import struct
+
+    from evopolicygym.policy import POLICY_ABI_VERSION, Policy, PolicyContext, TensorValue, copy_policy_value
+
+    class Controller:
+        def __init__(self, context: PolicyContext) -> None:
+            self.gain = 1.0
+            self.n = 0
+            seed = context.policy_seed
+            assert 0 <= seed < 1 << 64 and type(seed) is int
+            assert context.environment_parameters == {}
+            print(json.dumps([POLICY_ABI_VERSION, context.observation_space, context.action_space,
+                              dict(context.metadata), seed]))
+
+        def act(self, observation: TensorValue) -> list[float]:
+            assert (observation.dtype, observation.shape) == ("float32", (3,)), observation
+            assert copy_policy_value(observation) == observation
+            position, _, target = struct.unpack("<3f", observation.data)
+            self.n += 1
+            return [self.gain * (target - position)]
+
+    def make_policy(context: PolicyContext) -> Policy:
+        return Controller(context)
+"""
+EARLIER = """
+    import numpy as np
+    class Policy:
+        def __init__(self, *spaces): pass
+        def reset(self, episode_index): pass
+        def act(self, obs): return [float(obs[2]) - float(obs[0])]
+"""
+
+
+def test_a_policy_of_the_newest_form_plays_as_one_of_the_earlier_form_does(slots: Slots) -> None:
+    newest, earlier = slots.play(NEWEST), slots.play(EARLIER)
+    assert newest.failure is None
+    assert [row.action for row in rows(newest)] == [row.action for row in rows(earlier)]
+    version, obs_space, action_space, metadata, _ = json.loads(newest.stdout)
+    assert (version, obs_space["type"], action_space["shape"]) == ("policy/v2", "Box", [1])
+    assert (metadata["env"], metadata["max_episode_steps"]) == ("toy/line", 60)
+    assert not {"obs_space", "action_space"} & metadata.keys()
+
+
+def test_each_episode_has_a_new_policy_and_seed_with_scope_submit_too(slots: Slots) -> None:
+    outcomes = slots.play_all(NEWEST, first=0, n=3, policy_scope="submit")
+    assert [outcome.failure for outcome in outcomes] == [None] * 3
+    assert len({json.loads(outcome.stdout)[-1] for outcome in outcomes}) == 3
+
+
+def test_observations_as_lists_stay_lists_and_tensors_are_actions(slots: Slots) -> None:
+    policy = """
+        import struct
+        from evopolicygym.policy import TensorValue
+        class Policy:
+            def act(self, observation):
+                assert type(observation) is list and type(observation[0]) is float
+                return TensorValue("float64", (1,), struct.pack("<d", 0.25))
+        def make_policy(context):
+            return Policy()
+    """
+    outcome = slots.play(policy, observations="lists")
+    assert outcome.failure is None
+    assert float(rows(outcome)[0].action[0]) == 0.25
+
+
+@pytest.mark.parametrize(
+    ("returned", "message"),
+    [
+        ("np.zeros(1)", "TypeError"),
+        ("[np.float64(0.0)]", "TypeError"),
+        ("[float('inf')]", "ValueError"),
+        ("TensorValue('float64', (2,), bytes(8))", "ValueError"),
+        ("TensorValue('complex64', (1,), bytes(8))", "ValueError"),
+    ],
+)
+def test_an_action_that_the_published_software_refuses_is_a_failure(
+    slots: Slots, returned: str, message: str
+) -> None:
+    policy = f"""
+        import numpy as np
+        from evopolicygym.policy import TensorValue
+        class P:
+            def act(self, observation):
+                return {returned}
+        def make_policy(context):
+            return P()
+    """
+    outcome = slots.play(policy)
+    assert outcome.failure is not None
+    assert (outcome.failure.category, outcome.failure.step_index) == ("act_error", 0)
+    assert outcome.failure.message.startswith(message)
+    assert "programs.py" not in outcome.failure.traceback.splitlines()[1]
+
+
+def test_a_fault_in_make_policy_is_an_init_error_and_earlier_forms_keep_their_class(slots: Slots) -> None:
+    failed = slots.play("def make_policy(context):\n    return context.nothing\n", first=0)
+    assert failed.failure is not None
+    assert failed.failure.category == "init_error"
+    without = slots.play("def make_policy(context):\n    return object()\n", first=0)
+    assert without.failure is not None
+    assert (without.failure.category, "act" in without.failure.message) == ("init_error", True)
+    helper = slots.play(EARLIER.replace("import numpy as np", "def make_policy(context): raise ValueError"))
+    assert helper.failure is None
+
+
+def test_a_bundles_own_module_of_that_name_comes_first(slots: Slots) -> None:
+    files: dict[str, str | bytes] = {
+        "policy.py": "from evopolicygym.policy import MINE\n" + textwrap.dedent(EARLIER),
+        "evopolicygym/__init__.py": "",
+        "evopolicygym/policy.py": "MINE = 1\n",
+    }
+    assert slots.play(files).failure is None
