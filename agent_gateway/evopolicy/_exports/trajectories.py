@@ -130,11 +130,14 @@ def _episodes(run: Run, name: str) -> Iterator[tuple[Any, dict[str, Any]]]:
             try:
                 rows = list(_rows(path))
                 pictures = path.with_name("observations.npz")
+                if not pictures.is_file():
+                    pictures = path.with_name("observations.npy")
                 if rows and rows[0].obs is not None:
                     columns = _columns([row.obs for row in rows])
                 elif rows and pictures.is_file():
                     columns = read_arrays(read_regular(pictures, MAX_OBSERVATIONS_BYTES), MAX_BYTES)
-                    columns = columns["observations"] if list(columns) == ["observations"] else columns
+                    if list(columns) in ([""], ["observations"]):
+                        (columns,) = columns.values()
                 else:
                     continue
                 actions = _columns([row.action for row in rows])

@@ -36,6 +36,11 @@ def _policy(run: RunOpened) -> str:
         "npz": "in `observations.npz`, read with `numpy.load`: the array `observations`, or one for each part of the space, a row a"
         " step (`obs` in `trajectory.jsonl` is null)",
     }[run.env.obs_storage]
+    if run.profile != "own":
+        stored = (
+            "in the rows of `trajectory.jsonl`, or, if those of an episode have more than 4,096 bytes as one array, in"
+            " `observations.npy` (`observations.npz` for dictionaries; `obs` is null then)"
+        )
     kept = {
         "scores": "Feedback is the summary of each submit; it has no trajectories.",
         "trajectories": f"Feedback keeps the observations {stored}."

@@ -17,6 +17,7 @@ from evopolicy_common.messages.gateway import EpisodeFeedback, FeedbackDetail
 from evopolicy_common.records.episodes import rendered, trajectory
 from evopolicy_common.records.summary import SCHEMA_VERSION, utc_text
 from evopolicy_gateway.submits.formatting import cut_text, failure_line
+from evopolicy_gateway.submits.stacked import as_published
 
 FEEDBACK_ERROR = "feedback_error"
 """Category of the line in `error.txt` that reports an infrastructure failure; the policy did not fail."""
@@ -24,7 +25,7 @@ FEEDBACK_ERROR = "feedback_error"
 
 _NO_MESSAGE = "messages of a policy are left out at this run's level of feedback"
 
-LEFT_OUT_FIRST = ("video.mp4", "observations.npz", "trajectory.jsonl")
+LEFT_OUT_FIRST = ("video.mp4", "observations.npz", "observations.npy", "trajectory.jsonl")
 """Files that are left out, in this order, until the episode's files fit into its share."""
 MUCH_BYTES = 16 << 20
 """Files of larger episodes are made one after another."""
@@ -75,13 +76,14 @@ def episode_files(
     at: float,
     share: int,
     detail: FeedbackDetail = "pictures",
+    published: bool = False,
 ) -> dict[str, bytes]:
     """Returns the files of `episodes/ep_XXX/`, at most `share` bytes without the policy's printed output.
 
     At the level `scores` these are only the lines of `error.txt`, without messages; `packed` is not read then.
 
     `packed`: a rendered episode or, from workers of earlier versions, a trajectory. `at`: Unix time for `error.txt`,
-    seconds. Raises ProtocolError when `packed` is neither, or has another length or return than declared.
+    seconds. `published`: observations are where the published software has them. Raises ProtocolError when `packed` is neither, or has another length or return than declared.
     """
     texts = _text_files(episode, at, whole=shows_texts(detail, storage))
     if detail == "scores":
@@ -90,6 +92,8 @@ def episode_files(
         files = rendered.checked_files(packed, episode.length, episode.episode_return)
     else:
         files = rendered.files_of(trajectory.decode(packed, MAX_UNPACKED_BYTES), storage)
+    if published:
+        files = as_published(files)
     if detail == "trajectories":
         files.pop(rendered.OBSERVATIONS, None)
         files.pop("observations.npy", None)

@@ -609,6 +609,7 @@ class SubmitPipeline:
                         at=at,
                         share=episode_share(self.run.limits, self.run.episode_budget),
                         detail=self.run.feedback,
+                        published=self.run.profile != "own",
                     )
             except (ProtocolError, MemoryError, ValueError, TypeError, RecursionError) as error:
                 log.error(

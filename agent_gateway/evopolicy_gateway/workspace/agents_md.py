@@ -221,6 +221,10 @@ _FINISH = {
     "budget": "Spend the whole budget: a run that ends with episodes left is an error and has no score. When it is spent",
 }
 _LOOK = "head -n 2 feedback/$first_submit/episodes/$first_episode/trajectory.jsonl\n"
+_STACKED = (
+    "| `episodes/ep_*/observations.npy`, `.npz` for dictionaries | observations of more than 4,096 bytes in one array, read"
+    " with `numpy.load`; `obs` is null then |"
+)
 _FILES: dict[str, tuple[tuple[FeedbackDetail, ...], str]] = {
     "trajectory.jsonl": (
         ("trajectories", "pictures"),
@@ -333,7 +337,10 @@ def agents_md(run: RunOpened, urls: Urls, text: str = "") -> str:
 def _feedback_files(run: RunOpened) -> str:
     texts = shows_texts(run.feedback, run.env.obs_storage)
     shown = {"texts": texts, "error.txt": texts, "failure": not texts}
-    rows = [row for name, (levels, row) in _FILES.items() if shown.get(name, run.feedback in levels)]
+    known = dict(_FILES)
+    if run.profile != "own":
+        known["observations.npz"] = (("pictures",), _STACKED)
+    rows = [row for name, (levels, row) in known.items() if shown.get(name, run.feedback in levels)]
     if run.feedback in _LESS and not (run.feedback == "trajectories" and texts):
         rows += ["", _LESS[run.feedback]]
     return "\n".join(rows) + "\n"
