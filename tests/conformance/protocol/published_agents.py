@@ -89,11 +89,12 @@ assert task.startswith("# ")
 info = ask("/info")[1]
 assert info["env_meta"]["n_env_instances"] == 1024 and info["state"]["is_finalized"] is False
 for wrong, status in (([], "budget_invalid"), ([0] * 99, "budget_invalid"), ([1024], "invalid_env_instance"),
-                      ("3-1", "invalid_env_instance"), ([-1], "invalid_env_instance")):
+                      ("3-1", "budget_invalid"), ([-1], "budget_invalid")):
     code, answer = submit(wrong)
     assert (code, answer["status"]) == (400, status), (wrong, answer)
-assert ask("/info")[1]["state"]["remaining_budget"] == info["episode_budget"]
+assert ask("/info")[1]["state"] == {"remaining_budget": info["episode_budget"], "n_submits": 5, "is_finalized": False}
 answer = submit("1022-1023,0")[1]
+assert answer["submit_id"] == 5
 assert answer["summary"]["env_instances"] == [1022, 1023, 0] and answer["is_finalized"] is False
 assert ask("/finalize", {})[0] == 405
 spend_all()
@@ -101,6 +102,19 @@ assert ask("/info")[1]["state"] | {"n_submits": 0} == {"remaining_budget": 0, "n
 code, answer = submit([0])
 assert (code, answer["status"]) == (409, "run_closed")
 time.sleep(1000)  # and it is ended, after a time that AGENTS.md tells
+"""
+
+FAILS = f"""
+system, good = Path(os.environ["EVOPOLICYGYM_SYSTEM"]), {LIST_POLICY!r}
+(system / "policy.py").write_text(good.replace("self.played += 1", "self.played += 1; assert self.played != 2"))
+answer = submit([0, 1])[1]
+assert (answer["status"], answer["summary"]["errors"]) == ("rollout_timeout", [1]), answer
+assert answer["summary"]["episode_lengths"][1] == 0 and answer["summary"]["mean_return"] is None
+# It fails beyond its submit's episodes, as only hidden evaluation has that many.
+(system / "policy.py").write_text(good.replace("self.played += 1", "self.played += 1; assert episode_index < 1"))
+assert submit([0])[1]["status"] == "ok"
+(system / "policy.py").write_text(good)
+spend_all()
 """
 
 EARLY_STOP = """

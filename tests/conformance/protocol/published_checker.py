@@ -75,13 +75,19 @@ def _run(root: Path) -> Iterator[str]:
     yield from _artifacts(root, run)
     submits = _numbered(root / "workspace" / "feedback")
     checkpoints = _numbered(root / "checkpoints")
-    charged = {index: folder for index, folder in submits.items() if (folder / "summary.json").is_file()}
+    summaries = {index: folder for index, folder in submits.items() if (folder / "summary.json").is_file()}
+    # A rejected request may have a folder; it has no checkpoint.
+    charged = {
+        index: folder
+        for index, folder in summaries.items()
+        if _json(folder / "summary.json").get("n_episodes", 1)
+    }
     if checkpoints.keys() != charged.keys():
         yield (
             f"line 17: checkpoints of submits {sorted(checkpoints)}, charged submits {sorted(charged)}:"
             " one for every charged submit"
         )
-    for index, folder in charged.items():
+    for index, folder in summaries.items():
         yield from _summary(folder, index)
     for index, folder in checkpoints.items():
         summary = _json(charged[index] / "summary.json") if index in charged else None
@@ -201,6 +207,11 @@ def _summary(folder: Path, index: int) -> Iterator[str]:
         if not isinstance(returns, list) or not isinstance(ids, list) or len(returns) != len(ids):
             yield f"line 25: {where} has not one return for each of env_instances"
         yield from _episodes(folder)
+        return
+    if summary.get("status") == "rollout_timeout" and summary.get("returns") is not None:
+        for name in ("mean_return", "std_return"):
+            if summary.get(name, "missing") is not None:
+                yield f"{where} has failed episodes and {name} is {summary.get(name)!r}, not null"
         return
     for name in ("first_global_episode", *SUMMARY_ARRAYS, *SUMMARY_AGGREGATES):
         if summary.get(name, "missing") is not None:

@@ -39,6 +39,7 @@ PUBLISHED = {
     "bare": Agent(agents.BARE, *DONE),
     "requests": Agent(agents.REQUESTS, *DONE),
     "floods": Agent(agents.FLOODS, *DONE),
+    "fails": Agent(agents.FAILS, *DONE),
     "stops early": Agent(agents.EARLY_STOP, "error", "agent_stopped", 1),
     "exits early": Agent(agents.EARLY_EXIT, "error", "agent_stopped", 1),
     "says nothing": Agent(agents.SAYS_NOTHING, "error", "silent", 1, SOON_SILENT),
@@ -158,6 +159,13 @@ def test_runs_of_the_profile_are_stamped_and_marked_as_public(published: Played)
         assert (dimensions.observations, dimensions.simulation) == ("lists", "forbidden")
         assert (dimensions.step_limit, dimensions.n_train) == ("published", 1024)
         assert record.versions.data_secret is False
+
+
+def test_only_a_policy_that_never_fails_is_eligible(published: Played) -> None:
+    _, record = published["fails"]
+    assert record.experiment_dimensions.failed_episodes == "end-submit"
+    assert (list(record.outcome.val_scores or {}), record.outcome.best_submit_index) == (["2"], 2)
+    assert record.outcome.quarantined_submits == (1,)
 
 
 def test_one_policy_plays_a_submit_on_lists_and_unreadable_is_zero(published: Played) -> None:

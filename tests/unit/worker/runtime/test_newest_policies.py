@@ -101,7 +101,9 @@ def test_an_action_that_the_published_software_refuses_is_a_failure(
     assert outcome.failure is not None
     assert (outcome.failure.category, outcome.failure.step_index) == ("act_error", 0)
     assert outcome.failure.message.startswith(message)
-    assert "programs.py" not in outcome.failure.traceback.splitlines()[1]
+    if "TensorValue" not in returned:
+        # Found in what the policy returned: none of the sandbox's own lines are in the traceback.
+        assert "programs.py" not in outcome.failure.traceback
 
 
 def test_a_fault_in_make_policy_is_an_init_error_and_earlier_forms_keep_their_class(slots: Slots) -> None:
