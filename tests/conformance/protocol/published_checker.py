@@ -80,7 +80,7 @@ def _run(root: Path) -> Iterator[str]:
     charged = {
         index: folder
         for index, folder in summaries.items()
-        if _json(folder / "summary.json").get("n_episodes", 1)
+        if (_json(folder / "summary.json") or {}).get("n_episodes", 1)
     }
     if checkpoints.keys() != charged.keys():
         yield (

@@ -126,7 +126,7 @@ def test_selection_in_an_invented_run_is_that_of_the_published_rule(seed: int) -
     assert finished.status == ("no_ok_submit" if best is None else "completed")
 
 
-def test_a_rejected_request_takes_an_index_without_a_charge_and_outlives_a_restart() -> None:
+def test_a_rejected_request_takes_an_index_without_a_charge_across_restarts() -> None:
     rig = Rig()
     session = rig.register()
     rig.create(budget=2, **PROFILE)
@@ -145,7 +145,7 @@ def test_a_rejected_request_takes_an_index_without_a_charge_and_outlives_a_resta
     assert (finished.status, finished.best_submit_index, finished.budget_used) == ("completed", 1, 2)
 
 
-def test_rejected_requests_are_counted_up_to_a_limit_and_never_in_an_own_run() -> None:
+def test_rejected_requests_count_up_to_a_limit_in_published_profiles_only() -> None:
     rig = Rig()
     rig.register()
     rig.create(budget=1, **PROFILE)

@@ -415,7 +415,7 @@ def test_held_out_success_is_in_the_result_after_a_restart(reload: bool) -> None
 
 
 @pytest.mark.parametrize("settings_", [{"policy_scope": "submit"}, {**PUBLISHED, "profile": "published"}])
-def test_a_policy_can_tell_hidden_cases_by_its_arguments_in_published_profiles_only(
+def test_arguments_tell_a_policy_hidden_cases_in_published_profiles_only(
     settings_: dict[str, str],
 ) -> None:
     rig = Rig()

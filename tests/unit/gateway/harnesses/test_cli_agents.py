@@ -261,6 +261,6 @@ def test_settings_that_cannot_work_are_refused(tmp_path: Path) -> None:
         play(tmp_path, settings("codex", pass_environment=("NO_SUCH_NAME",)), "work")
 
 
-def test_a_session_that_fails_after_the_budget_is_spent_gets_no_further_prompt(tmp_path: Path) -> None:
+def test_a_session_that_fails_after_its_last_submit_gets_no_prompt(tmp_path: Path) -> None:
     played = play(tmp_path, settings("claude-code"), "submits_and_crashes", budget=2)
     assert (ended(played).reason, len(played.prompts)) == ("agent_stopped", 1)

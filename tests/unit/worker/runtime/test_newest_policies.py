@@ -43,7 +43,7 @@ EARLIER = """
 """
 
 
-def test_a_policy_of_the_newest_form_plays_as_one_of_the_earlier_form_does(slots: Slots) -> None:
+def test_a_policy_of_the_newest_form_plays_as_an_earlier_one(slots: Slots) -> None:
     newest, earlier = slots.play(NEWEST), slots.play(EARLIER)
     assert newest.failure is None
     assert [row.action for row in rows(newest)] == [row.action for row in rows(earlier)]
@@ -106,7 +106,7 @@ def test_an_action_that_the_published_software_refuses_is_a_failure(
         assert "programs.py" not in outcome.failure.traceback
 
 
-def test_a_fault_in_make_policy_is_an_init_error_and_earlier_forms_keep_their_class(slots: Slots) -> None:
+def test_a_fault_in_make_policy_is_an_init_error(slots: Slots) -> None:
     failed = slots.play("def make_policy(context):\n    return context.nothing\n", first=0)
     assert failed.failure is not None
     assert failed.failure.category == "init_error"
