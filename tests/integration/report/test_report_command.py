@@ -19,6 +19,7 @@ from typer.testing import CliRunner
 
 from evopolicy_results.cli.report import app
 from evopolicy_results.notebook import figures_of, rows, write_report
+from evopolicy_results.report import write_report as write
 from evopolicy_results.scoring import paper
 from evopolicy_results.studies.study import study
 
