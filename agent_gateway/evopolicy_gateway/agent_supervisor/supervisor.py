@@ -22,7 +22,7 @@ from evopolicy_common.logs import structlog
 from evopolicy_common.records.secrets import Redaction, is_secret, note_passed, without_keys
 from evopolicy_gateway.harnesses import config_of, make
 from evopolicy_gateway.harnesses.interface.agent_config import AgentConfig
-from evopolicy_gateway.harnesses.interface.base import Stage
+from evopolicy_gateway.harnesses.interface.base import RelayAddress, Stage
 from evopolicy_gateway.inputs import kept as inputs
 from evopolicy_gateway.inputs import own_config
 from evopolicy_gateway.jail.jail import Jail
@@ -119,6 +119,10 @@ def _stderr_tail(agent_log: AgentLog) -> tuple[str, ...]:
 
 async def _play(order: StartAgent, stage: Stage, config: AgentConfig | None) -> AgentEnded:
     harness = make(order.agent, Path(order.started_in), config)
+    urls, relayed = order.urls, bool(order.model_url)
+    if relayed:
+        harness.relay = RelayAddress(url=order.model_url, token=order.model_token)
+        urls = {**urls, "model": order.model_url}
     passed = [name for name in harness.variables if is_secret(name)]
     if order.jail is not None:
         passed += order.jail.settings.environment
@@ -135,13 +139,14 @@ async def _play(order: StartAgent, stage: Stage, config: AgentConfig | None) -> 
             order.jail,
             inputs=kept.shown(harness.skills_at),
             more_programs=kept.commands,
-            harness=harness.name,
+            # With the relay it needs neither the provider's hosts nor the variables with the key.
+            harness="" if relayed else harness.name,
             command=harness.command,
             variables=harness.variables,
             hosts=harness.hosts,
             packages=harness.packages,
             workspace=stage.workspace,
-            urls=order.urls,
+            urls=urls,
             started_in=Path(order.started_in),
         )
         inside = jail.environment(stage.environment, {**order.urls, **order.variables})

@@ -167,6 +167,46 @@ def _bubblewrap() -> list[str]:
     return [*command, *(["--disable-userns"] if _can_disable_userns(program) else [])]
 
 
+def confined(read: Sequence[Path], write: Sequence[Path]) -> list[str]:
+    """The bubblewrap command, up to the program, for a process of our own that needs the network: it sees the system, `read` and
+    `write`, and no variable but those of its proxy and certificates."""
+    command = [
+        *_bubblewrap(),
+        *_system(True),
+        "--proc",
+        "/proc",
+        "--dev",
+        "/dev",
+        "--tmpfs",
+        "/tmp",
+        "--clearenv",
+    ]
+    for name in ("PATH", *_NETWORK_VARIABLES):
+        if name in os.environ:
+            command += ["--setenv", name, os.environ[name]]
+    files = [os.environ[name] for name in ("SSL_CERT_FILE", "SSL_CERT_DIR") if name in os.environ]
+    for path in dict.fromkeys((*map(str, read), *files)):
+        command += ["--ro-bind", path, path]
+    for path in map(str, write):
+        command += ["--bind", path, path]
+    return [*command, "--remount-ro", "/", "--chdir", "/"]
+
+
+_NETWORK_VARIABLES = (
+    *(
+        "HTTP_PROXY",
+        "HTTPS_PROXY",
+        "ALL_PROXY",
+        "NO_PROXY",
+        "http_proxy",
+        "https_proxy",
+        "all_proxy",
+        "no_proxy",
+    ),
+    *("SSL_CERT_FILE", "SSL_CERT_DIR"),
+)
+
+
 @functools.cache
 def _can_disable_userns(program: str) -> bool:
     """Whether bubblewrap has the option (since 0.8); older versions leave the kernel's limits unchanged."""

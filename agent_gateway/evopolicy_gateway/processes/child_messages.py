@@ -118,6 +118,13 @@ class AgentEnded(Event, frozen=True, kw_only=True, tag="agent_ended"):
     """A failed agent's last lines on stderr, without keys."""
 
 
+class ModelBudgetSpent(Event, frozen=True, kw_only=True, tag="model_budget_spent"):
+    """The relay for model calls has refused a request beyond the run's limits."""
+
+    what: str
+    """The limit, such as `5,000 requests`."""
+
+
 class Order(msgspec.Struct, frozen=True, kw_only=True, tag_field="do"):
     """Parent to child."""
 
@@ -155,6 +162,10 @@ class StartAgent(Order, frozen=True, kw_only=True, tag="start_agent"):
     """A coding agent's settings: `AgentConfig`."""
     inputs: tuple[AgentInput, ...] = ()
     """Skills and MCP servers with which the run was opened; they need a jail."""
+    model_url: str = ""
+    """Where the relay serves the model's API; empty: the agent reaches the provider itself, with the key."""
+    model_token: str = ""
+    """The key that the relay accepts."""
     session_file: str | None = None
     passed_file: str | None = None
     """`Passed`: gets digests of values that the agent's variables and command line hold."""
@@ -164,6 +175,13 @@ class StartAgent(Order, frozen=True, kw_only=True, tag="start_agent"):
     """None: not jailed."""
     lock: str | None = None
     """Lock file that the agent supervisor holds while the agent may be alive; it first waits for an earlier holder."""
+
+
+class StartRelay(Order, frozen=True, kw_only=True, tag="start_relay"):
+    """The first line to a relay for model calls."""
+
+    order: dict[str, Any]
+    """`relay.service.Order`; it has the provider's key."""
 
 
 class HeldTime(Order, frozen=True, kw_only=True, tag="held_time"):
@@ -185,9 +203,18 @@ class StopAgent(Order, frozen=True, kw_only=True, tag="stop_agent"):
 
 
 AnyEvent = (
-    Ready | Waits | Progress | RunClosed | AgentTurn | AgentDoing | AgentTime | AgentSurvives | AgentEnded
+    Ready
+    | Waits
+    | Progress
+    | RunClosed
+    | AgentTurn
+    | AgentDoing
+    | AgentTime
+    | AgentSurvives
+    | AgentEnded
+    | ModelBudgetSpent
 )
-AnyOrder = CloseRun | StartAgent | HeldTime | SubmitsSeen | StopAgent
+AnyOrder = CloseRun | StartAgent | StartRelay | HeldTime | SubmitsSeen | StopAgent
 _events: msgspec.json.Decoder[AnyEvent] = msgspec.json.Decoder(AnyEvent)
 _orders: msgspec.json.Decoder[AnyOrder] = msgspec.json.Decoder(AnyOrder)
 
@@ -200,10 +227,10 @@ _MAX_TEXT = 2000
 def line(message: Event | Order) -> bytes:
     """Encodes a message as one line of JSON, shortened if it is too long, which an agent's CLI may cause.
 
-    `StartAgent`, with the operator's own settings, is never shortened.
+    `StartAgent` and `StartRelay`, with the operator's own settings, are never shortened.
     """
     data = msgspec.json.encode(message) + b"\n"
-    if len(data) <= MAX_LINE_BYTES or isinstance(message, StartAgent):
+    if len(data) <= MAX_LINE_BYTES or isinstance(message, StartAgent | StartRelay):
         return data
     shorter: dict[str, Any] = {}
     for name in message.__struct_fields__:

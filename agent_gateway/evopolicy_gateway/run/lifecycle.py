@@ -56,7 +56,9 @@ from evopolicy_gateway.processes.child_messages import (
     Waits,
 )
 from evopolicy_gateway.processes.child_rpc import Child
+from evopolicy_gateway.relay.service import Order
 from evopolicy_gateway.run import record
+from evopolicy_gateway.run.model_relay import ModelRelay
 from evopolicy_gateway.run.operations import Operations
 from evopolicy_gateway.run.plan import Plan
 from evopolicy_gateway.run.times import Stopwatch
@@ -121,6 +123,9 @@ class RunLifecycle:
         self._held_before = 0.0
         """`held_s` of the run when the agent supervisor was started."""
         self._order: CloseRun | None = None
+        self._relay: ModelRelay | None = None
+        self._model_spent = asyncio.Event()
+        """A request beyond the limits of the run's model was refused."""
         self._gateway: Child | None = None
         self._supervisor: Child | None = None
         self._stopwatch: Stopwatch
@@ -286,6 +291,8 @@ class RunLifecycle:
         serving = asyncio.create_task(self._keep_gateway())
         following = asyncio.create_task(self._follow())
         keeping: asyncio.Task[AgentEnded] | None = None
+        relaying: asyncio.Task[None] | None = None
+        model_spent = asyncio.create_task(self._model_spent.wait())
         spent = asyncio.create_task(self._spent.wait())
         try:
             up: list[asyncio.Future[Any]] = [serving, self._ready]
@@ -295,9 +302,15 @@ class RunLifecycle:
             if not self._ready.done():
                 return  # cancelled before it was served
             self._stopwatch.opened()
+            self._relay = self._new_relay()
+            if self._relay is not None:
+                relaying = asyncio.create_task(self._relay.serve())
             keeping = asyncio.create_task(self._keep_agent(self._ready.result()))
-            going: list[asyncio.Future[Any]] = [serving, keeping, spent]
+            going: list[asyncio.Future[Any]] = [serving, keeping, spent, model_spent]
+            going += [] if relaying is None else [relaying]
             await asyncio.wait(going, return_when=asyncio.FIRST_COMPLETED)
+            if relaying is not None and relaying.done():
+                relaying.result()
             if not serving.done() and not keeping.done():
                 await asyncio.wait(
                     [serving, keeping], timeout=LAST_WORDS_S, return_when=asyncio.FIRST_COMPLETED
@@ -310,13 +323,14 @@ class RunLifecycle:
             await self._close(ended)
             await serving
         finally:
-            tasks = [task for task in (serving, following, keeping, spent) if task is not None]
+            every = (serving, following, keeping, spent, relaying, model_spent)
+            tasks = [task for task in every if task is not None]
             for task in tasks:
                 # At the loop's end they are being cancelled too. A second time would interrupt their clean-up.
                 if not task.cancelling():
                     task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
-            for child in (self._supervisor, self._gateway):
+            for child in (self._supervisor, self._relay, self._gateway):
                 if child is not None:
                     await child.end(END_GRACE_S)
             self._survivors = await child_rpc.end_orphans()
@@ -324,6 +338,8 @@ class RunLifecycle:
 
     async def _close(self, ended: AgentEnded) -> None:
         reason = "budget_spent" if self._spent.is_set() else ended.reason
+        if self._model_spent.is_set() and reason in ("agent_stopped", "agent_failed", "told"):
+            reason = "model_budget_spent"
         reason = CANCELLED if self._cancelled else reason
         how = f"agent ended: {reason.replace('_', ' ')}"
         self._watch.note(self._name, f"{how}, {ended.detail}" if ended.detail else how)
@@ -357,6 +373,41 @@ class RunLifecycle:
             if finished is not None and finished.status == CANCELLED:
                 self._cancelled = True
                 self._spent.set()
+
+    def _new_relay(self) -> ModelRelay | None:
+        """The relay for the agent's model; None for an agent without one, or one that cannot use it. Tells the operator the limits."""
+        plan, name = self._plan, self._name
+        terms = harnesses.make(plan.agent, plan.started_in, plan.config).model
+        if terms is None:
+            return None
+        if terms.upstream is None:
+            how = "counted by the agent itself, so that only its tokens are limited"
+            self._watch.note(name, f"model limits: {terms.limits}; metering: agent ({how})")
+            return None
+        self._watch.note(name, f"model limits: {terms.limits}; metering: relay")
+        upstream = terms.upstream
+
+        def spent(what: str) -> None:
+            if not self._model_spent.is_set():
+                self._watch.note(name, f"the model budget is spent: {what}")
+            self._model_spent.set()
+
+        return ModelRelay(
+            lambda token: Order(
+                upstream=upstream,
+                token=token,
+                ledger=str(self._folder.model_requests),
+                limits=terms.limits,
+                prices=terms.prices,
+                model=terms.model,
+                declared_only=terms.declared_only,
+            ),
+            self._folder.model_requests,
+            self._folder.harness_log,
+            jailed=plan.jail.mode != "none",
+            doing=partial(self._watch.doing, name),
+            spent=spent,
+        )
 
     async def _keep_gateway(self) -> None:
         """Runs the gateway, with restarts, until it has closed the run."""
@@ -487,6 +538,8 @@ class RunLifecycle:
                 prompts=msgspec.to_builtins(self._plan.texts.prompts),
                 inputs=self._plan.texts.inputs,
                 config=None if self._plan.config is None else msgspec.to_builtins(self._plan.config),
+                model_url="" if self._relay is None else self._relay.url,
+                model_token="" if self._relay is None else self._relay.token,
                 session_file=str(self._folder.session),
                 passed_file=str(self._folder.passed),
                 lock=str(self._folder.supervisor_lock),
@@ -499,6 +552,8 @@ class RunLifecycle:
             if isinstance(event, AgentTurn):
                 self._watch.turn(self._name, event.turn, event.text)
             elif isinstance(event, AgentDoing):
+                if self._relay is not None:
+                    event = msgspec.structs.replace(event, tokens=None)  # the relay's count is the run's
                 self._watch.doing(self._name, event)
             elif isinstance(event, AgentTime):
                 self._stopwatch.agent_reported(event.used_s)

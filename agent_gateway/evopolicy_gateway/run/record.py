@@ -21,7 +21,7 @@ from typing import Any, cast, get_args
 import msgspec
 
 from evopolicy_common import catalogue
-from evopolicy_common.errors import ConfigError, StorageError, TransportError
+from evopolicy_common.errors import ConfigError, EvopolicyError, StorageError, TransportError
 from evopolicy_common.messages.environment import Split
 from evopolicy_common.messages.gateway import CANCELLED
 from evopolicy_common.messages.operator import RunFinished, SubmitRecord
@@ -40,6 +40,8 @@ from evopolicy_common.records.run_record import (
     Agent,
     Artifacts,
     ExperimentDimensions,
+    ModelLimits,
+    ModelUse,
     Outcome,
     ReferenceScore,
     RejectedStatus,
@@ -54,6 +56,9 @@ from evopolicy_common.records.run_record import (
 )
 from evopolicy_common.records.secrets import without_keys
 from evopolicy_common.records.summary import utc_text
+from evopolicy_gateway import harnesses
+from evopolicy_gateway.harnesses.coding_agents import session
+from evopolicy_gateway.relay import ledger
 from evopolicy_gateway.run import replays
 from evopolicy_gateway.run.operations import Operations
 from evopolicy_gateway.run.plan import Plan
@@ -232,7 +237,7 @@ def run_record(
 
 def told_at_close(folder: RunFolder, plan: Plan, facts: dict[str, Any]) -> dict[str, Any]:
     """The `GATEWAY_SIDE` of `run.json`, which the coordinator commits to when the run ends."""
-    agent = msgspec.to_builtins(_agent(plan, facts))
+    agent = msgspec.to_builtins(_agent(plan, _complete(folder, plan, facts)))
     settings = {name: value for name, value in agent["settings"].items() if name in PUBLISHED_SETTINGS}
     told = {f"agent.{name}": value for name, value in agent.items()}
     told |= {"jail": plan.jail.recorded, "agent.settings": settings}
@@ -242,6 +247,45 @@ def told_at_close(folder: RunFolder, plan: Plan, facts: dict[str, Any]) -> dict[
         told["versions.rules_hash"] = sha256_text(staged.agents_md_hash)
         told["versions.initial_policy_hash"] = sha256_text(staged.initial_policy_hash)
     return {name: told[name] for name in GATEWAY_SIDE if name in told}
+
+
+def _complete(folder: RunFolder, plan: Plan, facts: dict[str, Any]) -> dict[str, Any]:
+    """The facts about the agent, with those of its settings, its session's file and the relay's ledger: however the run ended."""
+    try:
+        harness = harnesses.make(plan.agent, plan.started_in, plan.config)
+    except EvopolicyError:  # its file or its key has gone meanwhile
+        return facts
+    state = session.load(folder.session)
+    found = harness.known()
+    found["cli_version"] = state.cli_version
+    found |= {name: value for name, value in facts.items() if value is not None}
+    found |= {name: max(getattr(state, name), int(facts.get(name, 0))) for name in ("turns", "retries")}
+    found["settings"] = {**harness.known().get("settings", {}), **facts.get("settings", {})}
+    if (terms := harness.model) is None:
+        return found
+    limits = ModelLimits(**msgspec.structs.asdict(terms.limits))
+    own = facts.get("tokens") or (state.usage.recorded(terms.prices) if state.usage.total else None)
+    if not folder.model_requests.exists():
+        return found | {"tokens": own, "model_use": ModelUse(metering="agent", limits=limits)}
+    used = ledger.read(folder.model_requests, terms.model)
+    answered = used.requests - used.failed
+    found["model_string"] = found.get("model_string") or max(
+        used.models, key=used.models.__getitem__, default=None
+    )
+    found["tokens"] = used.usage.recorded(terms.prices)
+    found["model_use"] = ModelUse(
+        metering="relay",
+        limits=limits,
+        requests=used.requests,
+        requests_failed=used.failed,
+        requests_estimated=used.estimated,
+        models=used.models,
+        other_models=used.other_models,
+        first_token_s=round(used.first_s / answered, 4) if answered else None,
+        rate_limit_s=round(used.wait_s, 3),
+        reported=None if own is None else msgspec.convert(own, Tokens),
+    )
+    return found
 
 
 def _agent(plan: Plan, facts: dict[str, Any]) -> Agent:
@@ -265,6 +309,7 @@ def _agent(plan: Plan, facts: dict[str, Any]) -> Agent:
         retries=int(facts.get("retries", 0)),
         turns=int(facts.get("turns", 0)),
         tokens=None if tokens is None else msgspec.convert(tokens, Tokens),
+        model_use=facts.get("model_use"),
     )
 
 
@@ -466,6 +511,8 @@ def _write_record(
     if plan.settings.feedback != "scores":
         with parts.part("the number of steps"):
             transitions = count_transitions(folder.feedback)
+    with parts.part("the agent's use of its model"):
+        finished = msgspec.structs.replace(finished, agent=_complete(folder, plan, finished.agent))
     done = run_record(
         plan, finished, staged, rejected, times, recorded, code, folder.artifacts(), transitions
     )

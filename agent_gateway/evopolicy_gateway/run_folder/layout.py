@@ -70,6 +70,11 @@ class RunFolder(msgspec.Struct, frozen=True):
         return self.root / "logs" / "agent.jsonl"
 
     @property
+    def model_requests(self) -> Path:
+        """The relay's ledger: a line for each request to the agent's model."""
+        return self.root / "logs" / "model_requests.jsonl"
+
+    @property
     def env_log(self) -> Path:
         """Played episodes with their results, written at the end."""
         return self.root / "logs" / "env.log"

@@ -278,7 +278,9 @@ class ClaimedSweep(Sweep):
 
     def _used_up(self) -> str | None:
         caps = self._suite.caps
-        tokens, cost = suite_index.used(self._index)
+        tokens, cost, requests = suite_index.used(self._index)
+        if caps.max_requests is not None and requests >= caps.max_requests:
+            return f"{requests} of {caps.max_requests} requests are made"
         if caps.max_tokens is not None and tokens >= caps.max_tokens:
             return f"{tokens} of {caps.max_tokens} tokens are used"
         if caps.max_cost is not None and cost >= caps.max_cost:

@@ -110,6 +110,8 @@ class Parallel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 class Caps(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Joint limits of all runs of this host. A used-up limit stops coding agents and prevents further runs."""
 
+    max_requests: Positive | None = None
+    """To the models, as far as the relay counts them."""
     max_tokens: Positive | None = None
     max_cost: Annotated[float, Meta(gt=0)] | None = None
     """US dollars, over the agents that have `prices`."""

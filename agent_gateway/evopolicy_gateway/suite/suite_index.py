@@ -16,7 +16,7 @@ from evopolicy_common.records.blobs import write_atomically
 from evopolicy_common.records.run_record import RunRecord
 from evopolicy_common.records.suite_folder import INDEX, SCHEMA_VERSION, Entry, Index, State
 from evopolicy_common.records.summary import utc_text
-from evopolicy_gateway.harnesses.interface.usage import tokens_in
+from evopolicy_gateway.relay.usage import tokens_in
 from evopolicy_gateway.run.plan import Plan
 
 _NO_RUN = "its agent failed before its first submit; its logs/agent.jsonl and logs/harness.log tell why"
@@ -75,12 +75,20 @@ def entry_of(plan: Plan, record: RunRecord, **more: Any) -> Entry:
         n_submits=len(outcome.val_scores or ()),
         budget_used=outcome.budget_used,
         closed_reason=outcome.closed_reason,
-        tokens=None if record.agent.tokens is None else msgspec.to_builtins(record.agent.tokens),
+        tokens=_tokens_of(record),
         error=outcome.error or (_NO_RUN if state == "error" else None),
         wall_s=record.timing.wall_time_seconds,
         finished_at=record.timing.end_time,
         **{"digest": plan.digest, **more},
     )
+
+
+def _tokens_of(record: RunRecord) -> dict[str, Any] | None:
+    """A run's tokens, with the number of its requests."""
+    if record.agent.tokens is None:
+        return None
+    use = record.agent.model_use
+    return {**msgspec.to_builtins(record.agent.tokens), "requests": 0 if use is None else use.requests or 0}
 
 
 def waiting(plan: Plan) -> Entry:
@@ -91,12 +99,13 @@ def waiting(plan: Plan) -> Entry:
     )
 
 
-def used(index: Index) -> tuple[int, float]:
-    """Tokens and US dollars of all runs, including earlier attempts."""
+def used(index: Index) -> tuple[int, float, int]:
+    """Tokens, US dollars and requests of all runs, including earlier attempts."""
     counts = [
         one for entry in index.runs.values() for one in (entry.tokens, entry.earlier) if one is not None
     ]
-    return sum(map(tokens_in, counts)), sum(float(one.get("cost") or 0.0) for one in counts)
+    cost = sum(float(one.get("cost") or 0.0) for one in counts)
+    return sum(map(tokens_in, counts)), cost, sum(int(one.get("requests") or 0) for one in counts)
 
 
 def added(one: dict[str, Any] | None, other: dict[str, Any] | None) -> dict[str, Any] | None:
@@ -108,5 +117,5 @@ def added(one: dict[str, Any] | None, other: dict[str, Any] | None) -> dict[str,
 
 def usage_line(index: Index) -> str | None:
     """The usage of all runs in one line; None for no tokens."""
-    tokens, cost = used(index)
+    tokens, cost, _ = used(index)
     return f"used in all: {tokens:,} tokens" + (f", {cost:.2f} dollars" if cost else "") if tokens else None

@@ -17,8 +17,8 @@ from evopolicy_common.console import Terminal, table
 from evopolicy_common.messages.gateway import FREE_SLOT
 from evopolicy_common.records.suite_folder import FINISHED, Entry
 from evopolicy_common.terminal import number, say_json
-from evopolicy_gateway.harnesses.interface.usage import tokens_in
 from evopolicy_gateway.processes.child_messages import AgentDoing
+from evopolicy_gateway.relay.usage import tokens_in
 from evopolicy_gateway.run.watch import PHASES, Row, View
 
 _SHOWN_ROWS = 24

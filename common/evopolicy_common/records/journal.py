@@ -137,6 +137,7 @@ GATEWAY_SIDE = (
     "agent.retries",
     "agent.turns",
     "agent.tokens",
+    "agent.model_use",
     "agent.settings",
     "versions.agents_md_hash",
     "versions.rules_hash",

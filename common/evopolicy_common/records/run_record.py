@@ -34,8 +34,10 @@ from evopolicy_common.messages.run_settings import HiddenCases, HiddenIsolation
 from evopolicy_common.records.code_metrics import PUBLISHED_SCHEMA
 from evopolicy_common.records.newest import described_data
 
-RECORD_VERSION = 2
-"""Version of our own fields. Incremented only when older readers would misunderstand a file, not for added fields."""
+RECORD_VERSION = 3
+"""Version of our own fields. Incremented only when older readers would misunderstand a file, not for added fields: since 3, `tokens` are
+counted at the wire where `model_use` says so."""
+READABLE_VERSIONS = (2, 3)
 
 PROTOCOL_VERSION = "protocol/v2.0-draft"
 """The agent-facing protocol that runs follow."""
@@ -54,6 +56,52 @@ class Tokens(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     """Reasoning tokens within `output`; None when the stream does not report them."""
     cost: float | None = None
     """Cost in US dollars; None without prices."""
+
+    @property
+    def total(self) -> int:
+        """All kinds together."""
+        return self.input_noncached + self.cache_read + self.cache_creation + self.output
+
+
+class ModelLimits(msgspec.Struct, frozen=True, kw_only=True):
+    """Limits of a run's use of its model."""
+
+    max_requests: int
+    max_tokens: int
+    """All kinds together."""
+    max_cost: float | None = None
+    """US dollars."""
+
+
+class ModelUse(msgspec.Struct, frozen=True, kw_only=True):
+    """How the agent used its model, besides `tokens`."""
+
+    metering: Literal["relay", "agent"]
+    """`relay`: every request of the run was counted at the wire, and the agent did not have the key. `agent`: `tokens` are the
+    agent's own count, and `requests` and what follows are unknown."""
+    limits: ModelLimits
+    requests: int | None = None
+    """Requests that went to the provider."""
+    requests_failed: int = 0
+    """Of these, requests without a whole answer."""
+    requests_estimated: int = 0
+    """Requests of which a count is estimated: the answer broke off, or told no count that can be."""
+    models: dict[str, int] = {}
+    """Requests by the model that the answer names."""
+    other_models: dict[str, int] = {}
+    """Requests by the model that was asked for and is not `model_string`."""
+    first_token_s: float | None = None
+    """Mean time to the first bytes of an answer."""
+    rate_limit_s: float = 0.0
+    """Sum of the times for which the provider asked to wait."""
+    reported: Tokens | None = None
+    """The agent's own count, beside that of the relay."""
+
+    def difference(self, tokens: Tokens | None) -> float | None:
+        """How far the agent's own count is from `tokens`, as a share of these; None where one is unknown."""
+        if tokens is None or self.reported is None or not tokens.total:
+            return None
+        return abs(self.reported.total - tokens.total) / tokens.total
 
 
 PUBLISHED_SETTINGS = frozenset({"wall_limit_s", "silence_limit_s", "effort"})
@@ -86,7 +134,7 @@ class Agent(msgspec.Struct, frozen=True, kw_only=True):
     """`codex`, `claude-code`, `command`, `replay`, `evolve`, …"""
     cli_version: str | None = None
     model_string: str | None = None
-    """The model that the harness was configured with; None for agents without a model."""
+    """The model that the harness was configured with, or else the one that answered most; None for agents without a model."""
     prompts: str = ""
     """SHA-256 (`sha256:…`) of the operator's prompts; empty: the standard ones."""
     inputs: tuple[AgentInput, ...] = ()
@@ -97,7 +145,9 @@ class Agent(msgspec.Struct, frozen=True, kw_only=True):
     """How often the session was resumed after a provider's or harness's failure."""
     turns: int = 0
     tokens: Tokens | None = None
-    """None when the agent reports no tokens."""
+    """None when nothing counted them."""
+    model_use: ModelUse | None = None
+    """None for agents without a model, and in files before version 3."""
 
 
 class ExperimentDimensions(msgspec.Struct, frozen=True, kw_only=True):
@@ -209,7 +259,8 @@ class Outcome(msgspec.Struct, frozen=True, kw_only=True):
     in runs of earlier versions, made its slot fail there."""
     random_reference: ReferenceScore | None = None
     closed_reason: str = ""
-    """Why submits ended: `budget_spent`, `agent_stopped`, `agent_failed`, `silent`, `wall_limit`, `cancelled`."""
+    """Why submits ended: `budget_spent`, `agent_stopped`, `agent_failed`, `silent`, `wall_limit`,
+    `model_budget_spent`, `cancelled`."""
     budget_used: int = 0
     """Episodes charged."""
     auxiliary: dict[str, Any] = {}
@@ -384,7 +435,7 @@ def decode_run_record(data: bytes) -> RunRecord:
         header = _headers.decode(data)
         if header.schema_version == 1:
             return _plausible(msgspec.convert(upgraded(msgspec.json.decode(data)), RunRecord))
-        if header.schema_version == PUBLISHED_SCHEMA and header.record_version == RECORD_VERSION:
+        if header.schema_version == PUBLISHED_SCHEMA and header.record_version in READABLE_VERSIONS:
             return _plausible(_runs.decode(data))
     except (*DECODE_ERRORS, AttributeError, TypeError, ValueError) as error:
         raise ProtocolError(f"not a run record: {error}") from error
@@ -394,7 +445,7 @@ def decode_run_record(data: bytes) -> RunRecord:
         )
     raise ProtocolError(
         f"run.json has schema_version {header.schema_version} and record_version {header.record_version}; this version"
-        f" reads {PUBLISHED_SCHEMA} and {RECORD_VERSION}: update evopolicy"
+        f" reads {PUBLISHED_SCHEMA} and {READABLE_VERSIONS[0]} to {RECORD_VERSION}: update evopolicy"
     )
 
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import re
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
@@ -25,11 +25,20 @@ BESIDE = ("[SUGGESTION MODE", "Managed memory has")
 
 class Step:
     """`command`: run it in the agent's shell. `tool`: call the offered tool whose name ends so, without arguments. `text`: say it
-    and end the turn. `status`: an HTTP error instead."""
+    and end the turn. `status`: an HTTP error instead. `unknown`: call a tool of this name, which the agent does not offer. `odd`:
+    answer in a way of its own (`odd_answers.py`)."""
 
     def __init__(
-        self, command: str | None = None, text: str = "", status: int = 200, tool: str | None = None
+        self,
+        command: str | None = None,
+        text: str = "",
+        status: int = 200,
+        tool: str | None = None,
+        unknown: str = "",
+        odd: Callable[[Any, dict[str, Any]], None] | None = None,
     ) -> None:
+        self.unknown = unknown
+        self.odd = odd
         self.command = command
         self.tool = tool
         self.text = text
@@ -37,10 +46,12 @@ class Step:
 
     @property
     def calls(self) -> bool:
-        return self.command is not None or self.tool is not None
+        return self.command is not None or self.tool is not None or bool(self.unknown)
 
     def call(self, offered: list[str]) -> tuple[str, dict[str, Any]]:
         """The tool that it calls, of those that an agent offers, and the arguments."""
+        if self.unknown:
+            return self.unknown, {"path": "policy.py"}
         if self.tool is not None:
             return next(name for name in offered if name.endswith(self.tool)), {}
         return _offered(offered), _shell_arguments(self.command or "")
@@ -54,11 +65,18 @@ class ModelApi:
         self.played = 0
         self.requests: list[dict[str, Any]] = []
         """Bodies of the requests that moved the script on."""
+        self.n_asked = self.n_answered = 0
+        """Requests that cost tokens, and those of them that were answered as `INPUT` and the others say; beside the conversation too."""
+        self.bodies: list[bytes] = []
+        """Of all requests, as they came."""
+        self.keys: set[str] = set()
+        """The keys that came with them."""
         self._lock = threading.Lock()
         api = self
 
         class Handler(BaseHTTPRequestHandler):
             protocol_version = "HTTP/1.1"
+            disable_nagle_algorithm = True
 
             def log_message(self, format: str, *args: Any) -> None:
                 pass
@@ -71,6 +89,7 @@ class ModelApi:
 
             def do_POST(self) -> None:
                 body = self.rfile.read(int(self.headers.get("content-length") or 0))
+                api.bodies.append(body)
                 api.answer(self, json.loads(body or b"{}"))
 
             def _send(self, status: int, data: bytes, kind: str) -> None:
@@ -103,11 +122,19 @@ class ModelApi:
             handler._send(200, b'{"input_tokens": 10}', "application/json")
             return
         search = self._search(path, request)
+        with self._lock:
+            self.n_asked += 1
+            self.keys |= {handler.headers.get(name, "") for name in ("authorization", "x-api-key")} - {""}
         step = Step() if search else self._next(request)
+        if step.odd is not None:
+            step.odd(handler, request)
+            return
         if step.status != 200:
             error = {"type": "error", "error": {"type": "overloaded_error", "message": step.text or "busy"}}
             handler._send(step.status, json.dumps(error).encode(), "application/json")
             return
+        with self._lock:
+            self.n_answered += 1
         events = search or _speech(path)(step, request)
         if path.endswith((":generateContent", ":countTokens")):
             handler._send(200, json.dumps(next(iter(events))).encode(), "application/json")
@@ -254,6 +281,8 @@ def _responses_with(identity: str, item: dict[str, Any]) -> Iterator[dict[str, A
 
 def _codex_call(step: Step, request: dict[str, Any]) -> dict[str, Any]:
     """Name and arguments of the call."""
+    if step.unknown:
+        return {"name": step.unknown, "arguments": "{}"}
     if step.tool is None:
         name, arguments = _shell_call(step.command or "", request)
         return {"name": name, "arguments": json.dumps(arguments)}

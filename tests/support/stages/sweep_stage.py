@@ -33,7 +33,14 @@ TIMEOUT_S = 30.0
 HEAD = 'name = "s"\nenvironments = ["toy/line"]\n'
 CODEX = '[[agents]]\nname = "{}"\n[agents.config]\nharness = "codex"\n'
 EVOLVE = '[[agents]]\nname = "{}"\nagent = "evolve"\n'
-TOKENS = {"input_noncached": 100, "cache_read": 20, "cache_creation": 0, "output": 30, "cost": 0.25}
+TOKENS = {
+    "input_noncached": 100,
+    "cache_read": 20,
+    "cache_creation": 0,
+    "output": 30,
+    "cost": 0.25,
+    "requests": 7,
+}
 
 
 class Cluster:

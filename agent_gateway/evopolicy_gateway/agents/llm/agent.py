@@ -52,8 +52,7 @@ class Events:
         """The model's text and tool calls, and the tokens that they took."""
         blocks: list[dict[str, Any]] = [{"type": "text", "text": reply.text}] if reply.text else []
         for call in reply.calls:
-            given = {"command": call.command}
-            blocks.append({"type": "tool_use", "id": call.id, "name": shell.NAME, "input": given})
+            blocks.append({"type": "tool_use", "id": call.id, "name": call.name, "input": call.given})
         self._n += 1
         message = {"id": f"m{self._n}", "role": "assistant", "content": blocks, "usage": reply.usage}
         self._emit({"type": "assistant", "message": message})
@@ -76,9 +75,14 @@ class Events:
         print(json.dumps(event), file=self._out, flush=True)
 
 
+MAX_FAULTY = 5
+"""Faulty calls in a row that end a turn: a model that has not understood the tool would go on without end, and be paid for it."""
+
+
 def play_turn(api: Api, prompt: str, session: Session, events: Events) -> int:
     """Plays one turn and returns the program's exit status."""
     api.say(prompt)
+    n_faulty = 0
     while True:
         try:
             reply = api.ask()
@@ -98,9 +102,14 @@ def play_turn(api: Api, prompt: str, session: Session, events: Events) -> int:
             text, succeeded = (call.fault, False) if call.fault else shell.run(call.command, call.timeout_s)
             events.output(call, text, succeeded=succeeded)
             outputs.append(text)
+            n_faulty = n_faulty + 1 if call.fault else 0
         api.answer(reply.calls, outputs)
         # Only here every call has its answer, as both protocols require of a conversation.
         session.save(api.messages)
         events.saved()
+        if n_faulty >= MAX_FAULTY:
+            why = f"{n_faulty} faulty calls in a row, the last: {reply.calls[-1].fault}"
+            events.failed(ApiError(why, None, None))
+            return 1
         if reply.context > api.context_tokens:
             api.shorten()

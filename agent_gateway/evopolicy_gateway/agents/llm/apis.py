@@ -10,7 +10,7 @@ import json
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +37,9 @@ class Call:
     """A command that the model calls."""
 
     id: str
+    name: str = shell.NAME
+    given: dict[str, Any] = field(default_factory=dict)
+    """The tool and the arguments as the model named them; arguments that are no object in the field `text`."""
     command: str = ""
     timeout_s: float = shell.USUAL_S
     fault: str = ""
@@ -289,12 +292,22 @@ def _skills(paths: Sequence[str]) -> str:
 
 def _call(identity: str, name: str, arguments: Any) -> Call:
     """A call as the model wrote it, which may be anything."""
+    try:
+        said = json.loads(arguments) if isinstance(arguments, str) else arguments
+    except (ValueError, RecursionError):
+        said = arguments
+    given = said if isinstance(said, dict) else {"text": str(said)}
+    return replace(_checked(identity, name, said), name=name, given=given)
+
+
+def _checked(identity: str, name: str, given: Any) -> Call:
     if name != shell.NAME:
         return Call(id=identity, fault=f"there is no tool {name!r}; the only one is {shell.NAME}")
+    if not isinstance(given, dict):
+        return Call(id=identity, fault="the arguments are not a JSON object; give one with `command`")
     try:
-        given = json.loads(arguments) if isinstance(arguments, str) else arguments
         command, timeout_s = given["command"], float(given.get("timeout_s") or shell.USUAL_S)
-    except (ValueError, TypeError, KeyError, AttributeError) as error:
+    except (ValueError, TypeError, KeyError) as error:
         return Call(
             id=identity, fault=f"the arguments cannot be read ({error!r}); give a JSON object with `command`"
         )

@@ -24,7 +24,7 @@ from evopolicy_gateway.harnesses.coding_agents.dialect import (
     string,
 )
 from evopolicy_gateway.harnesses.interface.agent_config import AcpTable, AgentConfig
-from evopolicy_gateway.harnesses.interface.usage import Usage, count
+from evopolicy_gateway.relay.usage import Usage, count
 
 _ENDED = ("end_turn", "max_tokens", "max_turn_requests", "refusal")
 """Reasons to stop after which the agent may be prompted again."""

@@ -20,8 +20,8 @@ from typing import Any
 
 from evopolicy_gateway.harnesses.coding_agents.dialect import Dialect, TurnReader, first_line, mapping, string
 from evopolicy_gateway.harnesses.coding_agents.turn_failure import turn_failure_of
-from evopolicy_gateway.harnesses.interface.usage import Usage, count
 from evopolicy_gateway.inputs.kept import MCP_FILE
+from evopolicy_gateway.relay.usage import Usage, count
 
 TOOLS = "Bash,Read,Edit,Write,Glob,Grep"
 _MAX_OPEN_MESSAGES = 1000

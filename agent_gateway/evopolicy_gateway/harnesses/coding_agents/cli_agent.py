@@ -19,6 +19,8 @@ import uuid
 from collections.abc import Mapping
 from typing import Any, Literal
 
+import msgspec
+
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.logs import structlog
 from evopolicy_gateway.harnesses.coding_agents import session
@@ -26,15 +28,17 @@ from evopolicy_gateway.harnesses.coding_agents.dialect import Dialect, TurnReade
 from evopolicy_gateway.harnesses.coding_agents.session import SessionState
 from evopolicy_gateway.harnesses.coding_agents.turn import Capped, play_turn
 from evopolicy_gateway.harnesses.coding_agents.turn_failure import TurnFailure, backoff_s
-from evopolicy_gateway.harnesses.interface.base import AgentError, Harness, Stage
-from evopolicy_gateway.harnesses.interface.usage import Usage
+from evopolicy_gateway.harnesses.interface.agent_config import relay_variables
+from evopolicy_gateway.harnesses.interface.base import AgentError, Harness, ModelTerms, RelayAddress, Stage
 from evopolicy_gateway.inputs import own_config
 from evopolicy_gateway.inputs.kept import Kept
 from evopolicy_gateway.processes.child_messages import AgentDoing, AgentEnded
+from evopolicy_gateway.relay.usage import Usage
 
 _PROBE_TIMEOUT_S = 60.0
 _MAX_PAUSE_S = 3600.0
 _IN_FLIGHT_PAUSE_S = 0.5
+_MAX_FAULTY = 2
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
@@ -51,15 +55,23 @@ class CliAgent(Harness):
         self.command = self._program
         self.variables = self._config.pass_environment
         self.packages = dialect.packages
-        reached = [host for server in self._config.mcp.values() for host in server.hosts]
-        self.hosts = (*dialect.hosts, *reached)
+        self.hosts = tuple(host for server in self._config.mcp.values() for host in server.hosts)
         self.own_files = own_config.places(self._config.user_config, self._program[0])
         self.skills_at = self._config.skills_at or dialect.skills_at
+        self.model = ModelTerms(
+            limits=self._config.limits,
+            prices=self._config.prices,
+            model=self._config.model,
+            declared_only=self._config.models == "declared",
+            upstream=self._config.upstream(os.environ),
+        )
         self._options = ""
         self._version: str | None = None
         self._state = SessionState()
         self._failures = 0
         """Failed turns since the last completed one."""
+        self._faulty = 0
+        """Turns in a row that ended by faulty calls."""
         self._pause_s = self._config.pause_s
 
     def take(self, kept: Kept) -> None:
@@ -73,8 +85,11 @@ class CliAgent(Harness):
     async def play(self, stage: Stage) -> AgentEnded:
         self._config.check(stage.environment)
         stage = stage.with_environment(self._dialect.environment() | self._config.environment)
+        if self.relay is not None:
+            stage = self._relayed(stage, self.relay)
         await self._probe(stage)
         self._state = session.load(stage.session_file)
+        self._keep(stage)
         then = await self._prompt_after_failure(stage)
         while not isinstance(then, AgentEnded):
             reader = await self._turn(stage, then)
@@ -84,6 +99,19 @@ class CliAgent(Harness):
             if stage.over.is_set() and not isinstance(then, AgentEnded):
                 return self._ending()
         return then
+
+    def _relayed(self, stage: Stage, relay: RelayAddress) -> Stage:
+        """The stage with the relay's address and token in place of the provider's and the key."""
+        upstream = self._config.upstream(os.environ)
+        assert upstream is not None
+        self._dialect.relay = relay
+        key = upstream.key
+        kept = {name: value for name, value in stage.environment.items() if not (key and key in value)}
+        stage.log.redact = stage.log.redact.knowing([key, relay.token])
+        variables = {}
+        if self._dialect.takes_variables:
+            variables = relay_variables(upstream.protocol, relay.url, relay.token)
+        return msgspec.structs.replace(stage, environment=kept | variables)
 
     async def _turn(self, stage: Stage, prompt: str) -> TurnReader:
         """Runs one turn and records its usage."""
@@ -126,7 +154,7 @@ class CliAgent(Harness):
         """The next prompt after a completed turn, or the end."""
         state = self._state
         state.turns += 1
-        self._failures, self._pause_s = 0, self._config.pause_s
+        self._failures, self._faulty, self._pause_s = 0, 0, self._config.pause_s
         self._keep(stage)
         stage.on_turn(state.turns, stage.log.redact.text(reader.text))
         if (why := self._capped(state.usage)) is not None:
@@ -154,6 +182,9 @@ class CliAgent(Harness):
             return self._ending("agent_failed", message)
         if failure.kind == "cap":
             return self._ending("agent_stopped", message)
+        self._faulty = self._faulty + 1 if failure.kind == "faulty" else 0
+        if self._faulty >= _MAX_FAULTY:
+            return self._ending("agent_failed", f"{self._faulty} turns in a row ended by {message}")
         self._failures += 1
         if failure.kind == "lost":
             state.session = None
@@ -168,7 +199,8 @@ class CliAgent(Harness):
                 backoff_s(self._failures, config.backoff_s, random.random()),
                 min(failure.wait_s or 0.0, _MAX_PAUSE_S),
             )
-            stage.on_doing(AgentDoing(action=f"retry {self._failures} in {wait_s:.0f} s: {message}"))
+            told = f"retry {self._failures} in {wait_s:.0f} s: {message}"
+            stage.on_doing(AgentDoing(action=told, note=told if self._failures == 1 else ""))
             await stage.sleep(wait_s)
         state.retries += 1
         self._keep(stage)
@@ -200,13 +232,16 @@ class CliAgent(Harness):
         return stage.prompts.resumed(left)
 
     def _keep(self, stage: Stage) -> None:
+        self._state.cli_version = self._version
         session.save(stage.session_file, self._state)
         stage.on_doing(AgentDoing(tokens=self._state.usage.recorded(self._config.prices)))
 
     def _capped(self, used: Usage) -> str | None:
         config = self._config
-        if config.max_tokens is not None and used.total > config.max_tokens:
-            return f"cap reached: {used.total} tokens of {config.max_tokens} used"
+        if self.relay is not None:
+            return None  # which counts more exactly
+        if used.total > config.limits.max_tokens:
+            return f"cap reached: {used.total} tokens of {config.limits.max_tokens} used"
         if config.max_cost is not None and config.prices is not None:
             cost = used.cost(config.prices)
             if cost > config.max_cost:

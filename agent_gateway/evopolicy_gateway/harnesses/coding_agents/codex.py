@@ -16,7 +16,7 @@ from typing import Any
 
 from evopolicy_gateway.harnesses.coding_agents.dialect import Dialect, TurnReader, first_line, mapping, string
 from evopolicy_gateway.harnesses.coding_agents.turn_failure import turn_failure_of
-from evopolicy_gateway.harnesses.interface.usage import Usage, count
+from evopolicy_gateway.relay.usage import Usage, count
 
 _BYPASS = "--dangerously-bypass-approvals-and-sandbox"
 _ISOLATION = ("--ignore-user-config", "--ignore-rules")
@@ -48,6 +48,9 @@ class Codex(Dialect):
             settings = {"command": _toml(server.command), "args": _toml(server.args), "env": f"{{{env}}}"}
             for key, value in settings.items():
                 words += ["--config", f"mcp_servers.{name}.{key}={value}"]
+        if self.relay is not None:
+            provider = f'{{name="relay",base_url="{self.relay.url}/v1",env_key="OPENAI_API_KEY",wire_api="responses"}}'
+            words += ["--config", "model_provider=relay", "--config", f"model_providers.relay={provider}"]
         words += self.config.extra_args
         if resume and session is not None:
             words.append(session)

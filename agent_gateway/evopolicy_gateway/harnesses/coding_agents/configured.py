@@ -6,15 +6,16 @@ reported an error.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 from evopolicy_common.errors import ConfigError
 from evopolicy_gateway.harnesses.coding_agents.dialect import Dialect, TurnReader, first_line
 from evopolicy_gateway.harnesses.coding_agents.turn_failure import turn_failure_of
 from evopolicy_gateway.harnesses.interface.agent_config import AgentConfig, Cli, Events
-from evopolicy_gateway.harnesses.interface.usage import Usage, count
 from evopolicy_gateway.inputs.kept import MCP_FILE
+from evopolicy_gateway.relay.paths import values
+from evopolicy_gateway.relay.usage import Usage, count
 
 _MCP = {"{mcp_config}": MCP_FILE}
 
@@ -115,30 +116,6 @@ class ConfiguredReader(TurnReader):
             reasoning=None if found["reasoning"] is None else count(found["reasoning"]),
         )
         self.usage = usage if paths.counts == "session" else self.usage + usage
-
-
-def values(document: Any, path: str) -> Iterator[Any]:
-    """Yields every value at a dotted path; nothing for an empty path."""
-    if not path:
-        return
-    if path.startswith("["):
-        condition, _, rest = path[1:].partition("]")
-        name, _, wanted = condition.partition("=")
-        if isinstance(document, dict) and document.get(name) == wanted:
-            yield from values(document, rest.removeprefix("."))
-        return
-    head, _, rest = path.partition(".")
-    if head == "*":
-        inner: Iterable[Any] = document if isinstance(document, list) else ()
-    elif isinstance(document, dict) and head in document:
-        inner = (document[head],)
-    else:
-        return
-    for value in inner:
-        if rest:
-            yield from values(value, rest)
-        else:
-            yield value
 
 
 def _first(document: Mapping[str, Any], paths: tuple[str, ...]) -> str:

@@ -13,8 +13,9 @@ from typing import Any
 
 from evopolicy_gateway.harnesses.coding_agents.turn_failure import TurnFailure
 from evopolicy_gateway.harnesses.interface.agent_config import AgentConfig
-from evopolicy_gateway.harnesses.interface.usage import Usage
+from evopolicy_gateway.harnesses.interface.base import RelayAddress
 from evopolicy_gateway.inputs.kept import Kept
+from evopolicy_gateway.relay.usage import Usage
 
 _MAX_VERSION_CHARS = 2000
 _VERSION = re.compile(r"\d+\.\d+(?:\.\d+)?[\w.+-]*")
@@ -65,6 +66,8 @@ class Dialect(ABC):
     prompt_on_stdin = True
     skills_at = "~/.agents/skills"
     """Folder in which the CLI looks for skills."""
+    takes_variables = True
+    """Whether its program reads the relay's address and token from variables, which its commands see too."""
     tells_end = True
     """Whether its stream reports how a turn ended; otherwise the exit status does."""
 
@@ -72,15 +75,12 @@ class Dialect(ABC):
         self.config = config
         self.kept = Kept()
         """The run's skills and MCP servers."""
+        self.relay: RelayAddress | None = None
+        """Where its program finds the model; None: at the provider."""
 
     @property
     def packages(self) -> tuple[str, ...]:
         """Distributions of our Python that its program imports."""
-        return ()
-
-    @property
-    def hosts(self) -> tuple[str, ...]:
-        """`HOST:PORT` that its settings make it reach, besides the usual ones of its kind."""
         return ()
 
     @abstractmethod

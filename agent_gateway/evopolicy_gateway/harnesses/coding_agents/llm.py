@@ -1,7 +1,7 @@
 """The built-in LLM agent (`agents/llm/`) as a CLI: it prints Claude Code's stream, so its turns are read as those.
 
-Its jail reaches the API's host alone. The API's key comes on stdin and never into the jail's environment, where the
-model's commands could read it.
+It gets the relay's token on stdin, and its memory is closed to its commands, which therefore use the model only through it. The
+API's key stays outside its jail.
 """
 
 from __future__ import annotations
@@ -11,13 +11,12 @@ import json
 import os
 import sys
 from typing import Any
-from urllib.parse import urlsplit
 
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.installation import add_extra
 from evopolicy_gateway.harnesses.coding_agents.claude_code import ClaudeReader
 from evopolicy_gateway.harnesses.coding_agents.dialect import Dialect
-from evopolicy_gateway.harnesses.interface.agent_config import AgentConfig, LlmApi
+from evopolicy_gateway.harnesses.interface.agent_config import AgentConfig, ApiTable
 from evopolicy_gateway.inputs.declared import IN_JAIL, SKILL
 
 _RETRIES = 4
@@ -33,6 +32,7 @@ class Llm(Dialect):
     # -P: modules in the workspace, which the agent writes, must not shadow installed ones.
     program = (sys.executable, "-P", "-m", "evopolicy_gateway.agents.llm")
     makes_session_id = True
+    takes_variables = False
     skills_at = f"{IN_JAIL}/skills"
 
     def __init__(self, config: AgentConfig) -> None:
@@ -44,7 +44,7 @@ class Llm(Dialect):
             )
         if config.mcp:
             raise ConfigError("harness llm starts no MCP servers; leave out [mcp], or use another harness")
-        self._api: LlmApi = config.api
+        self._api: ApiTable = config.api
         if importlib.util.find_spec(self._api.protocol) is None:
             raise ConfigError(f"the agent llm needs the package {self._api.protocol}: {add_extra('llm')}")
 
@@ -52,16 +52,11 @@ class Llm(Dialect):
     def packages(self) -> tuple[str, ...]:
         return (self._api.protocol,)
 
-    @property
-    def hosts(self) -> tuple[str, ...]:
-        parts = urlsplit(self._api.url)
-        return (f"{parts.hostname}:{parts.port or (443 if parts.scheme == 'https' else 80)}",)
-
     def arguments(self, session: str | None, *, resume: bool, prompt: str, options: str) -> list[str]:
         settings: dict[str, Any] = {
             "protocol": self._api.protocol,
             "model": self.config.model,
-            "base_url": self._api.url,
+            "base_url": self._base_url(),
             "system": self._api.system,
             "skills": [
                 f"{self.config.skills_at or self.skills_at}/{name}/{SKILL}" for name in self.kept.skills
@@ -76,7 +71,13 @@ class Llm(Dialect):
         return [*words, *(["--resume"] if resume else []), *self.config.extra_args]
 
     def stdin(self, prompt: str) -> str:
-        return json.dumps({"key": os.environ.get(self._api.variable, ""), "prompt": prompt})
+        key = os.environ.get(self._api.variable, "") if self.relay is None else self.relay.token
+        return json.dumps({"key": key, "prompt": prompt})
+
+    def _base_url(self) -> str:
+        if self.relay is None:
+            return self._api.url
+        return f"{self.relay.url}/v1" if self._api.protocol == "openai" else self.relay.url
 
     def version_in(self, text: str) -> str | None:
         return text.strip() or None
@@ -101,5 +102,5 @@ def config_of(rest: str) -> AgentConfig:
             f"--agent llm:{rest}: say it as llm:openai/MODEL or llm:anthropic/MODEL; for another endpoint that is compatible"
             ' with one of them, use --agent file:AGENT.toml with harness = "llm" and a table [api]'
         )
-    api = LlmApi(protocol="openai" if protocol == "openai" else "anthropic")
+    api = ApiTable(protocol="openai" if protocol == "openai" else "anthropic")
     return AgentConfig(harness="llm", model=model, api=api)

@@ -11,7 +11,7 @@ import msgspec
 
 from evopolicy_common.errors import DECODE_ERRORS
 from evopolicy_common.records.blobs import write_atomically
-from evopolicy_gateway.harnesses.interface.usage import Usage
+from evopolicy_gateway.relay.usage import Usage
 
 
 class SessionState(msgspec.Struct, kw_only=True):
@@ -19,6 +19,7 @@ class SessionState(msgspec.Struct, kw_only=True):
 
     session: str | None = None
     """The CLI's id of the session; None until the CLI has reported it."""
+    cli_version: str | None = None
     turns: int = 0
     """Turns that the agent completed."""
     retries: int = 0

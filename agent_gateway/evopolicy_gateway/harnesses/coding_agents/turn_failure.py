@@ -4,6 +4,7 @@
 - `quota`: the account's limit is reached; only time helps, so the run pauses.
 - `lost`: the CLI no longer knows the session; a new one is started.
 - `final`: a retry would fail in the same way (a wrong key, an unknown model), so the run ends.
+- `faulty`: the model called its tools wrongly, again and again; after two such turns in a row the run ends.
 - `cap`: the run has used up its limit of tokens or money.
 """
 
@@ -16,13 +17,14 @@ from typing import Literal
 
 import msgspec
 
-Kind = Literal["passing", "quota", "lost", "final", "cap"]
+Kind = Literal["passing", "quota", "lost", "final", "faulty", "cap"]
 
 MAX_BACKOFF_S = 300.0
 _MAX_MESSAGE = 500
 _MAX_SEARCHED = 20_000
 """Characters of a message that are searched for a waiting time."""
 
+_FAULTY = re.compile(r"\d+ faulty calls in a row")
 _LOST = re.compile(r"no conversation found|no rollout found|session not found", re.IGNORECASE)
 _QUOTA = re.compile(
     r"usage[ _]limit|insufficient_quota|exceeded your current quota|credit balance|billing|(hit|reached) your [\w ]*limit"
@@ -66,6 +68,8 @@ def turn_failure_of(message: str, status: int | None = None, now: float | None =
     text = " ".join(message.split())[:_MAX_MESSAGE] or "no message"
     found = _STATUS.search(text)
     code = status if status is not None else int(found.group(1) or found.group(2)) if found else None
+    if _FAULTY.match(text):
+        return TurnFailure(kind="faulty", message=text)
     if _LOST.search(text):
         return TurnFailure(kind="lost", message=text)
     if code in (401, 403) or _FINAL.search(text):

@@ -18,8 +18,10 @@ from msgspec import Meta
 
 from evopolicy_common.errors import DECODE_ERRORS, ConfigError
 from evopolicy_common.regular_files import read_given
-from evopolicy_gateway.harnesses.interface.usage import Prices
 from evopolicy_gateway.inputs.declared import McpServer
+from evopolicy_gateway.relay.apis import Protocol, Upstream
+from evopolicy_gateway.relay.limits import Limits
+from evopolicy_gateway.relay.usage import Prices
 from evopolicy_gateway.workspace.prompts import Prompts
 
 
@@ -90,17 +92,23 @@ class AcpTable(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     """Whether the tokens that end a turn are those of the turn, or of the session so far."""
 
 
-class LlmApi(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The endpoint of the built-in LLM agent."""
+class ApiTable(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The model's API, to which the relay passes requests on."""
 
-    protocol: Literal["openai", "anthropic"]
-    """OpenAI's Chat Completions, or Anthropic's Messages; many other providers speak one of them."""
+    protocol: Protocol
+    """OpenAI's Chat Completions and Responses, or Anthropic's Messages; many other providers speak one of them."""
     base_url: str = ""
     """As the vendor's library takes it, such as `https://api.example.com/v1`; empty: the vendor's own."""
     key: str | None = None
     """Name of the variable with the API key; None: OPENAI_API_KEY or ANTHROPIC_API_KEY; empty: none is needed."""
+    key_header: str = ""
+    """Header with the key, such as `api-key` for Azure; empty: the protocol's own."""
+    headers: dict[str, str] = {}
+    """Further headers of a company's gateway; each value is the name of a variable that holds the header's value."""
+    query: dict[str, str] = {}
+    """Added to each address, such as Azure's `api-version`."""
     parameters: dict[str, Any] = {}
-    """Further fields of each request, such as `temperature`."""
+    """Only for the built-in agent, as all that follows: further fields of each request, such as `temperature`."""
     system: str = ""
     """In place of the built-in system prompt."""
     max_output_tokens: Annotated[int, Meta(ge=1)] = 32_000
@@ -115,13 +123,28 @@ class LlmApi(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     @property
     def variable(self) -> str:
         """Name of the variable with the key; empty: none."""
-        return _VENDORS[self.protocol][1] if self.key is None else self.key
+        return _VENDORS[self.protocol][2] if self.key is None else self.key
 
 
-_VENDORS = {
-    "openai": ("https://api.openai.com/v1", "OPENAI_API_KEY"),
-    "anthropic": ("https://api.anthropic.com", "ANTHROPIC_API_KEY"),
+_VENDORS: dict[Protocol, tuple[str, str, str]] = {
+    "openai": ("https://api.openai.com/v1", "OPENAI_BASE_URL", "OPENAI_API_KEY"),
+    "anthropic": ("https://api.anthropic.com", "ANTHROPIC_BASE_URL", "ANTHROPIC_API_KEY"),
 }
+"""Base URL, and the variables with which an agent is given another one and the key."""
+_OWN_APIS: dict[str, tuple[Protocol, tuple[str, ...]]] = {
+    "codex": ("openai", ("CODEX_API_KEY", "OPENAI_API_KEY")),
+    "claude-code": ("anthropic", ("ANTHROPIC_API_KEY", "ANTHROPIC_AUTH_TOKEN")),
+}
+"""Of harnesses that need no `[api]` table: protocol, and the variables that may hold the key."""
+_OWN_PROVIDER = ("model_provider", "openai_base_url")
+"""In the arguments of a Codex with a provider of its own, which the relay cannot stand in for."""
+
+
+def relay_variables(protocol: Protocol, url: str, token: str) -> dict[str, str]:
+    """Variables that lead an agent to the relay. Empty ones replace the operator's."""
+    _, base, key = _VENDORS[protocol]
+    address = f"{url}/v1" if protocol == "openai" else url
+    return {base: address, key: token, **({} if protocol == "openai" else {"ANTHROPIC_AUTH_TOKEN": ""})}
 
 
 class AgentConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -131,6 +154,8 @@ class AgentConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     """`codex`, `claude-code`, `llm` with an `[api]` table, or any other name with an `[acp]` or `[cli]` table."""
     model: str | None = None
     """Model string in the CLI's form; None for its default."""
+    models: Literal["any", "declared"] = "any"
+    """`declared`: the relay refuses requests for other models than `model`."""
     effort: str | None = None
     program: tuple[str, ...] = ()
     """Replaces the CLI on the PATH."""
@@ -154,9 +179,11 @@ class AgentConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     """First pause for an outage or a quota without a stated end, seconds; doubled up to an hour."""
     max_pause_s: float = 86_400.0
     """Limit of all pauses of a run together, seconds; after them the run ends."""
-    max_tokens: int | None = None
+    max_requests: Annotated[int, Meta(ge=1)] | None = None
+    """Limit per run of requests to the model; None: the usual one of `Limits`, as for `max_tokens`."""
+    max_tokens: Annotated[int, Meta(ge=1)] | None = None
     """Limit per run, all kinds of tokens together."""
-    max_cost: float | None = None
+    max_cost: Annotated[float, Meta(gt=0)] | None = None
     """Limit per run, US dollars; needs `prices`."""
     prices: Prices | None = None
     prompts: Prompts | None = None
@@ -168,8 +195,8 @@ class AgentConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     mcp: dict[str, McpServer] = {}
     """MCP servers by name."""
     cli: Cli | None = None
-    api: LlmApi | None = None
-    """Of the built-in LLM agent."""
+    api: ApiTable | None = None
+    """The model's API, for the built-in agent and for other agents that take its address and key from the usual variables."""
     acp: AcpTable | None = None
     """Of an agent that speaks the Agent Client Protocol."""
 
@@ -188,6 +215,11 @@ class AgentConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
         key = "" if self.api is None else self.api.variable
         if key and not os.environ.get(key):
             raise ConfigError(f"the variable {key} with the API's key is not set; export it before starting")
+        for name in () if self.api is None else self.api.headers.values():
+            if not os.environ.get(name):
+                raise ConfigError(f"api.headers: the variable {name} is not set; export it before starting")
+        if self.models == "declared" and self.model is None:
+            raise ConfigError('models = "declared" needs `model`')
         if self.api is not None and not _is_reachable(self.api.url):
             raise ConfigError(
                 f"api.base_url = {self.api.url!r}: https://HOST… is needed, or http:// on this machine (localhost, 127.0.0.1)"
@@ -198,7 +230,9 @@ class AgentConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
         if self.retries < 0 or self.reprompts < 0:
             raise ConfigError("retries and reprompts must be at least 0")
         if self.max_cost is not None and self.prices is None:
-            raise ConfigError("max_cost needs [prices], in US dollars per million tokens")
+            raise ConfigError(
+                "max_cost needs prices in US dollars per million tokens, such as prices = { input = 1.0, output = 10.0 }"
+            )
         if self.prompts is not None:
             self.prompts.check("prompts")
         if self.skills_at and not re.fullmatch(r"(~|/inputs)(/[\w.-]*\w)+", self.skills_at):
@@ -211,6 +245,36 @@ class AgentConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
             for name, words in (("first", self.cli.first), ("resume", self.cli.resume)):
                 if words and not any("{prompt}" in word for word in words):
                     raise ConfigError(f'cli.{name} has no {{prompt}}, and cli.prompt is "argument"')
+
+    @property
+    def limits(self) -> Limits:
+        """What the run may use of its model."""
+        found = {name: getattr(self, name) for name in ("max_requests", "max_tokens", "max_cost")}
+        return Limits(**{name: value for name, value in found.items() if value is not None})
+
+    def upstream(self, environment: Mapping[str, str]) -> Upstream | None:
+        """The API behind the relay, with its key; None for an agent that cannot use the relay: one with a subscription's login, or a
+        provider of its own. `environment`: the operator's variables."""
+        variables = {**environment, **self.environment}
+        if self.api is not None:
+            return Upstream(
+                protocol=self.api.protocol,
+                base_url=self.api.url,
+                key=variables.get(self.api.variable, "") if self.api.variable else "",
+                key_header=self.api.key_header,
+                headers={name: variables.get(value, "") for name, value in self.api.headers.items()},
+                query=self.api.query,
+            )
+        if self.harness not in _OWN_APIS or self.user_config:
+            return None
+        protocol, names = _OWN_APIS[self.harness]
+        found = next((name for name in names if variables.get(name)), None)
+        base = variables.get(_VENDORS[protocol][1]) or _VENDORS[protocol][0]
+        own = any(word in argument for argument in self.extra_args for word in _OWN_PROVIDER)
+        if found is None or own or not _is_reachable(base):
+            return None
+        header = "authorization" if found == "ANTHROPIC_AUTH_TOKEN" else ""
+        return Upstream(protocol=protocol, base_url=base, key=variables[found], key_header=header)
 
     @property
     def provider_name(self) -> str:

@@ -26,6 +26,9 @@ from evopolicy_gateway.processes.agent_log import AgentLog
 from evopolicy_gateway.processes.agent_process import AgentProcess
 from evopolicy_gateway.processes.child_messages import AgentDoing, AgentEnded
 from evopolicy_gateway.processes.clock import Activity, AgentClock
+from evopolicy_gateway.relay.apis import Upstream
+from evopolicy_gateway.relay.limits import Limits
+from evopolicy_gateway.relay.usage import Prices
 from evopolicy_gateway.workspace.prompts import Prompts
 
 _INFO_TIMEOUT_S = 30.0
@@ -101,6 +104,25 @@ class Stage(msgspec.Struct, frozen=True, kw_only=True):
         return await asyncio.to_thread(_get_json, self.urls["EVOPOLICYGYM_INFO_URL"])
 
 
+class RelayAddress(msgspec.Struct, frozen=True, kw_only=True):
+    """The relay of the run, as its agent sees it."""
+
+    url: str
+    token: str
+
+
+class ModelTerms(msgspec.Struct, frozen=True, kw_only=True):
+    """The terms on which an agent may use its model."""
+
+    limits: Limits
+    prices: Prices | None = None
+    model: str | None = None
+    """The declared model."""
+    declared_only: bool = False
+    upstream: Upstream | None = None
+    """The API behind the relay; None: the agent cannot use the relay."""
+
+
 class Harness(ABC):
     """One kind of agent."""
 
@@ -124,6 +146,11 @@ class Harness(ABC):
     def take(self, kept: Kept) -> None:
         """Gives it the run's skills and MCP servers, before it plays."""
         assert not kept, "only agents with settings have inputs"
+
+    model: ModelTerms | None = None
+    """Of agents whose model is known; None for agents without one."""
+    relay: RelayAddress | None = None
+    """Where the agent finds its model; None: at the provider, with the operator's key."""
 
     def known(self) -> dict[str, Any]:
         """Facts for `run.json` that do not depend on the agent's end, in case its supervisor cannot report the

@@ -17,6 +17,7 @@ from pathlib import Path
 import msgspec
 import pytest
 from commands import command, record_in, run_dir
+from stages import odd_answers
 from stages.cli_stage import play, settings
 from stages.declared_inputs import DESCRIPTION, as_toml, declare
 from stages.model_api import CACHED, CREATED, INPUT, OUTPUT, REASONING, ModelApi, Step
@@ -155,6 +156,47 @@ def test_the_real_cli_plays_and_resumes_a_jailed_run(tmp_path: Path, harness: st
     assert "first" in str(api.requests[-1])
     policy = run_dir(tmp_path) / "checkpoints" / "submit_001" / "policy.py"
     assert policy.read_text().count("# better") == 2
+
+
+@pytest.mark.parametrize("harness", ["codex", "claude-code", "qwen"])
+def test_the_relay_counts_for_a_real_cli_which_never_has_the_key(
+    tmp_path: Path, harness: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever else it asks its model for, and whatever the model answers, the relay counts as the API does."""
+    needle = "$(printf %s fedcba9876543210-dliw-ks | rev)"
+    look = (
+        f"env | grep -c {needle}; cat /proc/[0-9]*/environ | grep -c {needle}; grep -rlaF {needle} ~ /tmp ."
+    )
+    odd = (odd_answers.busy(429, retry_after="1"), odd_answers.busy(500))
+    steps = [Step(command=look), *(Step(odd=each) for each in odd), Step(unknown="no_such_tool"), *SCRIPT]
+    anthropic = harness == "claude-code"
+    with ModelApi(steps) as api:
+        vendor = "ANTHROPIC" if anthropic else "OPENAI"
+        monkeypatch.setenv(f"{vendor}_API_KEY", "sk-wild-0123456789abcdef")
+        monkeypatch.setenv(f"{vendor}_BASE_URL", api.base_url if anthropic else f"{api.base_url}/v1")
+        program = Path(CLIS) / {"claude-code": "claude"}.get(harness, harness)
+        lines = [f'harness = "{harness}"\nmodel = "gpt-5.5"\nprogram = ["{program}"]\nbackoff_s = 0.01\n']
+        if harness == "qwen":
+            rest = (AGENTS / "qwen.toml").read_text()
+            lines += [
+                f'[api]\nprotocol = "openai"\nbase_url = "{api.base_url}/v1"\n',
+                rest[rest.index("[cli]") :],
+            ]
+        (tmp_path / "agent.toml").write_text("".join(lines))
+        arguments = ("--env", "toy/line", "--agent", "file:agent.toml", "--exp-id", "t", "--budget", "4")
+        with command(tmp_path, "local", *arguments, *SMALL_HIDDEN) as running:
+            assert running.wait() == 0, running.text
+    record = record_in(run_dir(tmp_path))
+    use, tokens = record.agent.model_use, record.agent.tokens
+    assert record.outcome.budget_used == 4
+    assert use is not None
+    assert tokens is not None
+    assert (use.metering, use.requests, use.requests_failed) == ("relay", api.n_asked, 2), running.text
+    assert (tokens.output, tokens.cache_read) == (api.n_answered * OUTPUT, api.n_answered * CACHED)
+    assert record.agent.cli_version is not None
+    assert all("sk-wild" in key for key in api.keys)
+    assert "sk-wild" not in json.dumps(api.requests)
+    assert "next try in 1 s" in running.text
 
 
 KEY = "sk-ant-stub-0123456789abcdef"
@@ -303,7 +345,9 @@ def inputs_config(name: str, api: ModelApi, home: Path) -> AgentConfig:
         variables = {"GOOGLE_GEMINI_BASE_URL": api.base_url, "OPENAI_BASE_URL": f"{api.base_url}/v1"}
         if name == "gemini":
             acp_settings(name, api, home)
-        return msgspec.structs.replace(agent, environment=variables, program=(f"{CLIS}/{name}",))
+        key = ("OPENAI_API_KEY" if name == "qwen" else "GEMINI_API_KEY",)
+        changed = {"environment": variables, "program": (f"{CLIS}/{name}",), "api": None}
+        return msgspec.structs.replace(agent, pass_environment=key, **changed)
     config = config_for(name, api)
     variables = {key: value for key, value in config.environment.items() if key != "PATH"}
     program = f"{CLIS}/{'codex' if name == 'codex' else 'claude'}"

@@ -129,7 +129,7 @@ def test_run_record_survives_a_round_trip_and_skips_unknown_fields() -> None:
 
 def test_file_of_a_newer_version_is_refused_by_name() -> None:
     document = json.loads(encode_run_record(RECORD))
-    for newer in ({"schema_version": 2}, {"schema_version": "0.2"}, {"record_version": 3}):
+    for newer in ({"schema_version": 2}, {"schema_version": "0.2"}, {"record_version": 4}):
         with pytest.raises(ProtocolError, match=r"run\.json has schema_version .*update evopolicy"):
             decode_run_record(json.dumps(document | newer).encode())
     with pytest.raises(ProtocolError, match="schema_version 2"):

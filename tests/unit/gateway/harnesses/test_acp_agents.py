@@ -13,7 +13,7 @@ from evopolicy_gateway import harnesses
 from evopolicy_gateway.harnesses.coding_agents.acp_stream import AcpReader, permission, usage_of
 from evopolicy_gateway.harnesses.interface.agent_config import AcpTable
 from evopolicy_gateway.harnesses.interface.base import AgentError
-from evopolicy_gateway.harnesses.interface.usage import Usage
+from evopolicy_gateway.relay.usage import Usage
 
 PROGRAM = (str(FAKES / "acp-agent"),)
 

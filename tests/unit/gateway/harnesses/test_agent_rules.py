@@ -25,8 +25,8 @@ from evopolicy_gateway.harnesses.interface.agent_config import (
     TokenPaths,
     read_agent,
 )
-from evopolicy_gateway.harnesses.interface.usage import MAX_COUNT, Usage
 from evopolicy_gateway.processes.clock import AgentClock
+from evopolicy_gateway.relay.usage import MAX_COUNT, Usage
 
 EXAMPLES = Path(__file__).parents[4] / "examples" / "agents"
 

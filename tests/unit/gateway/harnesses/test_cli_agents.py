@@ -10,8 +10,8 @@ from stages.cli_stage import PATH_TOKEN, Played, play, settings, thinks_without_
 from evopolicy_common.errors import ConfigError
 from evopolicy_gateway.harnesses.coding_agents import session
 from evopolicy_gateway.harnesses.interface.base import AgentError
-from evopolicy_gateway.harnesses.interface.usage import Prices
 from evopolicy_gateway.processes.child_messages import AgentEnded
+from evopolicy_gateway.relay.usage import Prices
 
 pytestmark = pytest.mark.slow
 

@@ -12,8 +12,8 @@ from stages.model_api import CACHED, CREATED, INPUT, OUTPUT, ModelApi, Step
 from evopolicy_common.errors import ConfigError
 from evopolicy_gateway import harnesses
 from evopolicy_gateway.agents.llm import apis, shell
-from evopolicy_gateway.harnesses.interface.agent_config import AgentConfig, LlmApi
-from evopolicy_gateway.harnesses.interface.usage import Prices
+from evopolicy_gateway.harnesses.interface.agent_config import AgentConfig, ApiTable
+from evopolicy_gateway.relay.usage import Prices
 
 pytestmark = pytest.mark.slow
 
@@ -34,7 +34,7 @@ def the_key_is_set(monkeypatch: pytest.MonkeyPatch) -> None:
 def config_for(protocol: Protocol, api: ModelApi, **more: Any) -> AgentConfig:
     base = f"{api.base_url}/v1" if protocol == "openai" else api.base_url
     return settings(
-        "llm", model="m-1", api=LlmApi(protocol=protocol, base_url=base, key="MODEL_ACCESS"), **more
+        "llm", model="m-1", api=ApiTable(protocol=protocol, base_url=base, key="MODEL_ACCESS"), **more
     )
 
 
@@ -183,16 +183,15 @@ def test_the_command_line_names_protocol_and_model(tmp_path: Path) -> None:
             harnesses.config_of(wrong, tmp_path)
 
 
-def test_only_the_endpoints_host_is_reachable(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_no_host_but_the_relay_is_reachable(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("OPENAI_API_KEY", KEY)
     made = harnesses.make("llm:openai/m", tmp_path)
-    assert (tuple(made.hosts), tuple(made.packages)) == (("api.openai.com:443",), ("openai",))
-    other = AgentConfig(
-        harness="llm", model="m", api=LlmApi(protocol="anthropic", base_url="http://127.0.0.1:8000", key="")
-    )
-    assert tuple(harnesses.make("llm", tmp_path, other).hosts) == ("127.0.0.1:8000",)
+    assert (tuple(made.hosts), tuple(made.packages)) == ((), ("openai",))
+    assert made.model is not None
+    assert made.model.upstream is not None
+    assert (made.model.upstream.base_url, made.model.upstream.key) == ("https://api.openai.com/v1", KEY)
     for url in ("http://gpu-box:8000/v1", "gpu-box", "https://", "https://h:x"):
-        wrong = AgentConfig(harness="llm", model="m", api=LlmApi(protocol="openai", base_url=url, key=""))
+        wrong = AgentConfig(harness="llm", model="m", api=ApiTable(protocol="openai", base_url=url, key=""))
         with pytest.raises(ConfigError, match="base_url"):
             harnesses.make("llm", tmp_path, wrong)
 

@@ -291,10 +291,10 @@ def test_a_sweeps_use_adds_up_over_its_runs(tmp_path: Path) -> None:
     tokens = {"input_noncached": 1, "cache_read": 2, "cache_creation": 3, "output": 4, "reasoning": 4}
     runs = {
         one.name: entry(one, tokens=tokens),
-        two.name: entry(two, tokens={**tokens, "cost": 0.5}),
+        two.name: entry(two, tokens={**tokens, "cost": 0.5, "requests": 7}),
         three.name: entry(three),
     }
-    assert used(Index(suite="s", runs=runs)) == (20, 0.5)
+    assert used(Index(suite="s", runs=runs)) == (20, 0.5, 7)
 
 
 def test_the_live_table_shows_each_run_and_the_totals(tmp_path: Path) -> None:

@@ -126,7 +126,7 @@ def test_an_unavailable_provider_holds_back_its_further_runs(
     assert any("paused a/toy/line/0" in line and "'seconds': 3600" in line for line in stage.events)
 
 
-@pytest.mark.parametrize("cap", ["max_tokens = 149", "max_cost = 0.2"])
+@pytest.mark.parametrize("cap", ["max_tokens = 149", "max_cost = 0.2", "max_requests = 7"])
 def test_a_sweeps_cap_begins_no_further_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cap: str
 ) -> None:

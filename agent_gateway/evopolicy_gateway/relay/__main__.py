@@ -1,0 +1,67 @@
+"""The relay's process: `python -m evopolicy_gateway.relay FD`. FD is the listening socket; the order comes as a line on stdin.
+
+It prints events of `processes/child_messages.py` on stdout, and ends with its stdin.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import ctypes
+import logging
+import signal
+import socket
+import sys
+
+import msgspec
+
+from evopolicy_common.cli.conventions import setup_logging
+from evopolicy_common.wire.http import serving
+from evopolicy_gateway.processes import child_messages
+from evopolicy_gateway.processes.child_messages import AgentDoing, ModelBudgetSpent, Orders, StartRelay
+from evopolicy_gateway.relay.service import Order, Relay
+
+_PR_SET_DUMPABLE = 4
+_TELL_S = 60.0
+"""How often the operator is told what was used."""
+
+
+async def _main(fd: int) -> None:
+    orders = Orders()
+    first = await orders.next()
+    if not isinstance(first, StartRelay):
+        return
+    order = msgspec.convert(first.order, Order)
+
+    def counted(note: str = "") -> None:
+        child_messages.emit(AgentDoing(tokens=relay.used.recorded(order.prices), note=note))
+
+    async def tell() -> None:
+        told = relay.used.requests
+        while True:
+            await asyncio.sleep(_TELL_S)
+            if relay.used.requests != told:
+                told = relay.used.requests
+                counted(relay.used.words(order.prices))
+
+    def spent(what: str) -> None:
+        child_messages.emit(ModelBudgetSpent(what=what))
+
+    relay = Relay(order, counted=counted, note=counted, spent=spent)
+    counted()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        asyncio.get_running_loop().add_signal_handler(number, orders.end)
+    async with serving(relay, socket.socket(fileno=fd)):
+        # A stream that breaks off is no error of this program.
+        logging.getLogger("uvicorn.error").disabled = True
+        telling = asyncio.create_task(tell())
+        while await orders.next() is not None:
+            pass
+        telling.cancel()
+    await relay.close()
+
+
+if __name__ == "__main__":
+    # No other process of this user may read its memory, which has the key.
+    ctypes.CDLL(None).prctl(_PR_SET_DUMPABLE, 0, 0, 0, 0)
+    setup_logging()
+    asyncio.run(_main(int(sys.argv[1])))

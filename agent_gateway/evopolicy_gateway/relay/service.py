@@ -1,0 +1,448 @@
+"""The relay's HTTP service: requests of the agent in, requests to the provider out, and the counting between them."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import hmac
+import re
+import time
+import zlib
+from collections.abc import AsyncIterator, Callable, Coroutine, Mapping
+from email.utils import parsedate_to_datetime
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import httpx
+import msgspec
+import orjson
+from starlette.requests import ClientDisconnect, Request
+from starlette.responses import Response, StreamingResponse
+from starlette.types import Receive, Scope, Send
+
+from evopolicy_gateway.relay import apis, limits
+from evopolicy_gateway.relay.answers import SHAPES, AnswerReader
+from evopolicy_gateway.relay.apis import Refusal, Upstream
+from evopolicy_gateway.relay.ledger import Ledger
+from evopolicy_gateway.relay.limits import Limits
+from evopolicy_gateway.relay.usage import Prices
+
+MAX_REQUEST_BYTES = 32 << 20
+MAX_ERROR_BYTES = 1 << 20
+MAX_ANSWER_BYTES = 256 << 20
+"""Of one answer, uncompressed."""
+MAX_IN_FLIGHT = 32
+REQUEST_WAIT_S = 60.0
+"""Time in which a request's body has to arrive."""
+MAX_RETRY_S = 60.0
+"""Longest wait that clients keep within a request; with a longer one their turn fails, and the harness waits."""
+_FIRST_RETRY_S = 1.0
+_CHUNK = 64 << 10
+_SHOWN = 200
+
+
+class Order(msgspec.Struct, frozen=True, kw_only=True):
+    """What a relay process is started with: one JSON line on its stdin."""
+
+    upstream: Upstream
+    token: str
+    """The agent's, which only this relay accepts."""
+    ledger: str
+    limits: Limits = Limits()
+    prices: Prices | None = None
+    model: str | None = None
+    """The declared model."""
+    declared_only: bool = False
+    """Whether requests for other models are refused."""
+    timeout_s: float = 600.0
+    """Longest time without a byte from the provider."""
+
+
+class Relay:
+    """The ASGI application."""
+
+    def __init__(
+        self,
+        order: Order,
+        *,
+        counted: Callable[[], None],
+        note: Callable[[str], None],
+        spent: Callable[[str], None],
+    ) -> None:
+        """`counted` is called after each request, `note` with a line for the operator, `spent` with the limit that is used up."""
+        self._order = order
+        self._upstream = order.upstream
+        self._ledger = Ledger(Path(order.ledger), order.model)
+        self._counted, self._note, self._spent = counted, note, spent
+        self.in_flight = 0
+        self._troubles = 0
+        """Failed requests since the last answered one."""
+        self._told: set[str] = set()
+        self._secrets = [
+            value.encode()
+            for value in (order.upstream.key, *order.upstream.headers.values())
+            if len(value) >= 8
+        ]
+        wait = httpx.Timeout(order.timeout_s, connect=min(30.0, order.timeout_s))
+        local = urlsplit(order.upstream.base_url).hostname in ("localhost", "127.0.0.1")
+        # The operator's proxy does not lead to this machine.
+        self._client = httpx.AsyncClient(timeout=wait, trust_env=not local)
+
+    @property
+    def shown(self) -> str:
+        """The base URL, for people."""
+        return self._upstream.shown
+
+    @property
+    def used(self) -> limits.Used:
+        return self._ledger.used
+
+    async def close(self) -> None:
+        await self._client.aclose()
+        self._ledger.close()
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http":
+            return
+        request = Request(scope, receive)
+        try:
+            response = await self._answer(request)
+        except ClientDisconnect:
+            return
+        await response(scope, receive, send)
+
+    async def _answer(self, request: Request) -> Response:
+        if not self._is_agents(request.headers):
+            return self.refused(
+                apis.NO_TOKEN, "the relay does not know this key; use the one of your environment"
+            )
+        if "transfer-encoding" in request.headers and "content-length" in request.headers:
+            return self.refused(apis.INVALID, "the request has two lengths", more={"connection": "close"})
+        found = apis.path_of(self._upstream.protocol, request.url.path)
+        if found is None:
+            why = f"{request.url.path[:_SHOWN]} is not served: only {', '.join(apis.METERED[self._upstream.protocol])}"
+            return self.refused(apis.NO_PATH, why)
+        api, path = found
+        if request.headers.get("content-encoding", "identity").lower() != "identity":
+            return self.refused(apis.COMPRESSED, "send the request uncompressed")
+        body = b""
+        if request.method == "POST":
+            try:
+                async with asyncio.timeout(REQUEST_WAIT_S):
+                    body = await _read(request)
+            except TimeoutError:
+                return self.refused(apis.TOO_SLOW, f"the request did not arrive within {REQUEST_WAIT_S:g} s")
+            except ValueError as error:
+                return self.refused(apis.TOO_LARGE, str(error))
+        elif request.method != "GET" or api in SHAPES:
+            return self.refused(apis.NO_PATH, f"{request.method} is not served here")
+        if api not in SHAPES:
+            return await self._free(request, path, body)
+        return await self._metered(request, api, path, body)
+
+    async def _free(self, request: Request, path: str, body: bytes) -> Response:
+        """Passes on a request that costs nothing."""
+        try:
+            async with self.sent(request, path, body) as answer:
+                data = await _all(answer, MAX_ERROR_BYTES)
+        except (httpx.HTTPError, ValueError, zlib.error) as error:
+            return self.refused(apis.UNREACHABLE, self.unreachable(error))
+        return Response(self.clean(data), answer.status_code, self.headers_of(answer))
+
+    async def _metered(self, request: Request, api: str, path: str, body: bytes) -> Response:
+        order, used = self._order, self.used
+        try:
+            document = orjson.loads(body)
+        except orjson.JSONDecodeError as error:
+            return self.refused(apis.INVALID, f"the request is not JSON: {error}")
+        if not isinstance(document, dict):
+            return self.refused(apis.INVALID, "the request is not a JSON object")
+        if document.get("background"):
+            # It would go on after its answer, uncounted.
+            return self.refused(apis.INVALID, "requests in the background are not served")
+        asked = str(document.get("model", ""))[:_SHOWN]
+        if order.model and asked != order.model:
+            if order.declared_only:
+                return self.refused(
+                    apis.OTHER_MODEL, f"the run's model is {order.model}; {asked!r} is not allowed"
+                )
+            self._once(f"the agent asks for the model {asked!r} besides {order.model}")
+        if what := used.over(order.limits, order.prices, self.in_flight):
+            if not used.over(order.limits, order.prices):
+                return self.refused(
+                    apis.TOO_MANY, "the last requests of the model budget are under way", retry_after="1"
+                )
+            self._spent(what)
+            return self.refused(apis.SPENT, f"the run's model budget is spent: {what}")
+        if self.in_flight >= MAX_IN_FLIGHT:
+            return self.refused(apis.TOO_MANY, f"{MAX_IN_FLIGHT} requests are under way", retry_after="1")
+        if order.declared_only:
+            # A name that occurs twice is read in one way here, and perhaps in another there.
+            body = orjson.dumps(document)
+        drops_usage = False
+        options = document.get("stream_options")
+        if api == "chat/completions" and document.get("stream") is True:
+            options = options if isinstance(options, dict) else {}
+            if options.get("include_usage") is not True:
+                drops_usage = True
+                body = orjson.dumps(document | {"stream_options": options | {"include_usage": True}})
+        exchange = _Exchange(self, api, asked, body, drops_usage=drops_usage)
+        response = None
+        try:
+            response = await exchange.answer(request, path)
+        finally:
+            if not isinstance(response, _Streamed):
+                await exchange.close()
+        return response
+
+    def _is_agents(self, headers: Mapping[str, str]) -> bool:
+        given = [headers.get("authorization", "").partition(" ")[2]]
+        given += [headers.get(name, "") for name in ("x-api-key", "api-key")]
+        return any(hmac.compare_digest(each.encode(), self._order.token.encode()) for each in given)
+
+    def sent(
+        self, request: Request, path: str, body: bytes
+    ) -> contextlib.AbstractAsyncContextManager[httpx.Response]:
+        """The request to the provider, built anew."""
+        headers = apis.passed_up(request.headers) | self._upstream.authorization()
+        # Compressed answers would have to be unpacked to be counted.
+        headers["accept-encoding"] = "identity"
+        url = self._upstream.url(path, request.query_params)
+        return self._client.stream(request.method, url, headers=headers, content=body)
+
+    def refused(
+        self, refusal: Refusal, message: str, *, retry_after: str = "", more: Mapping[str, str] = {}
+    ) -> Response:
+        """An answer of the relay's own. Without `retry_after` or headers in `more`, it is final."""
+        headers = {"retry-after": retry_after} if retry_after else dict(more) or {"x-should-retry": "false"}
+        headers["content-type"] = "application/json"
+        return Response(refusal.body(self._upstream.protocol, message), refusal.status, headers)
+
+    def count(self, request: limits.Request) -> None:
+        """Writes a finished request to the ledger. Raises OSError when the disk refuses."""
+        self.in_flight -= 1
+        self._ledger.write(request)
+        self._counted()
+
+    def answered(self) -> None:
+        """The provider has answered: the next failure is a first one."""
+        self._troubles = 0
+
+    def headers_of(self, answer: httpx.Response) -> dict[str, str]:
+        return {
+            name: self.clean(value.encode()).decode("latin-1")
+            for name, value in apis.passed_down(answer.headers).items()
+        }
+
+    def clean(self, data: bytes) -> bytes:
+        """The bytes without the key, which some servers repeat in their errors."""
+        for secret in self._secrets:
+            data = data.replace(secret, b"[key]")
+        return data
+
+    def unreachable(self, error: Exception) -> str:
+        why = str(error) or type(error).__name__
+        return self.clean(f"base_url {self._upstream.shown} gives no answer: {why}".encode()).decode(
+            "utf-8", "replace"
+        )
+
+    def _once(self, text: str) -> None:
+        if text not in self._told and len(self._told) < 20:
+            self._told.add(text)
+            self._note(text)
+
+    def trouble(self, what: str, stated_s: float | None) -> float:
+        """Seconds until the next try, after a failure that another try may resolve: as stated, or longer each time. Tells the operator
+        of the first."""
+        wait_s = stated_s if stated_s is not None else min(MAX_RETRY_S, _FIRST_RETRY_S * 2.0**self._troubles)
+        self._troubles = min(self._troubles + 1, 10)
+        if self._troubles == 1:
+            at = time.strftime("%H:%M:%S UTC", time.gmtime(time.time() + wait_s))
+            self._note(f"{self._upstream.shown} {what}; next try in {wait_s:.0f} s, at {at}")
+        return wait_s
+
+
+class _Exchange:
+    """One request that costs tokens, and its answer. Call `close` at the end of both."""
+
+    def __init__(self, relay: Relay, api: str, asked: str, body: bytes, *, drops_usage: bool) -> None:
+        self._relay = relay
+        self._api, self._asked, self._body, self._drops_usage = api, asked, body, drops_usage
+        self._at, self._begun = time.time(), time.monotonic()
+        self._first_s: float | None = None
+        self._written = False
+        self._status = 0
+        self._reader: AnswerReader | None = None
+        self._opened = contextlib.AsyncExitStack()
+        relay.in_flight += 1
+
+    async def answer(self, request: Request, path: str) -> Response:
+        relay = self._relay
+        try:
+            got = await _unless_gone(
+                request, self._opened.enter_async_context(relay.sent(request, path, self._body))
+            )
+        except httpx.HTTPError as error:
+            wait_s = relay.trouble("gives no answer", None)
+            self._write(wait_s=wait_s)
+            return relay.refused(apis.UNREACHABLE, relay.unreachable(error), retry_after=f"{wait_s:.0f}")
+        self._status = got.status_code
+        kind = got.headers.get("content-type", "").partition(";")[0].strip().lower()
+        events = kind == "text/event-stream"
+        if 200 <= got.status_code < 300 and (events or kind.endswith("json")):
+            relay.answered()
+            self._reader = AnswerReader(SHAPES[self._api], events=events, drops_usage=self._drops_usage)
+            return _Streamed(self, self._passed(got, self._reader), got.status_code, relay.headers_of(got))
+        try:
+            data = await _all(got, MAX_ERROR_BYTES)
+        except (httpx.HTTPError, ValueError, zlib.error):
+            data = b""
+        return self._failed(got, kind, data)
+
+    async def close(self) -> None:
+        """Counts an answer that broke off, and ends the provider's."""
+        self._write_read(broken=True)
+        await self._opened.aclose()
+
+    def _failed(self, got: httpx.Response, kind: str, data: bytes) -> Response:
+        """The answer for one that is no success of this API."""
+        relay, status = self._relay, got.status_code
+        shown = relay.clean(data[:_SHOWN]).decode("utf-8", "replace").strip()
+        came = f"base_url {relay.shown} answered {status} with {kind or 'no content type'}: {shown!r}"
+        if status < 400:
+            self._write(broken=True)
+            return relay.refused(apis.INVALID, f"{came}; the base URL of a model API answers with JSON")
+        headers, wait_s = relay.headers_of(got), 0.0
+        if status in (408, 429) or status >= 500:
+            wait_s = relay.trouble(f"answered {status}", _stated_s(got.headers))
+            headers["retry-after"] = f"{wait_s:.0f}"
+            if wait_s > MAX_RETRY_S:
+                headers["x-should-retry"] = "false"
+        self._write(wait_s=wait_s)
+        if kind.endswith("json"):
+            return Response(relay.clean(data), status, headers)
+        same = msgspec.structs.replace(apis.UNREACHABLE, status=status)
+        return relay.refused(same, came, more=headers)
+
+    async def _passed(self, got: httpx.Response, reader: AnswerReader) -> AsyncIterator[bytes]:
+        """The answer's bytes, the last of them after the request is in the ledger."""
+        async for data in _unpacked(got):
+            if self._first_s is None:
+                self._first_s = time.monotonic() - self._begun
+            passed = reader.feed(data)
+            if reader.complete:
+                self._write_read(broken=False)
+            if passed:
+                yield self._relay.clean(passed)
+        last = reader.end()
+        self._write_read(broken=False)
+        if last:
+            yield self._relay.clean(last)
+
+    def _write_read(self, *, broken: bool) -> None:
+        if self._reader is None:
+            self._write(broken=broken)
+        elif not self._written:
+            found = self._reader.metered(len(self._body))
+            self._write(broken=broken, usage=found.usage, estimated=found.estimated, answered=found.model)
+
+    def _write(self, **more: Any) -> None:
+        if self._written:
+            return
+        self._written = True
+        self._relay.count(
+            limits.Request(
+                at=round(self._at, 3),
+                api=self._api,
+                asked=self._asked,
+                status=self._status,
+                first_s=None if self._first_s is None else round(self._first_s, 4),
+                whole_s=round(time.monotonic() - self._begun, 4),
+                **more,
+            )
+        )
+
+
+class _Streamed(StreamingResponse):
+    """Closes the exchange, also when the agent has gone before the first byte."""
+
+    def __init__(self, exchange: _Exchange, *given: Any) -> None:
+        super().__init__(*given)
+        self._exchange = exchange
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        try:
+            await super().__call__(scope, receive, send)
+        finally:
+            await self._exchange.close()
+
+
+async def _unless_gone(request: Request, opening: Coroutine[Any, Any, httpx.Response]) -> httpx.Response:
+    """What `opening` returns. Raises ClientDisconnect, and cancels it, when the agent goes meanwhile."""
+    waits, gone = asyncio.ensure_future(opening), asyncio.ensure_future(request.receive())
+    try:
+        # The body is read: the next message is the end of the connection.
+        await asyncio.wait([waits, gone], return_when=asyncio.FIRST_COMPLETED)
+        if not waits.done():
+            raise ClientDisconnect
+        return waits.result()
+    finally:
+        for task in (waits, gone):
+            task.cancel()
+        await asyncio.gather(waits, gone, return_exceptions=True)
+
+
+async def _read(request: Request) -> bytes:
+    body = bytearray()
+    async for chunk in request.stream():
+        body += chunk
+        if len(body) > MAX_REQUEST_BYTES:
+            raise ValueError(f"the request has more than {MAX_REQUEST_BYTES:,} bytes")
+    return bytes(body)
+
+
+async def _all(answer: httpx.Response, limit: int) -> bytes:
+    data = bytearray()
+    async for chunk in _unpacked(answer):
+        data += chunk
+        if len(data) > limit:
+            raise ValueError(f"the answer has more than {limit:,} bytes")
+    return bytes(data)
+
+
+async def _unpacked(answer: httpx.Response) -> AsyncIterator[bytes]:
+    """The answer's bytes, unpacked in pieces of bounded size: a small compressed answer may hold very many. Raises ValueError."""
+    coding = answer.headers.get("content-encoding", "identity").strip().lower()
+    if coding not in ("identity", "gzip", "x-gzip", "deflate"):
+        raise ValueError(
+            f"the answer is compressed as {coding[:_SHOWN]}, though no compression was asked for"
+        )
+    unpack = None if coding == "identity" else zlib.decompressobj(wbits=zlib.MAX_WBITS | 32)
+    n_bytes = 0
+    async for data in answer.aiter_raw():
+        rest = data
+        while rest:
+            if unpack is None:
+                piece, rest = rest, b""
+            else:
+                piece = unpack.decompress(rest, _CHUNK)
+                rest = unpack.unconsumed_tail
+            n_bytes += len(piece)
+            if n_bytes > MAX_ANSWER_BYTES:
+                raise ValueError(f"the answer has more than {MAX_ANSWER_BYTES:,} bytes")
+            yield piece
+
+
+_NUMBER = re.compile(r"\d{1,9}(\.\d{1,6})?")
+
+
+def _stated_s(headers: Mapping[str, str]) -> float | None:
+    """Seconds of `retry-after`, which is a number or a date; None without."""
+    text = headers.get("retry-after", "").strip()
+    if _NUMBER.fullmatch(text):
+        return float(text)
+    try:
+        return max(0.0, parsedate_to_datetime(text).timestamp() - time.time())
+    except (ValueError, TypeError, OverflowError):
+        return None

@@ -1,0 +1,91 @@
+"""The relay of one run: its process, which is started again when it dies, and the address and token for the agent.
+
+It is a child of the command that plays the run and not of the agent's supervisor, which ends all that is below it and holds no
+credentials. The command keeps the listening socket, so that a relay that is started again has its address.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import secrets
+import sys
+import sysconfig
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+import evopolicy_common
+import evopolicy_gateway
+from evopolicy_common.errors import EvopolicyError
+from evopolicy_common.processes.preflight import LOOPBACK
+from evopolicy_common.wire.http import bound
+from evopolicy_gateway.jail.view import confined
+from evopolicy_gateway.processes.child_messages import AgentDoing, ModelBudgetSpent, StartRelay
+from evopolicy_gateway.processes.child_rpc import Child
+from evopolicy_gateway.relay.service import Order
+
+_MAX_DEATHS = 20
+_PAUSE_S = 0.2
+
+
+class ModelRelay:
+    """The relay, from `start` to `end`."""
+
+    def __init__(
+        self,
+        order: Callable[[str], Order],
+        ledger: Path,
+        log: Path,
+        *,
+        jailed: bool,
+        doing: Callable[[AgentDoing], None],
+        spent: Callable[[str], None],
+    ) -> None:
+        """`order` makes the relay's order from the agent's token. `doing` and `spent` get its reports."""
+        self._sock = bound(LOOPBACK, 0)
+        # Connections queue here while a relay is started.
+        self._sock.listen(64)
+        self.url = f"http://{LOOPBACK}:{self._sock.getsockname()[1]}"
+        self.token = secrets.token_hex(24)
+        ledger.parent.mkdir(parents=True, exist_ok=True)
+        ledger.touch(mode=0o600)
+        self._order = StartRelay(order=msgspec.to_builtins(order(self.token)))
+        self._program = _program(self._sock.fileno(), ledger, jailed)
+        self._log = log
+        self._doing, self._spent = doing, spent
+        self._child: Child | None = None
+
+    async def serve(self) -> None:
+        """Runs the relay until this is cancelled. Raises EvopolicyError when it cannot stay alive."""
+        for _ in range(_MAX_DEATHS):
+            self._child = await Child.start(
+                self._program, self._log, talks=True, keeps=(self._sock.fileno(),)
+            )
+            await self._child.tell(self._order)
+            async for event in self._child.events():
+                if isinstance(event, AgentDoing):
+                    self._doing(event)
+                elif isinstance(event, ModelBudgetSpent):
+                    self._spent(event.what)
+            await self._child.ended()
+            await asyncio.sleep(_PAUSE_S)
+        raise EvopolicyError(f"the relay for model calls died {_MAX_DEATHS} times; see {self._log}")
+
+    async def end(self, grace_s: float) -> None:
+        self._sock.close()
+        if self._child is not None:
+            await self._child.end(grace_s)
+
+
+def _program(fd: int, ledger: Path, jailed: bool) -> list[str]:
+    python = [sys.executable, "-P", "-m", "evopolicy_gateway.relay", str(fd)]
+    if not jailed:
+        return python
+    ours: list[Any] = [evopolicy_common, evopolicy_gateway]
+    places = [sys.base_prefix, os.path.realpath(sys.base_prefix), sys.prefix, sysconfig.get_path("platlib")]
+    places += [str(Path(each.__file__).parent) for each in ours]
+    read = [Path(place) for place in dict.fromkeys(places) if not place.startswith("/usr")]
+    return [*confined(read, [ledger]), "--", *python]

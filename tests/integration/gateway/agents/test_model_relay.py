@@ -1,0 +1,244 @@
+"""Whole runs of agents with a model, behind the relay: what is counted, limited and told, and where the key is."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from commands import Command, command, record_in, run_arguments, run_dir, toy_cluster
+from stages import odd_answers
+from stages.model_api import CACHED, INPUT, OUTPUT, ModelApi, Step
+from waiting import wait_until
+
+from evopolicy_common.records.run_record import RunRecord
+from evopolicy_gateway.relay.ledger import read
+
+pytestmark = pytest.mark.slow
+
+KEY = "key-of-the-test-0123456789"
+SUBMIT = Step(command="curl -s -X POST -d '{\"env_instances\": [0, 1]}' $EVOPOLICYGYM_SUBMIT_URL")
+ENDS = [SUBMIT, SUBMIT, SUBMIT, Step(text="done")]
+"""Spends the budget of six episodes."""
+SEARCH = """
+import os
+needle, found = b"-".join((b"key", b"of", b"the", b"test", b"0123456789")), []
+def look(path):
+    try:
+        with open(path, "rb") as file:
+            while (data := file.read(1 << 20)):
+                if needle in data:
+                    found.append(path)
+    except OSError:
+        pass
+for root, folders, files in os.walk("/"):
+    folders[:] = [f for f in folders if os.path.join(root, f) not in ("/usr", "/sys", "/proc", "/dev", "/lib", BASE)]
+    for name in files:
+        if os.path.isfile(os.path.join(root, name)):
+            look(os.path.join(root, name))
+for pid in filter(str.isdecimal, os.listdir("/proc")):
+    for name in ("environ", "cmdline") if int(pid) != os.getpid() else ("environ",):
+        look(f"/proc/{pid}/{name}")
+print("searched", len(found), found)
+"""
+
+
+@pytest.fixture(scope="module")
+def operator(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    with toy_cluster(tmp_path_factory.mktemp("cluster")) as file:
+        yield file
+
+
+@pytest.fixture(autouse=True)
+def the_key_is_set(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MODEL_ACCESS", KEY)
+
+
+def agent(folder: Path, api: ModelApi, protocol: str = "openai", **more: Any) -> str:
+    base = f"{api.base_url}/v1" if protocol == "openai" else api.base_url
+    usual = {"harness": "llm", "model": "m-1", "backoff_s": 0.01, "pause_s": 0.1, "max_pause_s": 0.2}
+    lines = [f"{name} = {json.dumps(value)}" for name, value in {**usual, **more}.items()]
+    table = f'[api]\nprotocol = "{protocol}"\nbase_url = "{base}"\nkey = "MODEL_ACCESS"\n'
+    (folder / "agent.toml").write_text("\n".join([*lines, table]))
+    return f"file:{folder / 'agent.toml'}"
+
+
+def played(
+    folder: Path, operator: Path, script: list[Step], protocol: str = "openai", **more: Any
+) -> tuple[RunRecord, ModelApi, str]:
+    """The record of a run, the API that it used, and what the command said."""
+    with (
+        ModelApi(script) as api,
+        command(folder, *run_arguments(operator, agent(folder, api, protocol, **more))) as running,
+    ):
+        running.wait()
+        return record_in(run_dir(folder)), api, running.text
+
+
+def test_odd_answers_are_counted_as_they_were_given(tmp_path: Path, operator: Path) -> None:
+    usage = {"prompt_tokens": -5, "completion_tokens": "many"}
+    odd = [
+        odd_answers.busy(429, retry_after="0"),
+        odd_answers.busy(429),
+        odd_answers.busy(500, retry_after="0"),
+        odd_answers.stream(odd_answers.says("x" * 40, end=False), whole=False),
+        odd_answers.bomb,
+    ]
+    talks = [odd_answers.stream(odd_answers.says("y" * 40))]
+    talks += [odd_answers.stream(odd_answers.says("z" * 40), {"choices": [], "usage": usage})]
+    script = [SUBMIT, *(Step(odd=each) for each in odd + talks), *ENDS[1:]]
+    record, api, text = played(tmp_path, operator, script)
+    used, tokens = record.agent.model_use, record.agent.tokens
+    assert record.outcome.status == "completed"
+    assert used is not None
+    assert tokens is not None
+    assert (used.metering, used.requests, used.requests_failed) == ("relay", api.n_asked, len(odd))
+    assert used.models == {"m-1": len(script) - 4}
+    assert used.requests_estimated == 4
+    assert tokens.cache_read == api.n_answered * CACHED
+    assert tokens.output - api.n_answered * OUTPUT >= 30
+    assert "answered 429; next try in 0 s, at" in text
+    assert KEY not in text
+
+
+@pytest.mark.parametrize("protocol", ["openai", "anthropic"])
+def test_the_key_is_nowhere_in_the_jail(tmp_path: Path, operator: Path, protocol: str) -> None:
+    base = json.dumps(os.path.realpath(os.sys.base_prefix))  # type: ignore[attr-defined]
+    search = f"cat > /tmp/s.py <<'E'\nBASE = {base}\n{SEARCH}\nE\npython3 -P /tmp/s.py; env"
+    record, api, _ = played(tmp_path, operator, [Step(command=search), *ENDS], protocol)
+    assert record.agent.model_use is not None
+    assert record.agent.model_use.requests == api.n_asked == 5
+    assert api.keys == {KEY if protocol == "anthropic" else f"Bearer {KEY}"}
+    found = json.dumps(api.requests[1])
+    assert "searched 0 []" in found
+    assert "EVOPOLICYGYM_SUBMIT_URL" in found
+    # Its commands have the relay's token as little as the key.
+    assert "_API_KEY=" not in found
+    assert KEY not in "".join(
+        path.read_text(errors="replace") for path in (run_dir(tmp_path) / "logs").iterdir()
+    )
+
+
+@pytest.mark.parametrize(
+    ("script", "told", "asked"),
+    [
+        ([Step(odd=odd_answers.page)], "answered 200 with text/html", 1),
+        ([Step(status=401, text="no such key")], "no such key", 1),
+        ([Step(status=404, text="no such model")], "no such model", 1),
+        ([Step(unknown="edit_file")] * 20, "5 faulty calls in a row, the last: there is no tool", 10),
+    ],
+)
+def test_a_model_that_cannot_play_ends_the_run_with_the_reason(
+    tmp_path: Path, operator: Path, script: list[Step], told: str, asked: int
+) -> None:
+    record, api, text = played(tmp_path, operator, [*script, *ENDS])
+    assert (record.outcome.closed_reason, record.agent.harness) == ("agent_failed", "llm")
+    assert told in text
+    assert record.agent.model_use is not None
+    assert record.agent.model_use.requests == api.n_asked == asked
+    if script[0].unknown:
+        assert (
+            '"name": "edit_file", "input": {"path": "policy.py"}'
+            in (run_dir(tmp_path) / "logs/agent.jsonl").read_text()
+        )
+
+
+def test_a_spent_model_budget_ends_the_run_with_what_it_has(tmp_path: Path, operator: Path) -> None:
+    record, api, text = played(tmp_path, operator, [SUBMIT, *[Step(command="true")] * 9], max_requests=3)
+    assert (record.outcome.status, record.outcome.closed_reason) == ("completed", "model_budget_spent")
+    assert record.outcome.budget_used == 2
+    use = record.agent.model_use
+    assert use is not None
+    assert (use.requests, use.limits.max_requests, use.limits.max_tokens) == (3, 3, 100_000_000)
+    assert api.n_asked == 3
+    assert "model limits: 3 requests, 100,000,000 tokens; metering: relay" in text
+    assert "the model budget is spent: 3 requests" in text
+
+
+def test_a_program_that_hangs_is_counted_and_resumed(tmp_path: Path, operator: Path) -> None:
+    script = [Step(odd=odd_answers.hang(14.0)), *ENDS]
+    record, api, _ = played(tmp_path, operator, script, silence_s=10.0)
+    use = record.agent.model_use
+    assert (record.outcome.status, record.agent.retries) == ("completed", 1)
+    assert use is not None
+    assert (use.requests, use.requests_failed) == (api.n_asked, 1)
+
+
+def test_a_cancelled_run_has_all_that_it_used(tmp_path: Path, operator: Path) -> None:
+    script = [SUBMIT, Step(text="one"), *[Step(command="sleep 0.2")] * 99]
+    with (
+        ModelApi(script) as api,
+        command(tmp_path, *run_arguments(operator, agent(tmp_path, api))) as running,
+    ):
+        wait_until(lambda: api.n_asked >= 6)
+        running.process.send_signal(signal.SIGINT)
+        running.wait()
+        record = record_in(run_dir(tmp_path))
+    use, tokens = record.agent.model_use, record.agent.tokens
+    assert record.outcome.status == "cancelled"
+    assert (record.agent.harness, record.agent.model_string, record.agent.turns) == ("llm", "m-1", 1)
+    assert record.agent.cli_version is not None
+    assert use is not None
+    assert tokens is not None
+    assert use.requests == api.n_asked
+    assert tokens.output == (api.n_asked - use.requests_failed) * OUTPUT
+    assert use.reported is not None
+
+
+@pytest.mark.parametrize("victim", ["relay", "supervisor", "command", "everything"])
+def test_a_kill_loses_no_finished_request(tmp_path: Path, operator: Path, victim: str) -> None:
+    script = [SUBMIT, *[Step(command="sleep 0.1")] * 12, *ENDS[1:]]
+    with ModelApi(script) as api:
+        arguments = run_arguments(operator, agent(tmp_path, api))
+        with command(tmp_path, *arguments) as running:
+            wait_until(lambda: api.n_asked >= 5)
+            kill(running, victim)
+            if victim in ("relay", "supervisor"):
+                assert running.wait() == 0, running.text
+        if victim in ("command", "everything"):
+            ledger = read(run_dir(tmp_path) / "logs/model_requests.jsonl")
+            assert api.n_asked - ledger.requests <= 1
+            with command(tmp_path, *arguments, "--resume") as running:
+                assert running.wait() == 0, running.text
+        record = record_in(run_dir(tmp_path))
+    use, tokens = record.agent.model_use, record.agent.tokens
+    assert use is not None
+    assert tokens is not None
+    assert record.outcome.status == "completed"
+    assert use.requests is not None
+    # At most the request in flight is lost.
+    assert api.n_asked - 1 <= use.requests <= api.n_asked
+    assert tokens.input_noncached >= (api.n_asked - 2) * (INPUT - CACHED)
+
+
+def kill(running: Command, victim: str) -> None:
+    if victim == "everything":
+        running.kill_all()
+    elif victim == "command":
+        running.kill()
+    elif victim == "supervisor":
+        os.kill(running.running("agent_supervisor.supervisor"), signal.SIGKILL)
+    else:
+        for entry in Path("/proc").iterdir():
+            words = (entry / "cmdline").read_bytes().split(b"\0") if entry.name.isdecimal() else []
+            if (
+                words
+                and b"python" in words[0]
+                and b"evopolicy_gateway.relay" in words
+                and is_below(int(entry.name), running)
+            ):
+                os.kill(int(entry.name), signal.SIGKILL)
+                return
+        raise AssertionError("no relay runs")
+
+
+def is_below(pid: int, running: Command) -> bool:
+    while pid > 1:
+        if pid == running.process.pid:
+            return True
+        pid = int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1])
+    return False

@@ -1,0 +1,405 @@
+"""The relay between an HTTP client and a model API on loopback."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+from stages import odd_answers
+from stages.model_api import CACHED, CREATED, INPUT, OUTPUT, REASONING, ModelApi, Step
+
+from evopolicy_common.wire.http import bound, serving
+from evopolicy_gateway.relay import service
+from evopolicy_gateway.relay.apis import Protocol, Upstream
+from evopolicy_gateway.relay.ledger import read
+from evopolicy_gateway.relay.limits import Limits, Used
+from evopolicy_gateway.relay.service import Order, Relay
+from evopolicy_gateway.relay.usage import Prices
+
+KEY = "sk-the-real-key-0123456789"
+TOKEN = "token-of-the-run-0123456789"
+TOOLS = [{"type": "function", "function": {"name": "bash"}, "name": "bash"}]
+PATHS = {"chat/completions": "openai", "responses": "openai", "messages": "anthropic"}
+
+
+class Served:
+    """A running relay, with what it reported."""
+
+    def __init__(self, ledger: Path, api: ModelApi) -> None:
+        self.ledger, self.api = ledger, api
+        self.notes: list[str] = []
+        self.spent: list[str] = []
+        self.client: httpx.AsyncClient
+        self.port = 0
+
+    @property
+    def used(self) -> Used:
+        return read(self.ledger)
+
+    async def ask(self, path: str = "chat/completions", **more: Any) -> httpx.Response:
+        body = {"model": "m", "stream": True, "tools": TOOLS, "messages": [], "input": [], **more}
+        return await self.client.post(f"/v1/{path}", json=body)
+
+
+@asynccontextmanager
+async def relay(
+    tmp_path: Path, api: ModelApi, protocol: Protocol = "openai", **more: Any
+) -> AsyncIterator[Served]:
+    served = Served(tmp_path / "ledger.jsonl", api)
+    base = f"{api.base_url}/v1" if protocol == "openai" else api.base_url
+    upstream = Upstream(protocol=protocol, base_url=base, key=KEY, **more.pop("upstream", {}))
+    order = Order(upstream=upstream, token=TOKEN, ledger=str(served.ledger), **more)
+    app = Relay(order, counted=lambda: None, note=served.notes.append, spent=served.spent.append)
+    sock = bound("127.0.0.1", 0)
+    served.port = sock.getsockname()[1]
+    async with serving(app, sock):
+        headers = {"authorization": f"Bearer {TOKEN}"}
+        url = f"http://127.0.0.1:{served.port}"
+        async with httpx.AsyncClient(base_url=url, headers=headers, trust_env=False) as served.client:
+            yield served
+    await app.close()
+
+
+def played(
+    tmp_path: Path, script: list[Step], act: Callable[[Served], Awaitable[Any]], **more: Any
+) -> Served:
+    """Does `act` with a relay to an API that plays the script."""
+    found: list[Served] = []
+
+    async def main() -> None:
+        async with relay(tmp_path, api, **more) as served:
+            found.append(served)
+            await act(served)
+
+    with ModelApi(script) as api:
+        asyncio.run(main())
+    return found[0]
+
+
+@pytest.mark.parametrize(("path", "protocol"), PATHS.items())
+def test_an_answer_passes_and_is_counted_with_the_real_key(
+    tmp_path: Path, path: str, protocol: Protocol
+) -> None:
+    async def act(served: Served) -> None:
+        answer = await served.ask(path)
+        assert answer.status_code == 200
+        assert "hello" in answer.text
+
+    served = played(tmp_path, [Step(text="hello")], act, protocol=protocol)
+    used = served.used.usage
+    assert (used.input_noncached, used.cache_read, used.output) == (INPUT - CACHED, CACHED, OUTPUT)
+    assert used.cache_creation == (CREATED if path == "messages" else 0)
+    assert used.reasoning == (REASONING if path == "responses" else None)
+    assert served.api.keys == {KEY if protocol == "anthropic" else f"Bearer {KEY}"}
+    assert KEY not in served.ledger.read_text()
+
+
+def test_a_request_is_in_the_ledger_before_its_answer_ends(tmp_path: Path) -> None:
+    async def act(served: Served) -> None:
+        body = {"model": "m", "stream": True, "tools": TOOLS, "messages": []}
+        async with served.client.stream("POST", "/v1/chat/completions", json=body) as answer:
+            async for line in answer.aiter_lines():
+                if line == "data: [DONE]":
+                    assert served.used.usage.output == OUTPUT
+                    return
+        raise AssertionError("the stream had no end")
+
+    played(tmp_path, [Step(text="hello")], act)
+
+
+def test_only_the_agents_token_is_accepted(tmp_path: Path) -> None:
+    async def act(served: Served) -> None:
+        for name, value in (("x-api-key", TOKEN), ("api-key", TOKEN)):
+            served.client.headers = httpx.Headers({name: value})
+            assert (await served.ask()).status_code == 200
+        for wrong in ("", "Bearer", f"Bearer {KEY}", "Bearer é", TOKEN):
+            served.client.headers = httpx.Headers({"authorization": wrong.encode()})
+            assert (await served.ask()).status_code == 401
+
+    assert played(tmp_path, [], act).api.n_asked == 2
+
+
+def test_a_key_that_the_provider_repeats_does_not_reach_the_agent(tmp_path: Path) -> None:
+    async def act(served: Served) -> None:
+        answer = await served.ask()
+        assert answer.status_code == 400
+        assert "bad request" in answer.text
+        assert KEY not in answer.text
+        assert "other-secret" not in answer.text
+
+    headers = {"x-team": "other-secret"}
+    served = played(tmp_path, [Step(odd=odd_answers.repeats_its_headers)], act, upstream={"headers": headers})
+    assert served.used.failed == 1
+
+
+def test_azure_gets_its_header_and_version(tmp_path: Path) -> None:
+    async def act(served: Served) -> None:
+        assert "hello" in (await served.ask()).text
+        assert "api-key" in (await served.ask()).text
+
+    def shows(handler: Any, _: dict[str, Any]) -> None:
+        names = {**dict.fromkeys(handler.headers, ""), "path": handler.path}
+        handler._send(400, json.dumps(names).encode(), "application/json")
+        assert handler.path.endswith("?api-version=7")
+        assert handler.headers["api-key"] == KEY
+
+    script = [Step(text="hello"), Step(odd=shows)]
+    upstream = {"key_header": "api-key", "query": {"api-version": "7"}}
+    assert played(tmp_path, script, act, upstream=upstream).api.keys == set()
+
+
+def test_requests_beyond_a_limit_are_refused_in_the_providers_form(tmp_path: Path) -> None:
+    async def act(served: Served) -> None:
+        answers = await asyncio.gather(*(served.ask() for _ in range(8)))
+        assert sorted(each.status_code for each in answers)[:3] == [200, 200, 200]
+        final = await served.ask()
+        assert (final.status_code, final.headers["x-should-retry"]) == (400, "false")
+        assert final.json()["error"]["code"] == "billing_hard_limit_reached"
+        assert "model budget is spent: 3 requests" in final.text
+
+    served = played(tmp_path, [], act, limits=Limits(max_requests=3))
+    assert served.api.n_asked == served.used.requests == 3
+    assert served.spent[-1] == "3 requests"
+
+
+@pytest.mark.parametrize(
+    ("limits", "what"),
+    [(Limits(max_tokens=INPUT), "1,000 tokens"), (Limits(max_cost=0.001), "0.00 dollars")],
+)
+def test_tokens_and_cost_are_limited_too(tmp_path: Path, limits: Limits, what: str) -> None:
+    async def act(served: Served) -> None:
+        assert (await served.ask("messages")).status_code == 200
+        final = await served.ask("messages")
+        assert (final.status_code, final.json()["type"]) == (400, "error")
+
+    prices = Prices(input=1.0, output=50.0)
+    served = played(tmp_path, [], act, protocol="anthropic", limits=limits, prices=prices)
+    assert served.spent == [what]
+
+
+def test_other_models_are_told_or_refused(tmp_path: Path) -> None:
+    async def act(served: Served) -> None:
+        assert (await served.ask(model="other")).status_code == status
+
+    status = 200
+    served = played(tmp_path, [], act, model="m")
+    assert served.notes == ["the agent asks for the model 'other' besides m"]
+    assert read(served.ledger, "m").other_models == {"other": 1}
+    status = 404
+    (tmp_path / "strict").mkdir()
+    served = played(tmp_path / "strict", [], act, model="m", declared_only=True)
+    assert served.api.n_asked == served.used.requests == 0
+
+
+def test_a_model_that_is_named_twice_is_the_one_that_was_checked(tmp_path: Path) -> None:
+    async def act(served: Served) -> None:
+        twice = b'{"model": "dear", "model": "m", "tools": [{"name": "bash"}], "input": []}'
+        assert (await served.client.post("/v1/responses", content=twice)).status_code == 200
+
+    served = played(tmp_path, [], act, model="m", declared_only=True)
+    assert b"dear" not in served.api.bodies[0]
+
+
+def test_a_web_page_is_an_error_that_names_the_base_url(tmp_path: Path) -> None:
+    async def act(served: Served) -> None:
+        answer = await served.ask()
+        assert (answer.status_code, answer.headers["x-should-retry"]) == (400, "false")
+        message = answer.json()["error"]["message"]
+        assert f"base_url {served.api.base_url}/v1 answered 200 with text/html" in message
+        assert "Sign in" in message
+
+    assert played(tmp_path, [Step(odd=odd_answers.page)], act).used.failed == 1
+
+
+@pytest.mark.parametrize(
+    ("odd", "wait", "final"),
+    [
+        (odd_answers.busy(429, retry_after="7"), "7", False),
+        (odd_answers.busy(429, retry_after="3600"), "3600", True),
+        (odd_answers.busy(429), "1", False),
+        (odd_answers.busy(500, retry_after="soon"), "1", False),
+    ],
+)
+def test_the_operator_is_told_of_the_first_failure_with_the_next_try(
+    tmp_path: Path, odd: odd_answers.Odd, wait: str, final: bool
+) -> None:
+    async def act(served: Served) -> None:
+        answer = await served.ask()
+        assert (answer.headers["retry-after"], "x-should-retry" in answer.headers) == (wait, final)
+        await served.ask()
+        assert len(served.notes) == 1
+        assert f"next try in {wait} s, at" in served.notes[0]
+        await served.ask()
+        await served.ask()
+
+    served = played(tmp_path, [Step(odd=odd), Step(odd=odd), Step(text="ok"), Step(odd=odd)], act)
+    assert len(served.notes) == 2
+    assert (served.used.requests, served.used.failed) == (4, 3)
+    assert served.used.wait_s >= 3 * int(wait)
+
+
+def test_a_provider_that_cannot_be_reached_is_named(tmp_path: Path) -> None:
+    async def act(served: Served) -> None:
+        answer = await served.ask()
+        assert answer.status_code == 502
+        assert f"base_url {served.api.base_url}/v1 gives no answer" in answer.text
+
+    hangs = Step(odd=odd_answers.hang(1.0))
+    assert played(tmp_path, [hangs], act, timeout_s=0.3).used.failed == 1
+
+
+def test_half_a_stream_is_no_whole_answer(tmp_path: Path) -> None:
+    async def act(served: Served) -> None:
+        with pytest.raises(httpx.RemoteProtocolError):
+            await served.ask()
+
+    half = odd_answers.stream(odd_answers.says("x" * 400, end=False), whole=False)
+    used = played(tmp_path, [Step(odd=half)], act).used
+    assert (used.failed, used.estimated, used.usage.output) == (1, 1, 100)
+
+
+@pytest.mark.parametrize("asked", [None, {"include_usage": False}, {"include_usage": True}])
+def test_a_stream_is_asked_for_its_counts_which_only_who_asks_sees(tmp_path: Path, asked: Any) -> None:
+    async def act(served: Served) -> None:
+        answer = await served.ask(**({} if asked is None else {"stream_options": asked}))
+        wanted = asked == {"include_usage": True}
+        assert ('"usage"' in answer.text) is wanted
+        assert answer.text.endswith("data: [DONE]\n\n")
+
+    served = played(tmp_path, [Step(text="hello")], act)
+    assert served.api.requests[0]["stream_options"]["include_usage"] is True
+    assert (served.used.usage.output, served.used.estimated) == (OUTPUT, 0)
+
+
+@pytest.mark.parametrize(
+    "usage",
+    [
+        None,
+        {"prompt_tokens": -5, "completion_tokens": "many"},
+        {"prompt_tokens": 1e30, "completion_tokens": 10**30},
+    ],
+)
+def test_missing_and_wrong_counts_are_estimated_and_marked(tmp_path: Path, usage: Any) -> None:
+    async def act(served: Served) -> None:
+        assert "x" * 400 in (await served.ask()).text
+
+    documents = [odd_answers.says("x" * 400)] + ([] if usage is None else [{"choices": [], "usage": usage}])
+    used = played(tmp_path, [Step(odd=odd_answers.stream(*documents))], act).used
+    assert (used.estimated, used.failed, used.usage.output) == (1, 0, 100)
+
+
+def test_a_compressed_bomb_is_cut_off(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(service, "MAX_ANSWER_BYTES", 8 << 20)
+    monkeypatch.setattr(odd_answers, "BOMB_BYTES", 64 << 20)
+
+    async def act(served: Served) -> None:
+        with pytest.raises(httpx.RemoteProtocolError):
+            await served.ask()
+
+    assert played(tmp_path, [Step(odd=odd_answers.bomb)], act).used.failed == 1
+
+
+@pytest.mark.parametrize(
+    ("path", "body", "headers", "status"),
+    [
+        ("/v1/chat/completions", b"{}", {"content-encoding": "gzip"}, 415),
+        ("/v1/chat/completions", b" " * 2000, {}, 413),
+        ("/v1/chat/completions", b"[1]", {}, 400),
+        ("/v1/chat/completions", b"{", {}, 400),
+        ("/v1/responses", b'{"model": "m", "background": true}', {}, 400),
+        ("/v1/files", b"{}", {}, 404),
+        ("/v1/messages", b"{}", {}, 404),
+        ("/v1/../v1/fine_tuning/jobs", b"{}", {}, 404),
+        ("/v1/responses/../files", b"{}", {}, 404),
+    ],
+)
+def test_hostile_requests_do_not_reach_the_provider(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    path: str,
+    body: bytes,
+    headers: dict[str, str],
+    status: int,
+) -> None:
+    monkeypatch.setattr(service, "MAX_REQUEST_BYTES", 1000)
+
+    async def act(served: Served) -> None:
+        answer = await served.client.post(path, content=body, headers=headers)
+        assert answer.status_code == status
+        assert "error" in answer.json()
+
+    assert played(tmp_path, [], act).api.n_asked == 0
+
+
+@pytest.mark.parametrize(
+    "framing",
+    [
+        "content-length: 4\r\ntransfer-encoding: chunked\r\n\r\n0\r\n\r\n",
+        "content-length: 2\r\ncontent-length: 3\r\n\r\n{}x",
+        "transfer-encoding: xchunked\r\n\r\n0\r\n\r\n",
+        "transfer-encoding:\tchunked, identity\r\n\r\n0\r\n\r\n",
+    ],
+)
+def test_a_request_of_two_lengths_is_not_read_in_two_ways(tmp_path: Path, framing: str) -> None:
+    inner = f"POST /v1/responses HTTP/1.1\r\nhost: x\r\nauthorization: Bearer {TOKEN}\r\ncontent-length: 2\r\n\r\n{{}}"
+    head = f"POST /v1/chat/completions HTTP/1.1\r\nhost: x\r\nauthorization: Bearer {TOKEN}\r\n"
+
+    async def act(served: Served) -> None:
+        reader, writer = await asyncio.open_connection("127.0.0.1", served.port)
+        writer.write((head + framing + inner).encode())
+        answer = await asyncio.wait_for(reader.read(), 30.0)
+        writer.close()
+        assert answer.count(b"HTTP/1.1") == 1
+        assert answer.startswith(b"HTTP/1.1 4")
+
+    assert played(tmp_path, [], act).api.n_asked == 0
+
+
+def test_only_chosen_headers_reach_the_provider(tmp_path: Path) -> None:
+    seen: dict[str, str] = {}
+
+    def shows(handler: Any, _: dict[str, Any]) -> None:
+        seen.update({name.lower(): value for name, value in handler.headers.items()})
+        handler._send(200, b"{}", "application/json")
+
+    async def act(served: Served) -> None:
+        served.client.headers.update(
+            {
+                "openai-organization": "other",
+                "x-forwarded-for": "1.2.3.4",
+                "openai-beta": "b",
+            }
+        )
+        await served.ask(stream=False)
+
+    played(tmp_path, [Step(odd=shows)], act)
+    assert (seen["authorization"], seen["openai-beta"]) == (f"Bearer {KEY}", "b")
+    assert not {"openai-organization", "x-forwarded-for"} & set(seen)
+
+
+def test_an_agent_that_goes_away_leaves_no_request_behind(tmp_path: Path) -> None:
+    async def act(served: Served) -> None:
+        with pytest.raises(httpx.ReadTimeout):
+            await served.client.post("/v1/chat/completions", json={"model": "m", "tools": TOOLS}, timeout=0.3)
+        while served.used.requests == 0:
+            await asyncio.sleep(0.02)
+        assert (await served.ask()).status_code == 200
+
+    served = played(tmp_path, [Step(odd=odd_answers.hang(2.0))], act, limits=Limits(max_requests=2))
+    assert (served.used.requests, served.used.failed) == (2, 1)
+
+
+def test_a_ledger_with_half_a_line_goes_on(tmp_path: Path) -> None:
+    async def act(served: Served) -> None:
+        await served.ask()
+
+    played(tmp_path, [], act)
+    whole = (tmp_path / "ledger.jsonl").read_bytes()
+    (tmp_path / "ledger.jsonl").write_bytes(whole + whole[:30])
+    assert played(tmp_path, [], act).used.requests == 2
