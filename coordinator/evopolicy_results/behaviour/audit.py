@@ -70,6 +70,10 @@ class AuditSignals(msgspec.Struct, frozen=True, kw_only=True):
     """Places in its log and code that deserve a look."""
 
 
+COUNTS_DIFFER = 0.05
+"""Share of the relay's count above which the agent's own is shown as another."""
+
+
 class TokenUse(msgspec.Struct, frozen=True, kw_only=True):
     """Mean token use of one entry on one environment, in millions of tokens, over the runs that record it."""
 
@@ -84,6 +88,10 @@ class TokenUse(msgspec.Struct, frozen=True, kw_only=True):
     """Including reasoning."""
     cost: float | None
     """US dollars per run; None when any of the runs has no price."""
+    metering: str = ""
+    """Who counted: `relay`, `agent`, or both in different runs; empty in files of earlier versions."""
+    differing: int = 0
+    """Runs in which the agent's own count differs from the relay's by more than `COUNTS_DIFFER`."""
 
 
 def audit_signals(runs: Iterable[Run]) -> list[AuditSignals]:
@@ -161,6 +169,8 @@ def token_use(runs: Sequence[Run]) -> list[TokenUse]:
 
 def _token_use(env: str, entry: str, runs: list[Run]) -> TokenUse:
     counts = [run.record.agent.tokens for run in runs if run.record.agent.tokens is not None]
+    uses = [(run.record.agent.model_use, run.record.agent.tokens) for run in runs]
+    apart = [use.difference(tokens) or 0.0 for use, tokens in uses if use is not None]
     costs = [tokens.cost for tokens in counts if tokens.cost is not None]
     return TokenUse(
         entry=entry,
@@ -170,4 +180,6 @@ def _token_use(env: str, entry: str, runs: list[Run]) -> TokenUse:
         cache=fmean(t.cache_read + t.cache_creation for t in counts) / 1e6 if counts else None,
         output=fmean(t.output for t in counts) / 1e6 if counts else None,
         cost=fmean(costs) if counts and len(costs) == len(counts) else None,
+        metering=", ".join(sorted({use.metering for use, _ in uses if use is not None})),
+        differing=sum(each > COUNTS_DIFFER for each in apart),
     )

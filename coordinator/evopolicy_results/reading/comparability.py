@@ -3,7 +3,8 @@ confinement, and whether hidden episodes and agents shared a kernel. Results tha
 with others.
 
 These must agree over all runs of a suite: budget, scope, observation form, simulation rule, finish rule, detail of
-the feedback, text of `AGENTS.md`, failed episodes, hidden evaluation, profile, jail, hidden isolation and hidden cases. The prompts must agree over the runs
+the feedback, text of `AGENTS.md`, failed episodes, hidden evaluation, profile, jail, hidden isolation, hidden cases,
+and the limits of agents with a model. The prompts must agree over the runs
 of one entry. These must agree over the runs of one environment, since environments differ
 in them anyway: splits (by hash), library fingerprint, environment version, bounds of a submit, a policy's limits,
 step limit, and videos in feedback. Runs with hidden cases of their own differ in these splits by design.
@@ -122,6 +123,7 @@ REMEDIES = {
     "profile": "the same --profile",
     "jail": "the same --jail",
     "hidden cases": "the same --hidden-cases",
+    "model limits": "the same max_requests, max_tokens, and max_cost in the agents' files",
     **dict.fromkeys(("train split", "validation split", "held-out split"), _SAME_CASES),
     "episodes a submit": "the same --min-episodes and --max-episodes",
     "policy limits": "the same --limit",
@@ -148,6 +150,12 @@ def _step_limit(run: Run) -> str:
     return run.record.experiment_dimensions.step_limit if both else ""
 
 
+def _model_limits(run: Run) -> str:
+    use = run.record.agent.model_use
+    assert use is not None
+    return " ".join(f"{k}={v}" for k, v in msgspec.to_builtins(use.limits).items() if v is not None)
+
+
 def _limits(run: Run) -> str:
     """As `name=value` words; empty if the run has no record of them."""
     limits = run.record.experiment_dimensions.limits
@@ -164,6 +172,9 @@ def mixtures(runs: Iterable[Run]) -> list[Mixture]:
         together = [run for env in envs for run in by_env[env]]
         out += _differences(_BY_SUITE, suite, together)
         out += _isolation(suite, together)
+        # Agents without a model have no limits, and stand beside those with any.
+        limited = [run for run in together if run.record.agent.model_use is not None]
+        out += _differences({"model limits": _model_limits}, suite, limited)
         for entry in sorted({run.entry for run in together}):
             out += _differences(
                 _BY_ENTRY, f"{suite}, {entry}", [run for run in together if run.entry == entry]

@@ -429,6 +429,8 @@ def _tokens(study: Study) -> Table:
             "output": row.output,
             "cost": row.cost,
             "runs": row.n_runs,
+            "metering": row.metering or None,
+            "differing": row.differing if "relay" in row.metering else None,
         }
         for row in study.tokens
     ]
@@ -440,7 +442,8 @@ def _tokens(study: Study) -> Table:
         name="tokens",
         title="Tokens and cost",
         caption="Mean of a run, in millions of tokens. In: input that no cache served. Cache: cache read and creation. Out: output with "
-        "reasoning. Diagnostic only, no part of a score. A dash: the agent does not tell.",
+        "reasoning. Diagnostic only, no part of a score. A dash: nothing counted them. Counted by the relay: at the wire; by the agent: as "
+        "its program reports.",
         columns=(
             ENV,
             ENTRY,
@@ -449,6 +452,8 @@ def _tokens(study: Study) -> Table:
             millions("output", "Out (M)", "Output, reasoning included."),
             Column("cost", "Cost (US$)", "number", digits=2),
             Column("runs", "Runs that tell", "integer"),
+            Column("metering", "Counted by"),
+            Column("differing", "Runs whose agent counts otherwise", "integer", note="By more than 5 %."),
         ),
         rows=tuple(rows) if any(row.n_runs for row in study.tokens) else (),
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
@@ -183,6 +184,19 @@ def test_cost_is_the_mean_of_runs_that_all_have_a_price(tmp_path: Path) -> None:
         write_run(tmp_path, VERSIONS[:1], tokens=tokens, repeat=repeat)
     (reported,) = token_use(load_runs([tmp_path]).runs)
     assert reported.cost == 3.5
+
+
+def test_a_count_of_the_agent_that_differs_from_the_relays_is_shown(tmp_path: Path) -> None:
+    for repeat, own in enumerate((100, 104, 106, None)):
+        tokens = Tokens(input_noncached=60, cache_read=20, cache_creation=10, output=10)
+        run = write_run(tmp_path, VERSIONS[:1], tokens=tokens, repeat=repeat)
+        record = json.loads((run / "run.json").read_text())
+        zero = {"input_noncached": 0, "cache_read": 0, "cache_creation": 0}
+        use = {"metering": "relay", "limits": {"max_requests": 1, "max_tokens": 1}}
+        record["agent"]["model_use"] = use | {"reported": own and {**zero, "output": own}}
+        (run / "run.json").write_text(json.dumps(record))
+    (found,) = token_use(load_runs([tmp_path]).runs)
+    assert (found.metering, found.differing) == ("relay", 1)
 
 
 def test_random_reference_of_one_split_counts_once(tmp_path: Path) -> None:

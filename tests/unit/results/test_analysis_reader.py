@@ -325,6 +325,19 @@ def test_runs_whose_agents_had_other_means_are_refused(tmp_path: Path, change: d
     assert [mixture.what for mixture in mixtures(load_runs([tmp_path]).runs)] == [what]
 
 
+def test_model_limits_must_agree_among_agents_with_a_model(tmp_path: Path) -> None:
+    limits = {"max_requests": 5000, "max_tokens": 10**8}
+    for entry, given in (("A", limits), ("B", limits), ("C", {**limits, "max_requests": 9}), ("D", None)):
+        run = write_run(tmp_path, VERSIONS, entry=entry)
+        record = json.loads((run / "run.json").read_text())
+        record["agent"]["model_use"] = given and {"metering": "relay", "limits": given}
+        (run / "run.json").write_text(json.dumps(record))
+    runs = load_runs([tmp_path]).runs
+    (mixture,) = mixtures(runs)
+    assert (mixture.what, list(mixture.values.values())) == ("model limits", [2, 1])
+    assert mixtures([run for run in runs if run.entry != "C"]) == []
+
+
 def test_prompts_must_agree_within_an_entry_and_may_differ_between_entries(tmp_path: Path) -> None:
     for entry, digest in (("Agent A", ""), ("Agent B", "a"), ("Agent B", "b")):
         run = write_run(tmp_path, VERSIONS, entry=entry, exp_id=f"e{digest}")

@@ -61,7 +61,7 @@ class TensorValue:
 
 
 PolicyScalar = None | bool | int | float | str | bytes
-PolicyValue = PolicyScalar | TensorValue | list | tuple | dict
+PolicyValue = PolicyScalar | TensorValue | list[Any] | tuple[Any, ...] | dict[str, Any]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -205,4 +205,4 @@ EXPORTED = (
 for _name in EXPORTED:
     if isinstance(globals()[_name], type | types.FunctionType):
         globals()[_name].__module__ = MODULE
-sys.meta_path.append(Finder)  # type: ignore[arg-type]
+sys.meta_path.append(Finder)
