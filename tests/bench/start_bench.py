@@ -2,7 +2,9 @@
 
 Rows: the help; `evopolicy local` from its call to the answer of a first one-episode submit, then that submit and the next
 one; `evopolicy try` on one case; a report of 48 runs; a worker that offers all environments installed here, from its call to
-its registration, for which the floor is one that offers Core16 (`--workers-only`: this row alone). Wall time and processor time (of all processes), the best of
+its registration, for which the floor is one that offers Core16 (`--workers-only`: this row alone); a thousand requests to a model API
+on loopback through the relay, for which the floor is the same without it (`--relay-only`): the wall time of
+`N_REQUESTS`, so that seconds read as milliseconds a request. Wall time and processor time (of all processes), the best of
 `--times`; the floor is the same of bare Pythons, one for each process that the command starts, which import what it imports.
 Prints a table, asserts nothing.
 """
@@ -10,6 +12,7 @@ Prints a table, asserts nothing.
 from __future__ import annotations
 
 import argparse
+import http.client
 import json
 import os
 import resource
@@ -28,11 +31,15 @@ from coordinator_harness import Coordinator
 from invented.study import AGENTS, write_suite
 from rich.console import Console
 from rich.table import Table
+from stages.model_api import ModelApi
 
 from evopolicy_common import catalogue
+from evopolicy_common.wire.http import bound
+from evopolicy_gateway.processes.child_messages import StartRelay, line
 from evopolicy_worker.environments import registry
 
 HERE = Path(__file__).parent
+N_REQUESTS = 1000
 ENV, GYMNASIUM_ID = "gym/acrobot", "Acrobot-v1"
 AGENT = """
 import json, os, pathlib, sys, time, urllib.request
@@ -164,6 +171,49 @@ def workers(folder: Path, times: int) -> Row:
     return Row(name, Cost(min(many), unknown), Cost(min(few), unknown))
 
 
+def relay(folder: Path, times: int) -> Row:
+    """Streamed requests one after another, as an agent makes them."""
+    unknown, token = float("nan"), "token-of-the-bench"
+    order = {"token": token, "ledger": str(folder / "ledger.jsonl"), "limits": {"max_requests": 10**9}}
+    sock = bound("127.0.0.1", 0)
+    sock.listen()
+    program = [sys.executable, "-m", "evopolicy_gateway.relay", str(sock.fileno())]
+    with ModelApi([]) as api:
+        upstream = {"protocol": "openai", "base_url": f"{api.base_url}/v1"}
+        first = StartRelay(order={**order, "upstream": upstream})
+        with subprocess.Popen(
+            program, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, pass_fds=[sock.fileno()]
+        ) as process:
+            assert process.stdin is not None
+            process.stdin.write(line(first))
+            process.stdin.flush()
+            places = (sock.getsockname()[1], int(api.base_url.rpartition(":")[2]))
+            asked(places[0], token, 10)
+            least = [min(asked(port, token, N_REQUESTS) for _ in range(times)) for port in places]
+            process.terminate()
+    return Row(
+        f"{N_REQUESTS} model requests through the relay (floor: without)",
+        *(Cost(each, unknown) for each in least),
+    )
+
+
+def asked(port: int, token: str, n: int) -> float:
+    """Seconds that `n` requests over one connection take."""
+    body = json.dumps(
+        {"model": "m", "stream": True, "stream_options": {"include_usage": True}, "messages": []}
+    )
+    headers = {"authorization": f"Bearer {token}", "content-type": "application/json"}
+    connection = http.client.HTTPConnection("127.0.0.1", port)
+    started = time.perf_counter()
+    for _ in range(n):
+        connection.request("POST", "/v1/chat/completions", body, headers)
+        with connection.getresponse() as answer:
+            assert b"[DONE]" in answer.read()
+    took = time.perf_counter() - started
+    connection.close()
+    return took
+
+
 def rows(folder: Path, times: int) -> list[Row]:
     """Everything that is measured. The state is kept between commands, as a user's is."""
     state = folder / "state"
@@ -187,7 +237,7 @@ def rows(folder: Path, times: int) -> list[Row]:
     found.append(
         Row(f"evopolicy report, {n_runs} runs", cost(lambda: evopolicy(*report), times), floor(REPORT, times))
     )
-    return [*found, workers(folder, times)]
+    return [*found, workers(folder, times), relay(folder, times)]
 
 
 def main() -> None:
@@ -196,11 +246,13 @@ def main() -> None:
     )
     parser.add_argument("--times", type=int, default=3, help="of each; the least counts (default: 3)")
     parser.add_argument("--workers-only", action="store_true", help="only the start of a worker")
+    parser.add_argument("--relay-only", action="store_true", help="only the relay for model calls")
     parser.add_argument("--json", type=Path, help="also write all numbers to this file")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="evopolicy-bench-") as name:
         folder = Path(name)
-        found = [workers(folder, options.times)] if options.workers_only else rows(folder, options.times)
+        chosen = [workers] * options.workers_only + [relay] * options.relay_only
+        found = [each(folder, options.times) for each in chosen] or rows(folder, options.times)
     console = Console()
     console.print(
         f"seconds, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}; over floor: CPU, or wall where there is no other"
