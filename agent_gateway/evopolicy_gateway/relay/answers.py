@@ -213,3 +213,26 @@ def _decoded(data: bytes) -> Any:
         return orjson.loads(data)
     except orjson.JSONDecodeError:
         return None
+
+
+class Cleaner:
+    """Takes secrets out of a stream of bytes, also one that is divided between pieces."""
+
+    def __init__(self, secrets: tuple[bytes, ...]) -> None:
+        self._secrets = secrets
+        self._held = b""
+
+    def feed(self, data: bytes) -> bytes:
+        """The bytes that may go on. An end that could begin a secret is held back until more is known."""
+        data = self._held + data
+        for secret in self._secrets:
+            data = data.replace(secret, b"[key]")
+        starts = (secret[:n] for secret in self._secrets for n in range(1, len(secret)))
+        held = max((len(start) for start in starts if data.endswith(start)), default=0)
+        self._held = data[len(data) - held :]
+        return data[: len(data) - held]
+
+    def end(self) -> bytes:
+        """What is held at the end of the stream."""
+        rest, self._held = self._held, b""
+        return rest

@@ -22,7 +22,7 @@ from starlette.responses import Response, StreamingResponse
 from starlette.types import Receive, Scope, Send
 
 from evopolicy_gateway.relay import apis, limits
-from evopolicy_gateway.relay.answers import SHAPES, AnswerReader
+from evopolicy_gateway.relay.answers import SHAPES, AnswerReader, Cleaner
 from evopolicy_gateway.relay.apis import Refusal, Upstream
 from evopolicy_gateway.relay.ledger import Ledger
 from evopolicy_gateway.relay.limits import Limits
@@ -79,11 +79,11 @@ class Relay:
         self._troubles = 0
         """Failed requests since the last answered one."""
         self._told: set[str] = set()
-        self._secrets = [
+        self._secrets = tuple(
             value.encode()
             for value in (order.upstream.key, *order.upstream.headers.values())
             if len(value) >= 8
-        ]
+        )
         wait = httpx.Timeout(order.timeout_s, connect=min(30.0, order.timeout_s))
         local = urlsplit(order.upstream.base_url).hostname in ("localhost", "127.0.0.1")
         # The operator's proxy does not lead to this machine.
@@ -237,9 +237,12 @@ class Relay:
 
     def clean(self, data: bytes) -> bytes:
         """The bytes without the key, which some servers repeat in their errors."""
-        for secret in self._secrets:
-            data = data.replace(secret, b"[key]")
-        return data
+        cleaner = self.cleaner()
+        return cleaner.feed(data) + cleaner.end()
+
+    def cleaner(self) -> Cleaner:
+        """Takes the key out of an answer that comes in pieces."""
+        return Cleaner(self._secrets)
 
     def unreachable(self, error: Exception) -> str:
         why = str(error) or type(error).__name__
@@ -327,18 +330,19 @@ class _Exchange:
 
     async def _passed(self, got: httpx.Response, reader: AnswerReader) -> AsyncIterator[bytes]:
         """The answer's bytes, the last of them after the request is in the ledger."""
+        cleaner = self._relay.cleaner()
         async for data in _unpacked(got):
             if self._first_s is None:
                 self._first_s = time.monotonic() - self._begun
             passed = reader.feed(data)
             if reader.complete:
                 self._write_read(broken=False)
-            if passed:
-                yield self._relay.clean(passed)
+            if passed and (cleaned := cleaner.feed(passed)):
+                yield cleaned
         last = reader.end()
         self._write_read(broken=False)
-        if last:
-            yield self._relay.clean(last)
+        if cleaned := cleaner.feed(last) + cleaner.end():
+            yield cleaned
 
     def _write_read(self, *, broken: bool) -> None:
         if self._reader is None:

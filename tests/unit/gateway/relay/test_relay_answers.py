@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+from itertools import pairwise
 from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from evopolicy_gateway.relay.answers import CHARS_PER_TOKEN, MAX_TOKENS, SHAPES, AnswerReader
+from evopolicy_gateway.relay.answers import CHARS_PER_TOKEN, MAX_TOKENS, SHAPES, AnswerReader, Cleaner
 from evopolicy_gateway.relay.usage import Usage
 
 counts = st.integers(0, MAX_TOKENS)
@@ -127,3 +128,19 @@ def test_an_endless_event_is_not_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     passed = b"".join(reader.feed(b"data: x" * 20) for _ in range(100))
     assert len(passed) + len(reader.end()) == 100 * 140
     assert reader.metered(0).estimated
+
+
+@given(
+    st.lists(st.sampled_from([b"sk-secret-1", b"token-22", b"s", b"sk-", b"data: ", b"\n\n"]), max_size=12),
+    st.lists(st.integers(0, 80), max_size=8),
+)
+def test_no_division_of_an_answer_lets_a_secret_through(parts: list[bytes], cuts: list[int]) -> None:
+    secrets = (b"sk-secret-1", b"token-22")
+    whole = b"".join(parts)
+    places = sorted({0, len(whole), *(cut for cut in cuts if cut < len(whole))})
+    cleaner = Cleaner(secrets)
+    passed = b"".join(cleaner.feed(whole[a:b]) for a, b in pairwise(places)) + cleaner.end()
+    expected = whole
+    for secret in secrets:
+        expected = expected.replace(secret, b"[key]")
+    assert passed == expected
