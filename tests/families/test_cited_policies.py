@@ -83,7 +83,7 @@ def play(environment: Environment, seed: int, rules: ModuleType | None) -> float
 @pytest.mark.slow
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize("env_id", IDS)
-def test_a_policy_from_the_text_alone_beats_random_on_cases_drawn_by_its_name(env_id: str) -> None:
+def test_a_policy_from_the_text_alone_beats_random_on_drawn_cases(env_id: str) -> None:
     environment = make(env_id)
     seeds = proofs.drawn(f"cited {env_id}")[:N_CASES]
     ours, random = (

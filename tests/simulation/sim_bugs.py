@@ -94,7 +94,13 @@ BUGS = (
     Bug("answer for outcomes that were not stored", results, "_commit", "step.persist(row)", "pass"),
     Bug("count attempts from one after a restart", State, "__init__", "(incarnation - 1) *", "0 *"),
     Bug("show episodes before the gate", result_polls, "_released", "if 0 in group.digests", "if True"),
-    Bug("let ties go to the earlier submit", finished, "select", ">= best_mean", "> best_mean"),
+    Bug(
+        "let ties go to the earlier submit",
+        finished,
+        "select",
+        "best_validated(means, run.row.settings.profile)",
+        "max(means, key=lambda index: (means[index], -index), default=None)",
+    ),
     Bug("select before all are validated", finalisation, "advance", "if waiting:", "if False:"),
     Bug(
         "forget idempotency keys at a restart",

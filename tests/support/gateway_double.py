@@ -238,8 +238,11 @@ class Double:
         self._tasks = [asyncio.create_task(self._work()), asyncio.create_task(self._beat())]
 
     async def stop(self) -> None:
-        for task in self._tasks:
-            task.cancel()
+        # Again until they end: asyncio.wait_for of Python 3.11 loses a cancellation that comes with its answer.
+        while pending := [task for task in self._tasks if not task.done()]:
+            for task in pending:
+                task.cancel()
+            await asyncio.wait(pending, timeout=1.0)
         ended = await asyncio.gather(*self._tasks, return_exceptions=True)
         await self.world.service.stop()
         self.world.store.close()

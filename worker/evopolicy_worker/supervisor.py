@@ -290,8 +290,11 @@ class Supervisor:
 
     async def _register_again(self, session: str, error: RefusedError) -> bool:
         """Registers anew where the session has ended. Returns False for a refusal that this does not help against."""
-        renewed = error.status == Refusal.REVOKED and await self._link.renewed(self._token)
-        if error.status != Refusal.UNKNOWN_WORKER and not renewed:
+        if error.status not in (Refusal.UNKNOWN_WORKER, Refusal.REVOKED):
+            return False
+        if session != self._session:
+            return True  # registered meanwhile: the refused request was sent before
+        if error.status == Refusal.REVOKED and not await self._link.renewed(self._token):
             return False
         if session == self._session:
             log.info("this session has ended; registering again", why=error.message)

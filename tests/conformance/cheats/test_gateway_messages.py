@@ -36,6 +36,10 @@ ALLOWED: dict[str, dict[str, str]] = {
         "finish": "'budget' | 'early'",
         "feedback": "'pictures' | 'scores' | 'trajectories'",
         "max_steps": "int",
+        "profile": "'own' | 'published' | 'published-data'",
+        "failed_episodes": "'end-submit' | 'play-on'",
+        # How every run of the profile plays its hidden episodes, as the published software does: no result of them.
+        "hidden_evaluation": "'pool' | 'submit'",
     },
     "EnvironmentDescription": {
         "env": "str",
@@ -131,8 +135,8 @@ ALLOWED: dict[str, dict[str, str]] = {
     "BlobRef": {"digest": "str", "size": "int", "inline": "bytes | none"},
     "SubmitDone": {
         "status": (
-            "'cancelled' | 'denied_import' | 'import_error' | 'init_error' | 'missing_policy' | 'ok' | 'quarantined'"
-            " | 'rollout_timeout'"
+            "'budget_invalid' | 'cancelled' | 'denied_import' | 'import_error' | 'init_error' | 'invalid_env_instance'"
+            " | 'missing_policy' | 'ok' | 'quarantined' | 'rollout_timeout'"
         ),
         "n_episodes": "int",
         "env_instances": "[int]",

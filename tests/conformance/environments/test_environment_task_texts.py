@@ -125,7 +125,7 @@ def test_no_text_is_left_without_an_environment() -> None:
     assert there.keys() <= known | taken | read_by_families
 
 
-def test_every_pattern_of_a_family_matches_one_of_its_ids_or_of_mo_gymnasiums() -> None:
+def test_every_pattern_of_a_family_matches_an_id() -> None:
     ids = {str(each.gymnasium_id) for each in entries().values()}
     patterns = {pattern for name in families() for group in template.groups(name) for pattern in group["ids"]}
     assert [each for each in sorted(patterns) if not fnmatch.filter(ids, each)] == []

@@ -117,7 +117,7 @@ SUITES = sorted(catalogue.suites().keys() & catalogue.families().keys() - {"toy"
 @pytest.mark.slow
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize("suite", SUITES)
-def test_every_text_of_a_family_is_whole_and_has_nothing_of_a_library(suite: str) -> None:
+def test_every_text_of_a_family_is_whole_and_our_own(suite: str) -> None:
     ids = [each for each in catalogue.suites()[suite].environments if not missing(each)]
     if not ids:
         pytest.skip(f"{suite} needs {missing(catalogue.suites()[suite].environments[0])}")

@@ -6,12 +6,12 @@ import json
 from pathlib import Path
 
 import pytest
-from evopolicy_results.cli.leaderboard import app as leaderboard
 from typer.testing import CliRunner
 
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.records.newest import described
 from evopolicy_gateway.operator.trials import policy_bundle
+from evopolicy_results.leaderboard.command import app as leaderboard
 from evopolicy_results.reading.reader import load_runs
 from evopolicy_results.verify.source import read_run
 

@@ -1,4 +1,4 @@
-"""The gateway's answers in the published profile, field by field as `golden/published_*.json` has them."""
+"""The gateway's answers in the published profile, field by field as `published/*.json` has them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from gateway_double import Double, Served, answering, gateway_on, opened, prepar
 from evopolicy_common.messages.episode import PolicyFailure
 from evopolicy_common.records.summary import decode_summary
 
-GOLDEN = Path(__file__).parent / "golden"
+GOLDEN = Path(__file__).parent / "published"
 REQUESTS: dict[str, Any] = json.loads((GOLDEN / "published_requests.json").read_text())
 FAILURES: dict[str, Any] = json.loads((GOLDEN / "published_failures.json").read_text())
 

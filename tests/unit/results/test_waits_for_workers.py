@@ -28,12 +28,18 @@ LINK = cast(Any, SimpleNamespace(credentials=SimpleNamespace(token="", cluster="
 class Cluster:
     """A cluster whose worker could not describe the environment, or did not start."""
 
+    own = True
+
     def __init__(self, knows_run: bool = True) -> None:
         self.knows_run = knows_run
         self.closed = False
+        self.failed: dict[str, dict[str, str]] = {}
 
     async def describe(self, message: DescribeEnvironment) -> EnvironmentState:
         return EnvironmentState(split_hashes={}, knows_run=self.knows_run, fingerprints=())
+
+    async def environments(self) -> tuple[list[Any], dict[str, Any], dict[str, dict[str, str]]]:
+        return [], {}, self.failed
 
     async def evaluate(self, message: object) -> AsyncGenerator[tuple[None, int, str], None]:
         try:
@@ -65,6 +71,8 @@ def test_a_check_waits_for_no_worker_without_end(monkeypatch: pytest.MonkeyPatch
     why_not, _ = soon(replay.unplayable(client, cast(Any, run)))
     assert "no worker" in why_not
     assert f"check-env {env}" in why_not
+    client.ask.failed = {env: {"w": "it raised in its 3rd step"}}  # type: ignore[attr-defined]
+    assert soon(replay.unplayable(client, cast(Any, run))) == ("it raised in its 3rd step", False)
 
 
 @pytest.mark.parametrize(("own", "remedy"), [(True, "check-env gym/acrobot"), (False, "--env gym/acrobot")])

@@ -11,8 +11,9 @@ from stages.sweep_stage import CODEX, EVOLVE, HEAD, TOKENS, Stage, until
 
 from evopolicy_common.errors import EvopolicyError
 from evopolicy_common.messages.operator import ClaimState
+from evopolicy_common.records.open_run import OpenedRun
 from evopolicy_common.records.suite_folder import Entry
-from evopolicy_gateway.run_folder.layout import OpenedRun, save
+from evopolicy_gateway.run_folder.layout import save
 from evopolicy_gateway.suite import claimed, sweep
 from evopolicy_gateway.suite.decisions import Decision, Found, decide
 

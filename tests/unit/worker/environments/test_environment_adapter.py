@@ -168,7 +168,7 @@ def test_a_family_that_is_not_installed_is_not_offered(monkeypatch: pytest.Monke
 
     monkeypatch.setattr(minigrid.FAMILY, "modules", ("gymnasium", "no_such_package"), raising=False)
     assert not [env_id for env_id in registry.offered() if "MiniGrid" in env_id]
-    with pytest.raises(WorkerError, match=r"evopolicy\[worker\]"):
+    with pytest.raises(WorkerError, match=r"\.\[worker\]"):
         make("gymnasium/MiniGrid-FourRooms-v0")
 
 
