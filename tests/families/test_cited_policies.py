@@ -16,6 +16,8 @@ from task_tables import selected, table
 from evopolicy_common.messages.environment import Case, SpaceSchema
 from evopolicy_worker.environments import Environment, make
 
+pytestmark = pytest.mark.families
+
 FOLDER = Path(__file__).parent / "cited"
 IDS = sorted(each.stem.replace("_", "/", 1) for each in FOLDER.glob("*.py"))
 N_CASES = 16

@@ -16,6 +16,8 @@ from evopolicy_common import catalogue
 from evopolicy_worker.environments import missing
 from evopolicy_worker.environments.interface import settings
 
+pytestmark = pytest.mark.families
+
 PROGRAM = Path(__file__).with_name("parity_loops.py")
 SUITES = sorted(parity_loops.TABLE["family"])
 

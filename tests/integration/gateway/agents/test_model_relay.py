@@ -18,7 +18,7 @@ from waiting import wait_until
 from evopolicy_common.records.run_record import RunRecord
 from evopolicy_gateway.relay.ledger import read
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.system, pytest.mark.slow]
 
 KEY = "key-of-the-test-0123456789"
 SUBMIT = Step(command="curl -s -X POST -d '{\"env_instances\": [0, 1]}' $EVOPOLICYGYM_SUBMIT_URL")
