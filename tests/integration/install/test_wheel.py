@@ -313,12 +313,12 @@ def test_an_agent_plays_where_its_extra_alone_is_installed(built: Built, tmp_pat
         place.run(*played, "--agent", agents.pop(extra), *shown, **given)
         ((other, agent),) = agents.items()
         told = place.run(*played, "--agent", agent, "--overwrite", code=2, **given)
-        assert f"install 'evopolicy[{other}] @ file://" in told
+        assert f"'evopolicy[{other}] @ file://" in told
     (run,) = (tmp_path / "runs").glob("*/toy_line/t")
     record = decode_run_record((run / "run.json").read_bytes())
     assert (record.outcome.status, record.outcome.budget_used) == ("completed", 2)
-    assert "install 'evopolicy[local] @ file://" in place.run("demo", code=2)
-    assert "install 'evopolicy[coordinator] @ file://" in place.run("report", str(run), "--out", "x", code=2)
+    assert "'evopolicy[local] @ file://" in place.run("demo", code=2)
+    assert "'evopolicy[coordinator] @ file://" in place.run("report", str(run), "--out", "x", code=2)
 
 
 @pytest.mark.slow

@@ -105,7 +105,7 @@ def test_a_sweep_is_watched_from_start_to_end(tmp_path: Path) -> None:
                 page.until(f"{TEXT}.includes('watched') && {TEXT}.includes('training')")
                 assert "<b>careful" in page.run(TEXT)
                 page.until("document.querySelectorAll('#run-rows tr').length === 2")
-                page.until("document.querySelector('#run-rows tr td:nth-child(6)')?.textContent === '1'")
+                page.until("document.querySelector('#run-rows tr td:nth-child(7)')?.textContent === '1'")
                 assert page.violations() == []
                 page.visit(page.run("document.querySelector('#run-rows a').href"))
                 page.until("document.querySelectorAll('#submit-rows tr').length === 1")
@@ -168,7 +168,7 @@ def test_a_sweep_is_watched_from_start_to_end(tmp_path: Path) -> None:
                             "![...document.querySelectorAll('#run-rows tr')].some((row) => row.innerText.includes('hidden'))"
                         )
                         scores = page.run(
-                            "[...document.querySelectorAll('#run-rows td:nth-child(8)')].map((cell) => cell.textContent)"
+                            "[...document.querySelectorAll('#run-rows td:nth-child(9)')].map((cell) => cell.textContent)"
                         )
                         assert all(float(score.replace("−", "-")) for score in scores), scores
                         page.visit(page.run("document.querySelector('#run-rows a').href"))
