@@ -18,7 +18,8 @@ LIST = TOP / "docs" / "reference" / "environments.md"
 DOCUMENTS = (TOP / "README.md", LIST)
 END = "<!-- End of what it writes. -->"
 
-WEB_PAGES = "In web pages a drag or a scroll takes 60 to 200 ms,\nand most other actions take 3 to 10 ms; the time in the table is the mean of all actions."
+CPU = """*CPU ms a step*: processor time of a step of the library's environment alone, without accelerations, and in a worker's slot
+with its policy and recording; the median of the suite's ids."""
 
 
 def table() -> str:
@@ -26,7 +27,7 @@ def table() -> str:
     original, families, costs = _original(), _families(), _costs()
     named, newest = original["paper"]["families"], original["newest"]
     lines = [
-        "| suite | environments | named in the paper | deterministic | played | ms a step | to install |",
+        "| suite | environments | named in the paper | deterministic | played | CPU ms a step: bare, slot | to install |",
         "|---|--:|---|--:|--:|--:|---|",
     ]
     for suite in families:
@@ -50,8 +51,8 @@ def table() -> str:
         f"The {len(families)} suites hold {_total(families):,} environments; the suite `paper13` holds the {len(named)} families that the paper",
         f"names. The paper validates its protocol on {original['paper']['validated']} tasks. The newest version of the original software has",
         f"about {newest['profiles']} environment profiles in {newest['ecosystems']} ecosystems, each with its own lock file. *Deterministic*: ids whose episodes depend",
-        "only on seed and actions. *Played*: ids that `check-env` has played. *ms a step*: median of a bare step over the played ids,",
-        f"on a busy machine. {WEB_PAGES}",
+        "only on seed and actions. *Played*: ids that `check-env` has played.",
+        CPU,
         "",
         "The newest version of the original also has, and we do not offer:",
         "",
@@ -79,14 +80,14 @@ def short() -> str:
     )
     return "\n".join(
         [
-            "| suite | environments | ms a step | suite | environments | ms a step |",
+            "| suite | environments | CPU ms a step | suite | environments | CPU ms a step |",
             "|---|--:|--:|---|--:|--:|",
             *(f"| {left} | {right} |" for left, right in rows),
             "",
             f"The {len(families)} suites hold {total:,} environments; the paper names the families in bold (together `paper13`). {every}",
             "deterministic: seed and actions determine the episode. `evopolicy-worker check-env ID` plays an environment in two processes",
-            f"and compares the episodes; it has confirmed {'all' if played == total else f'{played:,}'} ids. The column *ms a step* is the time of one step of the environment",
-            f"alone. {WEB_PAGES}",
+            f"and compares the episodes; it has confirmed {'all' if played == total else f'{played:,}'} ids.",
+            CPU,
         ]
     )
 
@@ -114,22 +115,24 @@ def _total(families: list[catalogue.Suite]) -> int:
     return len({each for suite in families for each in suite.environments})
 
 
-def _cost(suite: catalogue.Suite, costs: dict[str, float]) -> str:
-    found = [costs[each] for each in suite.environments if each in costs]
-    return f"{statistics.median(found) / 1000:.3g}" if found else "-"
+def _cost(suite: catalogue.Suite, costs: dict[str, tuple[str, ...]]) -> str:
+    """Median of the bare time and of the slot's, ms, over the ids that have one."""
+    columns = zip(*(costs[each] for each in suite.environments if each in costs), strict=True)
+    known = [[float(each.strip("*").replace(",", "")) for each in column if each] for column in columns]
+    return ", ".join(f"{statistics.median(column) / 1000:.2g}" if column else "-" for column in known)
 
 
-def _costs() -> dict[str, float]:
-    """By id, microseconds of a bare step, from the tables of played environments."""
-    found: dict[str, float] = {}
+def _costs() -> dict[str, tuple[str, ...]]:
+    """By id, processor time of a step, bare and in a slot, µs, from the tables of played environments; "" is unknown."""
+    found: dict[str, tuple[str, ...]] = {}
     column = 0
     pages = sorted(LIST.with_suffix("").glob("*.md"))
     for line in (line for path in pages for line in path.read_text("utf-8").splitlines()):
         cells = [each.strip() for each in line.strip("|").split("|")]
-        if cells[0] == "environment" and "µs a step" in cells:
-            column = cells.index("µs a step")
+        if cells[0] == "environment" and "CPU µs, bare" in cells:
+            column = cells.index("CPU µs, bare")
         elif column and cells[0].startswith("`") and len(cells) > column:
-            found[cells[0].strip("`")] = float(cells[column].replace(",", ""))
+            found[cells[0].strip("`")] = tuple(cells[column : column + 2])
     return found
 
 

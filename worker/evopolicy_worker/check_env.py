@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import os
+import statistics
 import subprocess
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import msgspec
-import numpy as np
 import typer
 
 from evopolicy_common import catalogue
@@ -27,6 +28,7 @@ from evopolicy_common.regular_files import read_given
 from evopolicy_common.terminal import say
 from evopolicy_worker import environments
 from evopolicy_worker.environments.checks.conformance import SEEDS, CheckResult
+from evopolicy_worker.environments.checks.costs import Stretch, literal
 from evopolicy_worker.environments.interface.actions import compile_actions
 from evopolicy_worker.environments.interface.settings import use_browser
 from evopolicy_worker.sandbox import available_tiers
@@ -42,8 +44,8 @@ COLUMNS = (
     "ends",
     "same episode",
     "drawn",
-    "µs a step",
-    "in a slot",
+    "CPU µs, bare",
+    "CPU µs, slot",
     "bytes a step",
     "MB",
     "verdict",
@@ -51,16 +53,29 @@ COLUMNS = (
 
 
 class InASlot(msgspec.Struct, frozen=True, kw_only=True):
-    """The cost of a worker's slot that plays the environment."""
+    """The cost of a worker's slot that plays the environment, with its policy, and of the bare environment beside it."""
 
-    microseconds: float = 0.0
-    """A step of a train episode with a policy that always returns the same; 0: not measured."""
+    bare_us: float = 0.0
+    """Processor time of a step of the library's environment without the adapter, and without accelerations, µs; the median of
+    `TURNS`. 0: not measured, as of an episode of one step."""
+    slot_us: float = 0.0
+    """Processor time of the same steps in the slot, with its policy, recording and accelerations, in turns, µs; 0: not measured, as where they take less than `LEAST_S` together."""
+    busy: bool = False
+    """Whether the machine had more to do than it has cores."""
     memory_mb: int = 0
     """Memory of all of the slot's processes after it, MiB; shared memory counts for each."""
     fault: str = ""
     """Why an episode could not be played."""
     notes: str = ""
     """As `EnvironmentDescription.notes`."""
+
+    def times(self) -> tuple[str, str]:
+        """Both times as a table has them."""
+        mark = "*" if self.busy else ""
+        return tuple(
+            f"{us:,.3g}{mark}" if 0 < us < 100 else f"{us:,.0f}{mark}" if us else ""
+            for us in (self.bare_us, self.slot_us)
+        )
 
 
 class Checked(msgspec.Struct, frozen=True):
@@ -88,8 +103,7 @@ class Checked(msgspec.Struct, frozen=True):
             here.ended,
             same if here.fresh and here.reused and here.digest == self.there.digest else "no",
             here.rendered,
-            f"{here.microseconds:,.0f}",
-            f"{self.slot.microseconds:,.0f}" if self.slot.microseconds else "",
+            *self.slot.times(),
             f"{here.step_bytes:,}",
             f"{self.slot.memory_mb or here.memory_mb:,}",
             self.verdict,
@@ -124,10 +138,13 @@ def check(env_ids: Sequence[str], steps: int, definitions: Iterable[Entry]) -> I
             started.stdin.close()
             processes.append(started)
         try:
-            for env_id in env_ids:
-                here, there = (_next(started, env_id) for started in processes)
-                own = tuple(each for each in definitions if each.id == env_id)
-                yield Checked(here, there, InASlot() if here.faults else asyncio.run(in_a_slot(env_id, own)))
+            with bare_loop(definitions) as bare:
+                for env_id in env_ids:
+                    here, there = (_next(started, env_id) for started in processes)
+                    own = tuple(each for each in definitions if each.id == env_id)
+                    yield Checked(
+                        here, there, InASlot() if here.faults else asyncio.run(in_a_slot(env_id, own, bare))
+                    )
         finally:
             for started in processes:
                 started.kill()
@@ -136,18 +153,51 @@ def check(env_ids: Sequence[str], steps: int, definitions: Iterable[Entry]) -> I
                 started.stdout.close()
 
 
-_SLOT_STEPS = 100
+TURNS = 3
+LEAST_S = 2e-3
+"""Processor time of an episode's start varies by about this."""
 _POLICY = """
 class Policy:
     def __init__(self, *spaces): pass
-    def reset(self, episode_index): pass
-    def act(self, obs): return ACTION
+    def reset(self, episode_index): self.left = iter(ACTIONS)
+    def act(self, obs): return next(self.left)
 
-ACTION = """
+ACTIONS = """
 
 
-async def in_a_slot(env_id: str, definitions: tuple[Entry, ...]) -> InASlot:
-    """Plays the beginning of one train episode twice in a slot of its own, once for longer: the difference is of steps alone."""
+@contextlib.contextmanager
+def bare_loop(definitions: tuple[Entry, ...]) -> Iterator[Callable[[str], Stretch]]:
+    """A process that plays the stretch of an environment without a slot, at each call; see `costs`."""
+    program = [sys.executable, "-P", "-m", "evopolicy_worker.environments.checks.costs"]
+    variables = environments.process_environment(accelerations=False)
+    with (
+        scratch_folder("check") as scratch,
+        subprocess.Popen(
+            program,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            env=os.environ | variables | {"TMPDIR": str(scratch)},
+        ) as process,
+    ):
+        assert process.stdin is not None
+        assert process.stdout is not None
+        process.stdin.write(msgspec.json.encode(definitions) + b"\n")
+
+        def play(env_id: str) -> Stretch:
+            process.stdin.write(f"{env_id}\n".encode())
+            process.stdin.flush()
+            line = process.stdout.readline()
+            return msgspec.json.decode(line, type=Stretch) if line else Stretch(fault="its process ended")
+
+        try:
+            yield play
+        finally:
+            process.kill()
+
+
+async def in_a_slot(env_id: str, definitions: tuple[Entry, ...], bare: Callable[[str], Stretch]) -> InASlot:
+    """Plays the begin of one train episode bare, and in a slot of its own once for one step and once for all its steps: the
+    difference is of steps alone."""
     tier = available_tiers(unsandboxed=True)[0]
     with scratch_folder("check") as scratch:
         slot = Slot(None, tier, scratch / "slot", definitions=definitions)
@@ -156,19 +206,21 @@ async def in_a_slot(env_id: str, definitions: tuple[Entry, ...]) -> InASlot:
         try:
             await slot.start()
             (description,) = await slot.describe([env_id])
-            neutral = compile_actions(description.action_space).neutral()
-            (bundle / "policy.py").write_text(_POLICY + repr(_literal(neutral)))
-            timed: list[tuple[int, float]] = []
-            for steps in (1, 1 + _SLOT_STEPS):
-                job = _job(description, tier, steps)
-                (outcome,) = await slot.play(job, bundle, lambda episodes, steps: None)
-                if outcome.failure is not None:
-                    return InASlot(fault=f"in a slot: {outcome.failure.message[:200]}")
-                timed.append((outcome.length, outcome.wall_s))
-            (n, spent), (more, longer) = timed
-            each = (longer - spent) / (more - n) if more > n else 0.0
+            first = bare(env_id)
+            neutral = literal(compile_actions(description.action_space).neutral())
+            (bundle / "policy.py").write_text(_POLICY + repr(first.actions or [neutral]))
+            n = len(first.actions)
+            bare_s, slot_s = [first.cpu_s], []
+            for turn in range(TURNS if n > 1 else 1):
+                if turn:
+                    bare_s.append(bare(env_id).cpu_s)
+                short = await _played(slot, _job(description, tier, 1), bundle)
+                slot_s.append(await _played(slot, _job(description, tier, max(n, 1)), bundle) - short)
+            slot_each = statistics.median(slot_s)
             return InASlot(
-                microseconds=round(1e6 * max(each, 0.0), 1),
+                bare_us=round(1e6 * statistics.median(bare_s) / n, 2) if n else 0.0,
+                slot_us=round(1e6 * slot_each / (n - 1), 2) if slot_each > LEAST_S else 0.0,
+                busy=os.getloadavg()[0] > len(os.sched_getaffinity(0)),
                 memory_mb=slot.memory_bytes() >> 20,
                 notes=description.notes(),
             )
@@ -176,6 +228,15 @@ async def in_a_slot(env_id: str, definitions: tuple[Entry, ...]) -> InASlot:
             return InASlot(fault=f"in a slot: {error}"[:300])
         finally:
             await slot.close()
+
+
+async def _played(slot: Slot, job: Job, bundle: Path) -> float:
+    """Processor time of all of the slot's processes for an episode, seconds."""
+    before = slot.cpu_s()
+    (outcome,) = await slot.play(job, bundle, lambda episodes, steps: None)
+    if outcome.failure is not None:
+        raise WorkerError(outcome.failure.message[:200])
+    return slot.cpu_s() - before + outcome.policy_cpu_s
 
 
 def _job(description: EnvironmentDescription, tier: Tier, steps: int) -> Job:
@@ -197,17 +258,6 @@ def _job(description: EnvironmentDescription, tier: Tier, steps: int) -> Job:
         tier=tier,
         max_steps=steps,
     )
-
-
-def _literal(value: Any) -> Any:
-    """An action as a Python literal."""
-    if isinstance(value, np.ndarray):
-        return value.tolist()
-    if isinstance(value, dict):
-        return {key: _literal(part) for key, part in value.items()}
-    if isinstance(value, tuple):
-        return tuple(map(_literal, value))
-    return value
 
 
 def _next(process: subprocess.Popen[bytes], env_id: str) -> CheckResult:

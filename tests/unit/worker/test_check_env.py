@@ -12,7 +12,7 @@ import msgspec
 import pytest
 
 from evopolicy_common import catalogue
-from evopolicy_worker.check_env import COLUMNS, MOST_MEMORY_MB, Checked, InASlot, page
+from evopolicy_worker.check_env import COLUMNS, MOST_MEMORY_MB, Checked, InASlot, bare_loop, page
 from evopolicy_worker.environments.checks import conformance
 from evopolicy_worker.environments.checks.conformance import CheckResult
 
@@ -46,6 +46,20 @@ def test_a_page_keeps_the_rows_of_environments_that_were_not_played_again(tmp_pa
         if line.startswith("| `")
     }
     assert rows == {CARTPOLE: "7", PENDULUM: "600"}
+
+
+def test_the_bare_loop_plays_the_same_stretch_at_each_turn() -> None:
+    with bare_loop(()) as bare:
+        first, again, other = bare(CARTPOLE), bare(CARTPOLE), bare("toy/line")
+    assert first.actions == again.actions
+    assert set(first.actions) == {0, 1}
+    assert first.cpu_s > 0
+    assert other.fault == "TypeError: it is not a Gymnasium environment, and has no bare loop"
+
+
+def test_a_time_says_whether_the_machine_was_busy() -> None:
+    assert InASlot(bare_us=12.345, slot_us=1234.5, busy=True).times() == ("12.3*", "1,234*")
+    assert InASlot(bare_us=12.345).times() == ("12.3", "")
 
 
 MARK = b"of test_check_env"

@@ -110,7 +110,7 @@ class Watch:
         self._answer_waited: float | None = None
         # How long it has been stopped, and waiting, up to the last look.
         self._stood_s = self._waiting_s = self._cpu_s = 0.0
-        self._cpu_clock = (~child.host_pid << 3) | 2 if child.host_pid else 0
+        self._cpu_clock = proc.clock(child.host_pid) if child.host_pid else 0
         self._count_threads = count_threads
         for fd in (child.stdout, child.stderr):
             os.set_blocking(fd, False)

@@ -36,7 +36,6 @@ from evopolicy_worker.environments import registry
 from evopolicy_worker.environments.checks.episodes import digest, digest_of, rollout
 from evopolicy_worker.environments.interface import spaces
 from evopolicy_worker.environments.interface.base import Environment, Step
-from evopolicy_worker.environments.interface.gymnasium_adapter import GymnasiumEnvironment
 
 SEEDS = (20_011_117, 20_011_229)
 """Large, so that an occurrence in an observation or info is recognisable as a leak."""
@@ -48,8 +47,6 @@ LONGEST_S = 3600.0
 _LOOK_S = 1.0
 _WORKS_S = 0.05
 """A process that has used so much more processor time since the last look has not hung, seconds."""
-_TIMED_STEPS, _TIMED_S = 200, 5.0
-"""How long a step is timed: so many steps, or so many seconds."""
 _REMOVALS, _REMOVAL_S = 20, 0.1
 """How often the removal of a process's temporary files is tried, and the pause between, seconds."""
 _RENDERED_STEPS = 30
@@ -76,8 +73,6 @@ class CheckResult(msgspec.Struct, kw_only=True):
     """Whether the same environment, after another episode, played the same episode again."""
     rebuilt: bool = False
     """Whether it is made anew for each episode."""
-    microseconds: float = 0.0
-    """Mean time of a step of the bare environment."""
     step_bytes: int = 0
     """Mean bytes per step in the feedback of a train episode."""
     memory_mb: int = 0
@@ -133,8 +128,6 @@ def _play(played: CheckResult, steps: int) -> None:
     environment.close()
     again = registry.make(played.env)
     played.fresh = digest(again, SEEDS[0], steps) == first
-    if isinstance(again, GymnasiumEnvironment):
-        played.microseconds = round(_bare_step(again, steps) * 1e6, 1)
     played.rendered = _rendered(played, again, min(steps, _RENDERED_STEPS)) if description.renders else "none"
     again.close()
 
@@ -230,23 +223,6 @@ def _nonsense(environment: Environment) -> None:
         step = environment.step(action)
         if step.terminated or step.truncated:
             environment.reset(Case(seed=SEEDS[0]))
-
-
-def _bare_step(environment: GymnasiumEnvironment, steps: int) -> float:
-    """Mean seconds per step of the environment without the adapter and without resets."""
-    rng = np.random.default_rng(0)
-    bare, n, spent = environment.bare, 0, 0.0
-    obs, _ = bare.reset(seed=0)
-    most = min(steps, _TIMED_STEPS)
-    while n < most and spent < _TIMED_S:
-        action = environment.draw(rng, obs)
-        began = time.perf_counter()
-        obs, _, terminated, truncated, _ = bare.step(action)
-        spent += time.perf_counter() - began
-        n += 1
-        if terminated or truncated or n % environment.description.max_episode_steps == 0:
-            obs, _ = bare.reset(seed=n)
-    return spent / n
 
 
 def _numbers(value: Any) -> set[float]:
