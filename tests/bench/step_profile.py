@@ -1,9 +1,13 @@
 """Where a step's time goes: `python tests/bench/step_profile.py [ENV…]`. Prints µs per step, asserts nothing.
 
+`--limit ENV N` prints JSON, `{"limit_s": …}`: the time of N episodes of the bench with accelerations, adapter, the slot's recording, a
+byte to another process and back at each step, and one fork and exit of a Python with numpy for each episode. No slot that starts
+a process for each policy, and leaves the core to it at each step, takes less.
+
 One episode of zero actions each way, accelerations off, pinned to one core, the best of three:
 - bare: `env.step` alone.
 - adapter: our adapter, which copies the observation and keeps the plain part of `info`.
-- recorded: and the action checked, the row kept, the trajectory packed at the end.
+- recorded: and the action checked, the row kept, the feedback packed at the end.
 - switched: and a byte to another process and back, before every step: what leaving the core for a moment costs this
   simulator. Beside it the same round trip with nothing around it.
 - slot: the whole, with a sandboxed policy; its start and end are in it.
@@ -12,7 +16,9 @@ One episode of zero actions each way, accelerations off, pinned to one core, the
 from __future__ import annotations
 
 import asyncio
+import json
 import os
+import statistics
 import sys
 import tempfile
 import time
@@ -28,8 +34,9 @@ from runtime_bench import ACCELERATIONS, jobs, pipe_round_trip_s
 
 from evopolicy_common import catalogue
 from evopolicy_common.messages.environment import Case
-from evopolicy_common.records.episodes.trajectory import Recorder
+from evopolicy_common.records.episodes.rendered import Renderer
 from evopolicy_worker import environments
+from evopolicy_worker.environments.checks.costs import literal
 from evopolicy_worker.environments.interface import settings
 from evopolicy_worker.slots.slot import Slot
 
@@ -66,11 +73,20 @@ def bare(env: Any, action: Any) -> tuple[int, float]:
             return n, time.perf_counter() - started
 
 
+def recorder_of(env: environments.Environment) -> Renderer:
+    """As a slot makes it for a train episode."""
+    return Renderer("arrays", env.description.obs_storage)
+
+
 def adapted(
-    env: environments.Environment, action: Any, recorder: Recorder | None, before: Callable[[], None]
+    env: environments.Environment,
+    action: Any,
+    recorder: Renderer | None,
+    before: Callable[[], None],
+    seed: int = SEED,
 ) -> float:
     """Seconds of one episode through the adapter, without the reset."""
-    obs = env.reset(Case(seed=SEED))
+    obs = env.reset(Case(seed=seed))
     repair = env.action_codec.repair
     started = time.perf_counter()
     while True:
@@ -121,8 +137,8 @@ def profile(env_id: str, call: Callable[[], None]) -> list[float]:
     ways: list[Callable[[], float]] = [
         lambda: bare(env, action)[1],
         lambda: adapted(own, given, None, lambda: None),
-        lambda: adapted(own, given, Recorder(), lambda: None),
-        lambda: adapted(own, given, Recorder(), call),
+        lambda: adapted(own, given, recorder_of(own), lambda: None),
+        lambda: adapted(own, given, recorder_of(own), call),
     ]
     seconds = [min(way() for _ in range(3)) for way in ways]
     with tempfile.TemporaryDirectory(prefix="evopolicy-profile-") as folder:
@@ -130,7 +146,37 @@ def profile(env_id: str, call: Callable[[], None]) -> list[float]:
     return [one / n * 1e6 for one in seconds]
 
 
+def fork_s(n: int = 100) -> float:
+    """Median seconds for the fork of this process and its child's exit."""
+    times = []
+    for _ in range(n):
+        started = time.perf_counter()
+        if (pid := os.fork()) == 0:
+            os._exit(0)
+        os.waitpid(pid, 0)
+        times.append(time.perf_counter() - started)
+    return statistics.median(times)
+
+
+def limit(env_id: str, n: int) -> float:
+    """Seconds of `n` episodes; see above."""
+    # Before a simulator is loaded: a policy's process has none.
+    fork = fork_s()
+    env = environments.make(env_id, accelerations=True)
+    action, call = literal(env.action_codec.neutral()), echo()
+    # The first episode makes what later ones find.
+    adapted(env, action, recorder_of(env), call, seed=1)
+    started = time.perf_counter()
+    for seed in seeds(n):
+        adapted(env, action, recorder_of(env), call, seed=seed)
+    return time.perf_counter() - started + n * fork
+
+
 def main() -> None:
+    if sys.argv[1:2] == ["--limit"]:
+        os.sched_setaffinity(0, {sorted(os.sched_getaffinity(0))[0]})
+        print(json.dumps({"limit_s": limit(sys.argv[2], int(sys.argv[3]))}))
+        return
     os.environ[ACCELERATIONS] = "off"
     settings.apply()
     round_trip_us = pipe_round_trip_s() * 1e6
