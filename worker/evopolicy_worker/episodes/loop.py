@@ -26,9 +26,10 @@ import hashlib
 import sys
 import time
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -59,12 +60,14 @@ from evopolicy_common.records.episodes.trajectory import Recorder, decode
 from evopolicy_common.wire import codec
 from evopolicy_worker import environments
 from evopolicy_worker.environments import Environment
+from evopolicy_worker.environments.interface.actions import ActionCodec
+from evopolicy_worker.environments.interface.base import Observation, Step
 from evopolicy_worker.environments.interface.calls import described, note
 from evopolicy_worker.environments.interface.trial import solved
 from evopolicy_worker.episodes import float_environment
 from evopolicy_worker.episodes.monitor import Monitor
 from evopolicy_worker.episodes.policies import JobPolicies, Policies
-from evopolicy_worker.episodes.policy_process import BundleFiles, Ended, PolicyFailedError, PolicyProcess
+from evopolicy_worker.episodes.policy_process import BundleFiles, PolicyFailedError, PolicyProcess
 from evopolicy_worker.episodes.progress import CancelledJobError, Progress
 from evopolicy_worker.episodes.recording import VideoRecorder
 from evopolicy_worker.sandbox.jail import Jail
@@ -85,7 +88,14 @@ the job."""
 MAX_WARM_ENVIRONMENTS = 4
 """Environments kept for later jobs: all sixteen in one process would take 230 MB."""
 
+INVALID, FAILED = "action_invalid", "policy_failed"
+"""Marks: the action was outside the space and was repaired; it is random, in place of a failed policy's."""
+Source = Callable[[int, Observation], tuple[Any, Any, str]]
+"""From a step's index and observation to the action as returned, as repaired, and its mark or ""."""
 _ACTING = messages.framed(messages.Acting())
+_Tell = Callable[[bytes], None]
+_Film = tuple[int, Case, bytes, int]
+"""A video to make: the episode's index in the job, case, actions and length."""
 
 
 class Player:
@@ -102,7 +112,7 @@ class Player:
         job: Job,
         files: BundleFiles | None,
         progress: Progress,
-        tell: Callable[[bytes], None],
+        tell: _Tell,
         first: int = 0,
         failure: PolicyFailure | None = None,
     ) -> bytes:
@@ -125,20 +135,17 @@ class Player:
             for k in range(first, len(job.episodes)):
                 if frame:
                     tell(frame)
-                spec = job.episodes[k]
                 if progress.cancelled:
                     raise CancelledJobError
-                begun = before[k].unpacked() if k in before else Begun()
-                if failure is not None:
-                    begun = Begun(failure=failure)
+                begun = before[k].unpacked() if failure is None and k in before else Begun(failure=failure)
                 if is_kept(job):
                     progress.begins(k, begun)
                 if job.bundle is not None:
                     self._log.begins(job.job_id, k, begun)
-                failure, frame, film_of = self._play(k, job, spec, policies, progress, tell, begun)
+                failure, frame, film_of = self._play(k, job, policies, progress, tell, begun)
                 films += film_of
                 progress.episodes_done += 1
-                if failure is not None and _verdict_of_submit(job, spec, failure):
+                if failure is not None and _verdict_of_submit(job, job.episodes[k], failure):
                     others = (_unplayed(each.index, failure) for each in job.episodes[k + 1 :])
                     finished = (messages.Finished(outcome=_brief(each, _share(job))) for each in others)
                     # Joined once: there may be thousands, each with a traceback.
@@ -165,28 +172,21 @@ class Player:
         return b"" if mp4 is None else messages.framed(messages.Filmed(place=k, video=_blob(mp4)))
 
     def _play(
-        self,
-        k: int,
-        job: Job,
-        spec: EpisodeSpec,
-        policies: JobPolicies,
-        progress: Progress,
-        tell: Callable[[bytes], None],
-        begun: Begun,
+        self, k: int, job: Job, policies: JobPolicies, progress: Progress, tell: _Tell, begun: Begun
     ) -> tuple[PolicyFailure | None, bytes, list[_Film]]:
         """The failure in one episode, which continues from `begun`, its framed outcome, and the video to make."""
         n_ends = 0
         while True:
             environment = self._environment(job.env)
-            episode = _Episode(job, spec, environment, policies, progress, tell, begun)
+            episode = _Episode(job, k, environment, policies, progress, tell, begun)
             try:
-                outcome, log = episode.play(k)
+                outcome, log = episode.play()
                 # In every split, as a policy of several episodes can measure the pause between them.
                 packed = begun.packed() if job.bundle is not None and len(job.episodes) > 1 else None
                 kept = packed if is_kept(job) else None
                 finished = messages.Finished(outcome=_brief(outcome, _share(job)), begun=kept)
                 films = log and job.video and (not job.video_episodes or k < job.video_episodes)
-                film = [_Film(k, spec.case, log, outcome.length)] if films else []
+                film = [(k, job.episodes[k].case, log, outcome.length)] if films else []
                 return outcome.failure, messages.framed(finished), film
             except EndedFromOutsideError as error:
                 # Where one policy plays several episodes it took with it what it had learned.
@@ -236,108 +236,74 @@ class Player:
         return environment
 
 
-class _Film(NamedTuple):
-    """A video to make."""
-
-    place: int
-    """The episode's index in the job."""
-    case: Case
-    actions: bytes
-    length: int
-
-
+@dataclass
 class _Episode:
     """One episode from reset to its end."""
 
-    def __init__(
-        self,
-        job: Job,
-        spec: EpisodeSpec,
-        environment: Environment,
-        policies: JobPolicies,
-        progress: Progress,
-        tell: Callable[[bytes], None],
-        begun: Begun,
-    ) -> None:
-        """`begun`: the actions that the policy returned in this episode before it was ended from outside. They remain valid:
-        the policy is asked again, and its first answers are ignored; later ones are added to `begun`. If the policy had
-        failed, no policy is asked, and random actions follow.
-        """
-        self._tell = tell
-        self._begun = begun
-        self._job = job
-        self._spec = spec
-        self._environment = environment
-        self._policies = policies
-        self._progress = progress
-        self.acted = False
-        """Whether an action of the policy's has reached the environment."""
+    job: Job
+    k: int
+    """The episode's index in the job."""
+    environment: Environment
+    policies: JobPolicies
+    progress: Progress
+    tell: _Tell
+    begun: Begun
+    """The policy's earlier actions. It is asked for them again, but they remain; random ones follow a failure."""
+    acted: bool = False
+    """Whether an action of the policy's has reached the environment."""
 
     @property
-    def failure(self) -> PolicyFailure | None:
-        """How the policy has failed."""
-        return self._begun.failure
+    def spec(self) -> EpisodeSpec:
+        return self.job.episodes[self.k]
 
-    def play(self, k: int) -> tuple[EpisodeOutcome, bytes]:
+    def play(self) -> tuple[EpisodeOutcome, bytes]:
         """The outcome, without a video, and the log of actions if it was kept."""
-        job, spec = self._job, self._spec
+        job, spec, begun = self.job, self.spec, self.begun
         start = time.monotonic()
-        full, actions = self._recorders()
-        policy = self._begin(k) if job.bundle is not None and self.failure is None else None
-        if self.failure is not None and _verdict_of_submit(job, spec, self.failure):
-            ended = self._policies.release()
-            unplayed = msgspec.structs.replace(
-                _unplayed(spec.index, self.failure),
-                stdout=ended.stdout,
-                stderr=ended.stderr,
-                policy_cpu_s=ended.cpu_s,
-                wall_s=time.monotonic() - start,
-            )
-            return unplayed, b""
-        total, components, length, terminated, truncated, success = self._steps(policy, full, actions)
+        recorded = _recorded_actions(spec)
+        course = _Course(job, self.environment, recorded)
+        policy = self._begin() if job.bundle is not None and begun.failure is None else None
+        unplayed = begun.failure is not None and _verdict_of_submit(job, spec, begun.failure)
+        at_once = begun.failure is not None and begun.failure.step_index is None and not begun.taken
+        if not (unplayed or (at_once and job.failed_episodes == "end-submit") or recorded == []):
+            self._steps(self._source(policy, recorded), course)
         wall_s = time.monotonic() - start
-        ended = self._policies.release() if job.bundle is not None else Ended(b"", b"", 0.0)
-        # A policy of several episodes can measure the pause between them, in which feedback files are made.
-        pauses = job.policy_scope == "submit"
-        rows = full.finish() if full is not None and (pauses or job.record == "full") else b""
-        log = (
-            actions.finish() if actions is not None and (pauses or job.record != "full" or job.video) else b""
-        )
-        feedback, kept = _blob(rows), _blob(log)
+        ended = self.policies.release()
         outcome = EpisodeOutcome(
             index=spec.index,
-            episode_return=total,
-            length=length,
-            terminated=terminated,
-            truncated=truncated,
-            failure=self.failure,
-            reward_components=components,
-            success=success,
-            trajectory=feedback if job.record == "full" else kept,
+            episode_return=course.total,
+            length=course.length,
+            terminated=course.terminated,
+            truncated=course.truncated,
+            failure=begun.failure,
             stdout=ended.stdout,
             stderr=ended.stderr,
             wall_s=wall_s,
             policy_cpu_s=ended.cpu_s,
         )
+        if unplayed:
+            return outcome, b""
+        # A policy of several episodes can measure the pause between them, in which feedback files are made.
+        pauses = job.policy_scope == "submit"
+        full, actions = course.full, course.actions
+        rows = full.finish() if full and (pauses or job.record == "full") else b""
+        log = actions.finish() if actions and (pauses or job.record != "full" or job.video) else b""
+        feedback, kept = _blob(rows), _blob(log)
+        # An agent's feedback has only the success that the environment's description names.
+        told = job.record != "full" or self.environment.description.success
+        outcome = msgspec.structs.replace(
+            outcome,
+            reward_components=course.sums,
+            success=course.success if told else None,
+            trajectory=feedback if job.record == "full" else kept,
+        )
         return outcome, log
 
-    def _recorders(self) -> tuple[Recorder | None, Recorder | None]:
-        """One of everything, as feedback has it, and one of the actions, as hidden results and videos need them."""
-        job = self._job
-        full = actions = None
-        if job.record == "full" and not job.render:
-            full = Recorder("full", job.observations)
-        elif job.record == "full" or job.bundle is not None:
-            full = Renderer(job.observations, self._environment.description.obs_storage)
-        if job.record == "actions" or job.video or job.bundle is not None:
-            actions = Recorder("actions", job.observations)
-        return full, actions
-
-    def _begin(self, k: int) -> PolicyProcess | None:
+    def _begin(self) -> PolicyProcess | None:
         """The policy, told of the new episode; None, with the failure noted, when it failed before its first act."""
         try:
-            policy = self._policies.take(k, self._spec, self._progress)
-            policy.reset(self._spec.episode_index)
+            policy = self.policies.take(self.k, self.spec, self.progress)
+            policy.reset(self.spec.episode_index)
             policy.prepare_acts()
             return policy
         except PolicyFailedError as error:
@@ -345,98 +311,130 @@ class _Episode:
             return None
 
     def _note(self, failure: PolicyFailure, step: int | None = None) -> None:
-        if self._progress.cancelled:
+        if self.progress.cancelled:
             raise CancelledJobError
-        self._begun.fail(msgspec.structs.replace(failure, step_index=step))
+        self.begun.fail(msgspec.structs.replace(failure, step_index=step))
 
-    def _steps(
-        self, policy: PolicyProcess | None, full: Recorder | None, actions: Recorder | None
-    ) -> tuple[float, dict[str, float], int, bool, bool, bool | None]:
-        """Play to the end: return, components of the reward, length, terminated, truncated, whether the task was solved.
+    def _source(self, policy: PolicyProcess | None, recorded: list[Returned] | None = None) -> Source:
+        """The policy's actions, the recorded ones, or random ones after those that a policy has returned."""
+        codec, begun = self.environment.action_codec, self.begun
+        if policy is not None:
+            return _asked(codec, policy, begun)
+        if recorded is not None:
+            return _replayed(codec, recorded)
+        mark = FAILED if self.job.bundle is not None else ""
+        return _replayed(codec, begun.taken, _random(codec, self.spec.policy_seed, mark))
 
-        `full` is given the actions as the policy returned them, `actions` as they were played.
-        """
-        environment, progress = self._environment, self._progress
-        codec = environment.action_codec
-        repair, step = codec.repair, environment.step
-        recorded = _recorded_actions(self._spec)
-        last = (self._job.max_steps or sys.maxsize) - 1
-        rng = None if policy is not None or recorded is not None else random_actions(self._spec.policy_seed)
-        failed = False
-        ends = self._job.failed_episodes == "end-submit"
-        names = environment.description.reward_components
-        sums = dict.fromkeys(names, 0.0)
-        unplayed = (
-            ends and not self._begun.taken and self.failure is not None and self.failure.step_index is None
-        )
-        if unplayed or recorded == []:
-            return 0.0, sums, 0, False, False, None
-        solves = environment.description.success or environment.solved_by
-        ever = environment.description.success_at == "any"
-        success: bool | None = None
-        total, t = 0.0, 0
-        taken = self._begun.taken
-        n_taken, take = len(taken), self._begun.take
+    def _steps(self, source: Source, course: _Course) -> None:
+        """Plays from reset to the end."""
+        environment, progress, taken = self.environment, self.progress, self.begun.taken
         float_environment.reset()
-        obs = environment.reset(self._spec.case)
+        obs = environment.reset(self.spec.case)
         while True:
-            invalid = False
-            if policy is not None:
-                try:
-                    returned = policy.act(obs)
-                    if t >= n_taken:
-                        action, invalid = repair(returned)
-                        take(Returned(returned, action))
-                except PolicyFailedError as error:
-                    self._note(error.failure, t)
-                    policy = None
-                    rng = random_actions(self._spec.policy_seed)
-            if t < n_taken:
-                returned = taken[t].returned
-                action, invalid = repair(returned)
-            elif rng is not None:
-                action = returned = codec.sample(rng)
-                failed = self._job.bundle is not None
-            elif recorded is not None:
-                returned = recorded[t]
-                action, invalid = repair(returned)
+            t = course.length
+            try:
+                returned, action, mark = source(t, obs)
+            except PolicyFailedError as error:
+                self._note(error.failure, t)
+                source = self._source(None)
+                returned, action, mark = source(t, obs)
             if not self.acted and t < len(taken):
                 self.acted = True
-                self._tell(_ACTING)
-            next_obs, reward, terminated, truncated, info = step(action)
-            truncated = truncated or t >= last
-            components = info.get("rewards", info)
-            for name in names:
-                sums[name] += _number(components.get(name))
-            if solves and (reported_success := info.get(solves)) is not None:
-                now = solved(reported_success)
-                success = success if now is None else now or (ever and bool(success))
-            if invalid:
-                info = {**info, "action_invalid": True}
-            if failed:
-                info = {**info, "policy_failed": True}
-            if full is not None:
-                full.append(obs, returned, reward, terminated, truncated, info)
-            if actions is not None:
-                actions.append(None, action, reward, terminated, truncated, info)
-            total += reward
-            t += 1
+                self.tell(_ACTING)
+            result = environment.step(action)
             progress.steps += 1
-            if terminated or truncated or (recorded is not None and t == len(recorded)) or (ends and failed):
+            if course.add(obs, returned, action, mark, result):
                 break
             if progress.cancelled:
                 raise CancelledJobError
-            obs = next_obs
-        if self._job.record == "full" and not environment.description.success:
-            # An agent's feedback stays as it was.
-            success = None
-        for name, value in (("reward", total), *sums.items()):
+            obs = result.obs
+        for name, value in (("reward", course.total), *course.sums.items()):
             if not abs(value) <= LARGEST:
                 raise BrokenEnvironmentError(
-                    f"environment {self._job.env}, {name}: its sum over {t} steps is {value}; rewards, their components, and"
-                    f" their sums have to be finite, at most {LARGEST:g}"
+                    f"environment {self.job.env}, {name}: its sum over {course.length} steps is {value};"
+                    f" rewards, their components, and their sums have to be finite, at most {LARGEST:g}"
                 )
-        return total, sums, t, terminated, truncated, success
+
+
+class _Course:
+    """An episode so far: its sums, how it ended, and two recordings of it."""
+
+    def __init__(self, job: Job, environment: Environment, recorded: list[Returned] | None) -> None:
+        description = environment.description
+        self.total, self.length = 0.0, 0
+        self.sums = dict.fromkeys(description.reward_components, 0.0)
+        self.terminated = self.truncated = False
+        self.success: bool | None = None
+        self._solves = description.success or environment.solved_by
+        self._ever = description.success_at == "any"
+        self._last = (job.max_steps or sys.maxsize) - 1
+        self._n_recorded = len(recorded or ())
+        self._last_mark = FAILED if job.failed_episodes == "end-submit" else None
+        self.full: Recorder | None = None
+        """Of everything, as feedback has it, with the actions as the policy returned them."""
+        if job.record == "full" and not job.render:
+            self.full = Recorder("full", job.observations)
+        elif job.record == "full" or job.bundle is not None:
+            self.full = Renderer(job.observations, description.obs_storage)
+        kept = job.record == "actions" or job.video or job.bundle is not None
+        self.actions = Recorder("actions", job.observations) if kept else None
+        """Of the actions as played, which hidden results and videos need."""
+
+    def add(self, obs: Any, returned: Any, action: Any, mark: str, step: Step) -> bool:
+        """Adds the step that follows `obs`; whether the episode ends with it."""
+        _, reward, terminated, truncated, info = step
+        truncated = truncated or self.length >= self._last
+        if self.sums:
+            components = info.get("rewards", info)
+            for name in self.sums:
+                self.sums[name] += _number(components.get(name))
+        if self._solves and (reported := info.get(self._solves)) is not None:
+            now = solved(reported)
+            self.success = self.success if now is None else now or (self._ever and bool(self.success))
+        if mark:
+            info = {**info, mark: True}
+        if self.full is not None:
+            self.full.append(obs, returned, reward, terminated, truncated, info)
+        if self.actions is not None:
+            self.actions.append(None, action, reward, terminated, truncated, info)
+        self.total += reward
+        self.length += 1
+        self.terminated, self.truncated = terminated, truncated
+        return terminated or truncated or self.length == self._n_recorded or mark == self._last_mark
+
+
+def _random(codec: ActionCodec, policy_seed: bytes, mark: str) -> Source:
+    """Uniform random actions with this mark."""
+    rng = random_actions(policy_seed)
+    return lambda t, obs: (action := codec.sample(rng), action, mark)
+
+
+def _replayed(codec: ActionCodec, actions: Sequence[Returned], then: Source | None = None) -> Source:
+    """Actions of an earlier attempt or a recording; after the last, those of `then`."""
+
+    def act(t: int, obs: Observation) -> tuple[Any, Any, str]:
+        if then is not None and t >= len(actions):
+            return then(t, obs)
+        action, invalid = codec.repair(actions[t].returned)
+        return actions[t].returned, action, INVALID if invalid else ""
+
+    return act
+
+
+def _asked(codec: ActionCodec, policy: PolicyProcess, begun: Begun) -> Source:
+    """A policy's actions, which are added to `begun`. Raises PolicyFailedError."""
+    earlier, n_earlier = _replayed(codec, begun.taken), len(begun.taken)
+    ask, repair, take = policy.act, codec.repair, begun.take
+
+    def act(t: int, obs: Observation) -> tuple[Any, Any, str]:
+        returned = ask(obs)
+        if t < n_earlier:
+            return earlier(t, obs)
+        action, invalid = repair(returned)
+        take(Returned(returned, action))
+        return returned, action, INVALID if invalid else ""
+
+    return act
 
 
 def random_actions(policy_seed: bytes) -> np.random.Generator:
@@ -445,13 +443,13 @@ def random_actions(policy_seed: bytes) -> np.random.Generator:
     return np.random.default_rng(int.from_bytes(digest, "little"))
 
 
-def _recorded_actions(spec: EpisodeSpec) -> list[Any] | None:
+def _recorded_actions(spec: EpisodeSpec) -> list[Returned] | None:
     """The actions that are played again; None where a policy acts."""
     if spec.replay is None:
         return None
     if spec.replay.inline is None:
         raise WorkerError(f"episode {spec.index} came without the recording that it plays")
-    return [row.action for row in decode(spec.replay.inline).rows()]
+    return [Returned(row.action, row.action) for row in decode(spec.replay.inline).rows()]
 
 
 def _verdict_of_submit(job: Job, spec: EpisodeSpec, failure: PolicyFailure) -> bool:

@@ -100,6 +100,9 @@ class Slot:
         self._kept = ""
         """The last job, if its policy's actions remain valid."""
         self._begun: dict[int, PackedBegun] = {}
+        self._outcomes: list[EpisodeOutcome] = []
+        self._acting = False
+        """Whether an action of the policy's has reached the environment in the running episode."""
         self._n_replies = 0
         self._hung = ""
         """Why the processes were killed while they played."""
@@ -121,13 +124,9 @@ class Slot:
         self._saw_hidden = False
         for name in ("home", "tmp"):  # must not pass files from the previous process to this one
             remove_tree(self._scratch / name)
+        start = self._start
         self._process = await asyncio.create_subprocess_exec(
-            *env_jail.command(
-                self._start.tier,
-                self._scratch,
-                draws=self._start.draws,
-                definitions=self._start.definitions,
-            ),
+            *env_jail.command(start.tier, self._scratch, draws=start.draws, definitions=start.definitions),
             stdin=asyncio.subprocess.PIPE,
             stdout=asyncio.subprocess.PIPE,
             stderr=asyncio.subprocess.PIPE,
@@ -139,7 +138,7 @@ class Slot:
         self._listener = asyncio.create_task(self._listen(self._process))
         try:
             async with asyncio.timeout(START_TIMEOUT_S):
-                await self._send(self._start)
+                await self._send(start)
                 reply = await self._reply()
         except TimeoutError:
             await self.close()
@@ -170,76 +169,33 @@ class Slot:
         """
         self._begun = begun.unpack(job)
         self._kept = job.job_id if begun.is_kept(job) else ""
-        self._hung = ""
+        self._hung, self._cancelled, self._outcomes = "", False, []
         if self._process is None:
             raise WorkerError("the slot is not started")
         if job.tier != self._start.tier:
             raise WorkerError(f"job {job.job_id} demands tier {job.tier}; this slot has {self._start.tier}")
         self._idle.clear()
-        self._cancelled = False
         watcher = asyncio.create_task(self._end_what_stands_still(job.env))
-        outcomes: list[EpisodeOutcome] = []
+        failure: PolicyFailure | None = None
         try:
             if job.video and not self._start.draws and env_jail.graphics_devices():
                 self._start = msgspec.structs.replace(self._start, draws=True)
                 await self.start()
-            # An environment that does not ship, or a page, could remember a hidden episode and leak it to a train episode's policy.
+            # What an environment remembers of a hidden episode must not reach the policy of a train episode.
             if self._saw_hidden and job.record == "full":
                 await self.start()
-            files = None
-            if bundle is not None and str(bundle) == self._sent:
-                files = messages.Files(key=self._sent, names=None, data=b"")
-            elif bundle is not None:
-                files = await asyncio.to_thread(bundle_files, bundle)
-            if self._cancelled:
-                return ()
-            failure: PolicyFailure | None = None
             while True:
-                acted = False
-                # Here, as a process that dies of a hidden episode is replaced by one that plays it again.
-                self._saw_hidden = self._saw_hidden or (job.record != "full" and remembers(job.env))
+                files = None if bundle is None else messages.Files(key=str(bundle), names=None, data=b"")
+                if bundle is not None and str(bundle) != self._sent:
+                    files = await asyncio.to_thread(bundle_files, bundle)
+                if self._cancelled:
+                    return ()
+                play = messages.Play(job=job, bundle=files, first=len(self._outcomes), failure=failure)
                 try:
-                    await self._send(
-                        messages.Play(job=job, bundle=files, first=len(outcomes), failure=failure)
-                    )
-                    self._sent = files.key if files is not None else self._sent
-                    while not isinstance(reply := await self._reply(), messages.Played):
-                        if isinstance(reply, messages.Progress):
-                            on_progress(reply.episodes_done, reply.steps)
-                        elif isinstance(reply, messages.Acting):
-                            acted = True
-                        elif isinstance(reply, messages.Finished):
-                            acted = False
-                            if reply.begun is not None:
-                                self._begun[len(outcomes)] = reply.begun
-                            outcomes.append(reply.outcome)
-                        elif isinstance(reply, messages.Filmed):
-                            outcomes[reply.place] = msgspec.structs.replace(
-                                outcomes[reply.place], video=reply.video
-                            )
-                        elif isinstance(reply, messages.Begun):
-                            self._begun[reply.place] = reply.begun
-                        else:
-                            raise _error(reply)
-                    return () if reply.cancelled else tuple(outcomes)
+                    return await self._attempt(play, on_progress)
                 except (SlotDiedError, BrokenEnvironmentError) as error:
-                    told = isinstance(error, BrokenEnvironmentError)
-                    how = "overrun" if told or self._hung else self._how_it_ended()
-                    again = acted and job.environment_faults >= endings.AGAIN
-                    failure = endings.broken_down(Ending("environment", how, began=acted, again=again))
-                    if failure is None or self._cancelled or bundle is None:
-                        if told:
-                            raise
-                        why = f"environment {job.env}: its process ended while it played; {error}"
-                        raise self._broken(why) from error
-                    log.warning(
-                        "slot died on a policy's actions", job=job.job_id, error=self._hung or str(error)
-                    )
-                    self._hung = ""
-                    if begun.is_kept(job):
-                        self._begun[len(outcomes)] = PackedBegun(failure=failure)
+                    failure = self._failed(job, error)
                 await self.start()
-                files = await asyncio.to_thread(bundle_files, bundle)
         except asyncio.CancelledError:
             # The rest of this job's answers will not be read, so the processes cannot be used again.
             self._end_process()
@@ -247,6 +203,52 @@ class Slot:
         finally:
             watcher.cancel()
             self._idle.set()
+
+    async def _attempt(
+        self, play: messages.Play, on_progress: Callable[[int, int], None]
+    ) -> tuple[EpisodeOutcome, ...]:
+        """The job's outcomes, once the episodes from `play.first` have been played."""
+        outcomes, self._acting = self._outcomes, False
+        # Here, as a process that dies of a hidden episode is replaced by one that plays it again.
+        self._saw_hidden = self._saw_hidden or (play.job.record != "full" and remembers(play.job.env))
+        await self._send(play)
+        self._sent = play.bundle.key if play.bundle is not None else self._sent
+        while True:
+            match await self._reply():
+                case messages.Progress() as reply:
+                    on_progress(reply.episodes_done, reply.steps)
+                case messages.Acting():
+                    self._acting = True
+                case messages.Finished() as reply:
+                    self._acting = False
+                    if reply.begun is not None:
+                        self._begun[len(outcomes)] = reply.begun
+                    outcomes.append(reply.outcome)
+                case messages.Filmed(place=k, video=video):
+                    outcomes[k] = msgspec.structs.replace(outcomes[k], video=video)
+                case messages.Begun() as reply:
+                    self._begun[reply.place] = reply.begun
+                case messages.Played() as reply:
+                    return () if reply.cancelled else tuple(outcomes)
+                case reply:
+                    raise _error(reply)
+
+    def _failed(self, job: Job, error: SlotDiedError | BrokenEnvironmentError) -> PolicyFailure:
+        """The policy's failure if the environment ended on its actions. Raises if they are not the cause."""
+        told = isinstance(error, BrokenEnvironmentError)
+        how = "overrun" if told or self._hung else self._how_it_ended()
+        again = self._acting and job.environment_faults >= endings.AGAIN
+        failure = endings.broken_down(Ending("environment", how, began=self._acting, again=again))
+        if failure is None or self._cancelled or job.bundle is None:
+            if told:
+                raise error
+            why = f"environment {job.env}: its process ended while it played; {error}"
+            raise self._broken(why) from error
+        log.warning("slot died on a policy's actions", job=job.job_id, error=self._hung or str(error))
+        self._hung = ""
+        if begun.is_kept(job):
+            self._begun[len(self._outcomes)] = PackedBegun(failure=failure)
+        return failure
 
     @property
     def begun(self) -> HandedBack | None:
@@ -429,11 +431,9 @@ def _children(pid: int, tier: Tier) -> list[int]:
 def _memory(pid: int) -> int:
     found = 0
     for each in proc.family(pid):
+        # Where the kernel does not show it, what several share counts for each.
         size = proc.proportional_bytes(each.pid)
-        if size is None:
-            # The kernel shows it of fewer processes: where not, what is shared counts for each.
-            _, size = proc.sizes(each.pid) or (0, 0)
-        found += size
+        found += size if size is not None else (proc.sizes(each.pid) or (0, 0))[1]
     return found
 
 
