@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import difflib
+import itertools
 import os
 import re
 import shlex
@@ -28,18 +30,27 @@ from evopolicy_gateway.harnesses.interface.agent_config import AcpTable, AgentCo
 from evopolicy_gateway.harnesses.interface.base import Harness
 from evopolicy_gateway.harnesses.remote import RemoteHarness
 
-FORMS = "evolve, random, replay:DIR, command:PROGRAM…, codex, codex:MODEL, claude-code, claude-code:MODEL, llm:openai/MODEL, llm:anthropic/MODEL, acp:PROGRAM…, file:AGENT.toml, remote"
+FORMS = (
+    "evolve, random, replay:DIR, command:PROGRAM…, acp:PROGRAM…, file:AGENT.toml,",
+    "codex[:MODEL], claude-code[:MODEL], llm:openai/MODEL, llm:anthropic/MODEL, remote",
+)
+"""Values of `--agent`, in two lines."""
+_BY_KIND = {re.split(r"[:[]", form)[0]: form for form in reversed(re.findall(r"[^, ]+", " ".join(FORMS)))}
+_MODELS = {"openai": re.compile(r"(chat)?gpt-.+|o\d.*"), "anthropic": re.compile(r"claude-.*\d.*")}
+"""Names of models by their providers."""
 _INTERPRETER = re.compile(r"(python|bash|sh|node|perl|ruby)[\d.]*")
+_SCRIPTS = "py|sh|js|ts|rb|pl"
 _DIALECTS: dict[str, type[Dialect]] = {"codex": Codex, "claude-code": ClaudeCode, "llm": Llm}
 
 
 def entry_name(agent: str) -> str:
-    """An agent's default leaderboard entry: `evolve`, `replay-gaits`, `command-run.sh`."""
+    """An agent's default leaderboard entry: `evolve`, `replay-gaits`; of a command the program's name, such as `my_agent`."""
     kind, _, rest = agent.partition(":")
     if kind == "replay":
         return f"replay-{Path(rest).resolve().name}"
     if kind == "command" and rest.strip():
-        return f"command-{Path(_split(rest)[0]).name}"
+        name = _program_name(_split(rest))
+        return f"command-{name}" if name in _BY_KIND else name
     if kind == "acp" and rest.strip():
         return f"acp-{Path(_split(rest)[0]).name}"
     if kind in _DIALECTS and rest:
@@ -47,6 +58,16 @@ def entry_name(agent: str) -> str:
     if kind == "file" and rest:
         return Path(rest).stem
     return kind
+
+
+def _program_name(words: Sequence[str]) -> str:
+    """`my_agent` of `python3 -u my_agent.py`, `pkg.agent` of `python3 -m pkg.agent`, `run` of `/opt/run.sh --fast`."""
+    program, *rest = words
+    if _INTERPRETER.fullmatch(Path(program).name):
+        flags = list(itertools.takewhile(lambda word: word.startswith("-"), rest))
+        if len(rest) > len(flags) and not any(flag.endswith("c") for flag in flags):  # after -c stands code
+            program = rest[len(flags)]
+    return re.sub(rf"\.({_SCRIPTS})$", "", Path(program).name)
 
 
 def make(agent: str, started_in: Path, config: AgentConfig | None = None) -> Harness:
@@ -74,9 +95,12 @@ def make(agent: str, started_in: Path, config: AgentConfig | None = None) -> Har
         return CommandHarness(
             "command", _program(agent, words, started_in), hint=_no_files(words, started_in)
         )
-    if (meant := _meant(agent, started_in)) is not None:
-        raise ConfigError(f"--agent {agent!r} is not an agent; write --agent {shlex.quote(meant)}")
-    raise ConfigError(f"--agent {agent!r} is not an agent; the forms are {FORMS}")
+    meant = _meant(agent, started_in) or _nearest(agent)
+    advice = f"--agent {shlex.quote(meant)}, or " if meant else ""
+    error = ConfigError(f"--agent {agent!r} is not an agent; write {advice}one of these forms:")
+    for line in FORMS:
+        error.add_note(line)
+    raise error
 
 
 def _meant(agent: str, started_in: Path) -> str | None:
@@ -91,6 +115,20 @@ def _meant(agent: str, started_in: Path) -> str | None:
     if (started_in / words[0]).is_file() or (len(words) > 1 and shutil.which(words[0])):
         return f"command:{agent}"
     return f"replay:{agent}" if (started_in / agent).is_dir() else None
+
+
+def _nearest(agent: str) -> str | None:
+    """The form of `--agent` that a name of a model or a misspelt name was meant for."""
+    if agent.startswith(tuple(f"{provider}/" for provider in _MODELS)):
+        return f"llm:{agent}"
+    for provider, names in _MODELS.items():
+        if names.fullmatch(agent.lower()):
+            return f"llm:{provider}/{agent}"
+    kind, _, rest = agent.partition(":")
+    for near in difflib.get_close_matches(kind.lower(), _BY_KIND, 1):
+        form = _BY_KIND[near].removesuffix("[:MODEL]")
+        return f"{near}:{rest}" if rest and _BY_KIND[near] != near else form
+    return None
 
 
 def config_of(agent: str, started_in: Path) -> AgentConfig | None:
@@ -158,7 +196,7 @@ def _no_files(words: Sequence[str], started_in: Path) -> str:
 
 def _missing_files(words: Sequence[str], started_in: Path) -> list[str]:
     """The words that look like files and do not exist."""
-    looks = re.compile(r"(\./|\.\./)?[\w./-]+\.(py|sh|js|ts|rb|pl|toml|yaml|json)")
+    looks = re.compile(rf"(\./|\.\./)?[\w./-]+\.({_SCRIPTS}|toml|yaml|json)")
     return [word for word in words if looks.fullmatch(word) and not (started_in / word).exists()]
 
 

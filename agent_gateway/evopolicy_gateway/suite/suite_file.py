@@ -204,7 +204,8 @@ def check_agents_start(runs: Iterable[Plan]) -> None:
         try:
             harnesses.make(run.agent, run.started_in, run.config).check(run.settings.env)
         except ConfigError as error:
-            raise ConfigError(f"agent {run.entry!r}: {error}") from error
+            error.args = (f"agent {run.entry!r}: {error}",)
+            raise
 
 
 def _check_agent(agent: AgentTable, started_in: Path) -> None:
@@ -214,7 +215,8 @@ def _check_agent(agent: AgentTable, started_in: Path) -> None:
         harnesses.make(agent.agent, started_in, agent.config)
         agent.jail.check()
     except ConfigError as error:
-        raise ConfigError(f"agent {agent.name!r}: {error}") from error
+        error.args = (f"agent {agent.name!r}: {error}",)
+        raise
 
 
 def _table(suite: SuiteFile, agent: AgentTable, env: str) -> RunTable:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import signal
 import sys
-from collections.abc import Coroutine, Iterator, MutableMapping
+from collections.abc import Coroutine, Iterable, Iterator, MutableMapping
 from pathlib import Path
 from typing import Annotated, Any, NoReturn, TextIO, TypeVar, cast
 
@@ -116,9 +116,9 @@ def setup_notices() -> None:
     )
 
 
-def fail(message: str, code: int = USAGE_ERROR) -> NoReturn:
-    """Ends the command with one line on stderr, of bearable length."""
-    say_lines([f"error: {shortened(message)}"], err=True)
+def fail(message: str, code: int = USAGE_ERROR, notes: Iterable[str] = ()) -> NoReturn:
+    """Ends the command with one line on stderr, of bearable length, and one for each note."""
+    say_lines([f"error: {shortened(message)}", *notes], err=True)
     raise SystemExit(code)
 
 
@@ -129,11 +129,11 @@ def code_of(error: ConfigError | DamagedStoreError) -> int:
 
 @contextlib.contextmanager
 def fail_on_our_errors() -> Iterator[None]:
-    """Turns our errors into one line and an exit code: 2 for wrong options and files, 1 for all others."""
+    """Turns our errors into one line, their notes, and an exit code: 2 for wrong options and files, 1 for all others."""
     try:
         yield
     except (ConfigError, DamagedStoreError) as error:
-        fail(str(error), code_of(error))
+        fail(str(error), code_of(error), getattr(error, "__notes__", ()))
     except EvopolicyError as error:
         fail(str(error), FAILURE)
     except OSError as error:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import re
 import sys
 import threading
 from http.server import BaseHTTPRequestHandler, HTTPServer
@@ -200,6 +201,28 @@ def test_what_is_no_agent_is_refused_with_what_there_is(agent: str, tmp_path: Pa
         make(agent, tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("agent", "meant"),
+    [
+        ("claude", "claude-code"),
+        ("claude:opus", "claude-code:opus"),
+        ("Codex", "codex"),
+        ("evolve:x", "evolve"),
+        ("replay", "replay:DIR"),
+        ("gpt-5.5", "llm:openai/gpt-5.5"),
+        ("claude-opus-4-5", "llm:anthropic/claude-opus-4-5"),
+        ("openai/own", "llm:openai/own"),
+        ("comand:python3 a.py", "'command:python3 a.py'"),
+    ],
+)
+def test_a_wrong_agent_is_answered_with_the_nearest_one(agent: str, meant: str, tmp_path: Path) -> None:
+    with pytest.raises(
+        ConfigError, match=re.escape(f"write --agent {meant}, or one of these forms:")
+    ) as raised:
+        make(agent, tmp_path)
+    assert len(raised.value.__notes__) == 2
+
+
 def test_a_replay_without_policies_is_refused_before_a_run_is_opened(tmp_path: Path) -> None:
     (tmp_path / "all" / "gym_acrobot").mkdir(parents=True)
     (tmp_path / "all" / "other").mkdir()
@@ -226,7 +249,16 @@ def test_entries_are_named_after_their_agents(tmp_path: Path) -> None:
     assert entry_name("evolve") == "evolve"
     assert entry_name("random") == "random"
     assert entry_name(f"replay:{tmp_path}/gaits/") == "replay-gaits"
-    assert entry_name("command:/opt/agents/run.sh --fast") == "command-run.sh"
+    for command, name in {
+        "/opt/agents/run.sh --fast": "run",
+        "python3 my_agent.py 3": "my_agent",
+        f"{sys.executable} -u agents/mine.py": "mine",
+        "python3.12 -m my.agent": "my.agent",
+        "bash -ec 'python3 x.py'": "bash",
+        "./agent": "agent",
+        "python3 random.py": "command-random",
+    }.items():
+        assert entry_name(f"command:{command}") == name
 
 
 @pytest.mark.parametrize(
