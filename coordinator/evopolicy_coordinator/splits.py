@@ -22,6 +22,7 @@ from pathlib import Path
 
 import msgspec
 
+from evopolicy_common.catalogue import earlier_folder_name, folder_name
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.environment import Case, Split
 from evopolicy_common.records.blobs import fsync_directory
@@ -32,7 +33,6 @@ from evopolicy_common.records.splits import (
     SPLITS,
     SplitFile,
     cases_hash,
-    folder_name,
     folder_of,
     overlaps,
     read_split_file,
@@ -211,7 +211,8 @@ def _file_findings(folder: Path, split: Split, content: SplitFile, env: str) -> 
         findings.append(f"{name} says it is split {content.split!r}")
     if content.env != env:
         findings.append(f"{name} is of environment {content.env!r}, train.json of {env!r}")
-    if folder.name != folder_name(content.env) and not folder.as_posix().endswith(f"/{content.env}"):
+    names = (folder_name(content.env), earlier_folder_name(content.env))
+    if folder.name not in names and not folder.as_posix().endswith(f"/{content.env}"):
         findings.append(
             f"{name} is of environment {content.env!r}, which belongs in {folder_name(content.env)}/ or {content.env}/"
         )

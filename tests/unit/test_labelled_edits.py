@@ -59,3 +59,6 @@ def test_a_folder_without_the_environment_is_played_itself(tmp_path: Path) -> No
     (tmp_path / "gym_acrobot").mkdir()
     assert folder_for(tmp_path, "gym/acrobot") == tmp_path / "gym_acrobot"
     assert folder_for(tmp_path, "gym/racing") == tmp_path
+    for name in ("my_env:Glider-v0", "my_env_Glider-v0"):  # the second is preferred
+        (tmp_path / name).mkdir()
+        assert folder_for(tmp_path, "my_env:Glider-v0") == tmp_path / name

@@ -3,13 +3,14 @@
 Run as `python -m evopolicy_gateway.agents.replay DIR` in the workspace, with the `EVOPOLICYGYM_*` URLs set. A policy is
 a folder with a `policy.py` (such as a run's `checkpoints/submit_NNN/`), or with a `system/` that has one (such as a
 workspace). DIR is either a policy, or its subfolders are policies, which are submitted in sorted order. If DIR has a
-folder named like the environment, with `/` as `_`, that folder is used instead: so one DIR serves many environments,
+folder named like the environment, with `_` for `/` and `:`, that folder is used instead: so one DIR serves many environments,
 such as `examples/policies`.
 """
 
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import sys
 from collections.abc import Collection
@@ -32,8 +33,8 @@ def policies_in(folder: Path) -> list[Path]:
 
 def folder_for(folder: Path, env: str) -> Path:
     """The subfolder of `folder` for this environment, or else `folder` itself."""
-    own = folder / env.replace("/", "_")
-    return own if own.is_dir() else folder
+    named = (folder / re.sub("[/:]", "_", env), folder / env.replace("/", "_"))
+    return next((own for own in named if own.is_dir()), folder)
 
 
 def shares(budget: int, n_policies: int, least: int, most: int) -> list[int]:

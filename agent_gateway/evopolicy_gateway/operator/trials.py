@@ -236,7 +236,7 @@ def policy_bundle(policy: Path) -> bundles.Bundle:
 
 
 def _new_folder(out: Path, env: str) -> Path:
-    base = out / env.replace("/", "_")
+    base = out / catalogue.folder_name(env)
     base.mkdir(parents=True, exist_ok=True)
     number = 0
     while True:

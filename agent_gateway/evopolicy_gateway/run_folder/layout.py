@@ -1,4 +1,4 @@
-"""Paths of a run's files: `runs/<entry>/<env with / as _>/<exp-id>/`, with the contents listed in `protocol.md`.
+"""Paths of a run's files: `runs/<entry>/<env with _ for / and :>/<exp-id>/`, with the contents listed in `protocol.md`.
 
 While a run is open its folder also holds `.gateway/` (mode 0700): the gateway's credentials, its port and token, the
 journal and the bundles. It lies outside the workspace and is removed when `run.json` is written.
@@ -12,6 +12,7 @@ from typing import TypeVar
 
 import msgspec
 
+from evopolicy_common.catalogue import earlier_folder_name, folder_name
 from evopolicy_common.errors import DECODE_ERRORS, ConfigError
 from evopolicy_common.records import open_run
 from evopolicy_common.records.blobs import write_atomically
@@ -210,7 +211,12 @@ def run_folder(runs: Path, entry: str, env: str, exp_id: str) -> RunFolder:
     name = _ODD.sub("_", entry).strip(" .")
     if not name or len(name) > 100:
         raise ConfigError(f"entry {entry!r}: a name of 1 to 100 characters is needed")
-    return RunFolder((runs / name / env.replace("/", "_") / exp_id).absolute())
+    above = runs.absolute() / name
+    earlier = RunFolder(above / earlier_folder_name(env) / exp_id)
+    # Also while a run is replaced, whose folder is missing for moments: the lock is beside it.
+    if any(path.exists() for path in (earlier.root, earlier.lock, earlier.asked)):
+        return earlier
+    return RunFolder(above / folder_name(env) / exp_id)
 
 
 def save(path: Path, value: msgspec.Struct) -> None:

@@ -23,7 +23,15 @@ from typing import Any
 
 import msgspec
 
-from evopolicy_common.catalogue.definition import USUAL_STEPS, Entry, Wrapper, read_file, valid_id
+from evopolicy_common.catalogue.definition import (
+    USUAL_STEPS,
+    Entry,
+    Wrapper,
+    earlier_folder_name,
+    folder_name,
+    read_file,
+    valid_id,
+)
 from evopolicy_common.errors import ConfigError
 
 __all__ = [
@@ -33,9 +41,11 @@ __all__ = [
     "Wrapper",
     "add",
     "digests",
+    "earlier_folder_name",
     "entries",
     "entry",
     "families",
+    "folder_name",
     "is_shipped",
     "known",
     "near",

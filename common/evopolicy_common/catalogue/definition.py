@@ -115,6 +115,16 @@ def valid_id(env_id: str) -> bool:
     return len(env_id) <= _MAX_ID and _ID.fullmatch(env_id) is not None
 
 
+def folder_name(env_id: str) -> str:
+    """The name of files and folders of an environment, without characters that other systems forbid."""
+    return re.sub("[/:]", "_", env_id)
+
+
+def earlier_folder_name(env_id: str) -> str:
+    """As `folder_name` in earlier versions, whose folders are read too: with the colon of `module:Id`."""
+    return env_id.replace("/", "_")
+
+
 def read_file(path: Path) -> tuple[Entry, ...]:
     """The environments of a file. Raises ConfigError that names file, environment, field and remedy."""
     data = read_given(path, f"environment file {path}", MAX_FILE_BYTES)

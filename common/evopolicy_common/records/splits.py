@@ -10,6 +10,7 @@ from typing import Any
 
 import msgspec
 
+from evopolicy_common.catalogue import earlier_folder_name, folder_name
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.environment import Case, Split
 from evopolicy_common.regular_files import read_given
@@ -30,15 +31,10 @@ class SplitFile(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     """False when made from a public seed; None when the file does not declare it."""
 
 
-def folder_name(env: str) -> str:
-    """The folder to which `data make` writes the split files of `env`."""
-    return env.replace("/", "_")
-
-
 def folder_of(root: Path, env: str) -> Path:
     """Folder of the split files of `env` below `root`: `gym_acrobot/`, or as published `gym/acrobot/`."""
-    published = root / env
-    return published if holds_splits(published) else root / folder_name(env)
+    others = (root / env, root / earlier_folder_name(env))
+    return next(filter(holds_splits, others), root / folder_name(env))
 
 
 def folders_below(root: Path) -> list[Path]:

@@ -93,7 +93,7 @@ def _plan(
         for split, cases in splits.derive(secret, suite.name, env, counts).items():
             stem = split_files.FILE_STEMS[split]
             content = split_files.SplitFile(env=env, split=stem, cases=cases, secret=seed is None)
-            planned[root / split_files.folder_name(env) / f"{stem}.json"] = (
+            planned[split_files.folder_of(root, env) / f"{stem}.json"] = (
                 msgspec.json.format(msgspec.json.encode(content), indent=1) + b"\n"
             )
     return planned

@@ -8,6 +8,7 @@ from html import escape
 
 import msgspec
 
+from evopolicy_common.catalogue import folder_name
 from evopolicy_common.terminal import one_line
 from evopolicy_results.behaviour.edits import Transition, events_of, phases
 from evopolicy_results.figures.plot import INK, MUTED, Plot
@@ -63,7 +64,7 @@ def timeline_of(env: str, lines: Sequence[Timeline], looks: Mapping[str, Look]) 
     cut.sort(key=lambda line: (line.entry.casefold(), line.repeat))
     dropped = len(found) - len(cut)
     return Plot(
-        name="timeline_" + env.replace("/", "_"),
+        name=f"timeline_{folder_name(env)}",
         title=f"{title_of(env)} code phases",
         caption="Phases by edit type over the budget; a mark stands where its submit's episodes end. Rollbacks and retests are "
         "events within a phase. A filled star raises the best validation mean so far."

@@ -27,7 +27,7 @@ from evopolicy_common.messages.operator import DescribeEnvironment, Evaluate
 from evopolicy_common.processes.scratch import scratch_folder
 from evopolicy_common.records.episodes import compare
 from evopolicy_common.records.episodes.trajectory import Trajectory
-from evopolicy_common.records.splits import FILE_STEMS, SPLITS, SplitFile, cases_hash, folder_name
+from evopolicy_common.records.splits import FILE_STEMS, SPLITS, SplitFile, cases_hash
 from evopolicy_common.wire import credentials, transport
 from evopolicy_results.evaluations import Evaluations
 from evopolicy_results.publish.contents import Group
@@ -207,7 +207,7 @@ async def cluster_of(
     with scratch_folder("check-data") as data:
         by_env = {run.opening.settings.env: run for run in runs}
         for env, run in by_env.items():
-            folder = Path(data) / folder_name(env)
+            folder = Path(data) / catalogue.folder_name(env)
             folder.mkdir()
             for split in SPLITS:
                 content = SplitFile(env=env, split=FILE_STEMS[split], cases=run.cases(split), secret=False)

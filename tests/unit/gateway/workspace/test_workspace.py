@@ -196,9 +196,22 @@ def test_info_has_the_protocols_fields_and_no_more_of_the_cluster() -> None:
     assert info_document(run, run.state, True, None)["state"]["is_finalized"] is True
 
 
+@pytest.mark.parametrize("left", ["first", ".first.lock", ".first.asked"])
+def test_a_run_of_an_earlier_version_keeps_its_folder(left: str, tmp_path: Path) -> None:
+    earlier = tmp_path / "e" / "my_env:Glider-v0"
+    earlier.mkdir(parents=True)
+    (earlier / left).touch()
+    assert run_folder(tmp_path, "e", "my_env:Glider-v0", "first").root == earlier / "first"
+    new = run_folder(tmp_path, "e", "my_env:Glider-v0", "second").root
+    assert new == tmp_path / "e" / "my_env_Glider-v0" / "second"
+
+
 def test_a_runs_folder_has_no_surprises_in_its_name(tmp_path: Path) -> None:
     folder = run_folder(tmp_path, "GPT-5.5 (Codex)/../x", "gym/acrobot", "first")
     assert folder.root == tmp_path / "GPT-5.5 (Codex)_.._x" / "gym_acrobot" / "first"
+    assert (
+        run_folder(tmp_path, "e", "my_env:Glider-v0", "a").root == tmp_path / "e" / "my_env_Glider-v0" / "a"
+    )
     for entry, exp_id in (("..", "a"), ("", "a"), ("a", "../b"), ("a", ""), ("a", ".hidden")):
         with pytest.raises(ConfigError):
             run_folder(tmp_path, entry, "e", exp_id)
