@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import msgspec
 
 from evopolicy_common import catalogue
 from evopolicy_results.behaviour import structure
+from evopolicy_results.behaviour.audit import TokenUse
 from evopolicy_results.behaviour.edits import demand_of
 from evopolicy_results.reading.environments import family_of, family_title, suite_size, title_of
 from evopolicy_results.scoring.normalised import DEMANDS
+from evopolicy_results.scoring.ranking import CellResult
 from evopolicy_results.statistics.intervals import Estimate
 from evopolicy_results.statistics.standings import RankEstimate
 from evopolicy_results.studies.study import Study, Suite
@@ -19,6 +22,7 @@ from evopolicy_results.tables.run_tables import (
     ENV,
     HARNESS,
     RUN,
+    RUNS,
     LinkOf,
     no_link,
     one_or_all,
@@ -31,7 +35,7 @@ from evopolicy_results.tables.statistics_tables import (
     span,
     statistics_tables,
 )
-from evopolicy_results.tables.table import Column, Table, best_marks
+from evopolicy_results.tables.table import Column, Table, best_marks, tabulated
 
 _DEMAND = Column("demand", "Demand")
 
@@ -122,28 +126,19 @@ def _aggregate(suite: Suite, study: Study) -> Table:
 
 def _incomplete(suite: Suite) -> Table:
     n = len(suite.board.environments)
-    return Table(
+    return tabulated(
+        suite.board.incomplete,
+        (
+            ENTRY,
+            HARNESS,
+            Column("environments", "Environments", of=lambda one: f"{one.n_environments} of {n}"),
+            Column("missing", "Not played", of=lambda one: ", ".join(map(title_of, one.missing))),
+            Column("runs", "Runs", "integer", of=lambda one: None if one.is_reference else one.n_runs),
+        ),
         name=f"incomplete_{suite.name}",
         title=f"{suite.title} incomplete entries",
         caption="Entries that have not played every environment of this report are not ranked and have no mean over environments: "
         "it would not be comparable. Their returns are in the tables of single environments and of differences.",
-        columns=(
-            ENTRY,
-            HARNESS,
-            Column("environments", "Environments"),
-            Column("missing", "Not played"),
-            Column("runs", "Runs", "integer"),
-        ),
-        rows=tuple(
-            {
-                "entry": one.entry,
-                "harness": one.harness,
-                "environments": f"{one.n_environments} of {n}",
-                "missing": ", ".join(map(title_of, one.missing)),
-                "runs": None if one.is_reference else one.n_runs,
-            }
-            for one in suite.board.incomplete
-        ),
     )
 
 
@@ -200,47 +195,42 @@ def _heldout(suite: Suite) -> Table:
 
 
 def _cells(suite: Suite) -> Table:
-    rows = [
-        {
-            "env": title_of(env),
-            "family": family_title(family_of(env)),
-            "entry": cell.entry,
-            "mean": cell.mean,
-            "interval": interval_text(suite.statistics.means.get((cell.entry, env))),
-            "over": _over(suite.statistics.means.get((cell.entry, env))),
-            "runs": cell.n_runs,
-            "rank": cell.rank,
-            "score": cell.score,
-        }
-        for env in suite.board.environments
-        for cell in sorted(
-            (c for (_, e), c in suite.board.cells.items() if e == env),
-            key=lambda c: (c.rank is None, c.rank or 0, c.entry.casefold()),
-        )
-    ]
-    return Table(
+    def mean(cell: CellResult) -> Estimate | None:
+        return suite.statistics.means.get((cell.entry, cell.env))
+
+    def over(cell: CellResult) -> str | None:
+        found = mean(cell)
+        return None if found is None or found.low is None else found.over
+
+    place = {env: i for i, env in enumerate(suite.board.environments)}
+    table = tabulated(
+        sorted(
+            suite.board.cells.values(),
+            key=lambda cell: (place[cell.env], cell.rank is None, cell.rank or 0, cell.entry.casefold()),
+        ),
+        (
+            ENV,
+            Column("family", "Family", of=lambda cell: family_title(family_of(cell.env))),
+            ENTRY,
+            Column("mean", "Held-out mean", "number"),
+            Column("interval", "95 % interval", of=lambda cell: interval_text(mean(cell))),
+            Column(
+                "over",
+                "Over",
+                note="What a repetition would draw anew: cases, runs, or runs and cases.",
+                of=over,
+            ),
+            RUNS,
+            Column("rank", "Rank", "integer"),
+            Column("score", "Rank score", "number"),
+        ),
         name=f"cells_{suite.name}",
         title=f"{suite.title} cells",
         caption="Every entry on every environment: mean over its runs, 95 % interval of the mean over what the column Over names, rank "
-        "and rank score (of entries that played every environment). Entries share their cases, so two of these intervals may overlap where the difference is sure: compare by the "
-        "table of differences.",
-        columns=(
-            ENV,
-            Column("family", "Family"),
-            ENTRY,
-            Column("mean", "Held-out mean", "number"),
-            Column("interval", "95 % interval"),
-            Column("over", "Over", note="What a repetition would draw anew: cases, runs, or runs and cases."),
-            Column("runs", "Runs", "integer"),
-            Column("rank", "Rank", "integer"),
-            *([Column("score", "Rank score", "number")] if suite.is_ranked else []),
-        ),
-        rows=tuple(rows),
+        "and rank score (of entries that played every environment). Entries share their cases, so two of these intervals may overlap "
+        "where the difference is sure: compare by the table of differences.",
     )
-
-
-def _over(mean: Estimate | None) -> str | None:
-    return None if mean is None or mean.low is None else mean.over
+    return table if suite.is_ranked else msgspec.structs.replace(table, columns=table.columns[:-1])
 
 
 def _normalised(suite: Suite) -> Table:
@@ -275,81 +265,55 @@ def _normalised(suite: Suite) -> Table:
 
 
 def _evolution(study: Study, link_of: LinkOf) -> Table:
-    rows = [
-        {
-            "env": title_of(found.env),
-            "entry": found.entry,
-            "run": found.run.rsplit(" / ", 1)[-1],
-            "submits": len(found.steps),
-            "best": found.steps[-1].best if found.steps else None,
-            "improvements": found.n_improvements,
-            "area": found.area,
-            "to_50": found.to_50,
-            "to_80": found.to_80,
-        }
-        for found in study.evolutions
-    ]
-    return Table(
+    return tabulated(
+        study.evolutions,
+        (
+            ENV,
+            ENTRY,
+            RUN,
+            Column("submits", "Scored submits", "integer", of=lambda one: len(one.steps)),
+            Column(
+                "best",
+                "Best validation mean",
+                "number",
+                of=lambda one: one.steps[-1].best if one.steps else None,
+            ),
+            Column(
+                "improvements",
+                "Improvements",
+                "integer",
+                note="Rises after the first score.",
+                of=lambda one: one.n_improvements,
+            ),
+            Column("area", "Area", "number", digits=2),
+            Column("to_50", "To 50 % (episodes)", "integer"),
+            Column("to_80", "To 80 % (episodes)", "integer"),
+        ),
+        link=lambda one: link_of(one.run),
         name="evolution",
         title="Score evolution",
         caption="Best validation mean so far over the budget. Scale of each environment: 0 is the random reference, 1 the best "
         "validation mean of any run. Area: mean of the curve over the budget. To 50 % and 80 %: train episodes consumed when the "
         "curve first gets there. Validation is hidden from agents during the run.",
-        columns=(
-            ENV,
-            ENTRY,
-            RUN,
-            Column("submits", "Scored submits", "integer"),
-            Column("best", "Best validation mean", "number"),
-            Column("improvements", "Improvements", "integer", note="Rises after the first score."),
-            Column("area", "Area", "number", digits=2),
-            Column("to_50", "To 50 % (episodes)", "integer"),
-            Column("to_80", "To 80 % (episodes)", "integer"),
-        ),
-        rows=tuple(rows),
-        links={i: link for i, found in enumerate(study.evolutions) if (link := link_of(found.run))},
     )
 
 
 def _edit_types(study: Study) -> Table:
     harness = {run.entry: run.harness for run in study.runs}
-    rows = [
-        {
-            "entry": row.entry,
-            "harness": harness[row.entry],
-            "demand": row.demand,
-            "n_synthesis": row.n_synthesis,
-            "hit_synthesis": row.rate_synthesis,
-            "n_parametric": row.n_parametric,
-            "hit_parametric": row.rate_parametric,
-            "n_rollback": row.n_rollback,
-            "n_retest": row.n_retest,
-            "n_data": row.n_data,
-            "n_first": row.n_first,
-            "n_not_ok": row.n_not_ok,
-            "n_unscored": row.n_unscored,
-        }
-        for row in study.edit_rates
-    ]
 
     def count(key: str, title: str, note: str) -> Column:
         return Column(key, title, "integer", note=note)
 
-    return Table(
-        name="edit_types",
-        title="Edit types",
-        caption="Each score-bearing submit against the one before it. Synthesis: a numeric-constant-stripped AST topology that is new "
-        "to the run. Parametric: bytes changed, topology kept. A hit raises the validation best so far. The other columns are "
-        "excluded from both rates: rollbacks to an earlier topology, byte-identical retests, submits that changed data files only, the first score-bearing submit (it "
-        "follows none), submits that are not ok, and ok ones without a validation score.",
-        columns=(
+    return tabulated(
+        study.edit_rates,
+        (
             ENTRY,
-            HARNESS,
+            Column("harness", "Harness", of=lambda row: harness[row.entry]),
             _DEMAND,
             count("n_synthesis", "Synthesis n", "New topology."),
-            Column("hit_synthesis", "Synthesis hit", "percent"),
+            Column("hit_synthesis", "Synthesis hit", "percent", of=lambda row: row.rate_synthesis),
             count("n_parametric", "Parametric n", "Same topology, other bytes."),
-            Column("hit_parametric", "Parametric hit", "percent"),
+            Column("hit_parametric", "Parametric hit", "percent", of=lambda row: row.rate_parametric),
             count("n_rollback", "Rollback", "Back to an earlier topology."),
             count("n_retest", "Retest", "Byte-identical."),
             count("n_data", "Data only", "Files outside the source bundle changed, such as weights."),
@@ -357,103 +321,80 @@ def _edit_types(study: Study) -> Table:
             count("n_not_ok", "Not ok", "Accepted submits without a working policy."),
             count("n_unscored", "Unscored", "Ok, without a validation mean."),
         ),
-        rows=tuple(rows),
+        name="edit_types",
+        title="Edit types",
+        caption="Each score-bearing submit against the one before it. Synthesis: a numeric-constant-stripped AST topology that is new "
+        "to the run. Parametric: bytes changed, topology kept. A hit raises the validation best so far. The other columns are "
+        "excluded from both rates: rollbacks to an earlier topology, byte-identical retests, submits that changed data files only, "
+        "the first score-bearing submit (it follows none), submits that are not ok, and ok ones without a validation score.",
     )
 
 
 def _structure(study: Study) -> Table:
     keys = (*structure.FEATURES, "nodes", "lines")
     titles = ("Funcs", "Branches", "Loops", "Depth", "State", "AST nodes", "Lines")
-    rows = [
-        {
-            "demand": row.demand,
-            "entry": row.entry,
-            "harness": row.harness,
-            **{key: getattr(row, key) for key in keys},
-            "runs": row.n_runs,
-        }
-        for row in study.structure
-    ]
-    return Table(
-        name="structure",
-        title="Realised structure",
-        caption="AST features of the validation-selected policies (policy.py and the local modules it reaches), mean over "
-        "environments of a demand group. State counts attributes that methods assign on their instance.",
-        columns=(
+    return tabulated(
+        study.structure,
+        (
             _DEMAND,
             ENTRY,
             HARNESS,
             *(Column(k, t, "number", digits=1) for k, t in zip(keys, titles, strict=True)),
-            Column("runs", "Runs", "integer"),
+            RUNS,
         ),
-        rows=tuple(rows),
+        name="structure",
+        title="Realised structure",
+        caption="AST features of the validation-selected policies (policy.py and the local modules it reaches), mean over "
+        "environments of a demand group. State counts attributes that methods assign on their instance.",
     )
 
 
 def _edit_sizes(study: Study) -> Table:
-    rows = [
-        {
-            "entry": row.entry,
-            "lines": row.label,
-            "n": row.n,
-            "p_visible": row.p_visible,
-            "p_validation": row.p_validation,
-        }
-        for row in study.edit_sizes
-        if row.n
-    ]
-    return Table(
+    return tabulated(
+        [row for row in study.edit_sizes if row.n],
+        (
+            ENTRY,
+            Column("lines", "Changed lines", of=lambda row: row.label),
+            Column("n", "Transitions", "integer"),
+            Column("p_visible", "Visible mean improved", "percent"),
+            Column("p_validation", "Validation best improved", "percent"),
+        ),
         name="edit_sizes",
         title="Edit size and improvement",
         caption="Transitions between adjacent score-bearing submits by lines added and removed in the source bundle. Visible: the "
         "train mean rose (a retest may play other cases). Validation: the validation best rose, which an unchanged policy cannot. Data "
         "only: files outside the source bundle changed, such as weights.",
-        columns=(
-            ENTRY,
-            Column("lines", "Changed lines"),
-            Column("n", "Transitions", "integer"),
-            Column("p_visible", "Visible mean improved", "percent"),
-            Column("p_validation", "Validation best improved", "percent"),
-        ),
-        rows=tuple(rows),
     )
 
 
 def _tokens(study: Study) -> Table:
-    rows = [
-        {
-            "env": title_of(row.env),
-            "entry": row.entry,
-            "input": row.input_noncached,
-            "cache": row.cache,
-            "output": row.output,
-            "cost": row.cost,
-            "runs": row.n_runs,
-            "metering": row.metering or None,
-            "differing": row.differing if "relay" in row.metering else None,
-        }
-        for row in study.tokens
-    ]
+    def millions(
+        key: str, title: str, note: str, of: Callable[[TokenUse], float | None] | None = None
+    ) -> Column:
+        return Column(key, title, "number", digits=2, below=True, note=note, of=of)
 
-    def millions(key: str, title: str, note: str) -> Column:
-        return Column(key, title, "number", digits=2, below=True, note=note)
-
-    return Table(
+    return tabulated(
+        study.tokens if any(row.n_runs for row in study.tokens) else (),
+        (
+            ENV,
+            ENTRY,
+            millions("input", "In (M)", "Non-cached input.", lambda row: row.input_noncached),
+            millions("cache", "Cache (M)", "Cache read plus cache creation."),
+            millions("output", "Out (M)", "Output, reasoning included."),
+            Column("cost", "Cost (US$)", "number", digits=2),
+            Column("runs", "Runs that tell", "integer", of=lambda row: row.n_runs),
+            Column("metering", "Counted by", of=lambda row: row.metering or None),
+            Column(
+                "differing",
+                "Runs whose agent counts otherwise",
+                "integer",
+                note="By more than 5 %.",
+                of=lambda row: row.differing if "relay" in row.metering else None,
+            ),
+        ),
         name="tokens",
         title="Tokens and cost",
         caption="Mean of a run, in millions of tokens. In: input that no cache served. Cache: cache read and creation. Out: output with "
         "reasoning. Diagnostic only, no part of a score. A dash: nothing counted them. Counted by the relay: at the wire; by the agent: as "
         "its program reports.",
-        columns=(
-            ENV,
-            ENTRY,
-            millions("input", "In (M)", "Non-cached input."),
-            millions("cache", "Cache (M)", "Cache read plus cache creation."),
-            millions("output", "Out (M)", "Output, reasoning included."),
-            Column("cost", "Cost (US$)", "number", digits=2),
-            Column("runs", "Runs that tell", "integer"),
-            Column("metering", "Counted by"),
-            Column("differing", "Runs whose agent counts otherwise", "integer", note="By more than 5 %."),
-        ),
-        rows=tuple(rows) if any(row.n_runs for row in study.tokens) else (),
     )

@@ -13,12 +13,13 @@ from evopolicy_results.reading.environments import family_of, family_title, orde
 from evopolicy_results.reading.records import Run, path_text
 from evopolicy_results.scan.signals import TITLES, Signal
 from evopolicy_results.studies.study import Study
-from evopolicy_results.tables.table import Column, Table
+from evopolicy_results.tables.table import Column, Table, tabulated
 
 ENTRY = Column("entry", "Agent")
 HARNESS = Column("harness", "Harness")
-ENV = Column("env", "Environment")
-RUN = Column("run", "Run")
+ENV = Column("env", "Environment", of=lambda record: title_of(record.env))
+RUN = Column("run", "Run", of=lambda record: _short(record.run))
+RUNS = Column("runs", "Runs", "integer", of=lambda record: record.n_runs)
 
 _COUNTERS = frozenset({"reprompted", "paused_s", "requests_failed", "resumed"})
 """Counters of a run's course that a harness stores among its settings; they are not settings."""
@@ -57,35 +58,26 @@ def _short(run: str) -> str:
 
 
 def _runs(study: Study, link_of: LinkOf) -> Table:
-    rows = tuple(
-        {
-            "env": title_of(run.env),
-            "entry": run.entry,
-            "run": _short(run.name),
-            "submits": len(run.submits),
-            "score": run.score,
-            "journal": _journal(run),
-        }
-        for run in study.runs
-    )
-    return Table(
-        name="runs",
-        title="Runs",
-        caption="Open a run for its feedback use, timeline, checkpoints and differences.",
-        columns=(
+    return tabulated(
+        study.runs,
+        (
             ENV,
             ENTRY,
-            RUN,
-            Column("submits", "Submits", "integer"),
+            Column("run", "Run", of=lambda run: _short(run.name)),
+            Column("submits", "Submits", "integer", of=lambda run: len(run.submits)),
             Column("score", "Held-out mean", "number"),
             Column(
                 "journal",
                 "Journal",
-                note="Entry with the run's result, and the journal's head there. A head that you noted earlier shows whether the journal was rewritten.",
+                note="Entry with the run's result, and the journal's head there. A head that you noted earlier shows whether "
+                "the journal was rewritten.",
+                of=_journal,
             ),
         ),
-        rows=rows,
-        links={i: link for i, run in enumerate(study.runs) if (link := link_of(run.name))},
+        link=lambda run: link_of(run.name),
+        name="runs",
+        title="Runs",
+        caption="Open a run for its feedback use, timeline, checkpoints and differences.",
     )
 
 
@@ -364,34 +356,22 @@ def _signals(study: Study, link_of: LinkOf) -> Table:
 def _evidence(
     found: list[tuple[Run, Signal]], link_of: LinkOf, *, name: str, title: str, caption: str
 ) -> Table:
-    return Table(
+    return tabulated(
+        found,
+        (
+            Column("env", "Environment", of=lambda one: title_of(one[0].env)),
+            Column("entry", "Agent", of=lambda one: one[0].entry),
+            Column("run", "Run", of=lambda one: _short(one[0].name)),
+            Column("signal", "Signal", of=lambda one: TITLES[one[1].kind]),
+            Column("file", "File", of=lambda one: one[1].place),
+            Column("submits", "Submits", of=lambda one: submits_text(one[1].submits) or None),
+            Column("reason", "Why", of=lambda one: one[1].reason),
+            Column("quote", "Evidence", of=lambda one: one[1].quote[:_MAX_QUOTE]),
+        ),
+        link=lambda one: link_of(one[0].name),
         name=name,
         title=title,
         caption=caption,
-        columns=(
-            ENV,
-            ENTRY,
-            RUN,
-            Column("signal", "Signal"),
-            Column("file", "File"),
-            Column("submits", "Submits"),
-            Column("reason", "Why"),
-            Column("quote", "Evidence"),
-        ),
-        rows=tuple(
-            {
-                "env": title_of(run.env),
-                "entry": run.entry,
-                "run": _short(run.name),
-                "signal": TITLES[each.kind],
-                "file": each.place,
-                "submits": submits_text(each.submits) or None,
-                "reason": each.reason,
-                "quote": each.quote[:_MAX_QUOTE],
-            }
-            for run, each in found
-        ),
-        links={i: link for i, (run, _) in enumerate(found) if (link := link_of(run.name))},
     )
 
 
@@ -454,10 +434,10 @@ def _missing(study: Study) -> Table:
 
 
 def _left_out(study: Study) -> Table:
-    return Table(
+    return tabulated(
+        study.left_out,
+        (Column("path", "Folder", of=lambda item: path_text(item.path)), Column("reason", "Reason")),
         name="left_out",
         title="Left out",
         caption="Folders that are no complete run, and why. They are in no table and no figure.",
-        columns=(Column("path", "Folder"), Column("reason", "Reason")),
-        rows=tuple({"path": path_text(item.path), "reason": item.reason} for item in study.left_out),
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 from evopolicy_results.reading.environments import title_of
@@ -13,7 +14,7 @@ from evopolicy_results.statistics.repeats import MAX_REPEATS, Repeats
 from evopolicy_results.statistics.resolution import GAPS, Resolution
 from evopolicy_results.studies.study import Suite
 from evopolicy_results.tables.run_tables import ENTRY, ENV
-from evopolicy_results.tables.table import Column, Table
+from evopolicy_results.tables.table import Column, Table, tabulated
 
 CHECKPOINTS = "With one run a cell this compares the selected checkpoints, not the agents: how an agent's runs vary is not known."
 _SHOWN_TAUS = (0.1, 0.25, 0.5, 0.75, 0.9)
@@ -59,7 +60,56 @@ def has_single_runs(suite: Suite) -> bool:
 def _pairs(suite: Suite) -> Table:
     found = suite.statistics.pairs
     left_out = sum(pair.n_left_out > 0 for pair in found)
-    return Table(
+
+    def with_interval(field: str) -> Callable[[Pair], str | None]:
+        return lambda pair: None if pair.gap is None or pair.gap.low is None else getattr(pair.gap, field)
+
+    return tabulated(
+        found,
+        (
+            ENV,
+            Column("first", "First"),
+            Column("second", "Second"),
+            Column(
+                "gap", "Difference", "number", of=lambda pair: None if pair.gap is None else pair.gap.value
+            ),
+            Column(
+                "interval", "95 % interval", of=lambda pair: interval_text(pair.gap) or pair.reason or None
+            ),
+            Column(
+                "over",
+                "Over",
+                note="What a repetition would draw anew: cases, runs, or runs and cases.",
+                of=with_interval("over"),
+            ),
+            Column("method", "Method", of=with_interval("method")),
+            Column("p", "p", "number", digits=4, below=True),
+            Column("p_holm", "Corrected p", "number", digits=4, below=True),
+            Column(
+                "told_apart",
+                "Significantly better",
+                note="The better entry, or the reason for none.",
+                of=_told_apart,
+            ),
+            Column(
+                "needed",
+                "Needed",
+                "integer",
+                note="Runs of each agent, or cases of checkpoints.",
+                of=lambda pair: pair.n_needed,
+            ),
+            Column("p_these_cases", "p, these cases only", "number", digits=4, below=True),
+            Column("compares", "Compares", note="Checkpoints, where an entry has one run; else agents."),
+            Column("runs", "Runs", of=lambda pair: "{} and {}".format(*pair.n_runs)),
+            Column("cases", "Cases", "integer", of=lambda pair: pair.n_cases or None),
+            Column(
+                "left_out",
+                "Cases left out",
+                "integer",
+                note="Cases that only some of the runs have.",
+                of=lambda pair: pair.n_left_out,
+            ),
+        ),
         name=f"pairs_{suite.name}",
         title=f"{suite.title} differences",
         caption="Every two entries on every environment: first minus second, in held-out returns of the cases that both have. Interval: "
@@ -76,49 +126,12 @@ def _pairs(suite: Suite) -> Table:
             if left_out
             else ""
         ),
-        columns=(
-            ENV,
-            Column("first", "First"),
-            Column("second", "Second"),
-            Column("gap", "Difference", "number"),
-            Column("interval", "95 % interval"),
-            Column("over", "Over", note="What a repetition would draw anew: cases, runs, or runs and cases."),
-            Column("method", "Method"),
-            Column("p", "p", "number", digits=4, below=True),
-            Column("p_holm", "Corrected p", "number", digits=4, below=True),
-            Column("told_apart", "Significantly better", note="The better entry, or the reason for none."),
-            Column("needed", "Needed", "integer", note="Runs of each agent, or cases of checkpoints."),
-            Column("p_these_cases", "p, these cases only", "number", digits=4, below=True),
-            Column("compares", "Compares", note="Checkpoints, where an entry has one run; else agents."),
-            Column("runs", "Runs"),
-            Column("cases", "Cases", "integer"),
-            Column("left_out", "Cases left out", "integer", note="Cases that only some of the runs have."),
-        ),
-        rows=tuple(map(_pair, found)),
     )
 
 
-def _pair(pair: Pair) -> dict[str, Any]:
-    gap = pair.gap
+def _told_apart(pair: Pair) -> str | None:
     named = {"first": pair.first, "second": pair.second, "not told apart": _not_told(pair)}
-    return {
-        "env": title_of(pair.env),
-        "first": pair.first,
-        "second": pair.second,
-        "gap": gap.value if gap is not None else None,
-        "interval": interval_text(gap) or pair.reason or None,
-        "over": gap.over if gap is not None and gap.low is not None else None,
-        "method": gap.method if gap is not None and gap.low is not None else None,
-        "p": pair.p,
-        "p_holm": pair.p_holm,
-        "told_apart": named.get(pair.verdict),
-        "needed": pair.n_needed,
-        "p_these_cases": pair.p_these_cases,
-        "compares": pair.compares,
-        "runs": f"{pair.n_runs[0]} and {pair.n_runs[1]}",
-        "cases": pair.n_cases or None,
-        "left_out": pair.n_left_out,
-    }
+    return named.get(pair.verdict)
 
 
 def _not_told(pair: Pair) -> str:
@@ -244,29 +257,20 @@ def _share(tau: float, share: Bounded) -> dict[str, Any]:
 
 
 def _improvements(suite: Suite) -> Table:
-    return Table(
+    return tabulated(
+        suite.statistics.improvements,
+        (
+            Column("first", "First"),
+            Column("second", "Second"),
+            Column("probability", "Probability", "number", of=lambda one: one.probability.value),
+            Column("interval", "95 % interval", of=lambda one: _bounds(one.probability, 3)),
+            Column("environments", "Environments", "integer", of=lambda one: one.n_environments),
+        ),
         name=f"improvement_{suite.name}",
         title=f"{suite.title} probability of improvement",
         caption="How probably a run of the first agent scores above a run of the second, ties counting half, mean over the environments that "
         "have a scale (Agarwal et al. 2021). Interval: 95 %, stratified bootstrap over runs and their cases, or over the cases of single "
         "runs." + (f" {CHECKPOINTS}" if has_single_runs(suite) else ""),
-        columns=(
-            Column("first", "First"),
-            Column("second", "Second"),
-            Column("probability", "Probability", "number"),
-            Column("interval", "95 % interval"),
-            Column("environments", "Environments", "integer"),
-        ),
-        rows=tuple(
-            {
-                "first": one.first,
-                "second": one.second,
-                "probability": one.probability.value,
-                "interval": _bounds(one.probability, 3),
-                "environments": one.n_environments,
-            }
-            for one in suite.statistics.improvements
-        ),
     )
 
 

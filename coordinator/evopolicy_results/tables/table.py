@@ -9,7 +9,7 @@ from __future__ import annotations
 import csv
 import io
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Literal
 
 import msgspec
@@ -34,6 +34,8 @@ class Column(msgspec.Struct, frozen=True):
     """Whether a `number` above 0 but below its last decimal is shown as such (`<0.01`) instead of as 0."""
     note: str = ""
     """One-sentence explanation, shown on demand."""
+    of: Callable[[Any], Any] | None = None
+    """Its value in a record; default: the record's attribute `key`."""
 
 
 class Table(msgspec.Struct, frozen=True, kw_only=True):
@@ -49,6 +51,30 @@ class Table(msgspec.Struct, frozen=True, kw_only=True):
     """(row, column key) to 1 for the best and 2 for the second-best of its column."""
     links: dict[int, str] = {}
     """By row, the page about it, relative to the report."""
+
+
+def tabulated(
+    records: Iterable[Any],
+    columns: Sequence[Column],
+    *,
+    name: str,
+    title: str,
+    caption: str,
+    link: Callable[[Any], str] = lambda record: "",
+) -> Table:
+    """A row a record. `link`: the page about a record, relative to the report; empty for none."""
+    records = list(records)
+    return Table(
+        name=name,
+        title=title,
+        caption=caption,
+        columns=tuple(columns),
+        rows=tuple(
+            {column.key: column.of(each) if column.of else getattr(each, column.key) for column in columns}
+            for each in records
+        ),
+        links={i: href for i, each in enumerate(records) if (href := link(each))},
+    )
 
 
 def shown(value: Any, column: Column) -> str:
