@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib import pyplot
 
 from evopolicy_common.records.run_record import decode_run_record
-from evopolicy_results.statistics import intervals
+from evopolicy_common.statistics import intervals
 
 
 def draw(run: Path, out: Path) -> None:

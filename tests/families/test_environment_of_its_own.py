@@ -22,7 +22,7 @@ from test_parity import differences, named
 from evopolicy_common.catalogue import installs, suites
 from evopolicy_common.catalogue.installs import Made
 from evopolicy_common.records.run_record import decode_run_record
-from evopolicy_results.statistics.intervals import over_cases
+from evopolicy_common.statistics.intervals import over_cases
 
 pytestmark = pytest.mark.families
 

@@ -17,7 +17,7 @@ from slots import Slots, make_job
 
 from evopolicy_common import catalogue
 from evopolicy_common.messages.episode import ResourceLimits
-from evopolicy_results.statistics.intervals import over_cases
+from evopolicy_common.statistics.intervals import over_cases
 from evopolicy_worker import check_env
 from evopolicy_worker.environments import describe, missing
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 
 from evopolicy_common.console import Terminal, table
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.local.cluster import unless_failed
-from evopolicy_common.records.run_record import RunRecord
+from evopolicy_common.records.run_record import Outcome, RunRecord
 from evopolicy_common.records.suite_folder import Entry, Index
 from evopolicy_common.terminal import number
 from evopolicy_common.wire.credentials import Credentials
@@ -25,6 +25,9 @@ from evopolicy_gateway.suite.ends import next_step
 from evopolicy_gateway.suite.suite_file import Parallel
 from evopolicy_gateway.suite.suite_index import entry_of
 from evopolicy_gateway.suite.sweep import Sweep
+
+if TYPE_CHECKING:
+    from evopolicy_common.statistics.intervals import Estimate
 
 
 class PlayedRuns(msgspec.Struct, frozen=True):
@@ -100,6 +103,7 @@ def _document(run: Plan, entry: Entry, played: PlayedRuns) -> dict[str, Any]:
         "error": entry.error,
         "final_score": entry.score,
         "random_score": entry.random,
+        "above_random": None if record is None else _above_random(record.outcome),
         "best_submit_index": None if record is None else record.outcome.best_submit_index,
         "n_submits": 0 if record is None else len(list(run.folder.checkpoints.glob("submit_*"))),
         "budget_used": entry.budget_used,
@@ -108,6 +112,34 @@ def _document(run: Plan, entry: Entry, played: PlayedRuns) -> dict[str, Any]:
         "in_question": audit is not None and audit.in_question,
         "wrong_option": run.name in played.wrong,
     }
+
+
+def _above_random(outcome: Outcome) -> Estimate | None:
+    """Score minus the mean return of uniform random actions, paired by held-out case, with the 95 % interval over cases
+    that a report has of one run. None without a score, or if random actions were not played."""
+    returns, reference = outcome.heldout_returns, outcome.random_reference
+    if outcome.score is None or not returns or reference is None or len(reference.returns) != len(returns):
+        return None
+    # With numpy, which nothing else in this command needs.
+    import numpy as np
+
+    from evopolicy_common.statistics.intervals import difference
+
+    return difference(np.array([returns]), np.array([reference.returns]))
+
+
+def _against_random(found: Estimate) -> str:
+    """The difference from random actions as a sentence."""
+    if found.low is None or found.high is None:
+        return f"score − random = {number(found.value)}, without an interval: {found.reason}"
+    least, most = (found.low, found.high) if found.value >= 0.0 else (-found.high, -found.low)
+    interval = f"{number(abs(found.value))} (95 % interval {number(least)} to {number(most)})"
+    word = "better" if found.value >= 0.0 else "worse"
+    return (
+        f"{interval} {word} than random"
+        if least > 0.0
+        else f"not distinguishable from random: {interval} {word}"
+    )
 
 
 def report(played: PlayedRuns, runs: Path, console: Terminal) -> None:
@@ -125,6 +157,8 @@ def report(played: PlayedRuns, runs: Path, console: Terminal) -> None:
         if one["in_question"]:
             text = f"{one['env']}: audits put these results in question; see `audit` in run.json"
             console.print(text, soft_wrap=True)
+        if one["above_random"] is not None:
+            console.print(f"{one['env']}: {_against_random(one['above_random'])}", soft_wrap=True)
         console.print(f"run directory: {one['run_directory']}", soft_wrap=True)
     if any(one["status"] == "completed" for one in results):
         console.print(next_step(runs), soft_wrap=True)

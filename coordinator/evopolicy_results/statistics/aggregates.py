@@ -17,11 +17,11 @@ from collections.abc import Mapping, Sequence
 import msgspec
 import numpy as np
 
+from evopolicy_common.statistics.distributions import ALPHA
+from evopolicy_common.statistics.intervals import no_spread
+from evopolicy_common.statistics.resampling import RESAMPLES, Floats, weights
 from evopolicy_results.scoring.normalised import Scale
-from evopolicy_results.statistics.distributions import ALPHA
-from evopolicy_results.statistics.intervals import no_spread
-from evopolicy_results.statistics.resampling import RESAMPLES, weights
-from evopolicy_results.statistics.samples import Floats, Sample, matched
+from evopolicy_results.statistics.samples import Sample, matched
 
 LEAST_RUNS = 5
 NO_SCALE = "no scale: agents do not clearly beat random"

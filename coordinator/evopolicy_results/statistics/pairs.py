@@ -14,12 +14,12 @@ from typing import Literal
 import msgspec
 import numpy as np
 
-from evopolicy_results.statistics import intervals
-from evopolicy_results.statistics.distributions import ALPHA, holm, normal_quantile
-from evopolicy_results.statistics.intervals import Estimate, difference, of_runs
+from evopolicy_common.statistics import intervals
+from evopolicy_common.statistics.distributions import ALPHA, holm, normal_quantile
+from evopolicy_common.statistics.intervals import Estimate, difference, of_runs
+from evopolicy_common.statistics.resampling import RESAMPLES
 from evopolicy_results.statistics.permutation import Test, label_test
 from evopolicy_results.statistics.repeats import repeats_needed, spread_of
-from evopolicy_results.statistics.resampling import RESAMPLES
 from evopolicy_results.statistics.samples import Matched, Sample, matched
 
 Verdict = Literal["first", "second", "not told apart", "not comparable"]

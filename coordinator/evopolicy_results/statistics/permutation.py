@@ -13,8 +13,7 @@ from collections.abc import Sequence
 import msgspec
 import numpy as np
 
-from evopolicy_results.statistics.resampling import label_patterns
-from evopolicy_results.statistics.samples import Floats
+from evopolicy_common.statistics.resampling import Floats, label_patterns
 
 N_RANDOM = 1999
 _CHUNK = 20_000

@@ -6,9 +6,9 @@ import math
 
 import msgspec
 
-from evopolicy_results.statistics.distributions import ALPHA, t_quantile, t_two_sided
-from evopolicy_results.statistics.intervals import components
-from evopolicy_results.statistics.samples import Floats
+from evopolicy_common.statistics.distributions import ALPHA, t_quantile, t_two_sided
+from evopolicy_common.statistics.intervals import components
+from evopolicy_common.statistics.resampling import Floats
 
 MAX_REPEATS = 1000
 

@@ -10,12 +10,10 @@ from collections.abc import Iterable, Sequence
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
+from evopolicy_common.statistics.resampling import Floats
 from evopolicy_results.reading.records import Run
 from evopolicy_results.scoring.scores import ScoreTable
-
-Floats = NDArray[np.float64]
 
 
 class RunReturns(msgspec.Struct, frozen=True, kw_only=True):

@@ -20,10 +20,10 @@ from collections.abc import Mapping, Sequence
 import msgspec
 import numpy as np
 
-from evopolicy_results.statistics.distributions import ALPHA, holm
+from evopolicy_common.statistics.distributions import ALPHA, holm
+from evopolicy_common.statistics.resampling import RESAMPLES, Floats, t_weights
 from evopolicy_results.statistics.pairs import Pair
-from evopolicy_results.statistics.resampling import RESAMPLES, t_weights
-from evopolicy_results.statistics.samples import Floats, Sample, matched
+from evopolicy_results.statistics.samples import Sample, matched
 
 MAX_GROUPS = 200
 """Above this number of tie groups the letters are omitted: they would not be informative."""

@@ -6,15 +6,15 @@ from collections.abc import Sequence
 
 import msgspec
 
+from evopolicy_common.statistics.intervals import Estimate
+from evopolicy_common.statistics.resampling import RESAMPLES
 from evopolicy_results.reading.records import Run
 from evopolicy_results.scoring.normalised import scales_of
 from evopolicy_results.scoring.ranking import Leaderboard
 from evopolicy_results.scoring.scores import ScoreTable
 from evopolicy_results.statistics.aggregates import Aggregate, Improvement, aggregates
 from evopolicy_results.statistics.generalisation import Generalisation, Optimism, generalisation, optimism_of
-from evopolicy_results.statistics.intervals import Estimate
 from evopolicy_results.statistics.pairs import Pair, cell_mean, pairs
-from evopolicy_results.statistics.resampling import RESAMPLES
 from evopolicy_results.statistics.resolution import Resolution, overall, resolutions
 from evopolicy_results.statistics.samples import samples_of
 from evopolicy_results.statistics.standings import Standings, standings

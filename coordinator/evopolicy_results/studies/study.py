@@ -7,6 +7,7 @@ from pathlib import Path
 
 import msgspec
 
+from evopolicy_common.statistics.resampling import RESAMPLES
 from evopolicy_results.behaviour.audit import AuditSignals, TokenUse, audit_signals, token_use
 from evopolicy_results.behaviour.edits import EditRates, Transition, classify, edit_rates
 from evopolicy_results.behaviour.structure import EditSizeBin, StructureMean, edit_size_bins, structure_means
@@ -19,7 +20,6 @@ from evopolicy_results.scoring.evolution import Evolution, evolutions
 from evopolicy_results.scoring.normalised import Normalised, normalised
 from evopolicy_results.scoring.ranking import Leaderboard, leaderboard
 from evopolicy_results.scoring.scores import ScoreTable, score_table
-from evopolicy_results.statistics.resampling import RESAMPLES
 from evopolicy_results.statistics.suite import SuiteStatistics, suite_statistics
 
 

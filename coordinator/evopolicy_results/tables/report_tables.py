@@ -8,13 +8,13 @@ from typing import Any
 import msgspec
 
 from evopolicy_common import catalogue
+from evopolicy_common.statistics.intervals import Estimate
 from evopolicy_results.behaviour import structure
 from evopolicy_results.behaviour.audit import TokenUse
 from evopolicy_results.behaviour.edits import demand_of
 from evopolicy_results.reading.environments import family_of, family_title, suite_size, title_of
 from evopolicy_results.scoring.normalised import DEMANDS
 from evopolicy_results.scoring.ranking import CellResult
-from evopolicy_results.statistics.intervals import Estimate
 from evopolicy_results.statistics.standings import RankEstimate
 from evopolicy_results.studies.study import Study, Suite
 from evopolicy_results.tables.run_tables import (

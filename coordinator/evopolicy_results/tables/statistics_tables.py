@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+from evopolicy_common.statistics.distributions import ALPHA
+from evopolicy_common.statistics.intervals import Estimate
 from evopolicy_results.reading.environments import title_of
 from evopolicy_results.statistics.aggregates import LEAST_RUNS, TAUS, Bounded
-from evopolicy_results.statistics.distributions import ALPHA
-from evopolicy_results.statistics.intervals import Estimate
 from evopolicy_results.statistics.pairs import Pair
 from evopolicy_results.statistics.repeats import MAX_REPEATS, Repeats
 from evopolicy_results.statistics.resolution import GAPS, Resolution

@@ -11,12 +11,12 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from evopolicy_common.statistics.intervals import difference, mean, of_runs
+from evopolicy_common.statistics.resampling import RESAMPLES
 from evopolicy_results.scoring.normalised import Scale
 from evopolicy_results.statistics.aggregates import aggregates
-from evopolicy_results.statistics.intervals import difference, mean, of_runs
 from evopolicy_results.statistics.pairs import pairs
 from evopolicy_results.statistics.repeats import Spread, half_width, repeats_needed
-from evopolicy_results.statistics.resampling import RESAMPLES
 from evopolicy_results.statistics.samples import RunReturns, Sample
 from evopolicy_results.statistics.standings import standings
 

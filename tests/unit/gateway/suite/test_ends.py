@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
 import pytest
 from rigs.finished_run import finished
 
@@ -15,6 +16,7 @@ from evopolicy_common.console import Terminal
 from evopolicy_common.messages.run_settings import RunSettings
 from evopolicy_common.records.run_record import RunRecord
 from evopolicy_common.records.suite_folder import Entry, Index
+from evopolicy_common.statistics.intervals import difference
 from evopolicy_gateway.run.plan import Plan
 from evopolicy_gateway.run.record import run_record
 from evopolicy_gateway.run.times import Times
@@ -121,6 +123,15 @@ def test_a_script_is_told_of_a_run_by_the_same_names(tmp_path: Path) -> None:
             "error": None,
             "final_score": 2.0,
             "random_score": 0.5,
+            "above_random": {
+                "value": 1.5,
+                "low": None,
+                "high": None,
+                "method": "none",
+                "over": "cases",
+                "p": None,
+                "reason": "too few cases",
+            },
             "best_submit_index": 1,
             "n_submits": 3,
             "budget_used": 8,
@@ -130,6 +141,31 @@ def test_a_script_is_told_of_a_run_by_the_same_names(tmp_path: Path) -> None:
             "wrong_option": False,
         }
     ]
+
+
+@pytest.mark.parametrize(
+    ("returns", "begin", "end"),
+    [
+        ((2.0, 3.0, 4.0, 3.5, 2.5), "3 (95 % interval ", " better than random"),
+        ((-2.0, -3.0, -4.0, -3.5, -2.5), "3 (95 % interval ", " worse than random"),
+        ((1.0, -1.0, 0.5, -0.5, 0.1), "not distinguishable from random: 0.02 (95 % interval -", " better"),
+        ((2.0, 2.0), "score − random = 2, without an interval", ": too few cases"),
+    ],
+)
+def test_the_difference_from_random_is_told_with_its_interval(
+    tmp_path: Path, returns: tuple[float, ...], begin: str, end: str
+) -> None:
+    zeros = (0.0,) * len(returns)
+    mean = sum(returns) / len(returns)
+    plan, record = one_run(tmp_path, final_score=mean, heldout_returns=returns, random_heldout_returns=zeros)
+    index = Index(suite="", runs={plan.name: entry_of(plan, record)})
+    played, out = PlayedRuns([plan], index, {plan.name: record}, set()), io.StringIO()
+    report(played, tmp_path, Terminal(file=out, width=80))
+    (line,) = (line for line in out.getvalue().splitlines() if line.startswith("toy/line: "))
+    assert line.startswith(f"toy/line: {begin}")
+    assert line.endswith(end)
+    # A report has the same numbers.
+    assert documents(played)[0]["above_random"] == difference(np.array([returns]), np.array([zeros]))
 
 
 def test_a_sweep_plays_again_what_its_agent_never_played(tmp_path: Path) -> None:

@@ -19,7 +19,7 @@ from invented.simulated_entries import (
     runs_of,
 )
 
-from evopolicy_results.statistics.intervals import components
+from evopolicy_common.statistics.intervals import components
 
 TRIALS = 300
 # Four standard errors of a share of 0.95 in 300 trials are 5 %.

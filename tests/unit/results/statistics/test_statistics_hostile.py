@@ -20,12 +20,12 @@ from invented.run_dirs import write_run
 from invented.simulated_entries import World, observed_scores, suite_samples
 from invented.study import write_suite
 
+from evopolicy_common.statistics.distributions import holm
+from evopolicy_common.statistics.intervals import TOO_FEW_CASES
 from evopolicy_results.notebook import figures_of, tables_of
 from evopolicy_results.scoring.normalised import Scale
 from evopolicy_results.scoring.paper import heldout_returns
 from evopolicy_results.statistics.aggregates import NO_SCALE, aggregates
-from evopolicy_results.statistics.distributions import holm
-from evopolicy_results.statistics.intervals import TOO_FEW_CASES
 from evopolicy_results.statistics.pairs import NO_COMMON_CASES, NO_RETURNS, NO_SCORE, Pair, cell_mean, pairs
 from evopolicy_results.statistics.samples import RunReturns, Sample, matched
 from evopolicy_results.statistics.standings import Standings, standings

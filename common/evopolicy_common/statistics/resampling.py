@@ -6,8 +6,9 @@ import itertools
 from functools import lru_cache
 
 import numpy as np
+from numpy.typing import NDArray
 
-from evopolicy_results.statistics.samples import Floats
+Floats = NDArray[np.float64]
 
 RESAMPLES = 2000
 EXACT_UP_TO = 1 << 13

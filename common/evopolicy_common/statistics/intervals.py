@@ -1,5 +1,6 @@
 """95 % intervals of means and of paired differences, and the p values of the same distributions: a p value is at most
-0.05 exactly if its interval excludes 0. `docs/explanation/statistics.md` has the measured coverage of each method.
+0.05 exactly if its interval excludes 0. Reports use them, and so do the ends of `run` and `local`.
+`docs/explanation/statistics.md` has the measured coverage of each method.
 
 The method depends on the data, as chosen by measured coverage:
 
@@ -22,7 +23,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from evopolicy_results.statistics.distributions import (
+from evopolicy_common.statistics.distributions import (
     ALPHA,
     CONFIDENCE,
     normal_quantile,
@@ -30,8 +31,7 @@ from evopolicy_results.statistics.distributions import (
     t_quantile,
     t_two_sided,
 )
-from evopolicy_results.statistics.resampling import RESAMPLES, weights
-from evopolicy_results.statistics.samples import Floats
+from evopolicy_common.statistics.resampling import RESAMPLES, Floats, weights
 
 LEAST_CASES = 5
 """With fewer cases no method reaches its coverage."""
