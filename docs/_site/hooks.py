@@ -13,6 +13,7 @@ ROOT_PAGES = {
     "SECURITY.md": "explanation/security.md",
     "CONTRIBUTING.md": "contributing.md",
     "CHANGELOG.md": "changelog.md",
+    "THIRD_PARTY.md": "reference/third-party.md",
     "deploy/README.md": "how-to/deploy.md",
     "examples/policies/README.md": "reference/example-policies.md",
 }

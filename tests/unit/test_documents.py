@@ -24,6 +24,7 @@ DOCUMENTS = [
         "ARCHITECTURE.md",
         "SECURITY.md",
         "CONTRIBUTING.md",
+        "THIRD_PARTY.md",
         "deploy/README.md",
         "examples/policies/README.md",
     ),
