@@ -72,10 +72,11 @@ class InASlot(msgspec.Struct, frozen=True, kw_only=True):
     def times(self) -> tuple[str, str]:
         """Both times as a table has them."""
         mark = "*" if self.busy else ""
-        return tuple(
+        bare, slot = (
             f"{us:,.3g}{mark}" if 0 < us < 100 else f"{us:,.0f}{mark}" if us else ""
             for us in (self.bare_us, self.slot_us)
         )
+        return bare, slot
 
 
 class Checked(msgspec.Struct, frozen=True):
@@ -179,14 +180,15 @@ def bare_loop(definitions: tuple[Entry, ...]) -> Iterator[Callable[[str], Stretc
             env=os.environ | variables | {"TMPDIR": str(scratch)},
         ) as process,
     ):
-        assert process.stdin is not None
-        assert process.stdout is not None
-        process.stdin.write(msgspec.json.encode(definitions) + b"\n")
+        asked, answered = process.stdin, process.stdout
+        assert asked is not None
+        assert answered is not None
+        asked.write(msgspec.json.encode(definitions) + b"\n")
 
         def play(env_id: str) -> Stretch:
-            process.stdin.write(f"{env_id}\n".encode())
-            process.stdin.flush()
-            line = process.stdout.readline()
+            asked.write(f"{env_id}\n".encode())
+            asked.flush()
+            line = answered.readline()
             return msgspec.json.decode(line, type=Stretch) if line else Stretch(fault="its process ended")
 
         try:
