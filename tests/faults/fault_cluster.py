@@ -37,7 +37,7 @@ HIDDEN = 4
 TOTAL = SUBMITS * EPISODES + SUBMITS * HIDDEN + 2 * HIDDEN
 """Episodes of a whole run: train, validation of each checkpoint, held-out and the random reference."""
 TIMEOUT_S = 100.0
-DISK_BYTES = 48 << 20
+DISK_BYTES = 512 << 20
 """Of each file system: the coordinator's state is on one, the run directories on another."""
 KINDS = {
     "slot": ("python", "evopolicy_worker.episodes.env_process"),
