@@ -23,6 +23,7 @@ from pathlib import Path
 import msgspec
 
 from evopolicy_common.catalogue import earlier_folder_name, folder_name
+from evopolicy_common.catalogue.worlds import KEY, OPTION, unchanged
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.environment import Case, Split
 from evopolicy_common.records.blobs import fsync_directory
@@ -85,6 +86,17 @@ def derive(
             taken.add(seed)
             drawn[split].append(Case(seed=seed))
     return {split: tuple(drawn[split][: counts.get(split, 0)]) for split in SPLITS}
+
+
+def in_world(secret: bytes, env: str, cases: dict[Split, tuple[Case, ...]]) -> dict[Split, tuple[Case, ...]]:
+    """The cases with the key of their world, HMAC-SHA256(secret, world | environment) cut to 128 bits; of an environment
+    that is no world, as they are."""
+    if unchanged(env) == env:
+        return cases
+    options = {OPTION: hmac.digest(secret, f"world|{env}".encode(), "sha256").hex()[:32]}
+    return {
+        split: tuple(Case(seed=each.seed, options=options) for each in some) for split, some in cases.items()
+    }
 
 
 def _draw(secret: bytes, suite: str, env: str, split: Split, index: int, taken: set[int]) -> int:
@@ -250,6 +262,7 @@ class SplitSource:
                 key = hmac.digest(self._secret, f"hidden cases of run {own}".encode(), "sha256")
                 shared = {case.seed for members in cases.values() for case in members}
                 cases = {**derive(key, suite, env, counts, shared), "train": cases["train"]}
+            cases = in_world(self._secret, env, cases)
             return _splits(env, cases, secret=True, epoch=epoch_of(self._secret))
         if own:
             raise ConfigError(
@@ -262,6 +275,12 @@ class SplitSource:
             more = f" (and {len(findings) - 1} more)" if len(findings) > 1 else ""
             raise ConfigError(
                 f"splits of {env} in {folder} cannot be used: {findings[0]}{more}; see `evopolicy data check`"
+            )
+        known = {(case.options or {}).get(OPTION) for split in SPLITS for case in splits.cases(split)}
+        if unchanged(env) != env and (len(known) > 1 or not KEY.fullmatch(str(*known))):
+            raise ConfigError(
+                f"splits of {env} in {folder} cannot be used: all cases of a world have the same key; give each the options"
+                f' {{"{OPTION}": "32 hexadecimal digits"}}, as `evopolicy data create` does'
             )
         if splits.env != env:
             raise ConfigError(f"{folder} holds the splits of {splits.env!r}, not of {env!r}")
@@ -281,6 +300,7 @@ class SplitSource:
             )
         key = hmac.digest(self._secret, f"further hidden cases {name}".encode(), "sha256")
         cases = derive(key, suite, env, {"heldout": n}, (case.seed for case in taken))
+        cases = in_world(self._secret, env, cases)
         return FurtherSplit(cases=cases["heldout"], epoch=epoch_of(self._secret))
 
 

@@ -25,7 +25,7 @@ pytestmark = pytest.mark.families
 
 TABLE = proofs.table()
 each_family = pytest.mark.parametrize("proof", proofs.together(), ids=lambda proof: proof.family)
-ROLES = {"core16", "toy", "breadth", "paper13"}
+ROLES = {"core16", "core16-worlds", "toy", "breadth", "paper13"}
 """Suites that are no family."""
 
 

@@ -23,6 +23,7 @@ from typing import Any
 
 import msgspec
 
+from evopolicy_common.catalogue import worlds
 from evopolicy_common.catalogue.definition import (
     USUAL_STEPS,
     Entry,
@@ -139,6 +140,21 @@ def _load() -> _Loaded:
         grouped[name] = msgspec.structs.replace(
             suite, environments=tuple(itertools.chain.from_iterable(parts))
         )
+    core16 = grouped["core16"]
+    with_worlds: dict[str, Entry] = {}
+    for env_id, row in found.items():
+        with_worlds[env_id] = row
+        for n, world in enumerate(worlds.ids(env_id) if env_id in core16.environments else (), 1):
+            with_worlds[world] = msgspec.structs.replace(
+                row, id=world, title=f"{row.label}, world {n}", published_steps=None, demand=None, world=n
+            )
+    found = with_worlds
+    grouped["core16-worlds"] = msgspec.structs.replace(
+        core16,
+        name="core16-worlds",
+        title="Core16 and its worlds",
+        environments=tuple(each for env_id in core16.environments for each in (env_id, *worlds.ids(env_id))),
+    )
     prefixes = frozenset(env_id.partition("/")[0] for env_id in found)
     return _Loaded(found, grouped, titles, prefixes)
 
@@ -274,11 +290,13 @@ def resolve(patterns: Iterable[str]) -> list[str]:
 
     A pattern is a suite name (`core16`), a suite id (`gym/acrobot`), a glob over suite ids (`gymnasium/MiniGrid-*`), an
     environment file (`lander.toml`), or the id of an environment that does not ship: `module:Id`, or one with a prefix
-    of its own. Raises ConfigError for one that matches nothing.
+    of its own. A glob names worlds only if it has an `@` (`gym/*@w1`). Raises ConfigError for one that matches nothing.
     """
     wanted: dict[str, None] = {}
     for given in patterns:
         pattern, at, digest = given.partition("@")
+        if given in _load().entries or worlds.unchanged(given) != given:
+            pattern, at = given, ""
         if at:
             if not re.fullmatch("[0-9a-f]{8,64}", digest) or not (is_shipped(pattern) or is_foreign(pattern)):
                 raise ConfigError(
@@ -289,7 +307,11 @@ def resolve(patterns: Iterable[str]) -> list[str]:
             wanted.update(dict.fromkeys(suites()[pattern].environments))
         elif pattern.endswith(".toml"):
             wanted.update(dict.fromkeys(add(Path(pattern))))
-        elif hits := [env_id for env_id in _load().entries if fnmatch.fnmatchcase(env_id, pattern)]:
+        elif hits := [
+            env_id
+            for env_id, row in _load().entries.items()
+            if fnmatch.fnmatchcase(env_id, pattern) and ("@" in pattern or not row.world)
+        ]:
             wanted.update(dict.fromkeys(hits))
         elif pattern in _added or is_foreign(pattern):
             wanted[pattern] = None

@@ -30,7 +30,7 @@ MAX_STEPS = 1 << 22
 MAX_TASK_CHARACTERS = 64 << 10
 MAX_FILE_BYTES = 1 << 20
 MAX_DATA = 32
-_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*([/:][A-Za-z0-9][A-Za-z0-9_.-]*){0,3}")
+_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*([/:][A-Za-z0-9][A-Za-z0-9_.-]*){0,3}(@w[1-9][0-9]?)?")
 _MAX_ID = 120
 _MAX_REWARD_TEXT = 1000
 
@@ -89,6 +89,8 @@ class Entry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     data: tuple[str, ...] = ()
     """Files and folders that the environment reads besides its modules, relative to its file's folder; read from a file,
     absolute."""
+    world: int = 0
+    """Which world of an environment it is (see `worlds`); 0: the environment itself."""
     info_strings: tuple[str, ...] = ()
     """Keys of info whose texts feedback has; an environment's other texts are left out."""
 
@@ -102,7 +104,7 @@ class Entry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         return episodes * (self.max_episode_steps or USUAL_STEPS) * self.step_bytes
 
 
-_SHIPPED_ONLY = ("published_steps", "step_bytes", "observation", "action", "demand", "adapter")
+_SHIPPED_ONLY = ("published_steps", "step_bytes", "observation", "action", "demand", "adapter", "world")
 """Fields that environment files may not set."""
 
 

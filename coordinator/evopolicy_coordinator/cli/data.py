@@ -90,7 +90,8 @@ def _plan(
             "validation": valid or suite.n_validation,
             "heldout": heldout or suite.n_heldout,
         }
-        for split, cases in splits.derive(secret, suite.name, env, counts).items():
+        cases_of = splits.in_world(secret, env, splits.derive(secret, suite.name, env, counts))
+        for split, cases in cases_of.items():
             stem = split_files.FILE_STEMS[split]
             content = split_files.SplitFile(env=env, split=stem, cases=cases, secret=seed is None)
             planned[split_files.folder_of(root, env) / f"{stem}.json"] = (

@@ -188,3 +188,36 @@ def test_secret_that_others_may_read_or_that_is_cut_short_is_refused(tmp_path: P
     (tmp_path / "secret").write_bytes(b"short")
     with pytest.raises(ConfigError, match="5 bytes"):
         secret_of(tmp_path)
+
+
+WORLD, OTHER = "gym/acrobot@w1", "gym/acrobot@w2"
+
+
+def world_of(found: splits.EnvironmentSplits) -> set[str]:
+    """The keys in all cases."""
+    return {case.options["world"] for split in SPLITS for case in found.cases(split) if case.options}
+
+
+def test_all_cases_of_a_world_have_one_key_for_each_secret() -> None:
+    source = SplitSource(data=None, secret=b"s" * 32)
+    (key,) = world_of(source.splits("core16-worlds", WORLD, COUNTS))
+    assert re.fullmatch("[0-9a-f]{32}", key)
+    assert world_of(source.splits("core16-worlds", WORLD, COUNTS, own="run-7")) == {key}
+    further = source.further("core16-worlds", WORLD, "more", 3, ())
+    assert {case.options["world"] for case in further.cases if case.options} == {key}
+    assert world_of(source.splits("core16-worlds", OTHER, COUNTS)) != {key}
+    assert world_of(SplitSource(data=None, secret=b"t" * 32).splits("core16-worlds", WORLD, COUNTS)) != {key}
+    assert world_of(source.splits("core16", "gym/acrobot", COUNTS)) == set()
+
+
+@pytest.mark.parametrize("second", [None, {"world": "b" * 32}, {"world": "short"}])
+def test_files_of_a_world_need_one_key_for_all_cases(tmp_path: Path, second: Any) -> None:
+    folder = tmp_path / "gym_acrobot@w1"
+    for stem, seed in (("train", 1), ("valid", 2), ("heldout", 3)):
+        cases = [{"seed": seed, "options": {"world": "a" * 32}}]
+        write(folder, stem, [], env=WORLD, cases=cases)
+    source = SplitSource(data=tmp_path, secret=b"s" * 32)
+    assert world_of(source.splits("core16-worlds", WORLD, {})) == {"a" * 32}
+    write(folder, "valid", [], env=WORLD, cases=[{"seed": 2, "options": second}])
+    with pytest.raises(ConfigError, match="all cases of a world have the same key"):
+        source.splits("core16-worlds", WORLD, {})

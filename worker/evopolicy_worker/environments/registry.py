@@ -16,6 +16,7 @@ import numpy as np
 
 from evopolicy_common import catalogue
 from evopolicy_common.catalogue import Entry, installs
+from evopolicy_common.catalogue.worlds import unchanged
 from evopolicy_common.errors import ConfigError, WorkerError
 from evopolicy_common.messages.environment import Case, EnvironmentDescription
 from evopolicy_worker.environments.families import foreign
@@ -28,6 +29,7 @@ from evopolicy_worker.environments.interface.gymnasium_adapter import (
     GymnasiumFamily,
     quiet,
 )
+from evopolicy_worker.environments.interface.worlds import World
 
 _TIMED_STEPS, _TIMED_S = 16, 0.25
 """How long a description measures what a step costs."""
@@ -59,6 +61,9 @@ def make(env_id: str, *, render: bool = False, accelerations: bool | None = None
     on. Raises ConfigError for an unknown id, and WorkerError when packages are missing.
     """
     found = _entry(env_id)
+    if found.world:
+        base = make(unchanged(env_id), render=render, accelerations=accelerations)
+        return World(env_id, found.title, base)
     if found.adapter == "toy":
         from evopolicy_worker.environments.families import toy
 

@@ -1,0 +1,26 @@
+"""Worlds: ids such as `gym/acrobot@w1` of an environment under altered rules that its agent has to find out by playing.
+
+The rules follow from a key, which is in the options of each of its cases, and as secret as their seeds.
+"""
+
+from __future__ import annotations
+
+import re
+
+N_WORLDS = 3
+"""Worlds of each environment that has some."""
+OPTION = "world"
+"""The key's name in a case's options."""
+KEY = re.compile("[0-9a-f]{32}")
+_ID = re.compile(r"(.+)@w([1-9][0-9]*)")
+
+
+def unchanged(env_id: str) -> str:
+    """The environment that a world alters; any other id is returned as it is."""
+    found = _ID.fullmatch(env_id)
+    return found[1] if found else env_id
+
+
+def ids(env_id: str) -> tuple[str, ...]:
+    """The worlds of an environment."""
+    return tuple(f"{env_id}@w{n}" for n in range(1, N_WORLDS + 1))
