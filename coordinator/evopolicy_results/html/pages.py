@@ -14,7 +14,7 @@ from markupsafe import Markup, escape
 from evopolicy_results.behaviour.trace import Trace, TraceRow, diff, sources
 from evopolicy_results.figures.plot import Plot, inline_svg
 from evopolicy_results.figures.timelines import Row, timeline_svg
-from evopolicy_results.html import visible
+from evopolicy_results.html import notice, section, visible
 from evopolicy_results.reading.environments import title_of
 from evopolicy_results.reading.records import Run, Submit
 from evopolicy_results.scan.signals import TITLES, Signal
@@ -47,7 +47,7 @@ class PlayedEpisode(msgspec.Struct, frozen=True, kw_only=True):
     strip: str | None
 
 
-_TEMPLATES = ("base", "macros", "index", "trace", "failed", "replays", "site", "site_bundle", "site_episodes")
+_TEMPLATES = ("base", "macros", "index", "trace", "failed", "replays", "site_bundle", "site_episodes")
 
 
 @cache
@@ -68,6 +68,11 @@ def environment() -> Environment:
     for name in ("report.css", "report.js"):
         made.globals[name.split(".")[1]] = Markup(folder.joinpath(name).read_text(encoding="utf-8"))
     return made
+
+
+def page(template: str, **values: Any) -> str:
+    """A page from the template of that name."""
+    return environment().get_template(f"{template}.html.j2").render(**values)
 
 
 def index_page(
@@ -97,14 +102,14 @@ def index_page(
     returns += [{**v, "folded": n_envs >= _RANKS_FROM} for s in suites for v in shown_tables(f"cells_{s}")]
     timelines = [figure for figure in figures if figure.group == "timelines"]
     sections: list[dict[str, Any]] = [
-        _section(
+        section(
             "leaderboard",
             "Leaderboard",
             figures=shown_figures(*(f"rank_scores_{s}" for s in ranked)),
             tables=[v for s in ranked for v in shown_tables(f"leaderboard_{s}", f"incomplete_{s}")]
             + (returns if n_envs >= _RANKS_FROM else []),
         ),
-        _section(
+        section(
             "statistics",
             "Statistics",
             title="How sure the scores are",
@@ -115,13 +120,13 @@ def index_page(
             + [v for s in ranked for v in shown_tables(f"aggregates_{s}", f"improvement_{s}")]
             + [{**v, "folded": True} for s in suites for v in shown_tables(f"pairs_{s}", f"generalisation_{s}")],
         ),
-        _section(
+        section(
             "evolution",
             "Score evolution",
             figures=shown_figures(*(f"score_evolution_{s}" for s in suites)),
             tables=shown_tables("evolution"),
         ),
-        _section(
+        section(
             "demand",
             "Task demand",
             title="Performance by task demand",
@@ -130,21 +135,21 @@ def index_page(
             figures=shown_figures(*(f"normalised_{s}" for s in suites)),
             tables=shown_tables(*(f"normalised_{s}" for s in ranked)),
         ),
-        _section(
+        section(
             "edits", "Edits", title="What edits do",
             figures=shown_figures("edit_hits", "edit_size"), tables=shown_tables("edit_types", "edit_sizes"),
         ),
-        _section(
+        section(
             "timelines", "Timelines", title="Code-phase timelines", figures=timelines,
             picker=[(figure.data[0]["env"], title_of(figure.data[0]["env"])) for figure in timelines],
         ),
-        _section("structure", "Structure", title="Realised structure", figures=shown_figures("structure"),
+        section("structure", "Structure", title="Realised structure", figures=shown_figures("structure"),
                  tables=shown_tables("structure")),
-        _section(
+        section(
             "cost", "Cost and audit", figures=shown_figures("tokens", "wall_time"),
             tables=shown_tables("tokens", "audit", "signals", "simulator_flags"),
         ),
-        _section(
+        section(
             "feedback", "Feedback use",
             texts=["Each run has a page: what its agent read and said before every submit, what it changed, and what came of it, with "
                    "all checkpoints and their differences."],
@@ -153,14 +158,14 @@ def index_page(
             if trace_links
             else [],
         ),
-        _section(
+        section(
             "replays", "Replays",
             texts=["Videos of the selected checkpoints' episodes, agents side by side."] if replay_links else
             ["None of these runs has recorded episodes of its selected checkpoint."],
             links=[(title_of(env), href) for env, href in replay_links.items()],
         ),
-        _section("setup", "Setup", tables=shown_tables("agents", "environments", "not_told")),
-        _section(
+        section("setup", "Setup", tables=shown_tables("agents", "environments", "not_told")),
+        section(
             "left-out", "Left out",
             tables=shown_tables("left_out") if study.left_out else [],
             texts=[] if study.left_out else ["Nothing: every run folder that was found is in this report."],
@@ -168,11 +173,12 @@ def index_page(
     ]  # fmt: skip
     if n_envs < _RANKS_FROM:
         evolution = sections.pop(2)
-        sections[:0] = [_section("returns", "Returns", title="Held-out returns", tables=returns), evolution]
+        sections[:0] = [section("returns", "Returns", title="Held-out returns", tables=returns), evolution]
     kept = [
         s for s in sections if s["figures"] or s["tables"] or s["links"] or s["id"] in ("replays", "left-out")
     ]
-    return environment().get_template("index.html.j2").render(
+    return page(
+        "index",
         title=title,
         lead="Agents evolve an executable policy under a budget of train episodes; the checkpoint that hidden validation selects is "
         "scored on hidden held-out cases.",
@@ -188,12 +194,8 @@ def index_page(
         sections=kept,
         footer="Scores rank held-out means within each environment; everything below the leaderboard is a diagnostic and no part of "
         "the score. Made by evopolicy report.",
+        data="report.json",
     )  # fmt: skip
-
-
-def _section(ident: str, nav: str, *, title: str = "", **parts: Any) -> dict[str, Any]:
-    empty: dict[str, Any] = {"figures": [], "tables": [], "texts": [], "links": [], "picker": []}
-    return {**empty, "id": ident, "nav": nav, "title": title or nav, **parts}
 
 
 _ISOLATION_NOTICES = {
@@ -204,52 +206,39 @@ _ISOLATION_NOTICES = {
 
 
 def _notices(study: Study) -> list[dict[str, Any]]:
-    out: list[dict[str, Any]] = []
-    if study.post_hoc:
-        out.append({"title": study.post_hoc, "lines": []})
+    n, audit = len(study.runs), study.audit
+    found = [notice(study.post_hoc)] if study.post_hoc else []
     if study.mixtures:
-        out.append(
-            {
-                "title": "These runs are no fair comparison: they were mixed on purpose, and differ in",
-                "lines": [str(mixture) for mixture in study.mixtures],
-            }
-        )
-    public = sum(not signals.secret_splits for signals in study.audit)
-    if public:
-        out.append(
-            {
-                "title": f"{public} of {len(study.audit)} runs played public splits, of case files or a public seed: agents and "
-                "models may know the hidden cases.",
-                "lines": [],
-            }
-        )
-    if flagged := sum(bool(run.simulator_flags) for run in study.runs):
-        title = (
-            f"{flagged} of {len(study.runs)} runs have code that looks like a simulator, which their rules forbid: "
-            "a signal to read, never a verdict."
-        )
-        out.append({"title": title, "lines": []})
-    if noted := sum(bool(run.signals) for run in study.runs):
-        title = f"{noted} of {len(study.runs)} runs have signals in their log or code that deserve a look; none is a verdict."
-        out.append({"title": title, "lines": []})
-    if allowed := sum(run.simulation_allowed for run in study.runs):
-        title = f"{allowed} of {len(study.runs)} runs let their agent simulate, or are from before there was a rule against it."
-        out.append({"title": title, "lines": []})
-    unjailed = sum(signals.jail == "none" for signals in study.audit)
-    if unjailed:
-        out.append(
-            {"title": f"{unjailed} of {len(study.audit)} runs had no jail around their agent.", "lines": []}
-        )
-    for isolation, text in _ISOLATION_NOTICES.items():
-        if found := sum(signals.hidden_isolation == isolation for signals in study.audit):
-            out.append({"title": f"{found} of {len(study.audit)} runs {text}", "lines": []})
-    if own := sum(signals.hidden_cases == "per_run" for signals in study.audit):
-        title = (
-            f"{own} of {len(study.audit)} runs had hidden cases of their own: no two scores are on the same cases, "
-            "so differences between runs cannot be paired by case."
-        )
-        out.append({"title": title, "lines": []})
-    return out
+        title = "These runs are no fair comparison: they were mixed on purpose, and differ in"
+        found.append(notice(title, map(str, study.mixtures)))
+    counts = (
+        (
+            sum(not one.secret_splits for one in audit),
+            "played public splits, of case files or a public seed: agents and models may know the hidden cases.",
+        ),
+        (
+            sum(bool(run.simulator_flags) for run in study.runs),
+            "have code that looks like a simulator, which their rules forbid: a signal to read, never a verdict.",
+        ),
+        (
+            sum(bool(run.signals) for run in study.runs),
+            "have signals in their log or code that deserve a look; none is a verdict.",
+        ),
+        (
+            sum(run.simulation_allowed for run in study.runs),
+            "let their agent simulate, or are from before there was a rule against it.",
+        ),
+        (sum(one.jail == "none" for one in audit), "had no jail around their agent."),
+        *(
+            (sum(one.hidden_isolation == isolation for one in audit), text)
+            for isolation, text in _ISOLATION_NOTICES.items()
+        ),
+        (
+            sum(one.hidden_cases == "per_run" for one in audit),
+            "had hidden cases of their own: no two scores are on the same cases, so differences between runs cannot be paired by case.",
+        ),
+    )
+    return found + [notice(f"{count} of {n} runs {text}") for count, text in counts if count]
 
 
 def table_view(table: Table) -> dict[str, Any]:
@@ -330,7 +319,8 @@ def trace_page(
     label = f"Code phases of {len(run.submits)} submits over {run.budget} episodes"
     svg = inline_svg(timeline_svg([phases]), "phases", label) if transitions else ""
     closed = outcome.closed_reason.replace("_", " ")
-    return environment().get_template("trace.html.j2").render(
+    return page(
+        "trace",
         title=f"{run.entry} on {title_of(run.env)}, {run.record.exp_id}",
         entry=run.entry,
         env_title=title_of(run.env),
@@ -363,11 +353,7 @@ def _evidence(each: Signal) -> dict[str, Any]:
 
 def failed_page(run: Run, reason: str) -> str:
     """Replaces a run's page that could not be made."""
-    return (
-        environment()
-        .get_template("failed.html.j2")
-        .render(title=f"{run.entry} on {title_of(run.env)}, {run.record.exp_id}", reason=reason)
-    )
+    return page("failed", title=f"{run.entry} on {title_of(run.env)}, {run.record.exp_id}", reason=reason)
 
 
 def _trace_row(
@@ -494,7 +480,8 @@ def replays_page(env: str, episodes: Sequence[PlayedEpisode], looks: Mapping[str
                 "text": ", ".join(facts),
             }
         )
-    return environment().get_template("replays.html.j2").render(
+    return page(
+        "replays",
         title=f"Replays: {title_of(env)}",
         env_title=title_of(env),
         looks=looks,

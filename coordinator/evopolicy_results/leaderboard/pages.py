@@ -1,17 +1,13 @@
-"""The pages of a leaderboard site as text. Markup is in `html/templates/`; `write` writes the files."""
+"""Tables and curves of a leaderboard site. Markup is in `html/templates/`; `write` writes the files."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import msgspec
 from markupsafe import Markup
 
-from evopolicy_results.html.pages import environment
-from evopolicy_results.studies.palette import Look
-
-MADE_BY = "Made by evopolicy leaderboard"
 _WIDTH, _HEIGHT = 240.0, 72.0
 _LONG = 60
 
@@ -59,64 +55,6 @@ def _cell(cell: Cell) -> dict[str, Any]:
         "href": cell.href if isinstance(cell, Link) else None,
         "entry": text if isinstance(cell, str) else None,
     }
-
-
-def section(ident: str, nav: str, *, title: str = "", **parts: Any) -> dict[str, Any]:
-    """A section of the front page."""
-    empty: dict[str, Any] = {
-        "tables": [],
-        "texts": [],
-        "links": [],
-        "reasons": [],
-        "reasons_title": "",
-        "code": "",
-    }
-    return {**empty, "id": ident, "nav": nav, "title": title or nav, **parts}
-
-
-def front_page(
-    *,
-    title: str,
-    lead: str,
-    facts: Sequence[tuple[str, object]],
-    notices: Sequence[dict[str, Any]],
-    sections: Sequence[dict[str, Any]],
-    looks: Mapping[str, Look],
-) -> str:
-    """`index.html`."""
-    return (
-        environment()
-        .get_template("site.html.j2")
-        .render(
-            title=title,
-            lead=lead,
-            facts=facts,
-            notices=notices,
-            sections=sections,
-            looks=looks,
-            footer=f"{MADE_BY} from published results, each checked before it is shown.",
-        )
-    )
-
-
-def bundle_page(
-    *, title: str, lead: str, facts: Sequence[tuple[str, object]], tables: Sequence[dict[str, Any]]
-) -> str:
-    """Findings of the check of one file."""
-    return (
-        environment()
-        .get_template("site_bundle.html.j2")
-        .render(title=title, lead=lead, facts=facts, tables=tables)
-    )
-
-
-def episodes_page(*, title: str, lead: str, command: str, page: str, cards: Sequence[dict[str, Any]]) -> str:
-    """The recorded held-out episodes of one run."""
-    return (
-        environment()
-        .get_template("site_episodes.html.j2")
-        .render(title=title, lead=lead, command=command, page=page, cards=cards)
-    )
 
 
 def curve_svg(sums: Sequence[float], label: str) -> Markup:

@@ -17,20 +17,11 @@ from pathlib import Path
 from typing import Any
 
 from evopolicy_common.errors import ConfigError
-from evopolicy_results.html.pages import table_view
+from evopolicy_results.html import notice, section
+from evopolicy_results.html.pages import page, table_view
 from evopolicy_results.leaderboard.bundles import LabBundle, LabRun
 from evopolicy_results.leaderboard.compare import Board, boards
-from evopolicy_results.leaderboard.pages import (
-    MADE_BY,
-    Cell,
-    Link,
-    bundle_page,
-    curve_svg,
-    episodes_page,
-    front_page,
-    plain_view,
-    section,
-)
+from evopolicy_results.leaderboard.pages import Cell, Link, curve_svg, plain_view
 from evopolicy_results.publish.findings import KINDS
 from evopolicy_results.reading.environments import title_of
 from evopolicy_results.report import slug, write_report
@@ -38,6 +29,7 @@ from evopolicy_results.studies.palette import looks
 from evopolicy_results.studies.study import Study, study_of
 from evopolicy_results.tables.report_tables import tables_of
 
+_MADE_BY = "Made by evopolicy leaderboard"
 _SHOWN = ("leaderboard", "incomplete", "heldout", "cells", "pairs", "resolution")
 """Tables on the front page, by the first part of their names."""
 _FOLDED = ("cells", "pairs")
@@ -83,9 +75,9 @@ def _write_pages(bundles: Sequence[LabBundle], out: Path, title: str, tell: Tell
         sections.append(_board(board, study, number, folder))
         for bundle in board.bundles:
             for each in bundle.runs:
-                page = f"episodes/{slug(each.run)}-{number}.html"
-                _write(out / page, _episodes(each, bundle, f"../{folder}/traces/{slug(each.run)}.html"))
-                run_rows.append(_run_row(each, bundle, folder, page, bundle.page))
+                episodes = f"episodes/{slug(each.run)}-{number}.html"
+                _write(out / episodes, _episodes(each, bundle, f"../{folder}/traces/{slug(each.run)}.html"))
+                run_rows.append(_run_row(each, bundle, folder, episodes))
     sections.append(_files(bundles))
     if run_rows:
         columns = ("Entry", "Environment", "Repeat", "Held-out mean", "Run", "Episodes", "File", "Signed by")
@@ -104,7 +96,8 @@ def _write_pages(bundles: Sequence[LabBundle], out: Path, title: str, tell: Tell
         sections.append(section("refused", "Not shown", tables=[table]))
     sections.append(_checking(bundles))
     n_runs = sum(len(bundle.runs) for bundle in bundles)
-    page = front_page(
+    front = page(
+        "index",
         title=title,
         lead="Published results of several labs, each file checked before it is shown. Scores are held-out means of the checkpoints"
         " that hidden validation selected.",
@@ -118,8 +111,10 @@ def _write_pages(bundles: Sequence[LabBundle], out: Path, title: str, tell: Tell
         notices=_notices(bundles),
         sections=sections,
         looks=looks(sorted(entries), reference),
+        footer=f"{_MADE_BY} from published results, each checked before it is shown.",
+        data="",
     )
-    _write(out / "index.html", page)
+    _write(out / "index.html", front)
 
 
 def _check(out: Path) -> None:
@@ -129,7 +124,7 @@ def _check(out: Path) -> None:
     there = sorted(out.iterdir()) if out.exists() else []
     others = [each.name for each in there if each.name not in ours and not each.name.startswith("board-")]
     index = out / "index.html"
-    if there and not (index.is_file() and MADE_BY in index.read_text(encoding="utf-8", errors="replace")):
+    if there and not (index.is_file() and _MADE_BY in index.read_text(encoding="utf-8", errors="replace")):
         others.append("no index.html of a leaderboard")
     if others:
         raise ConfigError(
@@ -193,7 +188,7 @@ def _board(board: Board, study: Study, number: int, folder: str) -> dict[str, An
     )
 
 
-def _run_row(each: LabRun, bundle: LabBundle, folder: str, episodes: str, page: str) -> list[Cell]:
+def _run_row(each: LabRun, bundle: LabBundle, folder: str, episodes: str) -> list[Cell]:
     run = each.run
     return [
         run.entry,
@@ -202,7 +197,7 @@ def _run_row(each: LabRun, bundle: LabBundle, folder: str, episodes: str, page: 
         "–" if run.score is None else run.score,
         Link(run.record.exp_id, f"{folder}/traces/{slug(run)}.html"),
         Link(f"{len(each.episodes)} episodes", episodes) if each.episodes else "–",
-        Link(bundle.file, page),
+        Link(bundle.file, bundle.page),
         bundle.label,
     ]
 
@@ -277,7 +272,8 @@ def _bundle_page(bundle: LabBundle) -> str:
         rows = [[each.what, each.why] for each in checked.removed]
         text = "What the publisher's command removed, in its words."
         tables.append(plain_view("removed", "Removed before publication", text, ("What", "Why"), rows))
-    return bundle_page(
+    return page(
+        "site_bundle",
         title=bundle.file,
         lead=f"SHA-256 of the file: {bundle.sha256}. "
         + (f"Not shown: {bundle.refused}. " if bundle.refused else "")
@@ -293,7 +289,7 @@ def _bundle_page(bundle: LabBundle) -> str:
     )
 
 
-def _episodes(each: LabRun, bundle: LabBundle, page: str) -> str:
+def _episodes(each: LabRun, bundle: LabBundle, run_page: str) -> str:
     cards = []
     for one in each.episodes:
         text = f"return {one.episode_return:.4g}, {one.length} steps"
@@ -301,12 +297,13 @@ def _episodes(each: LabRun, bundle: LabBundle, page: str) -> str:
             text += f", the policy failed: {one.failure}"
         svg = curve_svg(one.sums, f"Sum of rewards in case {one.index}") if one.sums else ""
         cards.append({"index": one.index, "svg": svg, "text": text})
-    return episodes_page(
+    return page(
+        "site_episodes",
         title=f"{each.run.entry} on {title_of(each.run.env)}",
         lead="The sum of the recorded rewards over each episode. The command plays the recorded actions again in the installed"
         " environment and compares.",
         command=f"evopolicy check {shlex.quote(bundle.file)} --replay all",
-        page=page,
+        page=run_page,
         cards=cards,
     )
 
@@ -334,13 +331,13 @@ def _notices(bundles: Sequence[LabBundle]) -> list[dict[str, Any]]:
     unknown = [bundle.file for bundle in shown if not bundle.known]
     if unknown:
         title = f"{len(unknown)} of {len(shown)} files are self-signed: nobody named their signer's key to this site."
-        out.append({"title": title, "lines": unknown})
+        out.append(notice(title, unknown))
     not_replayed = [bundle.file for bundle in shown if bundle.state_of("replay") != "ok"]
     if not_replayed:
         title = f"{len(not_replayed)} of {len(shown)} files were not replayed for this site: their rewards rest on the publisher's word."
-        out.append({"title": title, "lines": not_replayed})
+        out.append(notice(title, not_replayed))
     processors = {each for bundle in shown for each in bundle.processors}
     if len(processors) > 1:
         title = "The runs were played on processors with different features, which can change numbers in their last digits."
-        out.append({"title": title, "lines": sorted(each[:200] for each in processors)})
+        out.append(notice(title, sorted(each[:200] for each in processors)))
     return out

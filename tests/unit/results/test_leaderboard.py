@@ -105,7 +105,7 @@ def test_an_earlier_site_stays_until_the_new_one_is_whole(
     first, second = (LabBundle(file=f"{n}.evp", sha256="", number=n, refused="torn") for n in (0, 1))
     index = write.write_site([first], out, title="First")
     with monkeypatch.context() as patched:
-        patched.setattr(write, "front_page", lambda **_: 1 / 0)
+        patched.setattr(write, "page", lambda *_, **__: 1 / 0)
         with pytest.raises(ZeroDivisionError):
             write.write_site([first, second], out, title="Second")
     assert "First" in index.read_text()
