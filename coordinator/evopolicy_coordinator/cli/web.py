@@ -10,7 +10,6 @@ import contextlib
 import ipaddress
 import ssl
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -127,17 +126,10 @@ def web(
         book = (action_log or credentials.state_home() / "web-actions.jsonl") if act else None
         if book is not None:
             check_writable(book.parent, "--action-log")
-        view = _Order(
-            roots=roots,
-            tokens=tokens,
-            names=tuple(names),
-            found=found,
-            named=bool(connect or file),
-            report=report,
-            book=book,
-        )
         with announcing(url_file) as announce:
-            asyncio.run(_serve(address, view, announce))
+            asyncio.run(
+                _serve(address, roots, tokens, names, found, bool(connect or file), report, book, announce)
+            )
 
 
 def _check_certificate(certificate: Path, key: Path) -> None:
@@ -152,40 +144,34 @@ def _check_certificate(certificate: Path, key: Path) -> None:
         ) from error
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Order:
-    """The command's options."""
-
-    roots: list[Path]
-    tokens: Tokens
-    names: tuple[str, ...]
-    found: Credentials | None
-    named: bool
-    """The cluster was named: without it nothing hidden is shown."""
-    report: Path | None
-    book: Path | None
-
-
-async def _serve(address: Address, order: _Order, announce: Callable[[bytes], None]) -> None:
+async def _serve(
+    address: Address,
+    roots: list[Path],
+    tokens: Tokens,
+    names: list[str],
+    found: Credentials | None,
+    named: bool,
+    report: Path | None,
+    book: Path | None,
+    announce: Callable[[bytes], None],
+) -> None:
+    """`named`: the cluster was named; without it nothing hidden is shown."""
     from evopolicy_coordinator.web.access import Access
     from evopolicy_coordinator.web.app import Site, listen, serve
 
     end_on_sigterm()
-    found = order.found
-    if found is not None and not order.named and not await _is_reachable(found):
+    if found is not None and not named and not await _is_reachable(found):
         say("this machine's coordinator does not answer: the folders alone are shown", err=True)
         found = None
     with listen(address) as sock:
         port = sock.getsockname()[1]
         site = Site(
-            order.roots,
-            Access(
-                order.tokens, acting=order.book is not None, names=order.names, cookie=f"evopolicy_{port}"
-            ),
+            roots,
+            Access(tokens, acting=book is not None, names=names, cookie=f"evopolicy_{port}"),
             credentials=found,
-            report=order.report,
-            action_log=order.book,
-            title=", ".join(root.name or str(root) for root in site_roots(order.roots)),
+            report=report,
+            action_log=book,
+            title=", ".join(root.name or str(root) for root in site_roots(roots)),
         )
         shown = "127.0.0.1" if address.host in ("0.0.0.0", "::") else address.host
         shown = f"[{shown}]" if ":" in shown else shown
@@ -193,10 +179,10 @@ async def _serve(address: Address, order: _Order, announce: Callable[[bytes], No
         base = f"{scheme}://{shown}:{port}/login#token="
 
         def ready() -> None:
-            announce((base + order.tokens.read).encode())
-            say(f"view: {base}{order.tokens.read}")
-            if order.book is not None:
-                say(f"view and act: {base}{order.tokens.act}")
+            announce((base + tokens.read).encode())
+            say(f"view: {base}{tokens.read}")
+            if book is not None:
+                say(f"view and act: {base}{tokens.act}")
             if scheme == "http" and not _is_loopback(address.host):
                 say(
                     "note: without --tls-certificate the token and the pages cross the network unencrypted",

@@ -17,10 +17,11 @@ import msgspec
 
 from evopolicy_common.errors import ConfigError, EvopolicyError
 from evopolicy_common.logs import structlog
+from evopolicy_common.records.json_lines import objects
 from evopolicy_common.records.suite_folder import PAUSED
 from evopolicy_common.records.summary import utc_text
 from evopolicy_common.wire.operator_client import OperatorClient
-from evopolicy_coordinator.web.content.run_folders import Sweep, key_of
+from evopolicy_coordinator.web.content.run_folders import Sweep
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
@@ -100,13 +101,7 @@ class Log:
                 lines = file.read().splitlines()
         except OSError:
             return []
-        found = []
-        for line in lines:
-            try:
-                found.append(msgspec.json.decode(line, type=dict[str, Any]))
-            except msgspec.MsgspecError:
-                continue
-        return found[::-1]
+        return list(objects(lines))[::-1]
 
 
 async def carry_out(
@@ -146,11 +141,6 @@ async def logged(
         await asyncio.to_thread(lambda: book.write(**what, outcome=refused))
         raise
     await asyncio.to_thread(lambda: book.write(**what, outcome="done"))
-
-
-def sweep_key(sweep: Sweep) -> str:
-    """The name of a sweep in URLs and ids."""
-    return "x" + key_of("\n".join(("sweep", str(sweep.root))))
 
 
 def _set_paused(root: Path, paused: bool) -> None:

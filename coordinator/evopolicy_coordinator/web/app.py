@@ -39,7 +39,7 @@ from evopolicy_coordinator.web.content.confined import Confined, NotThereError
 from evopolicy_coordinator.web.content.feeds import Feeds, View
 from evopolicy_coordinator.web.content.run_detail import IMAGES, Detail
 from evopolicy_coordinator.web.content.run_folders import Reader, RunFacts, Runs
-from evopolicy_coordinator.web.content.tables import Words
+from evopolicy_coordinator.web.content.tables import Words, ident
 from evopolicy_coordinator.web.views.cluster import cluster_view
 from evopolicy_coordinator.web.views.run import episode_values, run_view, submit_values
 from evopolicy_coordinator.web.views.sweeps import sweeps_view
@@ -363,7 +363,7 @@ class Site:
         if act is None:
             return self._message(request, "Not found", "There is no such action.", 404)
         back = {"worker": "/cluster", "run": "/", "sweep": "/"}[kind]
-        sweep = next((each for each in self.runs.sweeps if acting.sweep_key(each) == name), None)
+        sweep = next((each for each in self.runs.sweeps if ident("sweep", str(each.root)) == name), None)
         label = sweep.name if kind == "sweep" and sweep is not None else name
         if request.method == "GET":
             fingerprint_class = request.query_params.get("class", "")[:200]

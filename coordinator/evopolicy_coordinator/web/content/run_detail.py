@@ -6,9 +6,10 @@ an open run is in its gateway's folder, found by the gateway's journal; that of 
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections import OrderedDict
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from string import Formatter
 from typing import Any
@@ -135,19 +136,22 @@ class Detail:
         return None
 
     def _checkpoint(self, index: int) -> tuple[CodeFile, ...]:
+        folder = self._numbered("checkpoints/submit_", index)
+        if folder is None:
+            return ()
+        return _ordered(
+            CodeFile(path=path, size=size, text=self._text(f"{folder}/{path}"))
+            for path, size in self._below(folder)
+            if path not in METADATA
+        )
+
+    def _numbered(self, prefix: str, number: int) -> str | None:
+        """The folder with that prefix and number, which has 3 digits or more; None where there is none."""
         for width in range(3, 8):
-            folder = f"checkpoints/submit_{index:0{width}d}"
-            try:
-                self.files.names(folder)
-            except NotThereError:
-                continue
-            found = [
-                CodeFile(path=path, size=size, text=self._text(f"{folder}/{path}"))
-                for path, size in self._below(folder)
-                if path not in METADATA
-            ]
-            return tuple(_ordered(found))
-        return ()
+            with contextlib.suppress(NotThereError):
+                self.files.names(name := f"{prefix}{number:0{width}d}")
+                return name
+        return None
 
     def _below(self, folder: str) -> Iterator[tuple[str, int]]:
         waiting, n = [""], 0
@@ -171,14 +175,7 @@ class Detail:
 
     def folder_of(self, index: int) -> str | None:
         """The feedback folder of a submit."""
-        for width in range(3, 8):
-            name = f"workspace/feedback/submit_{index:0{width}d}"
-            try:
-                self.files.names(name)
-            except NotThereError:
-                continue
-            return name
-        return None
+        return self._numbered("workspace/feedback/submit_", index)
 
     def summary(self, index: int) -> Mapping[str, Any]:
         """A submit's summary, as its agent has it; empty where there is none."""
@@ -203,16 +200,10 @@ class Detail:
 
     def episode_files(self, index: int, episode: int) -> tuple[str, list[str]]:
         """The folder of an episode, and the names of its files. NotThereError for none."""
-        folder = self.folder_of(index)
-        if folder is None:
-            raise NotThereError(f"submit {index}")
-        for width in range(3, 8):
-            inner = f"{folder}/episodes/ep_{episode:0{width}d}"
-            try:
-                return inner, [name.name for name in self.files.names(inner) if not name.is_folder]
-            except NotThereError:
-                continue
-        raise NotThereError(f"episode {episode}")
+        inner = self._numbered(f"{self.folder_of(index)}/episodes/ep_", episode)
+        if inner is None:
+            raise NotThereError(f"submit {index}, episode {episode}")
+        return inner, [name.name for name in self.files.names(inner) if not name.is_folder]
 
     def text(self, path: str) -> str:
         """The beginning of a file as text; empty where there is none."""
@@ -322,11 +313,9 @@ def _unpacked(files: Confined, digest: str) -> tuple[CodeFile, ...] | None:
         bundle = bundles.load(packed, digest)
     except (NotThereError, BundleError, *DECODE_ERRORS):
         return None
-    found = tuple(
-        _ordered(
-            CodeFile(path=file.path, size=len(file.data), text=_as_text(file.data))
-            for file in bundle.files[:_MAX_FILES]
-        )
+    found = _ordered(
+        CodeFile(path=file.path, size=len(file.data), text=_as_text(file.data))
+        for file in bundle.files[:_MAX_FILES]
     )
     _unpacked_bundles[digest] = found
     if len(_unpacked_bundles) > 16:
@@ -334,8 +323,8 @@ def _unpacked(files: Confined, digest: str) -> tuple[CodeFile, ...] | None:
     return found
 
 
-def _ordered(files: Any) -> list[CodeFile]:
-    return sorted(files, key=lambda file: (file.path != "policy.py", file.path))
+def _ordered(files: Iterable[CodeFile]) -> tuple[CodeFile, ...]:
+    return tuple(sorted(files, key=lambda file: (file.path != "policy.py", file.path)))
 
 
 def _as_text(data: bytes) -> str | None:

@@ -53,7 +53,6 @@ class SubmitFacts(msgspec.Struct, frozen=True, kw_only=True):
     """Mean steps of an episode."""
     failed: int
     """Episodes in which the policy failed."""
-    started_at: str
     completed_at: str
     wall_s: float
     warning: str
@@ -68,7 +67,6 @@ class RunFacts(msgspec.Struct, frozen=True, kw_only=True):
     """None for a run without a folder on this host."""
     run: str = ""
     """The cluster's id."""
-    sweep: str = ""
     entry: str
     env: str
     exp_id: str = ""
@@ -79,7 +77,6 @@ class RunFacts(msgspec.Struct, frozen=True, kw_only=True):
     budget: int | None = None
     used: int = 0
     n_submits: int = 0
-    last_status: str = ""
     best: float | None = None
     """Highest mean train return of an ok submit."""
     tokens: int = 0
@@ -94,7 +91,6 @@ class RunFacts(msgspec.Struct, frozen=True, kw_only=True):
     agent_alive: bool = False
     started_at: float | None = None
     wall_s: float = 0.0
-    closed_reason: str = ""
     hidden_cases: str = "shared"
     score: float | None = None
     """Hidden; shown only where `Runs.may_show` permits it."""
@@ -265,23 +261,18 @@ class Reader:
             env=env,
             exp_id=exp_id,
             repeat=repeat,
-            attempt=1 if entry is None else entry.attempt,
             state=state,
             budget=budget,
             used=submits[-1].consumed if submits else 0,
             n_submits=len(submits),
-            last_status=submits[-1].status if submits else "",
             best=max(means, default=None),
-            tokens=0 if entry is None else _n_tokens(entry.tokens) + _n_tokens(entry.earlier),
-            cost=0.0 if entry is None else _cost(entry.tokens) + _cost(entry.earlier),
-            error="" if entry is None else entry.error or "",
-            host="" if entry is None else entry.host,
             waits_for="" if status is None else status.waits_for,
             running=0 if status is None else status.running,
             queued=0 if status is None else status.queued,
             agent_alive=alive,
             started_at=_began(folder),
             hidden_cases=hidden_cases,
+            **({} if entry is None else _of_entry(entry)),
         )
 
     def _forget(self, runs: Iterable[RunFacts]) -> None:
@@ -304,7 +295,6 @@ def _submit(summary: Summary) -> SubmitFacts:
         most=summary.max_return,
         length=summary.mean_episode_length,
         failed=len(summary.errors or ()),
-        started_at=summary.submit_started_at,
         completed_at=summary.submit_completed_at,
         wall_s=summary.wall_time_seconds,
         warning=summary.warning or "",
@@ -355,7 +345,6 @@ def _of_record(folder: Path, record: RunRecord) -> RunFacts:
         error=outcome.error or "",
         started_at=_unix(record.timing.start_time),
         wall_s=record.timing.wall_time_seconds,
-        closed_reason=outcome.closed_reason,
         retries=retries if isinstance(retries, int) else 0,
         hidden_cases=dimensions.hidden_cases,
         score=outcome.score,
@@ -366,35 +355,27 @@ def _of_record(folder: Path, record: RunRecord) -> RunFacts:
 
 def _without_folder(root: Path, entry: Entry, status: RunStatus | None) -> RunFacts:
     """A run of a sweep without a folder here: it has not started, or another host plays it."""
-    ended = entry.state not in ("pending", "running")
-    return RunFacts(
+    facts = RunFacts(
         key=key_of(f"{root}\n{entry.name}"),
         path=None,
-        run=entry.run if status is None else status.run,
+        run=entry.run,
         entry=entry.agent,
         env=entry.env,
         exp_id=entry.name,
         repeat=entry.repeat,
-        attempt=entry.attempt,
-        state=entry.state if status is None else status.phase,
-        budget=None if status is None else status.budget,
-        used=entry.budget_used if status is None else status.budget - status.remaining_budget,
-        n_submits=entry.n_submits if status is None else status.n_submits,
-        best=None if status is None else status.best_mean,
-        running=0 if status is None else status.running,
-        queued=0 if status is None else status.queued,
-        started_at=None if status is None else status.created_at or None,
-        tokens=_n_tokens(entry.tokens) + _n_tokens(entry.earlier),
-        cost=_cost(entry.tokens) + _cost(entry.earlier),
-        error=entry.error or "",
-        host=entry.host or ("" if status is None else status.agent_host),
-        waits_for="" if status is None else status.waits_for,
+        state=entry.state,
+        used=entry.budget_used,
+        n_submits=entry.n_submits,
         wall_s=entry.wall_s,
-        closed_reason=entry.closed_reason,
         score=entry.score,
         random=entry.random,
-        finished=ended,
+        finished=entry.state not in ("pending", "running"),
+        **_of_entry(entry),
     )
+    if status is None:
+        return facts
+    told = _of_status(status)
+    return msgspec.structs.replace(facts, **{**told, "host": entry.host or told["host"]})
 
 
 def _of_cluster(status: RunStatus) -> RunFacts:
@@ -402,23 +383,41 @@ def _of_cluster(status: RunStatus) -> RunFacts:
     return RunFacts(
         key=key_of(status.run),
         path=None,
-        run=status.run,
         entry=status.entry,
         env=status.env,
         exp_id=status.exp_id or status.run,
         repeat=status.repeat,
-        state=status.phase,
-        budget=status.budget,
-        used=status.budget - status.remaining_budget,
-        n_submits=status.n_submits,
-        best=status.best_mean,
-        waits_for=status.waits_for,
-        running=status.running,
-        queued=status.queued,
         agent_alive=_may_be_alive(status),
-        started_at=status.created_at or None,
-        host=status.agent_host,
+        **_of_status(status),
     )
+
+
+def _of_entry(entry: Entry) -> dict[str, Any]:
+    """The facts that only a sweep's index has."""
+    return {
+        "attempt": entry.attempt,
+        "tokens": _n_tokens(entry.tokens) + _n_tokens(entry.earlier),
+        "cost": _cost(entry.tokens) + _cost(entry.earlier),
+        "error": entry.error or "",
+        "host": entry.host,
+    }
+
+
+def _of_status(status: RunStatus) -> dict[str, Any]:
+    """The facts that the cluster has of a run without a folder here."""
+    return {
+        "run": status.run,
+        "state": status.phase,
+        "budget": status.budget,
+        "used": status.budget - status.remaining_budget,
+        "n_submits": status.n_submits,
+        "best": status.best_mean,
+        "waits_for": status.waits_for,
+        "running": status.running,
+        "queued": status.queued,
+        "started_at": status.created_at or None,
+        "host": status.agent_host,
+    }
 
 
 def _may_be_alive(status: RunStatus) -> bool:

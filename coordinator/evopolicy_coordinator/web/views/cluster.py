@@ -19,6 +19,7 @@ from evopolicy_coordinator.web.content.feeds import View
 from evopolicy_coordinator.web.content.rendering import duration, part, short
 from evopolicy_coordinator.web.content.run_folders import RunFacts, Runs
 from evopolicy_coordinator.web.content.tables import PAGE_ROWS, Words, ident, matches, paged
+from evopolicy_results.html import notice
 from evopolicy_results.reading.environments import title_of
 
 _NOTICE_LINES = 5
@@ -32,9 +33,7 @@ def cluster_view(cluster: Cluster, words: Words, runs: Runs, roots: Sequence[Pat
         why = cluster.trouble or "It has not answered yet."
         parts = {
             "facts": part("facts", facts=[]),
-            "notices": part(
-                "notices", notices=[{"title": "The coordinator does not answer.", "lines": [why]}]
-            ),
+            "notices": part("notices", notices=[notice("The coordinator does not answer.", [why])]),
             "history": part("figure", ident="history", svg="", empty="", title="History", caption=""),
             "queue": part("queue", rows=[], left_out=0),
             "disks": part("disks", disks=_disks(None, roots)),
@@ -96,72 +95,54 @@ def _cluster_facts(status: StatusReply) -> list[tuple[str, str]]:
 
 
 def _cluster_notices(cluster: Cluster, status: StatusReply) -> list[dict[str, Any]]:
+    workers = status.workers
+    told: tuple[tuple[str, Iterable[str]], ...] = (
+        ("The coordinator does not answer; this is the last that is known.", [cluster.trouble]),
+        ("The coordinator accepts no changes; this is the last state", [status.trouble]),
+        (
+            "Abandoned runs, without a gateway for an hour",
+            (f"{run.run}: evopolicy runs cancel {run.run} ends it" for run in status.runs if run.abandoned),
+        ),
+        ("Quarantined workers", (f"{name}: {why}" for name, why in status.quarantined.items())),
+        ("Disputes of audits", status.disputes),
+        (
+            "Turned away",
+            (
+                f"{one.worker} of {one.host}, {duration(one.ago_s)} ago: {one.why}"
+                for one in status.turned_away
+            ),
+        ),
+        ("Waits longer than it should", status.stalls),
+        (
+            "Workers that get no work of some runs",
+            (f"{one.worker}: {why} ({run})" for one in workers for run, why in one.refused.items()),
+        ),
+        (
+            "Workers without a sandbox tier",
+            (f"{one.worker}: {tier}: {why}" for one in workers for tier, why in one.missing_tiers.items()),
+        ),
+        (
+            "Environments that failed on a worker",
+            (
+                f"{one.worker}: {env}: {why}"
+                for one in workers
+                for env, why in one.failed_environments.items()
+            ),
+        ),
+        (
+            "Workers that play no hidden episodes now",
+            (f"{one.worker}: {one.hidden_bar}" for one in workers if one.hidden_bar),
+        ),
+    )
     notices: list[dict[str, Any]] = []
-
-    def tell(title: str, lines: Iterable[str]) -> None:
-        found = list(lines)
-        if found:
+    for title, lines in told:
+        if found := [line for line in lines if line]:
             more = [f"… and {len(found) - _NOTICE_LINES} more"] if len(found) > _NOTICE_LINES else []
-            notices.append({"title": title, "lines": found[:_NOTICE_LINES] + more})
-
-    if cluster.trouble:
-        notices.append(
-            {
-                "title": "The coordinator does not answer; this is the last that is known.",
-                "lines": [cluster.trouble],
-            }
-        )
-    tell(
-        "The coordinator accepts no changes; this is the last state",
-        [status.trouble] if status.trouble else [],
-    )
-    tell(
-        "Abandoned runs, without a gateway for an hour",
-        (f"{run.run}: evopolicy runs cancel {run.run} ends it" for run in status.runs if run.abandoned),
-    )
-    tell("Quarantined workers", (f"{name}: {why}" for name, why in status.quarantined.items()))
-    tell("Disputes of audits", status.disputes)
-    tell(
-        "Turned away",
-        (f"{one.worker} of {one.host}, {duration(one.ago_s)} ago: {one.why}" for one in status.turned_away),
-    )
-    tell("Waits longer than it should", status.stalls)
-    tell(
-        "Workers that get no work of some runs",
-        (
-            f"{worker.worker}: {why} ({run})"
-            for worker in status.workers
-            for run, why in worker.refused.items()
-        ),
-    )
-    tell(
-        "Workers without a sandbox tier",
-        (
-            f"{worker.worker}: {tier}: {why}"
-            for worker in status.workers
-            for tier, why in worker.missing_tiers.items()
-        ),
-    )
-    tell(
-        "Environments that failed on a worker",
-        (
-            f"{worker.worker}: {env}: {why}"
-            for worker in status.workers
-            for env, why in worker.failed_environments.items()
-        ),
-    )
-    tell(
-        "Workers that play no hidden episodes now",
-        (f"{worker.worker}: {worker.hidden_bar}" for worker in status.workers if worker.hidden_bar),
-    )
+            notices.append(notice(title, found[:_NOTICE_LINES] + more))
     if status.audit_share or status.audits:
         stand = ", ".join(f"{n} {state.replace('_', ' ')}" for state, n in sorted(status.audits.items()))
-        notices.append(
-            {
-                "title": f"Audits: {status.audit_share:g} of the episodes of new runs; now {stand or 'none'}.",
-                "lines": [],
-            }
-        )
+        text = f"Audits: {status.audit_share:g} of the episodes of new runs; now {stand or 'none'}."
+        notices.append(notice(text))
     return notices
 
 
@@ -200,14 +181,14 @@ def _history(cluster: Cluster) -> str:
         return ""
     now = time.time()
     hours = [(sample.at - now) / 3600 for sample in cluster.history]
-    rate = Line(
-        "episodes a second", [(x, one.episodes_per_s) for x, one in zip(hours, cluster.history, strict=True)]
-    )
-    running = Line(
-        "running", [(x, float(one.running)) for x, one in zip(hours, cluster.history, strict=True)]
-    )
-    queued = Line("queued", [(x, float(one.queued)) for x, one in zip(hours, cluster.history, strict=True)])
-    slots = Line("slots", [(x, float(one.slots)) for x, one in zip(hours, cluster.history, strict=True)])
+
+    def line(name: str, field: str) -> Line:
+        return Line(
+            name, [(x, float(getattr(one, field))) for x, one in zip(hours, cluster.history, strict=True)]
+        )
+
+    rate = line("episodes a second", "episodes_per_s")
+    jobs = [line(name, name) for name in ("running", "queued", "slots")]
     return chart("Episodes a second over the last day", "hours", [rate]) + chart(
-        "Jobs over the last day", "hours", [running, queued, slots]
+        "Jobs over the last day", "hours", jobs
     )

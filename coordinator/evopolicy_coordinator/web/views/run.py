@@ -23,6 +23,7 @@ from evopolicy_coordinator.web.content.run_detail import (
 from evopolicy_coordinator.web.content.run_folders import Reader, RunFacts, Runs, SubmitFacts
 from evopolicy_coordinator.web.content.tables import Words, ident
 from evopolicy_results.behaviour.trace import diff
+from evopolicy_results.html import notice
 from evopolicy_results.reading.environments import title_of
 from evopolicy_results.studies.palette import looks
 
@@ -129,25 +130,16 @@ def _run_facts(run: RunFacts, may_show: bool) -> list[tuple[str, str]]:
 def _one_run_notices(run: RunFacts, may_show: bool) -> list[dict[str, Any]]:
     notices: list[dict[str, Any]] = []
     if run.waits_for:
-        notices.append({"title": f"It waits for {run.waits_for}.", "lines": []})
+        notices.append(notice(f"It waits for {run.waits_for}."))
     if run.error:
-        notices.append(
-            {
-                "title": f"It {state_words(run.state)}" if run.state in ("failed",) else "Why it ended so",
-                "lines": [run.error],
-            }
-        )
+        title = f"It {state_words(run.state)}" if run.state == "failed" else "Why it ended so"
+        notices.append(notice(title, [run.error]))
     if run.finished and not may_show and run.state == "completed":
-        notices.append(
-            {"title": "Its hidden scores are shown once no agent of a related run is alive.", "lines": []}
-        )
+        notices.append(notice("Its hidden scores are shown once no agent of a related run is alive."))
     if run.path is None:
         where = f" on {run.host}" if run.host else ""
         notices.append(
-            {
-                "title": f"Its folder is not on this host{where}: only what the cluster tells is shown.",
-                "lines": [],
-            }
+            notice(f"Its folder is not on this host{where}: only what the cluster tells is shown.")
         )
     return notices
 

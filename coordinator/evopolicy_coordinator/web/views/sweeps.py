@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from evopolicy_coordinator.web.content.feeds import View
 from evopolicy_coordinator.web.content.rendering import STATES, duration, number, part, short, state_words
 from evopolicy_coordinator.web.content.run_folders import RunFacts, Runs, Sweep
 from evopolicy_coordinator.web.content.tables import Words, ident, matches, paged
+from evopolicy_results.html import notice
 from evopolicy_results.reading.environments import title_of
 from evopolicy_results.studies.palette import Look, looks
 
@@ -107,51 +109,31 @@ def _run_notices(
 ) -> list[dict[str, Any]]:
     notices: list[dict[str, Any]] = []
     if cluster is not None and cluster.trouble:
-        notices.append(
-            {
-                "title": "The coordinator does not answer; this is the last that is known.",
-                "lines": [cluster.trouble],
-            }
-        )
+        title = "The coordinator does not answer; this is the last that is known."
+        notices.append(notice(title, [cluster.trouble]))
     if runs.shut is None and any(run.finished for run in every):
         notices.append(
-            {
-                "title": "Hidden scores are not shown: without the coordinator nobody knows which agents are alive.",
-                "lines": [],
-            }
+            notice(
+                "Hidden scores are not shown: without the coordinator nobody knows which agents are alive."
+            )
         )
     elif hidden := sum(run.finished and run.state == "completed" and not runs.may_show(run) for run in every):
-        notices.append(
-            {
-                "title": f"{hidden} finished runs keep their hidden scores until no agent of a related run is alive.",
-                "lines": [],
-            }
-        )
-    waits: dict[str, int] = {}
-    for run in every:
-        if run.waits_for:
-            waits[run.waits_for] = waits.get(run.waits_for, 0) + 1
+        title = f"{hidden} finished runs keep their hidden scores until no agent of a related run is alive."
+        notices.append(notice(title))
+    waits = Counter(run.waits_for for run in every if run.waits_for)
     if waits:
-        lines = [
-            f"{n} run{'s' * (n != 1)}: {what}"
-            for what, n in sorted(waits.items(), key=lambda one: -one[1])[:12]
-        ]
-        notices.append({"title": "Runs wait", "lines": lines})
+        lines = [f"{n} run{'s' * (n != 1)}: {what}" for what, n in waits.most_common(12)]
+        notices.append(notice("Runs wait", lines))
     for root in roots:
         try:
             disk = shutil.disk_usage(root)
         except OSError as error:
-            notices.append({"title": f"{root} cannot be read: {error.strerror}", "lines": []})
+            notices.append(notice(f"{root} cannot be read: {error.strerror}"))
             continue
         if disk.free < disk.total * 0.05:
-            notices.append(
-                {
-                    "title": f"The disk of {root} is nearly full: {bytes_text(disk.free)} are free.",
-                    "lines": [],
-                }
-            )
+            notices.append(notice(f"The disk of {root} is nearly full: {bytes_text(disk.free)} are free."))
     if not every:
-        notices.append({"title": "No run was found yet. New ones appear here by themselves.", "lines": []})
+        notices.append(notice("No run was found yet. New ones appear here by themselves."))
     return notices
 
 
