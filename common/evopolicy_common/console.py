@@ -5,7 +5,7 @@ This is a module of its own because rich is large and most commands do not need 
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import Any
 
 import rich.console
@@ -108,6 +108,20 @@ def table(*headings: str, right: Collection[str] = (), whole: Collection[str] = 
     for heading in headings:
         justify: JustifyMethod = "right" if heading in right else "left"
         made.add_column(heading, overflow="fold", justify=justify, no_wrap=heading in whole)
+    return made
+
+
+def listing(
+    records: Iterable[Any],
+    columns: Mapping[str, Callable[[Any], str]],
+    *,
+    right: Collection[str] = (),
+    whole: Collection[str] = (),
+) -> Table:
+    """A `table` with a row a record. `columns`: by heading, the cell of a record."""
+    made = table(*columns, right=right, whole=whole)
+    for one in records:
+        made.add_row(*(cell(one) for cell in columns.values()))
     return made
 
 

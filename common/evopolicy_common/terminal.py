@@ -65,6 +65,16 @@ def number(value: float | None) -> str:
     return "–" if value is None else f"{value:.4g}"
 
 
+def duration(seconds: float | None) -> str:
+    """How long something takes, such as `5 min`; a dash for None."""
+    if seconds is None:
+        return "–"
+    for unit, size in (("d", 86400.0), ("h", 3600.0), ("min", 60.0)):
+        if seconds >= 2 * size:
+            return f"{seconds / size:.0f} {unit}"
+    return f"{seconds:.0f} s"
+
+
 def _shown(found: re.Match[str]) -> str:
     # Surrogates, which no stream can encode, are not printable either.
     return found[0] if found[0].isprintable() else "\N{REPLACEMENT CHARACTER}"

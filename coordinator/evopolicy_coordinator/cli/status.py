@@ -20,10 +20,10 @@ from rich.text import Text
 from evopolicy_common import catalogue
 from evopolicy_common.cli.conventions import Connect, CredentialsFile, fail_on_our_errors
 from evopolicy_common.cli.frame import App
-from evopolicy_common.console import table, terminal
+from evopolicy_common.console import listing, terminal
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.status import RunStatus, StatusReply, WorkerStatus
-from evopolicy_common.terminal import say, say_json, say_lines
+from evopolicy_common.terminal import duration, say, say_json, say_lines
 from evopolicy_common.wire import credentials, transport
 from evopolicy_common.wire.operator_client import OperatorClient
 
@@ -110,22 +110,20 @@ def list_workers(connect: Connect = None, file: CredentialsFile = None, as_json:
     if as_json:
         say_json(reply.workers)
         return
-    shown = table(
-        "worker",
-        "host",
-        "state",
-        "slots",
-        "running",
-        "tiers",
-        "environments",
+    shown = listing(
+        reply.workers,
+        {
+            "worker": lambda one: one.worker,
+            "host": lambda one: one.host,
+            "state": lambda one: one.state,
+            "slots": lambda one: str(one.slots),
+            "running": lambda one: str(one.running),
+            "tiers": _tiers,
+            "environments": lambda one: _names(one.environments),
+        },
         right=("slots", "running"),
         whole=("worker",),
     )
-    for worker in reply.workers:
-        counts = (str(worker.slots), str(worker.running))
-        shown.add_row(
-            worker.worker, worker.host, worker.state, *counts, _tiers(worker), _names(worker.environments)
-        )
     terminal().print(shown if reply.workers else "no worker is connected")
     say_lines(line for worker in reply.workers for line in _lacks(worker))
 
@@ -200,16 +198,22 @@ def list_runs(connect: Connect = None, file: CredentialsFile = None, as_json: Js
     if as_json:
         say_json(reply.runs)
         return
-    shown = table("run", "entry", "environment", "phase", "budget left", "waits for", whole=("run",))
-    for run in reply.runs:
-        left = f"{run.remaining_budget}/{run.budget}"
-        shown.add_row(run.run, run.entry, run.env, _phase(run), left, run.waits_for)
+    shown = listing(
+        reply.runs, {**_columns("environment"), "waits for": lambda run: run.waits_for}, whole=("run",)
+    )
     terminal().print(shown if reply.runs else "no run is open")
     say_lines(abandoned(reply.runs))
 
 
-def _phase(run: RunStatus) -> str:
-    return f"{run.phase}, abandoned" if run.abandoned else run.phase
+def _columns(env: str) -> dict[str, Callable[[RunStatus], str]]:
+    """The first columns of tables of runs. `env`: heading of the environment."""
+    return {
+        "run": lambda run: run.run,
+        "entry": lambda run: run.entry,
+        env: lambda run: run.env,
+        "phase": lambda run: f"{run.phase}, abandoned" if run.abandoned else run.phase,
+        "budget left": lambda run: f"{run.remaining_budget}/{run.budget}",
+    }
 
 
 @runs_app.command(epilog="Example: evopolicy runs cancel r-0f2e9a7c11d04b35")
@@ -265,7 +269,7 @@ def render(reply: StatusReply) -> RenderableType:
     """The status as tables."""
     slots = sum(worker.slots for worker in reply.workers if worker.state == "active")
     head = (
-        f"cluster {reply.cluster} · evopolicy {reply.version} · up {_age(reply.uptime_s)} · {slots} slots ·"
+        f"cluster {reply.cluster} · evopolicy {reply.version} · up {duration(reply.uptime_s)} · {slots} slots ·"
         f" {sum(run.queued for run in reply.runs)} queued, {sum(run.running for run in reply.runs)} running,"
         f" {reply.episodes_done} episodes done, {reply.episodes_per_s:.1f}/s over the last minute"
     )
@@ -280,22 +284,22 @@ def render(reply: StatusReply) -> RenderableType:
 
 
 def _workers(reply: StatusReply) -> Table:
-    headings = ("worker", "host", "state", "slots", "running", "held", "envs", "tiers", "class", "seen")
-    shown = table(*headings, whole=("worker", "class"))
-    for worker in reply.workers:
-        shown.add_row(
-            worker.worker,
-            worker.host,
-            worker.state,
-            str(worker.slots),
-            str(worker.running),
-            str(worker.held),
-            str(len(worker.environments)),
-            _tiers(worker),
-            worker.fingerprint,
-            f"{_age(worker.last_seen_s)} ago",
-        )
-    return shown
+    return listing(
+        reply.workers,
+        {
+            "worker": lambda one: one.worker,
+            "host": lambda one: one.host,
+            "state": lambda one: one.state,
+            "slots": lambda one: str(one.slots),
+            "running": lambda one: str(one.running),
+            "held": lambda one: str(one.held),
+            "envs": lambda one: str(len(one.environments)),
+            "tiers": _tiers,
+            "class": lambda one: one.fingerprint,
+            "seen": lambda one: f"{duration(one.last_seen_s)} ago",
+        },
+        whole=("worker", "class"),
+    )
 
 
 def _classes(reply: StatusReply) -> Iterator[Text]:
@@ -313,33 +317,15 @@ def _classes(reply: StatusReply) -> Iterator[Text]:
 
 
 def _runs(reply: StatusReply) -> Table:
-    shown = table(
-        "run",
-        "entry",
-        "env",
-        "phase",
-        "budget left",
-        "submits",
-        "queued",
-        "running",
-        "done",
-        "agent",
-        whole=("run",),
-    )
-    for run in reply.runs:
-        shown.add_row(
-            run.run,
-            run.entry,
-            run.env,
-            _phase(run),
-            f"{run.remaining_budget}/{run.budget}",
-            str(run.n_submits),
-            str(run.queued),
-            str(run.running),
-            str(run.done),
-            run.agent_host,
-        )
-    return shown
+    columns = {
+        **_columns("env"),
+        "submits": lambda run: str(run.n_submits),
+        "queued": lambda run: str(run.queued),
+        "running": lambda run: str(run.running),
+        "done": lambda run: str(run.done),
+        "agent": lambda run: run.agent_host,
+    }
+    return listing(reply.runs, columns, whole=("run",))
 
 
 def _remarks(reply: StatusReply) -> Iterator[str]:
@@ -349,7 +335,7 @@ def _remarks(reply: StatusReply) -> Iterator[str]:
         yield f"{name} is quarantined: {why} (evopolicy workers resume {name} takes it back)"
     for one in reply.turned_away:
         where = f" of {one.host}" if one.host else ""
-        yield f"{one.worker}{where} was turned away {_age(one.ago_s)} ago: {one.why}"
+        yield f"{one.worker}{where} was turned away {duration(one.ago_s)} ago: {one.why}"
     yield from reply.disputes
     for run in reply.runs:
         if run.waits_for:
@@ -369,13 +355,6 @@ def abandoned(runs: Iterable[RunStatus]) -> Iterator[str]:
     for run in runs:
         if run.abandoned:
             yield (
-                f"{run.run} has had no gateway for {_age(run.silent_s)}: give its command again with --resume, or end it with"
+                f"{run.run} has had no gateway for {duration(run.silent_s)}: give its command again with --resume, or end it with"
                 f" evopolicy runs cancel {run.run}"
             )
-
-
-def _age(seconds: float) -> str:
-    for unit, size in (("d", 86400.0), ("h", 3600.0), ("min", 60.0)):
-        if seconds >= 2 * size:
-            return f"{seconds / size:.0f} {unit}"
-    return f"{seconds:.0f} s"

@@ -10,7 +10,7 @@ import asyncio
 import functools
 import random
 import re
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -25,7 +25,7 @@ from evopolicy_common.cli.conventions import (
     fail_on_our_errors,
 )
 from evopolicy_common.cli.frame import App
-from evopolicy_common.console import table, terminal
+from evopolicy_common.console import listing, terminal
 from evopolicy_common.errors import DECODE_ERRORS, ConfigError, ProtocolError
 from evopolicy_common.processes.packages import checked_names
 from evopolicy_common.regular_files import read_given
@@ -117,7 +117,7 @@ def publish(
     if len(done.folders_left_out) > _SHOWN:
         say(f"… and {len(done.folders_left_out) - _SHOWN} more (--json tells all)")
     say(f"completeness: {done.completeness}; {len(done.folders_left_out)} folders were left out")
-    _say_listing("left out, of the same entries:", done.left_out)
+    _say_left_out(done.left_out)
     say(f"{len(done.removed)} things were removed; removed.json in the file lists them")
     say(f"next: evopolicy check {done.path} --identity {done.signer}")
 
@@ -290,9 +290,7 @@ def _print(checked: Checked) -> None:
             say(one_line(f"{marks['ok']} {kind}: " + (f"{meaning} ({n} runs)" if n else of_kind[0].text)))
     if checked.covered:
         say(f"the replay covered {checked.coverage()} episodes")
-    _say_listing(
-        "left out, of the same entries:", [each for each in checked.listing if each.state != "published"]
-    )
+    _say_left_out([each for each in checked.listing if each.state != "published"])
     shown = (
         "something in this file contradicts itself or what you expect"
         if checked.failed
@@ -305,22 +303,20 @@ def _print(checked: Checked) -> None:
     say(f"verdict: {shown}; " + ("the signer is the one that you named" if known else "self-signed"))
 
 
-def _say_listing(heading: str, listed: list[Listed] | tuple[Listed, ...]) -> None:
+def _say_left_out(listed: Sequence[Listed]) -> None:
     if not listed:
         return
-    say(heading)
-    shown = table("run", "entry", "environment", "experiment", "repeat", "attempt", "state", "replaced by")
-    for each in listed[:_SHOWN]:
-        shown.add_row(
-            each.run,
-            each.entry,
-            each.env,
-            each.exp_id,
-            str(each.repeat),
-            str(each.attempt),
-            each.state,
-            each.replaced_by,
-        )
-    terminal().print(shown)
+    say("left out, of the same entries:")
+    columns = {
+        "run": lambda one: one.run,
+        "entry": lambda one: one.entry,
+        "environment": lambda one: one.env,
+        "experiment": lambda one: one.exp_id,
+        "repeat": lambda one: str(one.repeat),
+        "attempt": lambda one: str(one.attempt),
+        "state": lambda one: one.state,
+        "replaced by": lambda one: one.replaced_by,
+    }
+    terminal().print(listing(listed[:_SHOWN], columns))
     if len(listed) > _SHOWN:
         say(f"… and {len(listed) - _SHOWN} more")

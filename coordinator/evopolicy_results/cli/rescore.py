@@ -21,7 +21,7 @@ from evopolicy_common.cli.conventions import (
     run_to_end,
 )
 from evopolicy_common.cli.frame import App
-from evopolicy_common.console import Terminal, table, terminal
+from evopolicy_common.console import Terminal, listing, terminal
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.processes.packages import packages_in
 from evopolicy_common.records.rescores import is_name
@@ -127,12 +127,14 @@ def _print(written: list[Written], as_json: bool, console: Terminal) -> None:
     if as_json:
         say_json(written)
         return
-    shown = table(
-        "environment", "entry", "held-out mean", "re-scored mean", "episodes", right=("held-out mean",)
-    )
-    for one in written:
-        shown.add_row(one.env, one.entry, number(one.score), number(one.rescored), str(one.episodes))
-    console.print(shown)
+    columns = {
+        "environment": lambda one: one.env,
+        "entry": lambda one: one.entry,
+        "held-out mean": lambda one: number(one.score),
+        "re-scored mean": lambda one: number(one.rescored),
+        "episodes": lambda one: str(one.episodes),
+    }
+    console.print(listing(written, columns, right=("held-out mean",)))
 
 
 async def _rescore(

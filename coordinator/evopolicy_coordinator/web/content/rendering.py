@@ -10,6 +10,7 @@ from typing import Any
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
+from evopolicy_common.terminal import duration, number
 from evopolicy_coordinator.web.content.feeds import View
 from evopolicy_results.html import visible
 from evopolicy_results.reading.environments import title_of
@@ -88,27 +89,12 @@ def page(template: str, *, view: View | None = None, live: str = "", cursor: str
     return made.render(part=one, listed=listed, live=live, cursor=cursor, **values)
 
 
-def number(value: float | None) -> str:
-    """A return or score; a dash for none."""
-    return "–" if value is None else f"{value:.4g}"
-
-
 def short(value: float) -> str:
     """A large number in few characters."""
     for size, letter in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
         if value >= size:
             return f"{value / size:.3g}{letter}"
     return f"{value:g}"
-
-
-def duration(seconds: float | None) -> str:
-    """How long something takes, for people."""
-    if seconds is None:
-        return "–"
-    for unit, size in (("d", 86400.0), ("h", 3600.0), ("min", 60.0)):
-        if seconds >= 2 * size:
-            return f"{seconds / size:.0f} {unit}"
-    return f"{seconds:.0f} s"
 
 
 def state_words(state: str) -> str:

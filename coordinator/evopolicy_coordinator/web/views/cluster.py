@@ -13,10 +13,11 @@ from markupsafe import Markup
 
 from evopolicy_common.cli.conventions import bytes_text
 from evopolicy_common.messages.status import DiskUse, StatusReply, WorkerStatus
+from evopolicy_common.terminal import duration
 from evopolicy_coordinator.web.content.charts import Line, chart
 from evopolicy_coordinator.web.content.cluster import Cluster
 from evopolicy_coordinator.web.content.feeds import View
-from evopolicy_coordinator.web.content.rendering import duration, part, short
+from evopolicy_coordinator.web.content.rendering import part, short
 from evopolicy_coordinator.web.content.run_folders import RunFacts, Runs
 from evopolicy_coordinator.web.content.tables import PAGE_ROWS, Words, ident, matches, paged
 from evopolicy_results.html import notice

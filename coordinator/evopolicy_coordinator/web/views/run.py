@@ -9,9 +9,10 @@ from markupsafe import Markup
 
 from evopolicy_common.messages.status import RetriedJobs, StatusReply
 from evopolicy_common.records.summary import utc_text
+from evopolicy_common.terminal import duration, number
 from evopolicy_coordinator.web.content.charts import Line, chart
 from evopolicy_coordinator.web.content.feeds import View
-from evopolicy_coordinator.web.content.rendering import duration, number, part, short, state_words
+from evopolicy_coordinator.web.content.rendering import part, short, state_words
 from evopolicy_coordinator.web.content.run_detail import (
     MAX_WORDS,
     CodeFile,

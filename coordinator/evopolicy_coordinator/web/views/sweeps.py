@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from evopolicy_common.cli.conventions import bytes_text
+from evopolicy_common.terminal import duration, number
 from evopolicy_coordinator.web.content.cluster import Cluster
 from evopolicy_coordinator.web.content.feeds import View
-from evopolicy_coordinator.web.content.rendering import STATES, duration, number, part, short, state_words
+from evopolicy_coordinator.web.content.rendering import STATES, part, short, state_words
 from evopolicy_coordinator.web.content.run_folders import RunFacts, Runs, Sweep
 from evopolicy_coordinator.web.content.tables import Words, ident, matches, paged
 from evopolicy_results.html import notice
