@@ -15,7 +15,6 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import hmac
-import os
 import secrets
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -26,7 +25,7 @@ from evopolicy_common.catalogue import earlier_folder_name, folder_name
 from evopolicy_common.catalogue.worlds import KEY, OPTION, unchanged
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.environment import Case, Split
-from evopolicy_common.records.blobs import fsync_directory
+from evopolicy_common.records.blobs import fsync_directory, write_atomically
 from evopolicy_common.records.journal import epoch_of
 from evopolicy_common.records.splits import (
     FILE_STEMS,
@@ -173,19 +172,7 @@ def load_or_create_secret(path: Path) -> bytes:
 
 def _create_secret(path: Path) -> bytes:
     data = secrets.token_bytes(SECRET_BYTES)
-    partial = path.with_suffix(".new")
-    partial.unlink(missing_ok=True)
-    fd = os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
-    with os.fdopen(fd, "wb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
-    os.rename(partial, path)
-    directory = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(directory)
-    finally:
-        os.close(directory)
+    write_atomically(path, data, mode=0o600)
     return data
 
 

@@ -6,21 +6,22 @@ reachable from an agent's host. Exit codes: 0 all well, 1 findings, 2 wrong usag
 
 from __future__ import annotations
 
-import os
 import secrets
 from pathlib import Path
-from typing import Annotated, Any, NoReturn
+from typing import Annotated, Any
 
 import msgspec
 import typer
 
 from evopolicy_common import catalogue
+from evopolicy_common.cli.conventions import fail, fail_on_our_errors
 from evopolicy_common.cli.frame import App
 from evopolicy_common.console import table, terminal
-from evopolicy_common.errors import ConfigError
+from evopolicy_common.errors import ConfigError, StorageError
 from evopolicy_common.messages.environment import Split
 from evopolicy_common.messages.run_settings import MAX_HIDDEN
 from evopolicy_common.records import splits as split_files
+from evopolicy_common.records.blobs import write_atomically
 from evopolicy_common.terminal import say, say_json
 from evopolicy_coordinator import splits
 
@@ -61,15 +62,14 @@ def make(
     as_json: Annotated[bool, typer.Option("--json", help="Print what was written as JSON.")] = False,
 ) -> None:
     """Write train.json, valid.json and heldout.json of each environment."""
-    try:
+    with fail_on_our_errors():
         planned = _plan(catalogue.resolve(env), root, seed, train, valid, heldout)
         if not force:
             _refuse_different(planned)
-        written = _write(planned)
-    except ConfigError as error:
-        _usage(str(error))
-    except OSError as error:
-        _usage(f"cannot write {error.filename}: {error.strerror}")
+        try:
+            written = _write(planned)
+        except (OSError, StorageError) as error:
+            fail(str(error))
     if as_json:
         say_json({"root": str(root), "written": [str(path) for path in written]}, indent=False)
         return
@@ -114,13 +114,7 @@ def _write(planned: dict[Path, bytes]) -> list[Path]:
         if path.exists() and path.read_bytes() == data:
             continue
         path.parent.mkdir(parents=True, exist_ok=True)
-        partial = path.with_suffix(".json.new")
-        partial.unlink(missing_ok=True)
-        with os.fdopen(os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(partial, path)
+        write_atomically(path, data, mode=0o600)
         written.append(path)
     return written
 
@@ -132,10 +126,10 @@ def check(
 ) -> None:
     """Check that split files are well-formed and disjoint, and print their hashes."""
     if not folder.is_dir():
-        _usage(f"{folder} is not a folder")
+        fail(f"{folder} is not a folder")
     folders = split_files.folders_below(folder)
     if not folders:
-        _usage(f"no train.json, valid.json or heldout.json in {folder} or in its folders")
+        fail(f"no train.json, valid.json or heldout.json in {folder} or in its folders")
     reports = [_report(item.resolve()) for item in folders]
     if as_json:
         say_json({"ok": not any(r["findings"] for r in reports), "environments": reports}, indent=False)
@@ -177,8 +171,3 @@ def _print(reports: list[dict[str, Any]]) -> None:
     for report in reports:
         for finding in report["findings"]:
             console.print(finding, style="red", soft_wrap=True)
-
-
-def _usage(message: str) -> NoReturn:
-    say(f"error: {message}", err=True)
-    raise typer.Exit(2)

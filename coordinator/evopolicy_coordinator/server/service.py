@@ -16,7 +16,7 @@ import asyncio
 import contextlib
 import hmac
 import time
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Coroutine, Iterator
 from functools import partial
 from importlib import metadata
 
@@ -159,19 +159,14 @@ class Service:
         if core is None or self.host.stopping:
             self._turn_away(query)
             return
-        try:
-            parsed = self._parser.parse(query.key, query.payload, core)
-            if parsed.subtree == "gw":
-                self._heard[parsed.asker] = self.host.now()
-            _ANSWERS.get(type(parsed.message), Service._serve_event)(self, core, query, parsed)
-        except RefusedError as error:
-            self._refuse(query, error)
-        except ProtocolError as error:
-            self._refuse(query, RefusedError(Refusal.BAD_MESSAGE, str(error)))
-        except Exception:
-            # A bug here must not stop the service. The client is notified immediately and may retry.
-            log.exception("request failed", key=query.key)
-            query.drop()
+        with self._answering(query):
+            try:
+                parsed = self._parser.parse(query.key, query.payload, core)
+                if parsed.subtree == "gw":
+                    self._heard[parsed.asker] = self.host.now()
+                _ANSWERS.get(type(parsed.message), Service._serve_event)(self, core, query, parsed)
+            except ProtocolError as error:
+                raise RefusedError(Refusal.BAD_MESSAGE, str(error)) from error
 
     def _serve_event(self, core: Core, query: IncomingQuery, parsed: Parsed) -> None:
         """Passes the request to the core, which answers it with an effect."""
@@ -245,20 +240,15 @@ class Service:
         """Serves requests whose event is built from files."""
         request = self._pending.admit(query, parsed.asker)
         stimulus = self._stimulus_of(parsed.message)
-        try:
-            event = await asyncio.to_thread(self._event_from_files, parsed, request, stimulus)
-        except RefusedError as error:
-            self._pending.take(request)
-            self._refuse(query, error)
-            return
-        except Exception:
-            log.exception("request failed", key=query.key)
-            self._pending.take(request)
-            query.drop()
-            return
-        if request in self._pending:  # otherwise the core was dropped meanwhile, and the query with it
-            self.host.handle(event)
-            self.host.flush()
+        with self._answering(query):
+            try:
+                event = await asyncio.to_thread(self._event_from_files, parsed, request, stimulus)
+            except BaseException:
+                self._pending.take(request)
+                raise
+            if request in self._pending:  # otherwise the core was dropped meanwhile, and the query with it
+                self.host.handle(event)
+                self.host.flush()
 
     def _event_from_files(self, parsed: Parsed, request: int, stimulus: str) -> AnyEvent:
         message = parsed.message
@@ -275,11 +265,18 @@ class Service:
 
     async def _serve_read(self, query: IncomingQuery, read: Callable[[], Message]) -> None:
         """Replies with a message that `read` makes from files and the store, on a thread."""
-        try:
+        with self._answering(query):
             query.reply(answer_bytes(await asyncio.to_thread(read)))
+
+    @contextlib.contextmanager
+    def _answering(self, query: IncomingQuery) -> Iterator[None]:
+        """Refuses the query where the body is refused, and drops it where the body fails."""
+        try:
+            yield
         except RefusedError as error:
             self._refuse(query, error)
         except Exception:
+            # A bug here must not stop the service. The client is notified immediately and may retry.
             log.exception("request failed", key=query.key)
             query.drop()
 
@@ -323,21 +320,14 @@ class Service:
 
     async def _claim(self, query: IncomingQuery, message: operator.Claim) -> None:
         """Serves a claim without the core: claims change no run."""
-        try:
-            answer: Message = await self._claims.ask(message, self.host.now())
-        except RefusedError as error:
-            self._refuse(query, error)
-            return
-        except DamagedStoreError as error:
-            self._refuse(query, damaged(error))
-            return
-        except StorageError as error:
-            answer = Refused(status=Refusal.UNAVAILABLE, message=str(error))
-        except Exception:
-            log.exception("request failed", key=query.key)
-            query.drop()
-            return
-        query.reply(answer_bytes(answer))
+        with self._answering(query):
+            try:
+                answer: Message = await self._claims.ask(message, self.host.now())
+            except DamagedStoreError as error:
+                raise damaged(error) from error
+            except StorageError as error:
+                answer = Refused(status=Refusal.UNAVAILABLE, message=str(error))
+            query.reply(answer_bytes(answer))
 
     def _serve_put(self, core: Core, query: IncomingQuery, parsed: Parsed) -> None:
         message = parsed.message

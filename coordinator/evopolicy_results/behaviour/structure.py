@@ -29,15 +29,6 @@ BINS: dict[str, tuple[int, int | None]] = {
 the second for submits that changed only files outside it."""
 
 
-class SelectedStructure(msgspec.Struct, frozen=True, kw_only=True):
-    """Features of one run's validation-selected policy."""
-
-    run: str
-    entry: str
-    env: str
-    features: Features
-
-
 class StructureMean(msgspec.Struct, frozen=True, kw_only=True):
     """Mean features of one entry's selected policies in one demand group. Runs have equal weight within an
     environment, environments within the group."""
@@ -81,28 +72,17 @@ class EditSizeBin(msgspec.Struct, frozen=True, kw_only=True):
         return self.validation_improved / self.n if self.n else None
 
 
-def selected_structures(runs: Iterable[Run]) -> list[SelectedStructure]:
-    """One record for every run with a readable selected checkpoint."""
-    out: list[SelectedStructure] = []
-    for run in runs:
-        selected = run.selected
-        if selected is not None and selected.source is not None:
-            out.append(
-                SelectedStructure(
-                    run=run.name, entry=run.entry, env=run.env, features=selected.source.features
-                )
-            )
-    return out
-
-
 def structure_means(runs: Sequence[Run]) -> list[StructureMean]:
     """Rows by demand group (`all` last, over every environment), then entry."""
     harness = {run.entry: run.harness for run in runs}
     groups: dict[tuple[str, str], dict[str, list[Features]]] = {}
-    for found in selected_structures(runs):
-        demand = demand_of(found.env)
+    for run in runs:
+        if run.selected is None or run.selected.source is None:
+            continue
+        demand = demand_of(run.env)
         for group in ([demand] if demand else []) + ["all"]:
-            groups.setdefault((group, found.entry), {}).setdefault(found.env, []).append(found.features)
+            by_group = groups.setdefault((group, run.entry), {})
+            by_group.setdefault(run.env, []).append(run.selected.source.features)
     order = {"synthesis": 0, "tuning": 1, "all": 2}
     rows: list[StructureMean] = []
     for (demand, entry), by_env in sorted(

@@ -18,7 +18,7 @@ from evopolicy_common.statistics import intervals
 from evopolicy_common.statistics.distributions import ALPHA, holm, normal_quantile
 from evopolicy_common.statistics.intervals import Estimate, difference, of_runs
 from evopolicy_common.statistics.resampling import RESAMPLES
-from evopolicy_results.statistics.permutation import Test, label_test
+from evopolicy_results.statistics.permutation import label_test
 from evopolicy_results.statistics.repeats import repeats_needed, spread_of
 from evopolicy_results.statistics.samples import Matched, Sample, matched
 
@@ -122,7 +122,6 @@ def _pair(draft: _Draft, p_holm: float | None, n_open: int) -> Pair:
         verdict = "not told apart"
         if p_holm <= ALPHA:
             verdict = "first" if draft.gap.value > 0.0 else "second"
-    test = _these_cases(draft)
     common = draft.common
     return Pair(
         env=first.env,
@@ -135,14 +134,14 @@ def _pair(draft: _Draft, p_holm: float | None, n_open: int) -> Pair:
         n_left_out=0 if common is None else common.n_left_out,
         p=draft.p,
         p_holm=p_holm,
-        p_these_cases=None if test is None else test.p,
+        p_these_cases=_these_cases(draft),
         verdict=verdict,
         n_needed=_needed(draft, n_open) if verdict == "not told apart" else None,
         reason=draft.reason,
     )
 
 
-def _these_cases(draft: _Draft) -> Test | None:
+def _these_cases(draft: _Draft) -> float | None:
     if draft.common is None or min(map(len, draft.common.returns)) < 2:
         return None
     one, other = (matrix.mean(axis=1).tolist() for matrix in draft.common.returns)

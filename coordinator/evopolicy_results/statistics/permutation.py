@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import msgspec
 import numpy as np
 
 from evopolicy_common.statistics.resampling import Floats, label_patterns
@@ -21,17 +20,8 @@ _CLOSE = 1e-9
 """Relative tolerance: statistics that differ only by rounding count as equal."""
 
 
-class Test(msgspec.Struct, frozen=True, kw_only=True):
-    """A permutation test's result."""
-
-    p: float
-    least: float
-    """The smallest p value possible with so few cases or runs."""
-    exact: bool
-
-
-def label_test(first: Sequence[float], second: Sequence[float], n_random: int = N_RANDOM) -> Test:
-    """Tests that two groups of run scores, of two or more runs each, come from one distribution."""
+def label_test(first: Sequence[float], second: Sequence[float], n_random: int = N_RANDOM) -> float:
+    """p value of two groups of run scores, of two or more runs each, coming from one distribution."""
     n_first, n_second = len(first), len(second)
     pooled = np.array([*first, *second])
     pooled = pooled - pooled.mean()
@@ -43,9 +33,7 @@ def label_test(first: Sequence[float], second: Sequence[float], n_random: int = 
     for start in range(0, len(patterns), _CHUNK):
         found = _welch(patterns[start : start + _CHUNK], pooled, n_first, n_second)
         reached += int((found >= observed * (1.0 - _CLOSE)).sum())
-    both_ways = 2 if n_first == n_second else 1
-    least = both_ways / len(patterns) if exact else 1.0 / (len(patterns) + 1)
-    return Test(p=_p(float(reached), len(patterns), exact), least=least, exact=exact)
+    return reached / len(patterns) if exact else (reached + 1.0) / (len(patterns) + 1.0)
 
 
 def _welch(labels: Floats, pooled: Floats, n_first: int, n_second: int) -> Floats:
@@ -63,7 +51,3 @@ def _welch(labels: Floats, pooled: Floats, n_first: int, n_second: int) -> Float
     with np.errstate(divide="ignore", invalid="ignore"):
         t: Floats = np.where(gap < _CLOSE, 0.0, gap / error)
     return t
-
-
-def _p(reached: float, n_patterns: int, exact: bool) -> float:
-    return reached / n_patterns if exact else (reached + 1.0) / (n_patterns + 1.0)

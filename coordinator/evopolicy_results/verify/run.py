@@ -77,6 +77,9 @@ class Report(msgspec.Struct, kw_only=True):
         self.identical = False
         self.differences.append(Finding(episode=episode, difference=difference))
 
+    def leaves_open(self, episode: str, difference: str) -> None:
+        self.not_checked.append(Finding(episode=episode, difference=difference))
+
 
 class _Recording(msgspec.Struct, kw_only=True):
     """The data of one episode before its replay."""
@@ -122,8 +125,7 @@ class Verifier:
             ours = versions.cases_hash(split).removeprefix("sha256:")
             theirs = state.split_hashes.get(split, "")
             if not ours:
-                text = "run.json has no hash of them: they may be others"
-                self.report.not_checked.append(Finding(episode=f"{split} cases", difference=text))
+                self.report.leaves_open(f"{split} cases", "run.json has no hash of them: they may be others")
             elif ours != theirs:
                 raise ConfigError(
                     f"this cluster's {split} cases of {self._run.record.env} are not the run's (SHA-256 {theirs[:12]}…"
@@ -144,14 +146,13 @@ class Verifier:
         for submit in self._run.submits:
             for name, content in (("summary.json", submit.summary), ("_meta.json", submit.meta)):
                 if content is None and submit.status != CANCELLED:
-                    finding = Finding(episode=f"submit {submit.index}", difference=f"it has no {name}")
-                    self.report.not_checked.append(finding)
+                    self.report.leaves_open(f"submit {submit.index}", f"it has no {name}")
         for name in rescore_names(self._run.root):
             text = (
                 "its returns are not played again: say `evopolicy rescore` with"
                 f" --name {name} for a copy of the run directory without this file, and compare"
             )
-            self.report.not_checked.append(Finding(episode=f"{FOLDER}/{name}.json", difference=text))
+            self.report.leaves_open(f"{FOLDER}/{name}.json", text)
 
     async def replay(self, played: EpisodeList, indexes: Sequence[int]) -> None:
         """Makes the exact check of these episodes of a list."""
@@ -180,11 +181,8 @@ class Verifier:
         dimensions = self._run.record.experiment_dimensions
         name = f"submit {played.submit_index}"
         if dimensions.policy_scope == "submit" and len(indexes) < len(played.env_instances):
-            self.report.not_checked.append(
-                Finding(
-                    episode=name,
-                    difference="its one policy plays whole submits, of which this sample is a part",
-                )
+            self.report.leaves_open(
+                name, "its one policy plays whole submits, of which this sample is a part"
             )
             return
         assert played.checkpoint is not None
@@ -248,9 +246,7 @@ class Verifier:
             else:
                 if not played.folders:
                     self.report.unchecked_episodes += 1
-                    self.report.not_checked.append(
-                        Finding(episode=name, difference="the coordinator has no record of it any more")
-                    )
+                    self.report.leaves_open(name, "the coordinator has no record of it any more")
                 continue
             found.append(
                 _Recording(

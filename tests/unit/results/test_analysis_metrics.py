@@ -14,7 +14,7 @@ from invented.run_dirs import write_run
 from evopolicy_common.records.run_record import Tokens
 from evopolicy_results.behaviour.audit import audit_signals, token_use
 from evopolicy_results.behaviour.edits import classify, edit_rates
-from evopolicy_results.behaviour.structure import edit_size_bins, selected_structures, structure_means
+from evopolicy_results.behaviour.structure import edit_size_bins, structure_means
 from evopolicy_results.reading.reader import load_runs, read_run
 from evopolicy_results.scoring.evolution import CurvePoint, area, best_at, episodes_to
 from evopolicy_results.scoring.scores import RANDOM_ENTRY, references, score_table
@@ -124,10 +124,8 @@ def test_structure_is_averaged_over_runs_then_environments(tmp_path: Path) -> No
     write_run(tmp_path, [Version(rich, (1.0,), 1.0)], env="gym/ant5")
     write_run(tmp_path, [Version(simple, (1.0,), 1.0)], env="gym/racing")
     runs = load_runs([tmp_path]).runs
-    by_run = {(found.env, found.run): found.features for found in selected_structures(runs)}
-    assert len(by_run) == 4
-    counts = sorted({features.functions for features in by_run.values()})
-    assert counts == [3, 4]
+    sources = [run.selected.source for run in runs if run.selected is not None]
+    assert sorted(source.features.functions for source in sources if source is not None) == [3, 3, 4, 4]
     synthesis, tuning, every = structure_means(runs)
     assert (synthesis.functions, synthesis.loops, synthesis.state) == (3.0, 0.0, 2.0)
     assert tuning.functions == pytest.approx((3.5 + 4.0) / 2)

@@ -134,7 +134,10 @@ def advance(state: State, run: Run, step: Step) -> None:
     if finished.unspent(run):
         _finish(state, run, None, step, unplayed=True)
         return
-    if random_group(run.id) not in run.hidden_returns:
+    has_reference = (
+        random_group(run.id) in run.hidden_returns
+    )  # groups that are opened here end in a later rule
+    if not has_reference:
         _open(state, templates.build("random", run, None, step.now, step.stimulus_id), step)
     waiting = [row for row in finished.ok_submits(run) if row.val_mean is None and row.ineligible is None]
     for row in waiting:
@@ -146,7 +149,7 @@ def advance(state: State, run: Run, step: Step) -> None:
     if best is not None and heldout_group(run.id, best.submit_index) not in run.hidden_returns:
         _open(state, templates.build("heldout", run, best, step.now, step.stimulus_id), step)
         return
-    if random_group(run.id) in run.hidden_returns and not audit_end.holds_up(state, run, step):
+    if has_reference and not audit_end.holds_up(state, run, step):
         _finish(state, run, best, step)
 
 
