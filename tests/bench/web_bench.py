@@ -85,7 +85,7 @@ async def watch(options: argparse.Namespace) -> int:
         site = site_of(Path(folder), cluster=status())
         assert site.cluster is not None
         site.cluster.take(decoded(cluster.status()))
-        await site.look()
+        await site.refresh()
         failed = []
         for name, template in (("runs", "runs.html.j2"), ("cluster", "cluster.html.j2")):
             page(site, name, template)
@@ -124,7 +124,7 @@ async def watch(options: argparse.Namespace) -> int:
             data = cluster.status()
             mark = time.process_time()
             site.cluster.take(decoded(data))
-            await site.look()
+            await site.refresh()
             for feed, make in site.feeds.watched():
                 feed.update(make())
             busy_s += time.process_time() - mark

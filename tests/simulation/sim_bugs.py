@@ -19,7 +19,7 @@ from evopolicy_coordinator.core.leasing import expiry, fleet, groups, leases, qu
 from evopolicy_coordinator.core.runs import audits, finalisation, finished, result_polls, submits
 from evopolicy_coordinator.core.structures.ledger import Ledger
 from evopolicy_coordinator.core.tables.model import JobGroup, Profile
-from evopolicy_coordinator.core.tables.related import Families
+from evopolicy_coordinator.core.tables.related import CaseSets
 from evopolicy_coordinator.core.tables.state import State
 from evopolicy_coordinator.core.tables.step import Step
 from evopolicy_coordinator.core.workers import membership, results, scheduler
@@ -75,7 +75,7 @@ BUGS = (
     Bug("send before persist", Step, "effects", "[first, *self._out]", "[*self._out, first]"),
     Bug("forget to queue after a back-off", queue, "backed_off", "if job is not None", "if False"),
     Bug("forget the adoption timer", loading, "load", "if state.adopting:", "if False:"),
-    Bug("forget the worker's timer", expiry, "look", "if deadlines:", "if False:"),
+    Bug("forget the worker's timer", expiry, "check", "if deadlines:", "if False:"),
     Bug(
         "skip the fencing",
         results,
@@ -116,7 +116,7 @@ BUGS = (
     Bug(
         "forget the hidden jobs that train jobs wait behind",
         leases,
-        "_look_again",
+        "_check_again",
         "if lane.n_ready[TRAIN]:",
         "if False:",
     ),
@@ -176,7 +176,7 @@ BUGS = (
     Bug(
         "wait for audits that nobody can play",
         finalisation,
-        "look_at_audits",
+        "check_audits",
         "if run is not None",
         "if False",
     ),
@@ -198,21 +198,21 @@ BUGS = (
         "play hidden episodes beside an agent",
         conflicts,
         "hidden_conflict",
-        "if permits_there(state, kernel, family):",
+        "if permits_there(state, kernel, case_set):",
         "if False:",
     ),
     Bug(
         "play hidden episodes beside train episodes",
         conflicts,
         "hidden_conflict",
-        "if related(kernel.train, family) or related(state.everywhere.train, family):",
+        "if related(kernel.train, case_set) or related(state.everywhere.train, case_set):",
         "if False:",
     ),
     Bug(
         "play train episodes beside hidden ones",
         conflicts,
         "train_conflict",
-        "if related(kernel.hidden, family) or related(state.everywhere.hidden, family):",
+        "if related(kernel.hidden, case_set) or related(state.everywhere.hidden, case_set):",
         "if False:",
     ),
     Bug(
@@ -226,7 +226,7 @@ BUGS = (
         "take an agent that may be anywhere for one that is nowhere",
         conflicts,
         "permits_there",
-        "or related(state.everywhere.permits, family)",
+        "or related(state.everywhere.permits, case_set)",
         "",
     ),
     Bug(
@@ -236,7 +236,7 @@ BUGS = (
         "if not occupancies:",
         "if not any(occupancy.lease is not None and occupancy.lease.live for occupancy in occupancies):",
     ),
-    Bug("take siblings for strangers", Families, "join", "(env, case.seed,", "(len(self._known), case.seed,"),
+    Bug("take siblings for strangers", CaseSets, "join", "(env, case.seed,", "(len(self._known), case.seed,"),
     Bug("forget permits at a restart", permits, "load", "row.ended_at is not None", "True"),
     Bug(
         "take a lease on its way for one that was let go of",
@@ -265,14 +265,14 @@ BUGS = (
         "never turn a kernel back",
         precedence,
         "_hidden",
-        "lane.done_looks[family] >= DONE_LOOKS",
+        "lane.done_checks[case_set] >= DONE_CHECKS",
         "False",
     ),
     Bug(
         "hold the submits of an agent that hidden episodes wait for",
         conflicts,
         "reversed_there",
-        "and not permits_there(state, kernel, family)",
+        "and not permits_there(state, kernel, case_set)",
         "",
     ),
     Bug(

@@ -93,7 +93,7 @@ PATTERNS: tuple[tuple[re.Pattern[bytes], str, tuple[bytes, ...]], ...] = (
 """Looks of secrets, each with its kind, and with texts of which each match holds one."""
 
 
-def looks(data: bytes) -> Iterator[tuple[re.Pattern[bytes], str]]:
+def patterns(data: bytes) -> Iterator[tuple[re.Pattern[bytes], str]]:
     """The patterns that may match in `data`, each with its kind."""
     return ((pattern, what) for pattern, what, parts in PATTERNS if any(part in data for part in parts))
 
@@ -103,7 +103,7 @@ def found(data: bytes, passed: Passed | None = None) -> Iterator[tuple[int, str]
 
     A text without a digit is none, and neither is one of few characters, such as the placeholder `sk-xxxxxxxxxxxxxxxx1`.
     """
-    for pattern, what in looks(data):
+    for pattern, what in patterns(data):
         for match in pattern.finditer(data):
             text = match[0]
             if text.startswith(b"-----") or (any(48 <= each < 58 for each in text) and len(set(text)) > 5):
@@ -116,7 +116,7 @@ def found(data: bytes, passed: Passed | None = None) -> Iterator[tuple[int, str]
 def redacted(data: bytes, passed: Passed | None = None) -> bytes:
     """The data without what looks like a secret, and without the values that a run has passed. JSON stays JSON."""
     data, _ = replaced(data, passed.places(data) if passed is not None else (), REDACTED)
-    for pattern, _ in looks(data):
+    for pattern, _ in patterns(data):
         data = pattern.sub(REDACTED, data)
     return data
 
@@ -224,7 +224,7 @@ def _words(words: Iterable[str], removed: list[str]) -> list[str]:
 
 def _look(text: str, removed: list[str]) -> str:
     data = text.encode("utf-8", "surrogateescape")
-    for pattern, _ in looks(data):
+    for pattern, _ in patterns(data):
         removed += [match[0].decode("utf-8", "surrogateescape") for match in pattern.finditer(data)]
         data = pattern.sub(REDACTED, data)
     return data.decode("utf-8", "surrogateescape")

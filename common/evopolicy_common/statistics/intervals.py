@@ -128,7 +128,7 @@ def of_runs(first: Sequence[float], second: Sequence[float] = ()) -> Estimate:
         return Estimate(value=value, reason=TOO_FEW_RUNS)
     variances = [float(group.var(ddof=1)) / len(group) for group in groups]
     total = sum(variances)
-    if _is_nought(total, groups):
+    if _is_zero(total, groups):
         return Estimate(value=value, reason=no_spread(min(map(len, groups))))
     return _t_interval(value, total, _runs_df(variances, [len(one) for one in groups]), "Welch t", "runs")
 
@@ -278,6 +278,6 @@ def _constant(values: Floats) -> bool:
     return float(np.ptp(values)) <= _RELATIVE_ZERO * float(np.abs(values).max(initial=0.0))
 
 
-def _is_nought(variance: float, groups: Sequence[Floats]) -> bool:
+def _is_zero(variance: float, groups: Sequence[Floats]) -> bool:
     scale = max(float(np.abs(group).max()) for group in groups)
     return variance <= (_RELATIVE_ZERO * scale) ** 2

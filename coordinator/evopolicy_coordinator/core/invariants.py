@@ -59,17 +59,17 @@ def check(state: State) -> None:
 
 
 def _isolation(state: State) -> None:
-    """Hidden jobs are on other kernels than agents and train jobs of related runs; a family's users are counted."""
+    """Hidden jobs are on other kernels than agents and train jobs of related runs; a case set's users are counted."""
     for kernel in state.kernels.values() if state.isolates else ():
         for occupancy in all_related(kernel.hidden, None):
             if occupancy.lease is None or not occupancy.lease.live:
                 continue
             others = (kernel, state.everywhere)
-            beside = [each for there in others for each in all_related(there.train, occupancy.family)]
+            beside = [each for there in others for each in all_related(there.train, occupancy.case_set)]
             # The worker's own lingering train occupancies do not count: when its lease was adopted, its heartbeat named
             # every job that it plays.
             train = any(each.lease is not None or each.worker != occupancy.worker for each in beside)
-            apart = not train and not any(related(there.permits, occupancy.family) for there in others)
+            apart = not train and not any(related(there.permits, occupancy.case_set) for there in others)
             want(
                 state, occupancy.id, apart, "a hidden job shares no kernel with related agents and train jobs"
             )
@@ -86,12 +86,12 @@ def _isolation(state: State) -> None:
             )
     flows = {group.flow for group in state.groups.values()}
     flows |= {run.flow for run in state.runs.values()} | {each.flow for each in state.evaluations.values()}
-    users = Counter(flow.family for flow in flows if flow.family is not None)
+    users = Counter(flow.case_set for flow in flows if flow.case_set is not None)
     for kernel in state.kernels.values():
         for index in (kernel.permits, kernel.asks, kernel.hidden, kernel.train, kernel.reversals):
-            users.update({family: len(there) for family, there in index.items() if family is not None})
-    for family in state.families.known():
-        want(state, "", family.users == users[family], "a family is kept while it has users")
+            users.update({case_set: len(there) for case_set, there in index.items() if case_set is not None})
+    for case_set in state.case_sets.known():
+        want(state, "", case_set.users == users[case_set], "a case set is kept while it has users")
     for group in state.held:
         want(state, group.id, group.held_since is not None and not group.closed, "only open groups are held")
 
@@ -215,11 +215,11 @@ def _queue(state: State) -> None:
     for lane in state.lanes.values():
         want(state, str(lane.key), lane.stopping == stopping[lane.key], "stopping jobs are counted")
         hidden = any(any(profile.hidden) for profile in lane.profiles)
-        looked_at = ("lane", lane.key) in state.timers
+        checked_at = ("lane", lane.key) in state.timers
         want(
             state,
             str(lane.key),
-            looked_at or not (lane.n_ready[TRAIN] and hidden),
+            checked_at or not (lane.n_ready[TRAIN] and hidden),
             "a lane whose train jobs wait beside hidden ones has a deadline",
         )
         for priority in range(N_PRIORITIES):
@@ -227,15 +227,15 @@ def _queue(state: State) -> None:
             want(state, str(lane.key), total == lane.n_ready[priority], "a lane counts its flows' ready jobs")
         waiting = [job for job in state.jobs.values() if job.queued and job.group.flow.lane is lane]
         for priority in range(N_PRIORITIES):
-            families = Counter(job.group.flow.family for job in waiting if job.priority == priority)
+            case_sets = Counter(job.group.flow.case_set for job in waiting if job.priority == priority)
             want(
                 state,
                 str(lane.key),
-                dict(families) == lane.waiting[priority],
-                "waiting families are counted",
+                dict(case_sets) == lane.waiting[priority],
+                "waiting case sets are counted",
             )
         backlog = Counter(
-            job.group.flow.family for job in waiting if job.group.hidden and job.group.flow.closed
+            job.group.flow.case_set for job in waiting if job.group.hidden and job.group.flow.closed
         )
         want(state, str(lane.key), dict(backlog) == lane.backlog, "hidden jobs of closed runs are counted")
         for profile in lane.profiles:

@@ -221,7 +221,7 @@ def _poll_ended(state: State, request: events.RequestId, this: Step) -> None:
         POLLS[poll.kind](state, poll, this)
 
 
-def _look_at_lane(state: State, key: LaneKey, this: Step) -> None:
+def _check_lane(state: State, key: LaneKey, this: Step) -> None:
     lane = state.lanes.get(key)
     if lane is not None:
         this.dirty[lane] = None
@@ -235,7 +235,7 @@ POLLS: Mapping[str, Rule] = {
 }
 
 TIMERS: dict[str, Rule] = {
-    "worker": expiry.look_at,
+    "worker": expiry.check_due,
     "lease": fleet.poll_ended,
     "beat": fleet.beat_ended,
     "bench": scheduler.bench_ended,
@@ -243,10 +243,10 @@ TIMERS: dict[str, Rule] = {
     "poll": _poll_ended,
     "job": queue.backed_off,
     "adopt": queue.give_up_adopting,
-    "lane": _look_at_lane,
-    "hidden": precedence.look_at,
+    "lane": _check_lane,
+    "hidden": precedence.check_due,
     "submit": submits.limit_passed,
-    "audits": finalisation.look_at_audits,
+    "audits": finalisation.check_audits,
     "linger": occupancies.expire,
     "ask": permits.ask_ended,
     "cancelled": permits.agent_ended,

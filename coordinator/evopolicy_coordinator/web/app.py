@@ -106,10 +106,10 @@ class Site:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
 
-    async def look(self) -> None:
+    async def refresh(self) -> None:
         """Reads the folders anew, unless that was just done."""
         if self.cluster is not None:
-            self.cluster.look()
+            self.cluster.wake()
         async with self._looking:
             if time.monotonic() - self._looked_at < max(_LOOK_S, _SHARE * self._took_s):
                 return
@@ -130,7 +130,7 @@ class Site:
             self._moved.clear()
             try:
                 if self.feeds.watchers:
-                    await self.look()
+                    await self.refresh()
                 for feed, view in self.feeds.watched():
                     feed.update(await asyncio.to_thread(view))
             except Exception:
@@ -174,7 +174,7 @@ class Site:
 
     async def live_page(self, request: Request, name: str, template: str, **values: Any) -> Response:
         """A page whose parts are kept up to date."""
-        await self.look()
+        await self.refresh()
         words = _words(request)
         shown = self._shown(request, name)
         make = self.view_of(name, words, may_act=shown["acting"])
@@ -231,7 +231,7 @@ class Site:
         return StreamingResponse(feed.events(cursor[:64]), media_type="text/event-stream", headers=headers)
 
     async def submit_page(self, request: Request) -> Response:
-        await self.look()
+        await self.refresh()
         run = self.runs.by_key.get(request.path_params["key"])
         index = request.path_params["index"]
         values = None
@@ -251,7 +251,7 @@ class Site:
         return HTMLResponse(html)
 
     async def episode_page(self, request: Request) -> Response:
-        await self.look()
+        await self.refresh()
         run = self.runs.by_key.get(request.path_params["key"])
         index, episode = request.path_params["index"], request.path_params["episode"]
         try:
@@ -272,7 +272,7 @@ class Site:
         path = request.query_params.get("path", "")
         allowed = path.startswith("workspace/feedback/")
         if run is not None and path.startswith("replays/"):
-            await self.look()
+            await self.refresh()
             run = self.runs.by_key.get(run.key)
             allowed = run is not None and self.runs.may_show(run)
         if run is None or run.path is None or not allowed:
@@ -288,7 +288,7 @@ class Site:
 
     async def report_file(self, request: Request) -> Response:
         """A file of a written report, which holds hidden scores of all its runs."""
-        await self.look()
+        await self.refresh()
         if self.report is None:
             return self._message(
                 request, "No report", "Start the view with --report DIR to have one here.", 404
@@ -343,7 +343,7 @@ class Site:
     async def metrics(self, request: Request) -> Response:
         """The coordinator's last metrics, and those of this process, in Prometheus' text format."""
         if self.cluster is not None:
-            self.cluster.look()
+            self.cluster.wake()
         return Response(await asyncio.to_thread(generate_latest, self._registry), media_type=CONTENT_TYPE)
 
     # ---- acting ----

@@ -150,7 +150,7 @@ def redact(
     counts: dict[str, int] = {}
     if passed is not None:
         data, counts[secrets.PASSED_VALUE] = secrets.replaced(data, passed.places(data), REDACTED)
-    for pattern, what in ((_HOME, "a home folder"), *secrets.looks(data)):
+    for pattern, what in ((_HOME, "a home folder"), *secrets.patterns(data)):
         data, counts[what] = pattern.subn(REDACTED, data)
     # The longest first: a folder's path may begin with another's.
     for needle in sorted(needles, key=lambda needle: -len(needle.text)):

@@ -22,7 +22,7 @@ from evopolicy_coordinator.core.contract.records import PermitRow, RunRow, RunSt
 from evopolicy_coordinator.core.isolation import conflicts, kernels
 from evopolicy_coordinator.core.isolation.kernels import all_related, put, related, take
 from evopolicy_coordinator.core.leasing import leases
-from evopolicy_coordinator.core.tables.model import Ask, Family, Kernel, Run
+from evopolicy_coordinator.core.tables.model import Ask, CaseSet, Kernel, Run
 from evopolicy_coordinator.core.tables.state import State
 from evopolicy_coordinator.core.tables.step import Step
 
@@ -53,38 +53,38 @@ def places(state: State, run: str) -> set[str]:
 
 def ask(state: State, run: Run, row: PermitRow, step: Step) -> Reason | None:
     """Request a permit, again or for the first time. Returns the reason that it waits for; None when it is granted."""
-    kernel, family = kernels.kernel(state, row.boot_id), run.family
-    if run.id in kernel.permits.get(family, ()):
+    kernel, case_set = kernels.kernel(state, row.boot_id), run.case_set
+    if run.id in kernel.permits.get(case_set, ()):
         return None
-    if run.id not in kernel.asks.get(family, ()):
-        family.users += 1
-        ask = state.asks[run.id, kernel.boot_id] = Ask(row, family, kernel)
-        put(kernel.asks, family, run.id, ask)
-    _preempt(state, family, kernel, step)
-    return _grant(state, run.id, kernel, family, step)
+    if run.id not in kernel.asks.get(case_set, ()):
+        case_set.users += 1
+        ask = state.asks[run.id, kernel.boot_id] = Ask(row, case_set, kernel)
+        put(kernel.asks, case_set, run.id, ask)
+    _preempt(state, case_set, kernel, step)
+    return _grant(state, run.id, kernel, case_set, step)
 
 
-def _preempt(state: State, family: Family, kernel: Kernel, step: Step) -> None:
+def _preempt(state: State, case_set: CaseSet, kernel: Kernel, step: Step) -> None:
     """Stop related hidden jobs for a permit, unless they have precedence."""
     if not state.isolates:
         return
     there = list(state.kernels.values()) if kernel is state.everywhere else [kernel]
-    if any(related(each.reversals, family) for each in there):
+    if any(related(each.reversals, case_set) for each in there):
         return
     for each in there:
-        for occupancy in all_related(each.hidden, family):
+        for occupancy in all_related(each.hidden, case_set):
             if occupancy.lease is not None and occupancy.lease.live:
                 leases.put_off(state, occupancy.lease, "an agent is to start there", step)
 
 
-def _grant(state: State, run: str, kernel: Kernel, family: Family, step: Step) -> Reason | None:
-    waits_for = conflicts.permit_conflict(state, family, kernel)
+def _grant(state: State, run: str, kernel: Kernel, case_set: CaseSet, step: Step) -> Reason | None:
+    waits_for = conflicts.permit_conflict(state, case_set, kernel)
     if waits_for is not None:
         return waits_for
-    ask = _withdraw(state, run, kernel, family)
+    ask = _withdraw(state, run, kernel, case_set)
     assert ask is not None
     row = msgspec.structs.replace(ask.row, granted_at=step.now)
-    restore(state, row, family)
+    restore(state, row, case_set)
     step.persist(row)
     step.log("info", "permit_granted", run=run, host=row.host, boot_id=row.boot_id)
     for poll in state.polls.take_all(poll_target(run, row.boot_id)):
@@ -92,21 +92,21 @@ def _grant(state: State, run: str, kernel: Kernel, family: Family, step: Step) -
     return None
 
 
-def restore(state: State, row: PermitRow, family: Family) -> None:
+def restore(state: State, row: PermitRow, case_set: CaseSet) -> None:
     """Enter a permit."""
-    family.users += 1
+    case_set.users += 1
     kernel = kernels.kernel(state, row.boot_id)
-    put(kernel.permits, family, row.run, row)
-    state.permits.setdefault(row.run, {})[kernel] = row, family
+    put(kernel.permits, case_set, row.run, row)
+    state.permits.setdefault(row.run, {})[kernel] = row, case_set
 
 
-def _withdraw(state: State, run: str, kernel: Kernel, family: Family) -> Ask | None:
+def _withdraw(state: State, run: str, kernel: Kernel, case_set: CaseSet) -> Ask | None:
     """Remove a permit request."""
-    ask = take(kernel.asks, family, run)
+    ask = take(kernel.asks, case_set, run)
     state.asks.pop((run, kernel.boot_id), None)
     if ask is not None:
         state.timers.disarm(("ask", (run, kernel.boot_id)))
-        state.families.leave(family)
+        state.case_sets.leave(case_set)
     return ask
 
 
@@ -114,8 +114,8 @@ def forget_ask(state: State, run: str, boot_id: str, step: Step) -> None:
     """Remove a permit request that was not repeated, and free the jobs that it barred."""
     ask = state.asks.get((run, boot_id))
     if ask is not None:
-        kernels.freed(state, ask.family, step, train_too=False)
-        _withdraw(state, run, ask.kernel, ask.family)
+        kernels.freed(state, ask.case_set, step, train_too=False)
+        _withdraw(state, run, ask.kernel, ask.case_set)
         kernels.tidy(state, ask.kernel)
 
 
@@ -128,8 +128,8 @@ def settle(state: State, step: Step) -> None:
     """At the end of a step: grant requested permits that have become possible."""
     state.grantable = False
     for ask in list(state.asks.values()):
-        _preempt(state, ask.family, ask.kernel, step)
-        _grant(state, ask.row.run, ask.kernel, ask.family, step)
+        _preempt(state, ask.case_set, ask.kernel, step)
+        _grant(state, ask.row.run, ask.kernel, ask.case_set, step)
 
 
 def drop_asks(state: State, run: str, refusal: Refusal, reason: Reason, step: Step) -> None:
@@ -155,15 +155,15 @@ def end(state: State, run: str, step: Step, why: str, *, boot_id: str = "") -> N
 
 def _end(state: State, kernel: Kernel, row: PermitRow, step: Step, why: str) -> None:
     there = state.permits[row.run]
-    _, family = there.pop(kernel)
+    _, case_set = there.pop(kernel)
     if not there:
         del state.permits[row.run]
-    take(kernel.permits, family, row.run)
+    take(kernel.permits, case_set, row.run)
     step.persist(msgspec.structs.replace(row, ended_at=step.now))
     step.log("info", "permit_ended", run=row.run, host=row.host, boot_id=row.boot_id, why=why)
-    kernels.freed(state, family, step)
+    kernels.freed(state, case_set, step)
     kernels.tidy(state, kernel)
-    state.families.leave(family)
+    state.case_sets.leave(case_set)
 
 
 def agent_ended(state: State, run: str, step: Step) -> None:
@@ -189,9 +189,9 @@ def load(
         run = runs.get(row.run)
         if run is None or row.ended_at is not None:
             continue
-        family = state.families.join(run.settings.env, (*run.validation, *run.heldout))
-        restore(state, row, family)
-        state.families.leave(family)
+        case_set = state.case_sets.join(run.settings.env, (*run.validation, *run.heldout))
+        restore(state, row, case_set)
+        state.case_sets.leave(case_set)
         stored = states.get(row.run)
         if stored is not None and stored.phase == "finished":
             at = step.now if stored.closed_at is None else min(stored.closed_at, step.now)

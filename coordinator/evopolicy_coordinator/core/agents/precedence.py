@@ -23,7 +23,7 @@ from evopolicy_coordinator.core.tables.model import (
     EARLY_VALIDATION,
     EVERYWHERE,
     TRAIN,
-    Family,
+    CaseSet,
     Kernel,
     Lane,
     LaneKey,
@@ -32,10 +32,10 @@ from evopolicy_coordinator.core.tables.model import (
 from evopolicy_coordinator.core.tables.state import State
 from evopolicy_coordinator.core.tables.step import AgentOverdue, Step
 
-LOOK_S = 1.0
+CHECK_S = 1.0
 """Interval between checks of waiting hidden jobs, and of train jobs that hidden ones may keep waiting."""
 
-DONE_LOOKS = 3
+DONE_CHECKS = 3
 """After this many checks without hidden jobs they count as done: jobs that follow from the last one may
 take a moment to queue."""
 
@@ -43,39 +43,39 @@ take a moment to queue."""
 def watch(state: State, lane: Lane, step: Step) -> None:
     """Schedule the lane's next check, if it has anything to check."""
     if state.isolates and (lane.backlog or lane.kept_s or lane.reversals or lane.waiting[TRAIN]):
-        state.timers.arm_once(("hidden", lane.key), step.now + LOOK_S)
+        state.timers.arm_once(("hidden", lane.key), step.now + CHECK_S)
 
 
-def look_at(state: State, key: LaneKey, step: Step) -> None:
+def check_due(state: State, key: LaneKey, step: Step) -> None:
     """A lane's deadline: check it."""
     lane = state.lanes.get(key)
     if lane is not None:
-        look(state, lane, step)
+        check(state, lane, step)
 
 
-def look(state: State, lane: Lane, step: Step) -> None:
+def check(state: State, lane: Lane, step: Step) -> None:
     """Reserve a kernel for hidden jobs that have waited for long, or release it; update which submits are held."""
-    passed_s = min(step.now - lane.looked_at, 2 * LOOK_S)
-    lane.looked_at = step.now
+    passed_s = min(step.now - lane.checked_at, 2 * CHECK_S)
+    lane.checked_at = step.now
     there = kernels.serving(state, lane)
-    for family in {**lane.backlog, **lane.kept_s, **lane.reversals}:
-        _hidden(state, lane, family, there, passed_s, step)
+    for case_set in {**lane.backlog, **lane.kept_s, **lane.reversals}:
+        _hidden(state, lane, case_set, there, passed_s, step)
     _train(state, lane, there, step)
     watch(state, lane, step)
 
 
 def _hidden(
-    state: State, lane: Lane, family: Family, there: dict[Kernel, None], passed_s: float, step: Step
+    state: State, lane: Lane, case_set: CaseSet, there: dict[Kernel, None], passed_s: float, step: Step
 ) -> None:
-    reversal = lane.reversals.get(family)
-    played = _played(state, lane, family)
-    if played or lane.backlog.get(family):
-        lane.done_looks.pop(family, None)
+    reversal = lane.reversals.get(case_set)
+    played = _played(state, lane, case_set)
+    if played or lane.backlog.get(case_set):
+        lane.done_checks.pop(case_set, None)
     else:
-        lane.done_looks[family] = lane.done_looks.get(family, 0) + 1
-        if lane.done_looks[family] >= DONE_LOOKS:
-            del lane.done_looks[family]
-            lane.kept_s.pop(family, None)
+        lane.done_checks[case_set] = lane.done_checks.get(case_set, 0) + 1
+        if lane.done_checks[case_set] >= DONE_CHECKS:
+            del lane.done_checks[case_set]
+            lane.kept_s.pop(case_set, None)
             if reversal is not None:
                 release_kernel(state, reversal, step, "no hidden case of closed runs is left")
         return
@@ -89,15 +89,15 @@ def _hidden(
     for kernel in there:
         if kernel.boot_id == EVERYWHERE:
             continue
-        if conflicts.hidden_conflict(state, family, kernel):
+        if conflicts.hidden_conflict(state, case_set, kernel):
             barred.append(kernel)
         elif _at_work(state, kernel):
             return
     if played or not barred:
         return
-    kept_s = lane.kept_s[family] = lane.kept_s.get(family, 0.0) + passed_s
+    kept_s = lane.kept_s[case_set] = lane.kept_s.get(case_set, 0.0) + passed_s
     if kept_s >= state.settings.hidden_wait_s:
-        _reserve_kernel(state, lane, family, barred, step)
+        _reserve_kernel(state, lane, case_set, barred, step)
 
 
 def _at_work(state: State, kernel: Kernel) -> bool:
@@ -108,32 +108,32 @@ def _at_work(state: State, kernel: Kernel) -> bool:
 def _end_overdue(state: State, reversal: Reversal, step: Step) -> None:
     """Report the runs whose agents have kept hidden jobs from a reserved kernel for too long."""
     for kernel in (reversal.kernel, state.everywhere):
-        for row in all_related(kernel.permits, reversal.family):
+        for row in all_related(kernel.permits, reversal.case_set):
             if row.run in state.runs and step.now - row.granted_at >= state.settings.agent_wait_s:
                 step.tell(AgentOverdue(state.runs[row.run]))
 
 
-def _played(state: State, lane: Lane, family: Family) -> bool:
+def _played(state: State, lane: Lane, case_set: CaseSet) -> bool:
     """Whether hidden jobs of the lane's closed runs are leased, or wait for their worker's release."""
     return any(
         occupancy.lease is not None
         and (occupancy.lease.live or occupancy.lease.parting)
         and occupancy.lease.job.group.flow.closed
         for kernel in state.kernels.values()
-        for occupancy in kernel.hidden.get(family, {}).values()
+        for occupancy in kernel.hidden.get(case_set, {}).values()
         if occupancy.lease is not None and occupancy.lease.job.group.flow.lane is lane
     )
 
 
-def _reserve_kernel(state: State, lane: Lane, family: Family, barred: list[Kernel], step: Step) -> None:
+def _reserve_kernel(state: State, lane: Lane, case_set: CaseSet, barred: list[Kernel], step: Step) -> None:
     def in_the_way(kernel: Kernel) -> tuple[int, int]:
-        return len(all_related(kernel.permits, family)), len(all_related(kernel.train, family))
+        return len(all_related(kernel.permits, case_set)), len(all_related(kernel.train, case_set))
 
     kernel = min(barred, key=in_the_way)
-    reversal = lane.reversals[family] = Reversal(kernel, lane, family)
-    family.users += 1
-    kernel.reversals.setdefault(family, {})[str(lane.key)] = reversal
-    for occupancy in all_related(kernel.hidden, family):
+    reversal = lane.reversals[case_set] = Reversal(kernel, lane, case_set)
+    case_set.users += 1
+    kernel.reversals.setdefault(case_set, {})[str(lane.key)] = reversal
+    for occupancy in all_related(kernel.hidden, case_set):
         lease = occupancy.lease
         if lease is not None and lease.live and lease.job.priority == EARLY_VALIDATION:
             leases.put_off(state, lease, "hidden jobs of closed runs go first there", step)
@@ -143,27 +143,27 @@ def _reserve_kernel(state: State, lane: Lane, family: Family, barred: list[Kerne
 
 def release_kernel(state: State, reversal: Reversal, step: Step, why: str) -> None:
     """Release a reserved kernel: agents have precedence again."""
-    kernel, family = reversal.kernel, reversal.family
-    del reversal.lane.reversals[family]
-    there = kernel.reversals[family]
+    kernel, case_set = reversal.kernel, reversal.case_set
+    del reversal.lane.reversals[case_set]
+    there = kernel.reversals[case_set]
     del there[str(reversal.lane.key)]
     if not there:
-        del kernel.reversals[family]
+        del kernel.reversals[case_set]
     step.log("info", "agents_first", env=reversal.lane.key[0], boot_id=kernel.boot_id, why=why)
-    kernels.freed(state, family, step)
+    kernels.freed(state, case_set, step)
     kernels.tidy(state, kernel)
-    state.families.leave(family)
+    state.case_sets.leave(case_set)
 
 
 def _train(state: State, lane: Lane, there: dict[Kernel, None], step: Step) -> None:
     """Start or stop counting the time for which submits are held."""
     barred = {
-        family
-        for family in lane.waiting[TRAIN]
-        if there and all(conflicts.train_conflict(state, family, kernel) for kernel in there)
+        case_set
+        for case_set in lane.waiting[TRAIN]
+        if there and all(conflicts.train_conflict(state, case_set, kernel) for kernel in there)
     }
     for group in [group for group in state.held if group.flow.lane is lane]:
-        if group.flow.family not in barred:
+        if group.flow.case_set not in barred:
             leases.let_go(state, group, step.now)
     if not barred:
         return
@@ -173,7 +173,12 @@ def _train(state: State, lane: Lane, there: dict[Kernel, None], step: Step) -> N
         run = state.runs.get(name)
         open_group = "" if run is None or run.open is None else train_group(run.id, run.open)
         found = state.groups.get(open_group)
-        if found is None or found.n_leased or found.flow.lane is not lane or found.flow.family not in barred:
+        if (
+            found is None
+            or found.n_leased
+            or found.flow.lane is not lane
+            or found.flow.case_set not in barred
+        ):
             continue
         if found.held_since is None:
             found.held_since = step.now

@@ -52,7 +52,7 @@ def requested(state: State, event: events.Requested[gateway.RequestPermit], step
 def answer(state: State, poll: Poll, step: Step) -> None:
     """A gateway's wait for a permit has timed out."""
     _, run, boot_id = poll.target.split(" ", 2)
-    waits_for = conflicts.permit_conflict(state, state.runs[run].family, kernels.kernel(state, boot_id))
+    waits_for = conflicts.permit_conflict(state, state.runs[run].case_set, kernels.kernel(state, boot_id))
     step.reply(poll.request, gateway.Permit(granted=False), waits_for)
 
 
@@ -103,7 +103,7 @@ def resume(state: State, run: Run, step: Step) -> None:
             kernel = permits.place(run, EVERYWHERE)
             if kernel is not None:
                 row = PermitRow(run=run.id, boot_id=kernel, granted_at=step.now)
-                permits.restore(state, row, run.family)
+                permits.restore(state, row, run.case_set)
                 step.persist(row)
     elif before != "shared" and not state.isolates:
         step.change_run(run, isolation="shared")

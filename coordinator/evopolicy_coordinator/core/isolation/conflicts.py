@@ -18,7 +18,7 @@ from evopolicy_coordinator.core.tables.model import (
     EARLY_VALIDATION,
     HIDDEN,
     TRAIN,
-    Family,
+    CaseSet,
     JobGroup,
     JobState,
     Kernel,
@@ -34,7 +34,7 @@ NO_BOOT_ID = (
 
 
 def concerns(state: State, priority: int, worker: Worker) -> bool:
-    """Whether `conflict` may hold for any family."""
+    """Whether `conflict` may hold for any case set."""
     if priority == TRAIN:
         kernel = worker.kernel
         there = kernel.hidden or kernel.reversals or state.everywhere.hidden
@@ -42,73 +42,75 @@ def concerns(state: State, priority: int, worker: Worker) -> bool:
     return state.isolates and priority in HIDDEN
 
 
-def conflict(state: State, priority: int, family: Family | None, worker: Worker) -> bool:
-    """Whether a job of that priority and family must not be leased to a worker now."""
+def conflict(state: State, priority: int, case_set: CaseSet | None, worker: Worker) -> bool:
+    """Whether a job of that priority and case set must not be leased to a worker now."""
     if not state.isolates:
         return False
     if priority == TRAIN:
-        return train_conflict(state, family, worker.kernel)
+        return train_conflict(state, case_set, worker.kernel)
     if priority not in HIDDEN:
         return False
-    return hidden_conflict(state, family, worker.kernel) is not None or _train_waits(priority, family, worker)
-
-
-def _train_waits(priority: int, family: Family | None, worker: Worker) -> bool:
-    """Whether related train jobs wait for workers like this one: hidden jobs must not delay them."""
-    assert family is not None
-    if priority != EARLY_VALIDATION and related(worker.kernel.reversals, family):
-        return False
-    busy = worker.profile.busy
-    return any(
-        lane in busy and each in lane.waiting[TRAIN] for each in family.relatives for lane in each.lanes
+    return hidden_conflict(state, case_set, worker.kernel) is not None or _train_waits(
+        priority, case_set, worker
     )
 
 
-def train_conflict(state: State, family: Family | None, kernel: Kernel) -> bool:
-    """Whether hidden jobs keep train jobs of a family from a kernel."""
+def _train_waits(priority: int, case_set: CaseSet | None, worker: Worker) -> bool:
+    """Whether related train jobs wait for workers like this one: hidden jobs must not delay them."""
+    assert case_set is not None
+    if priority != EARLY_VALIDATION and related(worker.kernel.reversals, case_set):
+        return False
+    busy = worker.profile.busy
+    return any(
+        lane in busy and each in lane.waiting[TRAIN] for each in case_set.relatives for lane in each.lanes
+    )
+
+
+def train_conflict(state: State, case_set: CaseSet | None, kernel: Kernel) -> bool:
+    """Whether hidden jobs keep train jobs of a case set from a kernel."""
     if kernel is state.everywhere:
         return any(
-            related(each.hidden, family) or reversed_there(state, each, family)
+            related(each.hidden, case_set) or reversed_there(state, each, case_set)
             for each in state.kernels.values()
         )
-    if related(kernel.hidden, family) or related(state.everywhere.hidden, family):
+    if related(kernel.hidden, case_set) or related(state.everywhere.hidden, case_set):
         return True
-    return bool(kernel.reversals) and reversed_there(state, kernel, family)
+    return bool(kernel.reversals) and reversed_there(state, kernel, case_set)
 
 
-def reversed_there(state: State, kernel: Kernel, family: Family | None) -> bool:
-    """Whether the kernel is reserved for related hidden jobs and train jobs of the family are held back for it."""
-    return related(kernel.reversals, family) is not None and not permits_there(state, kernel, family)
+def reversed_there(state: State, kernel: Kernel, case_set: CaseSet | None) -> bool:
+    """Whether the kernel is reserved for related hidden jobs and train jobs of the case set are held back for it."""
+    return related(kernel.reversals, case_set) is not None and not permits_there(state, kernel, case_set)
 
 
-def permits_there(state: State, kernel: Kernel, family: Family | None) -> dict[str, PermitRow] | None:
-    """Permits of the family's relatives that may be on a kernel; None for none."""
-    return related(kernel.permits, family) or related(state.everywhere.permits, family)
+def permits_there(state: State, kernel: Kernel, case_set: CaseSet | None) -> dict[str, PermitRow] | None:
+    """Permits of the case set's relatives that may be on a kernel; None for none."""
+    return related(kernel.permits, case_set) or related(state.everywhere.permits, case_set)
 
 
-def hidden_conflict(state: State, family: Family | None, kernel: Kernel) -> str | None:
-    """Why hidden jobs of a family must not be leased on a kernel: `kernel`, `agent`, `asked` or
+def hidden_conflict(state: State, case_set: CaseSet | None, kernel: Kernel) -> str | None:
+    """Why hidden jobs of a case set must not be leased on a kernel: `kernel`, `agent`, `asked` or
     `train`; None: they may."""
     if kernel is state.everywhere:
         return "kernel"
-    if permits_there(state, kernel, family):
+    if permits_there(state, kernel, case_set):
         return "agent"
-    turned_over = related(kernel.reversals, family)
-    if not turned_over and (related(kernel.asks, family) or related(state.everywhere.asks, family)):
+    turned_over = related(kernel.reversals, case_set)
+    if not turned_over and (related(kernel.asks, case_set) or related(state.everywhere.asks, case_set)):
         return "asked"
-    if related(kernel.train, family) or related(state.everywhere.train, family):
+    if related(kernel.train, case_set) or related(state.everywhere.train, case_set):
         return "train"
     return None
 
 
-def permit_conflict(state: State, family: Family, kernel: Kernel) -> Reason | None:
+def permit_conflict(state: State, case_set: CaseSet, kernel: Kernel) -> Reason | None:
     """The reason why a permit must wait; None when it may be granted."""
     if not state.isolates:
         return None
     there = state.kernels.values() if kernel is state.everywhere else (kernel, state.everywhere)
-    if any(related(each.reversals, family) for each in there):
+    if any(related(each.reversals, case_set) for each in there):
         return because("scoring")
-    occupancies = [occupancy for each in there for occupancy in all_related(each.hidden, family)]
+    occupancies = [occupancy for each in there for occupancy in all_related(each.hidden, case_set)]
     if not occupancies:
         return None
     if any(occupancy.lease is not None for occupancy in occupancies):
@@ -118,15 +120,15 @@ def permit_conflict(state: State, family: Family, kernel: Kernel) -> Reason | No
 
 def adoptable(state: State, job: JobState, worker: Worker) -> bool:
     """Whether a job that a worker reports to hold since before the core was loaded may continue there."""
-    family, here = job.group.flow.family, (worker.kernel, state.everywhere)
+    case_set, here = job.group.flow.case_set, (worker.kernel, state.everywhere)
     if not state.isolates or not (job.group.hidden or job.priority == TRAIN):
         return True
     if job.priority == TRAIN:
-        there = [occupancy for each in here for occupancy in all_related(each.hidden, family)]
-    elif hidden_conflict(state, family, worker.kernel) in ("kernel", "agent", "asked"):
+        there = [occupancy for each in here for occupancy in all_related(each.hidden, case_set)]
+    elif hidden_conflict(state, case_set, worker.kernel) in ("kernel", "agent", "asked"):
         return False
     else:
-        there = [occupancy for each in here for occupancy in all_related(each.train, family)]
+        there = [occupancy for each in here for occupancy in all_related(each.train, case_set)]
     # This worker's own lingering occupancies do not count: its heartbeat names every lease that it holds.
     return all(occupancy.lease is None and occupancy.worker == worker.name for occupancy in there)
 
@@ -137,20 +139,20 @@ def goes_first(lease: Lease) -> bool:
     return (
         occupancy is not None
         and lease.job.priority != EARLY_VALIDATION
-        and related(occupancy.kernel.reversals, occupancy.family) is not None
+        and related(occupancy.kernel.reversals, occupancy.case_set) is not None
     )
 
 
-def to_clear(state: State, family: Family | None) -> list[tuple[Kernel, list[Lease]]]:
-    """The kernels where related hidden jobs bar a family's train jobs, each with the live leases to stop there; those
+def to_clear(state: State, case_set: CaseSet | None) -> list[tuple[Kernel, list[Lease]]]:
+    """The kernels where related hidden jobs bar a case set's train jobs, each with the live leases to stop there; those
     with the fewest first. The list of leases is empty where all were stopped but not all are released yet."""
     found = []
     kernels: dict[Kernel, None] = {}
-    if state.isolates and family is not None:
-        kernels = {kernel: None for each in family.relatives for kernel in each.hidden_on}
+    if state.isolates and case_set is not None:
+        kernels = {kernel: None for each in case_set.relatives for kernel in each.hidden_on}
     for kernel in kernels:
-        occupancies = all_related(kernel.hidden, family)
-        if occupancies and not reversed_there(state, kernel, family):
+        occupancies = all_related(kernel.hidden, case_set)
+        if occupancies and not reversed_there(state, kernel, case_set):
             found.append(
                 (
                     kernel,
@@ -188,19 +190,21 @@ def obstacle(state: State, group: JobGroup) -> Reason | None:
 
     For a train group the only such reason is hidden jobs.
     """
-    lane, family = group.flow.lane, group.flow.family
+    lane, case_set = group.flow.lane, group.flow.case_set
     if lane is None or not state.isolates or not (group.hidden or group.kind == "train"):
         return None
     there = kernels.serving(state, lane)
     if not there:
         return None
     if group.kind == "train":
-        return because("scoring") if all(train_conflict(state, family, kernel) for kernel in there) else None
-    why = [hidden_conflict(state, family, kernel) for kernel in there]
+        return (
+            because("scoring") if all(train_conflict(state, case_set, kernel) for kernel in there) else None
+        )
+    why = [hidden_conflict(state, case_set, kernel) for kernel in there]
     if not all(why):
         return None
     for kernel in there:
-        permits = permits_there(state, kernel, family)
+        permits = permits_there(state, kernel, case_set)
         if permits is not None:
             row = next(iter(permits.values()))
             return because("agent_alive", run=row.run, place=row.host or row.boot_id)

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import TypeVar
 
-from evopolicy_coordinator.core.tables.model import Family, Kernel, Lane
+from evopolicy_coordinator.core.tables.model import CaseSet, Kernel, Lane
 from evopolicy_coordinator.core.tables.state import State
 from evopolicy_coordinator.core.tables.step import Step
 
@@ -45,51 +45,51 @@ def serving(state: State, lane: Lane) -> dict[Kernel, None]:
     return {workers[name].kernel: None for profile in lane.profiles for name in profile.workers}
 
 
-def freed(state: State, family: Family | None, step: Step, *, train_too: bool = True) -> None:
-    """Mark the lanes of a family's waiting jobs after a bar was lifted on some kernel: for hidden jobs, and with
+def freed(state: State, case_set: CaseSet | None, step: Step, *, train_too: bool = True) -> None:
+    """Mark the lanes of a case set's waiting jobs after a bar was lifted on some kernel: for hidden jobs, and with
     `train_too` also for train jobs and permits."""
     state.grantable = state.grantable or train_too
     lanes: Iterable[Lane] = state.lanes.values()
-    if family is not None:
-        lanes = [lane for each in family.relatives for lane in each.lanes]
+    if case_set is not None:
+        lanes = [lane for each in case_set.relatives for lane in each.lanes]
     for lane in lanes:
-        if lane not in step.dirty and lane.waits_of(family, train_too=train_too):
+        if lane not in step.dirty and lane.waits_of(case_set, train_too=train_too):
             step.dirty[lane] = None
 
 
-# ---- occupants of a kernel, by family ----
+# ---- occupants of a kernel, by case set ----
 
 
-def related(index: dict[Family | None, dict[str, T]], family: Family | None) -> dict[str, T] | None:
-    """The entries in `index` of one of the family's relatives; None when it has none."""
+def related(index: dict[CaseSet | None, dict[str, T]], case_set: CaseSet | None) -> dict[str, T] | None:
+    """The entries in `index` of one of the case set's relatives; None when it has none."""
     if not index:
         return None
-    if family is None:
+    if case_set is None:
         return next(iter(index.values()))
-    for each in family.relatives:
+    for each in case_set.relatives:
         there = index.get(each)
         if there is not None:
             return there
     return index.get(None)
 
 
-def all_related(index: dict[Family | None, dict[str, T]], family: Family | None) -> list[T]:
-    """All entries in `index` of the family's relatives."""
+def all_related(index: dict[CaseSet | None, dict[str, T]], case_set: CaseSet | None) -> list[T]:
+    """All entries in `index` of the case set's relatives."""
     if not index:
         return []
-    families = index if family is None else (*family.relatives, None)
-    return [each for member in families for each in index.get(member, {}).values()]
+    case_sets = index if case_set is None else (*case_set.relatives, None)
+    return [each for member in case_sets for each in index.get(member, {}).values()]
 
 
-def put(index: dict[Family | None, dict[str, T]], family: Family | None, name: str, what: T) -> None:
-    """Enter `what` under its family and name."""
-    index.setdefault(family, {})[name] = what
+def put(index: dict[CaseSet | None, dict[str, T]], case_set: CaseSet | None, name: str, what: T) -> None:
+    """Enter `what` under its case set and name."""
+    index.setdefault(case_set, {})[name] = what
 
 
-def take(index: dict[Family | None, dict[str, T]], family: Family | None, name: str) -> T | None:
-    """Remove and return the entry under a family and name; None when it is missing."""
-    there = index.get(family)
+def take(index: dict[CaseSet | None, dict[str, T]], case_set: CaseSet | None, name: str) -> T | None:
+    """Remove and return the entry under a case set and name; None when it is missing."""
+    there = index.get(case_set)
     taken = None if there is None else there.pop(name, None)
     if there is not None and not there:
-        del index[family]
+        del index[case_set]
     return taken

@@ -35,7 +35,7 @@ def leased(state: State, lease: Lease, worker: Worker, serial: int, step: Step) 
         worker.name,
         worker.kernel,
         worker.machine,
-        group.flow.family,
+        group.flow.case_set,
         group.hidden,
         lease,
         serial,
@@ -45,14 +45,14 @@ def leased(state: State, lease: Lease, worker: Worker, serial: int, step: Step) 
 
 
 def _enter(occupancy: Occupancy) -> None:
-    family = occupancy.family
-    if family is not None:
-        family.users += 1
+    case_set = occupancy.case_set
+    if case_set is not None:
+        case_set.users += 1
         if occupancy.hidden:
-            family.hidden_on[occupancy.kernel] = family.hidden_on.get(occupancy.kernel, 0) + 1
+            case_set.hidden_on[occupancy.kernel] = case_set.hidden_on.get(occupancy.kernel, 0) + 1
     put(
         occupancy.kernel.hidden if occupancy.hidden else occupancy.kernel.train,
-        occupancy.family,
+        occupancy.case_set,
         occupancy.key,
         occupancy,
     )
@@ -75,18 +75,18 @@ def left(state: State, lease: Lease, worker: Worker, step: Step, *, sure: bool) 
 def _gone(state: State, occupancy: Occupancy, step: Step) -> None:
     """Remove an ended occupancy, and mark the work that it barred."""
     index = occupancy.kernel.hidden if occupancy.hidden else occupancy.kernel.train
-    family = occupancy.family
-    take(index, family, occupancy.key)
-    if occupancy.hidden and family is not None:
-        left = family.hidden_on[occupancy.kernel] - 1
+    case_set = occupancy.case_set
+    take(index, case_set, occupancy.key)
+    if occupancy.hidden and case_set is not None:
+        left = case_set.hidden_on[occupancy.kernel] - 1
         if left:
-            family.hidden_on[occupancy.kernel] = left
+            case_set.hidden_on[occupancy.kernel] = left
         else:
-            del family.hidden_on[occupancy.kernel]
-    if not related(index, family):
-        kernels.freed(state, family, step, train_too=occupancy.hidden)
+            del case_set.hidden_on[occupancy.kernel]
+    if not related(index, case_set):
+        kernels.freed(state, case_set, step, train_too=occupancy.hidden)
     kernels.tidy(state, occupancy.kernel)
-    state.families.leave(family)
+    state.case_sets.leave(case_set)
 
 
 def forget(state: State, occupancy: Occupancy, step: Step) -> None:
@@ -135,13 +135,13 @@ def unknown(state: State, worker: Worker, item: HeldLease, step: Step) -> None:
     if job is not None:
         if not (job.group.hidden or job.group.kind == "train"):
             return
-        train, family = job.group.kind == "train", job.group.flow.family
+        train, case_set = job.group.kind == "train", job.group.flow.case_set
     else:
         run = state.runs.get(item.job_id.partition("/")[0])
-        family = None if run is None else run.flow.family
+        case_set = None if run is None else run.flow.case_set
     _linger(
         state,
-        Occupancy(item.lease_id, worker.name, worker.kernel, worker.machine, family, not train, None),
+        Occupancy(item.lease_id, worker.name, worker.kernel, worker.machine, case_set, not train, None),
         step,
     )
 

@@ -18,14 +18,14 @@ FORGET_S = 3600.0
 """A lost worker is listed for this long."""
 
 
-def look_at(state: State, name: str, step: Step) -> None:
+def check_due(state: State, name: str, step: Step) -> None:
     """A worker's deadline: check it."""
     worker = state.workers.get(name)
     if worker is not None:
-        look(state, worker, step)
+        check(state, worker, step)
 
 
-def look(state: State, worker: Worker, step: Step) -> None:
+def check(state: State, worker: Worker, step: Step) -> None:
     """Give up a worker's expired leases, declare it lost if it was silent, and set its next deadline."""
     settings, now = state.settings, step.now
     if now < state.hold_until:

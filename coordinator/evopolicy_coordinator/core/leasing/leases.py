@@ -105,10 +105,10 @@ def list_hidden(state: State, lease: Lease, worker: Worker, step: Step) -> None:
     if lease.job.priority != TRAIN:
         lease.hidden_in = worker.profile.hidden[lease.job.priority]
         lease.hidden_in[lease] = None
-        _look_again(state, worker, step)
+        _check_again(state, worker, step)
 
 
-def _look_again(state: State, worker: Worker, step: Step) -> None:
+def _check_again(state: State, worker: Worker, step: Step) -> None:
     """Check the worker's lanes again soon: train jobs that wait already (they avoided it, or the hidden job was adopted
     from its heartbeat) may stop its hidden job without any further event."""
     for lane in worker.profile.busy:

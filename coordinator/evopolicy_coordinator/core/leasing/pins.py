@@ -14,7 +14,7 @@ import msgspec
 from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_common.messages.episode import Tier
 from evopolicy_coordinator.core.leasing import fleet, queue
-from evopolicy_coordinator.core.tables.model import Family, Flow, Profile, Run, Worker
+from evopolicy_coordinator.core.tables.model import CaseSet, Flow, Profile, Run, Worker
 from evopolicy_coordinator.core.tables.state import State
 from evopolicy_coordinator.core.tables.step import FlowPinned, Step
 
@@ -26,14 +26,14 @@ def add_flow(
     env: str,
     tier: Tier,
     secret: bytes,
-    family: Family | None,
+    case_set: CaseSet | None,
     *,
     closed: bool,
     definition: str = "",
 ) -> Flow:
     """Create a flow for a run or an evaluation, not pinned to workers yet. `closed`: no agent works for it."""
     state.n_flows += 1
-    flow = Flow(name, env, tier, of, secret, state.n_flows, family, closed=closed, definition=definition)
+    flow = Flow(name, env, tier, of, secret, state.n_flows, case_set, closed=closed, definition=definition)
     state.unpinned[name] = flow
     return flow
 
@@ -42,7 +42,7 @@ def drop_flow(state: State, flow: Flow) -> None:
     """Remove the flow of a finished run or evaluation, which has no waiting jobs."""
     state.unpinned.pop(flow.id, None)
     flow.lane = None
-    state.families.leave(flow.family)
+    state.case_sets.leave(flow.case_set)
 
 
 def pin(state: State, flow: Flow, step: Step) -> None:

@@ -45,7 +45,7 @@ PASSES_MAX = 4
 """Most flows that are passed over because all their jobs were skipped."""
 
 BARRED_MAX = 64
-"""Most flows, or families of a lane, that are passed over because they conflict with the polling worker's kernel."""
+"""Most flows, or case sets of a lane, that are passed over because they conflict with the polling worker's kernel."""
 
 
 _RANK = tuple(next(n for n, rank in enumerate(RANKS) if each in rank) for each in range(N_PRIORITIES))
@@ -84,8 +84,8 @@ def place(state: State, flow: Flow, pin: str) -> Lane:
         for profile in state.profiles.values():
             _join(profile, lane)
     flow.pin, flow.lane = pin, lane
-    if flow.family is not None:
-        flow.family.lanes[lane] = None
+    if flow.case_set is not None:
+        flow.case_set.lanes[lane] = None
     for priority in range(N_PRIORITIES):
         flow.in_heap[priority] = False
         lane.count(priority, flow, flow.n_ready[priority] + suspects.count(priority))
@@ -104,8 +104,8 @@ def close(state: State, flow: Flow) -> None:
         for priority in HIDDEN
     }
     flow.closed = True
-    if flow.lane is not None and flow.family is not None:
-        add(flow.lane.backlog, flow.family, sum(waiting.values()))
+    if flow.lane is not None and flow.case_set is not None:
+        add(flow.lane.backlog, flow.case_set, sum(waiting.values()))
 
 
 def _join(profile: Profile, lane: Lane) -> None:
@@ -192,7 +192,7 @@ def take(state: State, worker: Worker, warm: Collection[str], now: float) -> Job
                 break
             flow, priority = found
             lane = found[0].lane
-            if conflicts.conflict(state, priority, flow.family, worker):
+            if conflicts.conflict(state, priority, flow.case_set, worker):
                 barred += 1
             else:
                 job = _first(flow, priority, worker, now, sole=lane.workers() <= 1)
@@ -231,13 +231,13 @@ def may_train(state: State, lane: Lane, worker: Worker) -> bool:
 
 
 def _open(state: State, lane: Lane, priority: int, worker: Worker) -> bool:
-    """Whether jobs of some family that waits in the lane may be leased on the worker's kernel."""
+    """Whether jobs of some case set that waits in the lane may be leased on the worker's kernel."""
     there = lane.waiting[priority]
     if not there:
         return False
     if len(there) > BARRED_MAX or not conflicts.concerns(state, priority, worker):
         return True
-    return any(not conflicts.conflict(state, priority, family, worker) for family in there)
+    return any(not conflicts.conflict(state, priority, case_set, worker) for case_set in there)
 
 
 def _serve(state: State, job: JobState) -> None:

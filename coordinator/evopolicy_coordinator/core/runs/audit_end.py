@@ -35,9 +35,9 @@ def holds_up(state: State, run: Run, step: Step) -> bool:
     if not waiting:
         state.timers.disarm(("audits", run.id))
         return False
-    if run.audits_looked_at is not None and all(_playable(state, run, row) for row in waiting):
-        run.audits_waited_s += step.now - run.audits_looked_at
-    run.audits_looked_at = step.now
+    if run.audits_checked_at is not None and all(_playable(state, run, row) for row in waiting):
+        run.audits_waited_s += step.now - run.audits_checked_at
+    run.audits_checked_at = step.now
     left_s = state.settings.audit_wait_s - run.audits_waited_s
     # After a start, or after the loop was blocked, workers may not have returned yet.
     in_vain = step.now >= state.hold_until and all(_obstacle(state, run, row) for row in waiting)
@@ -82,7 +82,7 @@ def _playable(state: State, run: Run, row: AuditRow) -> bool:
     return (
         not able
         or not state.isolates
-        or any(conflicts.hidden_conflict(state, run.family, worker.kernel) is None for worker in able)
+        or any(conflicts.hidden_conflict(state, run.case_set, worker.kernel) is None for worker in able)
     )
 
 

@@ -51,7 +51,7 @@ def request(state: State, event: events.EvaluationRequested, step: Step) -> None
 def enter(state: State, row: EvaluationRow) -> Evaluation:
     """Add an evaluation to the core, with none of its jobs queued yet."""
     hidden = templates.hidden_evaluation(row)
-    family = state.families.join(row.env, (*row.cases, *row.related)) if hidden else None
+    case_set = state.case_sets.join(row.env, (*row.cases, *row.related)) if hidden else None
     name = row.evaluation
     flow = pins.add_flow(
         state,
@@ -60,7 +60,7 @@ def enter(state: State, row: EvaluationRow) -> Evaluation:
         row.env,
         row.tier,
         row.secret,
-        family,
+        case_set,
         closed=True,
         definition=row.definition,
     )

@@ -97,7 +97,7 @@ def audits_moved(state: State, news: AuditsMoved, step: Step) -> None:
     advance(state, news.run, step)
 
 
-def look_at_audits(state: State, name: str, step: Step) -> None:
+def check_audits(state: State, name: str, step: Step) -> None:
     """The deadline of a run that waits for its audits: check whether a worker can still play them."""
     run = state.runs.get(name)
     if run is not None:

@@ -61,11 +61,11 @@ def create(state: State, event: events.RunCreated, step: Step) -> None:
 def enter(state: State, row: RunRow, stored: RunStateRow) -> Run:
     """Add a run to the core, with its whole budget available."""
     env, tier = row.settings.env, row.settings.sandbox_tier
-    family = state.families.join(env, (*row.validation, *row.heldout))
+    case_set = state.case_sets.join(env, (*row.validation, *row.heldout))
     closed = stored.phase != "open"
     definition = row.settings.definition
     flow = pins.add_flow(
-        state, row.run, "run", env, tier, row.secret, family, closed=closed, definition=definition
+        state, row.run, "run", env, tier, row.secret, case_set, closed=closed, definition=definition
     )
     run = Run(row, stored, Ledger(row.budget), flow)
     state.runs[row.run] = run

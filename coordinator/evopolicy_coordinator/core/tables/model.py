@@ -341,7 +341,7 @@ class Flow:
     """Of the run or evaluation: part of its leases' names."""
     seq: int
     """Order of creation: breaks ties."""
-    family: Family | None = None
+    case_set: CaseSet | None = None
     """Runs and evaluations with the same hidden cases; None if it has none."""
     closed: bool = False
     """No agent works for it: its hidden jobs wait for agents for a limited time only (`agents.precedence`)."""
@@ -380,33 +380,33 @@ class Lane:
         default_factory=lambda: tuple([] for _ in range(N_PRIORITIES))
     )
     n_ready: list[int] = field(default_factory=lambda: [0] * N_PRIORITIES)
-    waiting: tuple[dict[Family | None, int], ...] = field(
+    waiting: tuple[dict[CaseSet | None, int], ...] = field(
         default_factory=lambda: tuple({} for _ in range(N_PRIORITIES))
     )
-    """Waiting jobs, suspects included, by priority and family."""
-    backlog: dict[Family, int] = field(default_factory=dict)
+    """Waiting jobs, suspects included, by priority and case set."""
+    backlog: dict[CaseSet, int] = field(default_factory=dict)
     """The hidden ones of closed flows among them."""
-    kept_s: dict[Family, float] = field(default_factory=dict)
+    kept_s: dict[CaseSet, float] = field(default_factory=dict)
     """Seconds for which such jobs were kept from all kernels, since there last were none."""
-    done_looks: dict[Family, int] = field(default_factory=dict)
-    reversals: dict[Family, Reversal] = field(default_factory=dict)
-    looked_at: float = 0.0
+    done_checks: dict[CaseSet, int] = field(default_factory=dict)
+    reversals: dict[CaseSet, Reversal] = field(default_factory=dict)
+    checked_at: float = 0.0
     profiles: dict[Profile, None] = field(default_factory=dict)
     stopping: int = 0
     """Hidden jobs that were stopped for this lane and that their workers have not released yet."""
 
     def count(self, priority: int, flow: Flow, n: int) -> None:
         """Add `n` to the waiting jobs of a flow."""
-        add(self.waiting[priority], flow.family, n)
-        if flow.closed and priority in HIDDEN and flow.family is not None:
-            add(self.backlog, flow.family, n)
+        add(self.waiting[priority], flow.case_set, n)
+        if flow.closed and priority in HIDDEN and flow.case_set is not None:
+            add(self.backlog, flow.case_set, n)
 
-    def waits_of(self, family: Family | None, *, train_too: bool) -> bool:
-        """Whether related hidden jobs wait (of any family for None) and no related train jobs that they leave the
+    def waits_of(self, case_set: CaseSet | None, *, train_too: bool) -> bool:
+        """Whether related hidden jobs wait (of any case set for None) and no related train jobs that they leave the
         kernel to; with `train_too`, whether related jobs of either kind wait."""
-        if _of(self.waiting[TRAIN], family):
+        if _of(self.waiting[TRAIN], case_set):
             return train_too
-        return any(_of(self.waiting[priority], family) for priority in HIDDEN)
+        return any(_of(self.waiting[priority], case_set) for priority in HIDDEN)
 
     def slots(self) -> int:
         """Slots of the active workers that may serve it."""
@@ -474,8 +474,8 @@ class Profile:
         return env in self.classes and tier in self.key[1] and fingerprint_class == self.classes[env]
 
 
-def _of(there: dict[Family | None, int], family: Family | None) -> bool:
-    return bool(there) and (family is None or not family.relatives.keys().isdisjoint(there))
+def _of(there: dict[CaseSet | None, int], case_set: CaseSet | None) -> bool:
+    return bool(there) and (case_set is None or not case_set.relatives.keys().isdisjoint(there))
 
 
 def add(counts: dict[T, int], key: T, n: int) -> None:
@@ -497,12 +497,12 @@ EVERYWHERE = ""
 
 
 @dataclass(slots=True, eq=False)
-class Family:
+class CaseSet:
     """All runs and evaluations that have the same hidden cases."""
 
     cases: frozenset[CaseKey]
-    relatives: dict[Family, None] = field(default_factory=dict)
-    """Families that share a case with it, itself included."""
+    relatives: dict[CaseSet, None] = field(default_factory=dict)
+    """Case sets that share a case with it, itself included."""
     users: int = 0
     hidden_on: dict[Kernel, int] = field(default_factory=dict)
     """Kernel to the number of its hidden jobs there."""
@@ -519,7 +519,7 @@ class Occupancy:
     kernel: Kernel
     machine: str
     """As `Worker.machine`, of its worker."""
-    family: Family | None
+    case_set: CaseSet | None
     """None: not known, so related to all."""
     hidden: bool
     lease: Lease | None
@@ -535,7 +535,7 @@ class Occupancy:
         return f"{self.worker} {self.id}"
 
 
-Occupancies = dict[Family | None, dict[str, Occupancy]]
+Occupancies = dict[CaseSet | None, dict[str, Occupancy]]
 
 
 @dataclass(slots=True, eq=False)
@@ -543,17 +543,17 @@ class Ask:
     """A requested permit."""
 
     row: PermitRow
-    family: Family
+    case_set: CaseSet
     kernel: Kernel
 
 
 @dataclass(slots=True, eq=False)
 class Reversal:
-    """Hidden jobs of a family have precedence on a kernel."""
+    """Hidden jobs of a case set have precedence on a kernel."""
 
     kernel: Kernel
     lane: Lane
-    family: Family
+    case_set: CaseSet
 
 
 @dataclass(slots=True, eq=False)
@@ -562,12 +562,12 @@ class Kernel:
 
     boot_id: str
     workers: dict[str, None] = field(default_factory=dict)
-    permits: dict[Family | None, dict[str, PermitRow]] = field(default_factory=dict)
+    permits: dict[CaseSet | None, dict[str, PermitRow]] = field(default_factory=dict)
     """By run."""
-    asks: dict[Family | None, dict[str, Ask]] = field(default_factory=dict)
+    asks: dict[CaseSet | None, dict[str, Ask]] = field(default_factory=dict)
     hidden: Occupancies = field(default_factory=dict)
     train: Occupancies = field(default_factory=dict)
-    reversals: dict[Family | None, dict[str, Reversal]] = field(default_factory=dict)
+    reversals: dict[CaseSet | None, dict[str, Reversal]] = field(default_factory=dict)
 
 
 # ---- workers ----
@@ -678,7 +678,7 @@ class Run:
     """All drawn audits, by id."""
     audits_waited_s: float = 0.0
     """Seconds for which the run, otherwise done, has waited for playable audits."""
-    audits_looked_at: float | None = None
+    audits_checked_at: float | None = None
     """When that was last updated; None before."""
     retries: deque[RetriedJobs] = field(default_factory=lambda: deque(maxlen=RETRIES_KEPT))
     """The last retries after infrastructure failures, for operators."""
@@ -688,10 +688,10 @@ class Run:
         return self.row.run
 
     @property
-    def family(self) -> Family:
-        """The family of its hidden cases."""
-        assert self.flow.family is not None
-        return self.flow.family
+    def case_set(self) -> CaseSet:
+        """The case set of its hidden cases."""
+        assert self.flow.case_set is not None
+        return self.flow.case_set
 
 
 @dataclass(slots=True, eq=False)

@@ -1,6 +1,6 @@
-"""Families: runs and evaluations that share a hidden case are related; with `strict` all are.
+"""Case sets: runs and evaluations that share a hidden case are related; with `strict` all are.
 
-Rule: a family is known while a run, an evaluation, a permit or a lease belongs to it.
+Rule: a case set is known while a run, an evaluation, a permit or a lease belongs to it.
 """
 
 from __future__ import annotations
@@ -9,53 +9,53 @@ import json
 from collections.abc import Iterable
 
 from evopolicy_common.messages.environment import Case
-from evopolicy_coordinator.core.tables.model import CaseKey, Family
+from evopolicy_coordinator.core.tables.model import CaseKey, CaseSet
 
 
-class Families:
-    """Finds related families."""
+class CaseSets:
+    """Finds related case sets."""
 
     def __init__(self, *, strict: bool) -> None:
         self._strict = strict
-        self._known: dict[frozenset[CaseKey], Family] = {}
-        self._of_case: dict[CaseKey, dict[Family, None]] = {}
+        self._known: dict[frozenset[CaseKey], CaseSet] = {}
+        self._of_case: dict[CaseKey, dict[CaseSet, None]] = {}
 
-    def join(self, env: str, cases: Iterable[Case]) -> Family:
-        """Returns the family with these hidden cases and adds one to its users."""
+    def join(self, env: str, cases: Iterable[Case]) -> CaseSet:
+        """Returns the case set with these hidden cases and adds one to its users."""
         keys: frozenset[CaseKey] = frozenset()
         if not self._strict:
             keys = frozenset(
                 (env, case.seed, json.dumps(case.options or None, sort_keys=True)) for case in cases
             )
-        family = self._known.get(keys)
-        if family is None:
-            family = self._known[keys] = Family(keys)
-            family.relatives[family] = None
+        case_set = self._known.get(keys)
+        if case_set is None:
+            case_set = self._known[keys] = CaseSet(keys)
+            case_set.relatives[case_set] = None
             for key in keys:
                 there = self._of_case.setdefault(key, {})
                 for other in there:
-                    other.relatives[family] = None
-                    family.relatives[other] = None
-                there[family] = None
-        family.users += 1
-        return family
+                    other.relatives[case_set] = None
+                    case_set.relatives[other] = None
+                there[case_set] = None
+        case_set.users += 1
+        return case_set
 
-    def known(self) -> Iterable[Family]:
-        """Returns all families in use."""
+    def known(self) -> Iterable[CaseSet]:
+        """Returns all case sets in use."""
         return self._known.values()
 
-    def leave(self, family: Family | None) -> None:
-        """Remove one user of a family; the last one removes the family."""
-        if family is None:
+    def leave(self, case_set: CaseSet | None) -> None:
+        """Remove one user of a case set; the last one removes the case set."""
+        if case_set is None:
             return
-        family.users -= 1
-        if family.users:
+        case_set.users -= 1
+        if case_set.users:
             return
-        del self._known[family.cases]
-        for other in family.relatives:
-            if other is not family:
-                del other.relatives[family]
-        for key in family.cases:
-            del self._of_case[key][family]
+        del self._known[case_set.cases]
+        for other in case_set.relatives:
+            if other is not case_set:
+                del other.relatives[case_set]
+        for key in case_set.cases:
+            del self._of_case[key][case_set]
             if not self._of_case[key]:
                 del self._of_case[key]

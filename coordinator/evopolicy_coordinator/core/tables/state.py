@@ -23,9 +23,9 @@ from evopolicy_coordinator.core.tables.model import (
     EVERYWHERE,
     RANKS,
     Ask,
+    CaseSet,
     Ended,
     Evaluation,
-    Family,
     Flow,
     JobGroup,
     JobState,
@@ -39,7 +39,7 @@ from evopolicy_coordinator.core.tables.model import (
     Run,
     Worker,
 )
-from evopolicy_coordinator.core.tables.related import Families
+from evopolicy_coordinator.core.tables.related import CaseSets
 
 ATTEMPTS_PER_INCARNATION = 1_000_000
 
@@ -135,12 +135,12 @@ class State:
 
         # Occupants of kernels.
         self.isolates = settings.hidden_isolation != "off"
-        self.families = Families(strict=settings.hidden_isolation == "strict")
+        self.case_sets = CaseSets(strict=settings.hidden_isolation == "strict")
         self.everywhere = Kernel(EVERYWHERE)
         self.kernels: dict[str, Kernel] = {EVERYWHERE: self.everywhere}
         self.lingering: dict[str, dict[str, Occupancy]] = {}
         """Worker to its occupancies without a lease."""
-        self.permits: dict[str, dict[Kernel, tuple[PermitRow, Family]]] = {}
+        self.permits: dict[str, dict[Kernel, tuple[PermitRow, CaseSet]]] = {}
         """By run."""
         self.asks: dict[tuple[str, str], Ask] = {}
         """By run and boot id."""

@@ -18,7 +18,7 @@ from evopolicy_coordinator.core.tables.model import (
     HIDDEN_AUDIT,
     REFERENCE,
     TRAIN,
-    Family,
+    CaseSet,
     JobState,
     Lane,
     Lease,
@@ -29,8 +29,8 @@ from evopolicy_coordinator.core.tables.step import Step
 VICTIMS_MAX = 256
 """Most hidden leases checked for a lane in one step."""
 
-FAMILIES_MAX = 8
-"""Most families of waiting train jobs that hidden jobs are stopped for in one step."""
+CASE_SETS_MAX = 8
+"""Most case sets of waiting train jobs that hidden jobs are stopped for in one step."""
 
 
 def preempt(state: State, lane: Lane, step: Step) -> None:
@@ -44,8 +44,8 @@ def preempt(state: State, lane: Lane, step: Step) -> None:
         state.timers.arm_once(("lane", lane.key), step.now + queue.LOOK_AGAIN_S)
     wanted = lane.n_ready[TRAIN] - lane.stopping
     avoided = queue.avoided(lane, TRAIN, step.now)
-    for family in list(islice(lane.waiting[TRAIN], FAMILIES_MAX)):
-        wanted -= clear(state, lane, family, avoided, step)
+    for case_set in list(islice(lane.waiting[TRAIN], CASE_SETS_MAX)):
+        wanted -= clear(state, lane, case_set, avoided, step)
     for priority in (HIDDEN_AUDIT, AUDIT, EARLY_VALIDATION, HELDOUT, REFERENCE):
         for profile in lane.profiles:
             hidden = profile.hidden[priority]
@@ -69,12 +69,12 @@ def preempt(state: State, lane: Lane, step: Step) -> None:
                     lease.stopped_for = lane
 
 
-def clear(state: State, lane: Lane, family: Family | None, avoided: str | None, step: Step) -> int:
-    """Stop the related hidden jobs that keep a family's train jobs from kernels, on as many kernels as have slots for
+def clear(state: State, lane: Lane, case_set: CaseSet | None, avoided: str | None, step: Step) -> int:
+    """Stop the related hidden jobs that keep a case set's train jobs from kernels, on as many kernels as have slots for
     them: a single hidden job bars its whole kernel. Returns the number of freed slots."""
     slots = 0
-    wanted = lane.waiting[TRAIN].get(family, 0)
-    for kernel, playing in conflicts.to_clear(state, family):
+    wanted = lane.waiting[TRAIN].get(case_set, 0)
+    for kernel, playing in conflicts.to_clear(state, case_set):
         if slots >= wanted:
             break
         there = [state.workers[name] for name in kernel.workers if name != avoided]

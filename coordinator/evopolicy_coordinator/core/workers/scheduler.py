@@ -167,7 +167,7 @@ def _place_suspects(state: State, step: Step) -> None:
         if lane is not None and job.queued:
             if job.priority == TRAIN:
                 avoided = job.avoid if step.now < job.avoid_until and lane.workers() > 1 else None
-                preemption.clear(state, lane, job.group.flow.family, avoided, step)
+                preemption.clear(state, lane, job.group.flow.case_set, avoided, step)
             _try_parked(state, lane, step, TRIES_MAX)
 
 

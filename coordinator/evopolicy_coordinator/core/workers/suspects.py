@@ -51,7 +51,7 @@ def next_of(state: State, worker: Worker, step: Step) -> wire.Lease | None:
 
 
 def _barred(state: State, job: JobState, worker: Worker) -> bool:
-    return conflicts.conflict(state, job.priority, job.group.flow.family, worker)
+    return conflicts.conflict(state, job.priority, job.group.flow.case_set, worker)
 
 
 def _reserve(state: State, job: JobState, worker: Worker, step: Step) -> None:

@@ -74,7 +74,7 @@ class Cluster:
         """Whether the status is recent enough to decide by."""
         return self.status is not None and time.monotonic() - self._at < STALE_S
 
-    def look(self) -> None:
+    def wake(self) -> None:
         """Somebody looks: the next question need not wait for the idle pause."""
         self._wake.set()
 

@@ -484,7 +484,7 @@ def test_closed_runs_and_cancelled_ones_get_no_permit() -> None:
     assert splits(rig.poll(session, 8)) == {"random", "validation"}
 
 
-def test_families_are_forgotten_with_the_last_that_is_of_them() -> None:
+def test_case_sets_are_forgotten_with_their_last_user() -> None:
     rig = Rig()
     session = rig.register()
     for name in ("r1", "r2"):
@@ -494,8 +494,8 @@ def test_families_are_forgotten_with_the_last_that_is_of_them() -> None:
     for name in ("r1", "r2"):
         rig.close(name)
     rig.work_off(session)
-    families = rig.core.state.families
-    assert (families._known, families._of_case) == ({}, {})
+    case_sets = rig.core.state.case_sets
+    assert (case_sets._known, case_sets._of_case) == ({}, {})
 
 
 def test_a_gateway_may_name_only_so_many_kernels() -> None:

@@ -122,7 +122,7 @@ def test_submits_that_wait_for_hidden_cases_say_so() -> None:
     closed(rig, session, "r0")
     rig.create("r1", agent="remote")
     rig.play(session, *rig.poll(session, 1))
-    rig.core.state.lanes[next(iter(rig.core.state.lanes))].kept_s[rig.core.state.runs["r0"].family] = WAIT_S
+    rig.core.state.lanes[next(iter(rig.core.state.lanes))].kept_s[rig.core.state.runs["r0"].case_set] = WAIT_S
     # A train job that runs keeps the hidden ones away; meanwhile the order is turned over.
     rig.submit(0, 1, run="r1")
     (train,) = rig.poll(session, 1)
@@ -163,7 +163,7 @@ def test_the_time_a_submit_is_held_counts_against_no_limit() -> None:
     while split_of(train.job) != "train":
         rig.play(session, train)
         (train,) = rig.poll(session, 1)
-    lane.kept_s[rig.core.state.runs["r0"].family] = WAIT_S
+    lane.kept_s[rig.core.state.runs["r0"].case_set] = WAIT_S
     keep_alive(rig, session, 4.0, train)
     rig.play(session, train)
     (hidden,) = rig.poll(session, 1)
