@@ -13,7 +13,6 @@ next neighbour.
 from __future__ import annotations
 
 import json
-import secrets
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
@@ -28,7 +27,7 @@ from evopolicy_common.wire import transport
 from evopolicy_common.wire.credentials import TlsFiles, default_state_dir
 from evopolicy_coordinator.cli.certs import PORT, first_endpoint
 from evopolicy_coordinator.pki import certs
-from evopolicy_coordinator.pki.machines import Machine, Machines
+from evopolicy_coordinator.pki.machines import Machine, Machines, write_passwords
 from evopolicy_coordinator.storage.state_folder import cluster_of
 
 
@@ -83,10 +82,7 @@ def write_router_config(
         own.identity,
         own.password,
     )
-    lines = [f"{machine.identity}:{machine.password}\n" for machine in admitted]
-    # Never an empty file: that would admit clients that name no user.
-    lines.append(f"nobody:{secrets.token_urlsafe(24)}\n")
-    write_atomically(folder / "passwords", "".join(lines).encode(), mode=0o600)
+    write_passwords(folder / "passwords", admitted)
     write_atomically(
         folder / "zenohd.json", json.dumps(nested(settings), indent=2).encode() + b"\n", mode=0o600
     )

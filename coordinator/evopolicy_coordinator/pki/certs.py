@@ -42,14 +42,11 @@ class Pair(msgspec.Struct, frozen=True):
 class Described(msgspec.Struct, frozen=True, kw_only=True):
     """The fields of a certificate that we use."""
 
-    common_name: str
     serial: str
     """Hexadecimal."""
     expires: dt.datetime
     hosts: tuple[str, ...]
     """DNS names and addresses that clients may dial, as given."""
-    serves: bool
-    """Whether a listener may present it."""
 
 
 def make_authority(cluster: str, now: dt.datetime, days: int = AUTHORITY_DAYS) -> Pair:
@@ -107,14 +104,10 @@ def describe(certificate: bytes) -> Described:
     """Parses a PEM certificate. Raises ConfigError when it is not one."""
     try:
         found = x509.load_pem_x509_certificate(certificate)
-        names = found.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
-        common_name = str(names[0].value) if names else ""
         return Described(
-            common_name=common_name,
             serial=f"{found.serial_number:x}",
             expires=found.not_valid_after_utc,
             hosts=_hosts(found),
-            serves=_serves(found),
         )
     except ValueError as error:
         raise ConfigError(f"not a certificate in PEM form: {error}") from error
@@ -142,14 +135,6 @@ def _hosts(certificate: x509.Certificate) -> tuple[str, ...]:
     except x509.ExtensionNotFound:
         return ()
     return tuple(str(name.value) for name in names)
-
-
-def _serves(certificate: x509.Certificate) -> bool:
-    try:
-        usages = certificate.extensions.get_extension_for_class(x509.ExtendedKeyUsage).value
-    except x509.ExtensionNotFound:
-        return False
-    return ExtendedKeyUsageOID.SERVER_AUTH in usages
 
 
 def _name(common_name: str) -> x509.Name:

@@ -23,7 +23,7 @@ import fcntl
 import hmac
 import os
 import secrets
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import msgspec
@@ -99,10 +99,8 @@ class Machines:
         return (*_stat(self.folder / "machines.json"), *_stat(self.folder / "coordinator.pem"))
 
     def write_passwords(self) -> None:
-        """Writes the file that Zenoh's router reads. Never an empty one: that would admit clients that name no user."""
-        lines = [f"{machine.identity}:{machine.password}\n" for machine in self.admitted()]
-        lines.append(f"nobody:{secrets.token_urlsafe(24)}\n")
-        write_atomically(self.passwords, "".join(lines).encode(), mode=0o600)
+        """Writes the file that Zenoh's router reads."""
+        write_passwords(self.passwords, self.admitted())
 
     def holder(self, role: Role, token: str) -> Machine | None:
         """The admitted machine of this role with this token; compared in constant time."""
@@ -145,6 +143,13 @@ class Machines:
             log.error("the list of machines cannot be read", why=str(error))
         self._serials = {machine.serial: machine for machine in self._all.values()}
         self._stamp = stamp
+
+
+def write_passwords(path: Path, admitted: Iterable[Machine]) -> None:
+    """Writes a router's file of passwords. Never an empty one: that would admit clients that name no user."""
+    lines = [f"{machine.identity}:{machine.password}\n" for machine in admitted]
+    lines.append(f"nobody:{secrets.token_urlsafe(24)}\n")
+    write_atomically(path, "".join(lines).encode(), mode=0o600)
 
 
 def init(

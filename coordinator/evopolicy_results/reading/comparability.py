@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import islice
+from typing import NamedTuple
 
 import msgspec
 
@@ -77,58 +78,66 @@ IN_QUESTION = "results in dispute, or of a forger,"
 UNKNOWN_ISOLATION = "hidden isolation, where some runs do not tell it,"
 """Older runs without this record beside runs with it; their comparison needs an option of its own."""
 
-_BY_SUITE: dict[str, Callable[[Run], str]] = {
-    "episode budget": lambda run: str(run.budget),
-    "policy scope": lambda run: run.record.experiment_dimensions.policy_scope,
-    "observation form": lambda run: run.record.experiment_dimensions.observations,
-    "simulation rule": lambda run: run.record.experiment_dimensions.simulation,
-    "finish rule": lambda run: run.record.experiment_dimensions.finish,
-    "feedback detail": lambda run: run.record.experiment_dimensions.feedback,
-    "text of AGENTS.md": lambda run: _text(run.record.experiment_dimensions.agents_md),
-    "failed episodes": lambda run: run.record.experiment_dimensions.failed_episodes,
-    "hidden evaluation": lambda run: run.record.experiment_dimensions.hidden_evaluation,
-    "profile": lambda run: run.record.experiment_dimensions.profile,
-    "jail": lambda run: run.record.jail,
-    "hidden cases": lambda run: run.record.experiment_dimensions.hidden_cases,
-}
-_BY_ENTRY: dict[str, Callable[[Run], str]] = {
-    "prompts": lambda run: _text(run.record.agent.prompts),
-    "skills and MCP servers": lambda run: inputs_digest(run.record.agent.inputs)[:12] or "none",
-}
-_BY_ENVIRONMENT: dict[str, Callable[[Run], str]] = {
-    "train split": lambda run: _split(run, "train"),
-    "validation split": lambda run: _split(run, "validation"),
-    "held-out split": lambda run: _split(run, "heldout"),
-    "environment version": lambda run: run.record.versions.env,
-    "episodes a submit": lambda run: run.submit_size,
-    "policy limits": lambda run: _limits(run),
-    "step limit": lambda run: _step_limit(run),
-    "videos in feedback": lambda run: run.record.experiment_dimensions.video,
-}
-
-
 _SAME_CASES = "the same cases (one --state or --data for all, none with --fresh, all in the same --jail)"
+
+
+class _Setting(NamedTuple):
+    """A setting in which compared runs have to agree."""
+
+    of: Callable[[Run], str]
+    remedy: str = ""
+    """How to play runs that agree in it; empty where no option decides it."""
+
+
+def _dimension(name: str, remedy: str) -> _Setting:
+    return _Setting(lambda run: str(getattr(run.record.experiment_dimensions, name)), remedy)
+
+
+_BY_SUITE = {
+    "episode budget": _dimension("episode_budget", "the same --budget"),
+    "policy scope": _dimension("policy_scope", "the same --policy-scope"),
+    "observation form": _dimension("observations", "the same --observations"),
+    "simulation rule": _dimension("simulation", "the same --simulation"),
+    "finish rule": _dimension("finish", "the same --finish"),
+    "feedback detail": _dimension("feedback", "the same --feedback"),
+    "text of AGENTS.md": _Setting(
+        lambda run: _text(run.record.experiment_dimensions.agents_md), "the same --agents-md"
+    ),
+    "failed episodes": _dimension("failed_episodes", "the same --failed-episodes"),
+    "hidden evaluation": _dimension("hidden_evaluation", "the same --profile"),
+    "profile": _dimension("profile", "the same --profile"),
+    "jail": _Setting(lambda run: run.record.jail, "the same --jail"),
+    "hidden cases": _dimension("hidden_cases", "the same --hidden-cases"),
+}
+_ISOLATION = _Setting(lambda run: run.record.hidden_isolation)
+_MODEL_LIMITS = {
+    "model limits": _Setting(
+        lambda run: _model_limits(run), "the same max_requests, max_tokens, and max_cost in the agents' files"
+    )
+}
+_BY_ENTRY = {
+    "prompts": _Setting(
+        lambda run: _text(run.record.agent.prompts), "the same --prompts, or another --entry for each"
+    ),
+    "skills and MCP servers": _Setting(
+        lambda run: inputs_digest(run.record.agent.inputs)[:12] or "none",
+        "the same `skills` and `[mcp]` in the agent's file, or another --entry for each",
+    ),
+}
+_BY_ENVIRONMENT = {
+    "train split": _Setting(lambda run: _split(run, "train"), _SAME_CASES),
+    "validation split": _Setting(lambda run: _split(run, "validation"), _SAME_CASES),
+    "held-out split": _Setting(lambda run: _split(run, "heldout"), _SAME_CASES),
+    "environment version": _Setting(lambda run: run.record.versions.env),
+    "episodes a submit": _Setting(lambda run: run.submit_size, "the same --min-episodes and --max-episodes"),
+    "policy limits": _Setting(lambda run: _limits(run), "the same --limit"),
+    "step limit": _Setting(lambda run: _step_limit(run), "the same --step-limit"),
+    "videos in feedback": _dimension("video", "the same --video"),
+}
 REMEDIES = {
-    "episode budget": "the same --budget",
-    "policy scope": "the same --policy-scope",
-    "observation form": "the same --observations",
-    "simulation rule": "the same --simulation",
-    "finish rule": "the same --finish",
-    "feedback detail": "the same --feedback",
-    "text of AGENTS.md": "the same --agents-md",
-    "prompts": "the same --prompts, or another --entry for each",
-    "skills and MCP servers": "the same `skills` and `[mcp]` in the agent's file, or another --entry for each",
-    "failed episodes": "the same --failed-episodes",
-    "hidden evaluation": "the same --profile",
-    "profile": "the same --profile",
-    "jail": "the same --jail",
-    "hidden cases": "the same --hidden-cases",
-    "model limits": "the same max_requests, max_tokens, and max_cost in the agents' files",
-    **dict.fromkeys(("train split", "validation split", "held-out split"), _SAME_CASES),
-    "episodes a submit": "the same --min-episodes and --max-episodes",
-    "policy limits": "the same --limit",
-    "step limit": "the same --step-limit",
-    "videos in feedback": "the same --video",
+    what: setting.remedy
+    for what, setting in (_BY_SUITE | _BY_ENTRY | _MODEL_LIMITS | _BY_ENVIRONMENT).items()
+    if setting.remedy
 }
 """By `Mixture.what`: how to play runs that agree in it."""
 
@@ -174,14 +183,14 @@ def mixtures(runs: Iterable[Run]) -> list[Mixture]:
         out += _isolation(suite, together)
         # Agents without a model have no limits, and stand beside those with any.
         limited = [run for run in together if run.record.agent.model_use is not None]
-        out += _differences({"model limits": _model_limits}, suite, limited)
+        out += _differences(_MODEL_LIMITS, suite, limited)
         for entry in sorted({run.entry for run in together}):
             out += _differences(
                 _BY_ENTRY, f"{suite}, {entry}", [run for run in together if run.entry == entry]
             )
     for env in ordered_environments(by_env):
         out += _differences(_BY_ENVIRONMENT, env, by_env[env])
-        out += _differences({"fingerprint": _fingerprint_beside(by_env[env])}, env, by_env[env])
+        out += _differences({"fingerprint": _Setting(_fingerprint_beside(by_env[env]))}, env, by_env[env])
         out += _in_question(env, by_env[env])
     return out
 
@@ -203,11 +212,10 @@ def _fingerprint_beside(runs: list[Run]) -> Callable[[Run], str]:
 
 def _isolation(suite: str, runs: list[Run]) -> list[Mixture]:
     """Differences among runs with a record of their isolation, and runs without one beside them."""
-    checks = {"hidden isolation": lambda run: run.record.hidden_isolation}
     known = [run for run in runs if run.record.hidden_isolation != "unknown"]
-    found = _differences(checks, suite, known)
+    found = _differences({"hidden isolation": _ISOLATION}, suite, known)
     if 0 < len(known) < len(runs):
-        found += _differences({UNKNOWN_ISOLATION: checks["hidden isolation"]}, suite, runs)
+        found += _differences({UNKNOWN_ISOLATION: _ISOLATION}, suite, runs)
     return found
 
 
@@ -217,12 +225,12 @@ def _in_question(env: str, runs: list[Run]) -> list[Mixture]:
     return [Mixture(what=IN_QUESTION, where=env, values=dict.fromkeys(names, 1))] if names else []
 
 
-def _differences(checks: dict[str, Callable[[Run], str]], where: str, runs: list[Run]) -> list[Mixture]:
+def _differences(settings: dict[str, _Setting], where: str, runs: list[Run]) -> list[Mixture]:
     found: list[Mixture] = []
-    for what, value_of in checks.items():
+    for what, setting in settings.items():
         by_value: dict[str, list[str]] = {}
         for run in runs:
-            by_value.setdefault(value_of(run) or "none", []).append(path_text(run.path))
+            by_value.setdefault(setting.of(run) or "none", []).append(path_text(run.path))
         if len(by_value) > 1:
             folders = {value: tuple(those) for value, those in sorted(by_value.items())}
             counts = {value: len(those) for value, those in folders.items()}

@@ -46,11 +46,8 @@ class PublishedSummary(msgspec.Struct, frozen=True, kw_only=True):
     env_instances: tuple[int, ...] = ()
     remaining_budget: int | None = None
     mean_return: float | None = None
-    std_return: float | None = None
     errors: tuple[int, ...] | None = None
     submit_started_at: str = ""
-    submit_completed_at: str = ""
-    wall_time_seconds: float = 0.0
 
     @property
     def n_episodes(self) -> int:

@@ -48,14 +48,11 @@ class Submit(msgspec.Struct, frozen=True, kw_only=True):
     """Budget spent after it, episodes."""
     mean_return: float | None = None
     """Visible train mean; None when not ok."""
-    std_return: float | None = None
     val_mean: float | None = None
     """Hidden validation mean, known after the run; None when not ok or not eligible."""
     n_failed_episodes: int = 0
     """Train episodes in which the policy failed."""
     started_at: str = ""
-    completed_at: str = ""
-    wall_s: float = 0.0
     bundle_digest: str = ""
     """Digest of the whole `system/`, including data files; empty when unknown."""
     source: Source | None = None

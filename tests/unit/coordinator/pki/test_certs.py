@@ -49,7 +49,6 @@ def test_only_who_listens_may_show_its_certificate_as_a_server(serves: bool) -> 
     usages = loaded(pair).extensions.get_extension_for_class(x509.ExtendedKeyUsage).value
     assert ExtendedKeyUsageOID.CLIENT_AUTH in usages
     assert (ExtendedKeyUsageOID.SERVER_AUTH in usages) == serves
-    assert certs.describe(pair.certificate).serves == serves
 
 
 def test_a_machines_certificate_signs_nothing() -> None:
@@ -72,10 +71,9 @@ def test_a_machines_certificate_signs_nothing() -> None:
     days=st.integers(1, 3000),
 )
 def test_a_certificate_says_what_it_was_made_for(hosts: list[str], days: int) -> None:
-    description = certs.describe(
-        certs.issue(AUTHORITY, "router/x", NOW, days, hosts=hosts, serves=True).certificate
-    )
-    assert description.common_name == "router/x"
+    pair = certs.issue(AUTHORITY, "router/x", NOW, days, hosts=hosts, serves=True)
+    description = certs.describe(pair.certificate)
+    assert loaded(pair).subject.rfc4514_string() == "CN=router/x"
     assert description.hosts == tuple(hosts)
     assert description.expires == NOW + dt.timedelta(days=days)
 
