@@ -40,6 +40,13 @@ CredentialsFile = Annotated[
 ]
 """Options by which an operator's command finds its cluster."""
 
+State = Annotated[
+    Path | None,
+    typer.Option(
+        "--state", help="The coordinator's state folder [$EVOPOLICY_STATE or the user's state home]."
+    ),
+]
+
 USAGE_ERROR = 2
 FAILURE = 1
 

@@ -12,7 +12,8 @@ import fcntl
 import os
 import sys
 import time
-from collections.abc import AsyncIterator, Collection, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Sequence
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -63,18 +64,13 @@ class LocalCluster:
         self,
         ready: Ready,
         processes: _Processes,
-        *,
-        audited: bool,
-        kept: Path | None = None,
-        worker_options: Sequence[str] = (),
+        start_workers: Callable[[Workers], Awaitable[None]],
+        kept: Path | None,
     ) -> None:
         self.operator_file = Path(ready.credentials["operator"])
         self.failed = processes.failed
         """Completes only with a ConfigError, which names the process that cannot be kept running, and the reason."""
-        self._worker_file = ready.credentials["worker"]
-        self._processes = processes
-        self._audited = audited
-        self._worker_options = worker_options
+        self._start_workers = start_workers
         self._kept = kept
         """Folder of the records of `opened`; None for a temporary state folder."""
         self.note = ready.note
@@ -94,23 +90,11 @@ class LocalCluster:
 
         `tiers`: sandbox tiers that will be used. If one does not work here, the cluster fails with the remedy.
         """
-        wanted = Workers(env_ids, slots, tiers)
-        await _start_workers(
-            self._processes,
-            wanted,
-            ("--credentials", self._worker_file),
-            audited=self._audited,
-            options=self._worker_options,
-        )
+        await self._start_workers(Workers(env_ids, slots, tiers))
 
 
 async def _start_workers(
-    processes: _Processes,
-    wanted: Workers,
-    credentials: Sequence[str],
-    *,
-    audited: bool,
-    options: Sequence[str],
+    processes: _Processes, audited: bool, options: Sequence[str], credentials: Sequence[str], wanted: Workers
 ) -> None:
     notify_of_many_slots(wanted.slots)
     divided = installs.divided(wanted.env_ids)
@@ -193,17 +177,12 @@ async def local_cluster(
         if hidden_isolation is not None:
             coordinator += ["--hidden-isolation", hidden_isolation]
         processes = _Processes(root / "logs", kind, lock_fd)
+        start = partial(_start_workers, processes, bool(audit), worker_options)
         try:
             await processes.keep_up("coordinator", coordinator)
             if workers is not None:
                 # In parallel with the coordinator: meanwhile they import simulators and test sandboxes.
-                await _start_workers(
-                    processes,
-                    workers,
-                    ("--ready-file", str(ready_file)),
-                    audited=bool(audit),
-                    options=worker_options,
-                )
+                await start(("--ready-file", str(ready_file)), workers)
             try:
                 with notify_if_slow(f"the local coordinator to start; its log is in {root / 'logs'}"):
                     async with asyncio.timeout(START_TIMEOUT_S):
@@ -219,9 +198,8 @@ async def local_cluster(
             if kept is not None:
                 kept.mkdir(mode=0o700, exist_ok=True)
                 await _end_permits_of_killed(kept, Path(ready.credentials["operator"]))
-            yield LocalCluster(
-                ready, processes, audited=bool(audit), kept=kept, worker_options=worker_options
-            )
+            joining = partial(start, ("--credentials", ready.credentials["worker"]))
+            yield LocalCluster(ready, processes, joining, kept)
         finally:
             with notify_if_slow("the local cluster to end"):
                 await processes.end()

@@ -11,7 +11,7 @@ from typing import Annotated
 import msgspec
 import typer
 
-from evopolicy_common.cli.conventions import fail_on_our_errors
+from evopolicy_common.cli.conventions import State, fail_on_our_errors
 from evopolicy_common.cli.frame import App
 from evopolicy_common.console import table, terminal
 from evopolicy_common.errors import ConfigError
@@ -27,10 +27,6 @@ PORT = 7447
 """A coordinator's default address."""
 _LOOPBACK = ("localhost", "127.0.0.1", "::1")
 
-State = Annotated[
-    Path | None,
-    typer.Option(help="The coordinator's state folder [$EVOPOLICY_STATE or the user's state home]."),
-]
 Days = Annotated[int, typer.Option(min=1, max=3650, help="Validity of the certificate, in days.")]
 Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 

@@ -11,7 +11,7 @@ from typing import Annotated
 
 import typer
 
-from evopolicy_common.cli.conventions import fail, fail_on_our_errors
+from evopolicy_common.cli.conventions import State, fail, fail_on_our_errors
 from evopolicy_common.cli.frame import App
 from evopolicy_common.console import table, terminal
 from evopolicy_common.errors import ConfigError
@@ -33,10 +33,6 @@ app = App(
     no_args_is_help=True,
 )
 
-State = Annotated[
-    Path | None,
-    typer.Option(help="The coordinator's state folder [$EVOPOLICY_STATE or the user's state home]."),
-]
 AsJson = Annotated[bool, typer.Option("--json", help="Print as JSON.")]
 
 

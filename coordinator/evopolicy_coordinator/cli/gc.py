@@ -5,13 +5,12 @@ Exit codes: 0 all well, 1 what is planned does not fit or the disk refused, 2 wr
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from evopolicy_common import catalogue
-from evopolicy_common.cli.conventions import bytes_text, fail_on_our_errors
+from evopolicy_common.cli.conventions import State, bytes_text, fail_on_our_errors
 from evopolicy_common.cli.frame import App
 from evopolicy_common.processes.preflight import check_writable
 from evopolicy_common.terminal import say, say_json
@@ -21,17 +20,13 @@ from evopolicy_coordinator.storage import disk_use
 gc_app = App(name="gc")
 disk_app = App(name="disk")
 
-StateOption = Annotated[
-    Path | None,
-    typer.Option(help="The coordinator's state folder [$EVOPOLICY_STATE or the user's state home]."),
-]
 Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 DAY_S = 24 * 3600.0
 
 
 @gc_app.command(epilog="Example: evopolicy gc --state /var/lib/evopolicy --older-than 7 --dry-run")
 def collect(
-    state: StateOption = None,
+    state: State = None,
     older_than: Annotated[
         float, typer.Option(min=0.0, help="Keep runs that finished within this number of days.")
     ] = 7.0,
@@ -63,7 +58,7 @@ def collect(
 
 @disk_app.command(epilog="Example: evopolicy disk --env core16 --budget 128 --runs 5")
 def disk(
-    state: StateOption = None,
+    state: State = None,
     env: Annotated[
         list[str] | None, typer.Option(help="Suite, suite id or glob of the planned sweep; may be repeated.")
     ] = None,

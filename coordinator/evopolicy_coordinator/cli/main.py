@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 import msgspec
 import typer
 
-from evopolicy_common.cli.conventions import fail_on_our_errors, setup_logging
+from evopolicy_common.cli.conventions import State, fail_on_our_errors, setup_logging
 from evopolicy_common.cli.frame import App, Version, run_app
 from evopolicy_common.processes.packages import checked_names
 from evopolicy_common.records.blobs import announcing
@@ -180,10 +180,7 @@ def serve(
 @app.command(epilog="Example: evopolicy-coordinator backup /backup/monday --state /var/lib/evopolicy")
 def backup(
     target: Annotated[Path, typer.Argument(help="New folder for the backup.", show_default=False)],
-    state: Annotated[
-        Path | None,
-        typer.Option(help="The coordinator's state folder [$EVOPOLICY_STATE or the user's state home]."),
-    ] = None,
+    state: State = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print what was copied as JSON.")] = False,
 ) -> None:
     """Copy the state folder: a consistent database, blobs and keys. The coordinator may be running.

@@ -19,7 +19,7 @@ from typing import Annotated, Any
 
 import typer
 
-from evopolicy_common.cli.conventions import fail_on_our_errors
+from evopolicy_common.cli.conventions import State, fail_on_our_errors
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.records.blobs import write_atomically
 from evopolicy_common.terminal import say
@@ -106,10 +106,7 @@ def router_config(
         str, typer.Argument(help="The router's name, as in `certs issue router NAME`.", show_default=False)
     ],
     folder: Annotated[Path, typer.Option(help="The router's folder, which that command made.")],
-    state: Annotated[
-        Path | None,
-        typer.Option(help="The coordinator's state folder [$EVOPOLICY_STATE or the user's state home]."),
-    ] = None,
+    state: State = None,
     listen: Annotated[
         list[str] | None,
         typer.Option(help=f"Endpoint for the site's machines [tls/0.0.0.0:{PORT}]; may be repeated."),
