@@ -3,7 +3,7 @@
     core, effects = Core.load(settings, snapshot, now)
     effects = core.handle(event, now)
     effects = core.handle_deadline(now)         # when now >= core.next_deadline()
-    core.validate()                             # raises InvariantError with a trace; cheap enough for tests only
+    core.validate()                             # raises InvariantError; cheap enough for tests only
 
 The core has no clock, random numbers, disk, log or await: `now` and randomness come in, ordered effects and the next
 deadline go out.
@@ -35,9 +35,9 @@ attempt; policy seeds by HMAC (`leasing.seeds`). Attempt numbers also grow over 
 (incarnation − 1) · 1,000,000.
 
 *Tokens.* The shell checks tokens before it raises an event. `core.capability(run)` returns the token of a run, also of
-a finished one; `core.worker_of(session)` returns the worker of a session. The core checks sessions: it answers a
-request with an unknown session with `Refused("unknown_worker")`. The worker then registers again, sends a heartbeat
-with all leases that it holds, and continues.
+a finished one. The core checks sessions: it answers a request with an unknown session with
+`Refused("unknown_worker")`. The worker then registers again, sends a heartbeat with all leases that it holds, and
+continues.
 
 *Stopped leases.* A worker learns of leases to stop (preempted, cancelled, played elsewhere) from the first of these
 replies: its waiting lease poll, a heartbeat whose reply is delayed (`wait_s`), or its next heartbeat.
@@ -51,7 +51,7 @@ the blobs that its outcomes name. Inline trajectories are part of the outcome. T
 blobs, as long as digests stay the same.
 
 *Status* is read, not an event: `core.status(now, words)` returns workers, runs, stalls, episodes done and their rate as
-the parts of a `StatusReply`. `core.trace(key)` returns the recorded events of a job, lease, run or worker.
+the parts of a `StatusReply`.
 
 *Memory.* A core holds open work only: for each open group of episodes their returns and order of arrival, for each
 unfinished run its submits without their episodes, for each finished run its key and capability. `ReadResults` and

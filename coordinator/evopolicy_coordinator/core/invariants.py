@@ -6,14 +6,14 @@ from collections import Counter
 
 from evopolicy_coordinator.core.contract.records import train_group
 from evopolicy_coordinator.core.isolation.kernels import all_related, related
-from evopolicy_coordinator.core.structures.trace import InvariantError
+from evopolicy_coordinator.core.structures.faults import InvariantError
 from evopolicy_coordinator.core.tables import transitions
 from evopolicy_coordinator.core.tables.model import N_PRIORITIES, TRAIN, JobState
 from evopolicy_coordinator.core.tables.state import State
 
 
 def check(state: State) -> None:
-    """Raises InvariantError, with the trace of the record concerned, at the first violation."""
+    """Raises InvariantError, which names the record concerned, at the first violation."""
     _jobs(state)
     _queue(state)
     _workers(state)
@@ -117,12 +117,9 @@ def _audits(state: State) -> None:
 
 
 def want(state: State, key: str, holds: bool, what: str) -> None:
-    """Raises InvariantError with the trace of `key` when `holds` is false."""
+    """Raises InvariantError when `holds` is false. `key` names the record concerned."""
     if not holds:
-        lines = "\n".join(
-            f"  {line.at:.3f} {line.stimulus_id} {line.key}: {line.what}" for line in state.trace.of(key)
-        )
-        raise InvariantError(f"{key}: violated: {what}\n{lines}")
+        raise InvariantError(f"{key}: violated: {what}")
 
 
 def _jobs(state: State) -> None:

@@ -34,7 +34,6 @@ from evopolicy_coordinator.core.runs import (
     submits,
 )
 from evopolicy_coordinator.core.status import CoreStatus, Words
-from evopolicy_coordinator.core.structures.trace import TraceEntry
 from evopolicy_coordinator.core.tables import step
 from evopolicy_coordinator.core.tables.model import LaneKey
 from evopolicy_coordinator.core.tables.state import State
@@ -90,7 +89,7 @@ class Core:
         return effects
 
     def validate(self) -> None:
-        """Check every invariant; raises InvariantError, with a trace, at a violation. Visits all state: for tests."""
+        """Check every invariant; raises InvariantError at a violation. Visits all state: for tests."""
         invariants.check(self.state)
 
     # ---- reading ----
@@ -103,18 +102,9 @@ class Core:
         """Returns why a run that is not open refuses further requests."""
         return open_runs.over(self.state, run)
 
-    def worker_of(self, session: str) -> str | None:
-        """Returns the worker whose current session is `session` (its right to read and write blobs); None
-        for an unknown session."""
-        return self.state.sessions.get(session)
-
     def status(self, now: float, words: Words) -> CoreStatus:
         """Returns the core's part of a `StatusReply`; `words` puts a reason into words."""
         return status.status(self.state, now, words)
-
-    def trace(self, key: str) -> list[TraceEntry]:
-        """Returns the trace of a job, lease, worker, group or run, oldest entry first, as far back as it is kept."""
-        return self.state.trace.of(key)
 
     # ---- a step ----
 

@@ -74,7 +74,7 @@ def _preempt(state: State, case_set: CaseSet, kernel: Kernel, step: Step) -> Non
     for each in there:
         for occupancy in all_related(each.hidden, case_set):
             if occupancy.lease is not None and occupancy.lease.live:
-                leases.put_off(state, occupancy.lease, "an agent is to start there", step)
+                leases.put_off(state, occupancy.lease, step)
 
 
 def _grant(state: State, run: str, kernel: Kernel, case_set: CaseSet, step: Step) -> Reason | None:

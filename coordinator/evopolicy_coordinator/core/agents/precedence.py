@@ -136,7 +136,7 @@ def _reserve_kernel(state: State, lane: Lane, case_set: CaseSet, barred: list[Ke
     for occupancy in all_related(kernel.hidden, case_set):
         lease = occupancy.lease
         if lease is not None and lease.live and lease.job.priority == EARLY_VALIDATION:
-            leases.put_off(state, lease, "hidden jobs of closed runs go first there", step)
+            leases.put_off(state, lease, step)
     step.dirty[lane] = None
     step.log("info", "hidden_first", env=lane.key[0], boot_id=kernel.boot_id, agents=in_the_way(kernel)[0])
 

@@ -43,13 +43,13 @@ def check(state: State, worker: Worker, step: Step) -> None:
         due = lease.renewed + settings.lease_ttl_s if lease.orphan_until is None else lease.orphan_until
         overdue = (lease.started_at or lease.granted_at) + _longest_s(state, lease.job)
         if now >= overdue and lease.live:
-            leases.stop(state, lease, step, "overdue")
+            leases.stop(state, lease, step)
             leases.give_back(state, lease.job, "overdue", worker, step, ran=True)
         elif now >= overdue and lease.parting:
             leases.parted(state, lease, worker, step)
         elif now >= due:
             live, orphan = lease.live, lease.orphan_until is not None
-            leases.release(state, worker, lease, step, "no heartbeat names it")
+            leases.release(state, worker, lease, step)
             if live:
                 failure: JobFailure = "worker_lost" if orphan else "unlisted"
                 leases.give_back(state, lease.job, failure, worker, step, ran=orphan and lease.id in running)
@@ -77,7 +77,7 @@ def lose(state: State, worker: Worker, step: Step) -> None:
         fleet.answer_beat(state, worker, (), step)
     for lease in list(worker.leases.values()):
         live = lease.live
-        leases.release(state, worker, lease, step, "worker lost")
+        leases.release(state, worker, lease, step)
         if live:
             leases.give_back(state, lease.job, "worker_lost", worker, step, ran=lease.id in running)
     state.timers.arm(("forget", worker.name), step.now + FORGET_S)
@@ -93,6 +93,6 @@ def take_away(state: State, name: str, step: Step) -> None:
         fleet.answer_beat(state, worker, tuple(worker.leases), step)
     for lease in list(worker.leases.values()):
         live = lease.live
-        leases.release(state, worker, lease, step, "its worker is quarantined")
+        leases.release(state, worker, lease, step)
         if live:
             leases.give_back(state, lease.job, "returned", worker, step, ran=False)

@@ -32,7 +32,6 @@ def open_group(state: State, group: JobGroup, step: Step) -> None:
             state.adopting[job] = None
         else:
             queue.put(state, job, step)
-    state.trace.add(step.now, step.stimulus_id, group.id, f"opened, {group.done} of {group.n} done")
 
 
 def _cut(group: JobGroup, heads: list[OutcomeHead], attempts: int, now: float) -> list[JobState]:
@@ -62,21 +61,20 @@ def _cut(group: JobGroup, heads: list[OutcomeHead], attempts: int, now: float) -
     return list(group.jobs.values())
 
 
-def close_group(state: State, group: JobGroup, step: Step, why: str) -> None:
+def close_group(state: State, group: JobGroup, step: Step) -> None:
     """Close a group: its leased jobs are stopped, and no more of its jobs are played."""
     for job in list(group.jobs.values()):
-        close_job(state, job, step, why)
+        close_job(state, job, step)
     group.closed = True
     leases.let_go(state, group, step.now)
     state.groups.pop(group.id, None)
     state.timers.disarm(("submit", group.id))
-    state.trace.add(step.now, step.stimulus_id, group.id, f"closed: {why}")
 
 
-def close_job(state: State, job: JobState, step: Step, why: str) -> None:
+def close_job(state: State, job: JobState, step: Step) -> None:
     """Stop and remove an open job."""
     if job.lease is not None:
-        leases.stop(state, job.lease, step, why)
+        leases.stop(state, job.lease, step)
     job.parting = None
     queue.withdraw(state, job)
     fleet.unreserve(state, job)

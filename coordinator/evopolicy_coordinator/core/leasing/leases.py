@@ -62,7 +62,6 @@ def grant(state: State, job: JobState, worker: Worker, step: Step) -> wire.Lease
     job.held_attempts.add(lease.attempt)
     group = job.group
     description = group.flow.description or worker.profile.descriptions[group.template.env]
-    state.trace.add(step.now, step.stimulus_id, lease.id, f"granted to {worker.name}")
     return wire.Lease(
         lease_id=lease.id,
         attempt=lease.attempt,
@@ -168,7 +167,7 @@ def hear(
                 _leave(state, worker, lease, step, sure=sure)
         elif not lease.named and lease.granted_at < missing_since and now >= state.hold_until:
             sure = occupancies.surely(worker, lease.occupancy, settled)
-            release(state, worker, lease, step, "it never arrived", sure=sure)
+            release(state, worker, lease, step, sure=sure)
             give_back(state, lease.job, "unlisted", worker, step, ran=False)
     occupancies.heard(state, worker, named, settled, step)
     return tuple(stop)
@@ -191,7 +190,6 @@ def _adopt(state: State, worker: Worker, item: wire.HeldLease, step: Step) -> Le
     state.timers.disarm(("job", job.job_id))
     state.adopting.pop(job, None)
     job.held_attempts.add(item.attempt)
-    state.trace.add(step.now, step.stimulus_id, item.lease_id, f"adopted from {worker.name}")
     lease = _enter(state, job, worker, item.attempt, step, serial=0)
     lease.doubtful = True
     return lease
@@ -200,7 +198,7 @@ def _adopt(state: State, worker: Worker, item: wire.HeldLease, step: Step) -> Le
 # ---- giving up ----
 
 
-def end(state: State, lease: Lease, step: Step, why: str) -> None:
+def end(state: State, lease: Lease) -> None:
     """The lease no longer counts. Its worker learns of it from its next heartbeat, or at once if one waits."""
     if not lease.live:
         return
@@ -215,20 +213,19 @@ def end(state: State, lease: Lease, step: Step, why: str) -> None:
     worker.held[job.priority] -= 1
     if lease.hidden_in is not None:
         lease.hidden_in.pop(lease, None)
-    state.trace.add(step.now, step.stimulus_id, lease.id, why)
 
 
-def stop(state: State, lease: Lease, step: Step, why: str) -> None:
+def stop(state: State, lease: Lease, step: Step) -> None:
     """End a lease that its worker still holds; a waiting poll or heartbeat is answered with it at
     the end of this step."""
-    end(state, lease, step, why)
+    end(state, lease)
     step.stops.setdefault(lease.worker, []).append(lease.id)
 
 
-def release(state: State, worker: Worker, lease: Lease, step: Step, why: str, *, sure: bool = False) -> None:
+def release(state: State, worker: Worker, lease: Lease, step: Step, *, sure: bool = False) -> None:
     """End a lease that its worker has released. `sure`: the worker reported so; otherwise it is the
     coordinator's assumption."""
-    end(state, lease, step, why)
+    end(state, lease)
     _leave(state, worker, lease, step, sure=sure)
 
 
@@ -279,7 +276,6 @@ def give_back(
             alone=retry.alone,
             error=error[:2000],
         )
-    state.trace.add(step.now, step.stimulus_id, job.job_id, f"{failure} on {worker.name}: {retry}")
     job.alone = job.alone or retry.alone
     if retry.avoid:
         job.avoid, job.avoid_until = worker.name, step.now + retry.delay_s + state.settings.avoid_s
@@ -290,11 +286,11 @@ def give_back(
         queue.put(state, job, step, front=True)
 
 
-def put_off(state: State, lease: Lease, why: str, step: Step) -> None:
+def put_off(state: State, lease: Lease, step: Step) -> None:
     """Stop a hidden job without a failure. It returns to the queue, but a policy's job only after its
     worker has released it."""
     job = lease.job
-    stop(state, lease, step, why)
+    stop(state, lease, step)
     if job.group.template.bundle is None:
         give_back(state, job, "returned", state.workers[lease.worker], step, ran=False)
     else:

@@ -119,7 +119,7 @@ def replayed(state: State, news: EpisodesDone, step: Step) -> None:
     if worker is None:
         return  # loaded from the store, where its audit's row names the auditor
     run, row = _open(state, group.run, group.id.rpartition(".")[0])
-    groups.close_group(state, group, step, "played again")
+    groups.close_group(state, group, step)
     if run is not None and row is not None:
         machines = (*row.machines, worker.machine) if worker.machine else row.machines
         row = msgspec.structs.replace(row, replayed_by=(*row.replayed_by, worker.name), machines=machines)
@@ -182,9 +182,8 @@ def settle(state: State, run: Run, row: AuditRow, step: Step, *, verdict: str, *
     for n in range(1, len(row.replayed_by) + 2):
         group = state.groups.get(f"{row.audit}.{n}")
         if group is not None:
-            groups.close_group(state, group, step, "its audit is over")
+            groups.close_group(state, group, step)
     row = step.put_audit(run, msgspec.structs.replace(row, actions=None, state=verdict, **fields))
-    state.trace.add(step.now, step.stimulus_id, row.audit, f"audit: {row.state} {row.reason}")
 
 
 def _play(state: State, run: Run, row: AuditRow, step: Step) -> None:

@@ -112,7 +112,7 @@ def end(state: State, group: JobGroup, error: str, step: Step) -> None:
     evaluation = state.evaluations.pop(group.run)
     step.persist(msgspec.structs.replace(evaluation.row, finished=True, error=error))
     state.ended_evaluations[group.run] = Ended(group.done)
-    groups.close_group(state, group, step, error or "all done")
+    groups.close_group(state, group, step)
     pins.drop_flow(state, evaluation.flow)
     _answer_polls(state, group, step, finished=True)
 

@@ -81,7 +81,7 @@ def progressed(state: State, news: EpisodesDone, step: Step) -> None:
     else:
         run.hidden_returns[group.id] = group.returns()
         run.hidden_successes[group.id] = group.successes()
-    groups.close_group(state, group, step, "all done")
+    groups.close_group(state, group, step)
     advance(state, run, step)
 
 
@@ -194,7 +194,7 @@ def _cancel(state: State, run: Run, step: Step, *, error: str | None = None) -> 
         run.ledger.refund(index)
         step.change_submit(run, index, status="cancelled", completed_at=step.now, refunded=True)
         group = state.groups[train_group(run.id, index)]
-        groups.close_group(state, group, step, "run cancelled")
+        groups.close_group(state, group, step)
         result_polls.answer_polls(state, group, step)
     if run.state.phase == "open":
         step.change_run(run, phase="closed", closed_at=step.now, close_reason=gateway.CANCELLED)
@@ -218,7 +218,7 @@ def _finish(
     audit_end.cancel(state, run, step)
     state.timers.disarm(("audits", run.id))
     for group in [group for group in state.groups.values() if group.run == run.id] if unplayed else []:
-        groups.close_group(state, group, step, "run cancelled" if cancelled else "budget not spent")
+        groups.close_group(state, group, step)
     result = finished.result(state, run, best, step.now, cancelled=cancelled, error=error)
     result = journal.ended(state, result, step)
     step.persist(FinishedRow(run=run.id, result=result))

@@ -228,7 +228,7 @@ def end(
     run.rollout_s += step.now - started_at
     run.ledger.settle(group.submit_index)
     run.open = None
-    groups.close_group(state, group, step, f"submit ended: {status}")
+    groups.close_group(state, group, step)
     result_polls.answer_polls(state, group, step)
     step.log("info", "submit_ended", run=run.id, submit=group.submit_index, status=status, episodes=group.n)
     step.tell(SubmitEnded(run, row))

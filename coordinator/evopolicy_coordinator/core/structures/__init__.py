@@ -1,1 +1,1 @@
-"""Structures with invariants of their own, independent of runs, workers and jobs: deadlines, traces, ledgers, polls."""
+"""Structures with invariants of their own, independent of runs, workers and jobs: deadlines, ledgers, polls."""

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from evopolicy_common.refusals import Refusal
 from evopolicy_coordinator.core.contract.reasons import Reason, because
-from evopolicy_coordinator.core.structures.trace import InvariantError
+from evopolicy_coordinator.core.structures.faults import InvariantError
 
 
 class Ledger:

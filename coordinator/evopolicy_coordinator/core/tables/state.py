@@ -18,7 +18,6 @@ from evopolicy_coordinator.core.contract.settings import CoreSettings
 from evopolicy_coordinator.core.structures.polls import Polls
 from evopolicy_coordinator.core.structures.rate import Rate
 from evopolicy_coordinator.core.structures.timers import Timers
-from evopolicy_coordinator.core.structures.trace import Trace
 from evopolicy_coordinator.core.tables.model import (
     EVERYWHERE,
     RANKS,
@@ -68,7 +67,6 @@ class State:
         self.first_attempt = (incarnation - 1) * ATTEMPTS_PER_INCARNATION
         """Attempts up to this number were granted by earlier incarnations."""
         self.timers = Timers()
-        self.trace = Trace()
         self.polls = Polls(self.timers, settings.max_wait_s)
         self.rate = Rate()
         self.loading: Loading | None = None

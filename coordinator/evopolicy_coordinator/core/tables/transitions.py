@@ -9,7 +9,7 @@ from collections.abc import Collection, Mapping
 from typing import Literal, get_args
 
 from evopolicy_common.messages.gateway import SubmitStatus
-from evopolicy_coordinator.core.structures.trace import InvariantError
+from evopolicy_coordinator.core.structures.faults import InvariantError
 
 Table = Mapping[str, Collection[str]]
 """State to its allowed successors; a final state has none."""

@@ -61,7 +61,7 @@ def preempt(state: State, lane: Lane, step: Step) -> None:
                 if not may_stop(state, job):
                     del hidden[lease]
                     continue
-                stop_hidden(state, lease, f"preempted for {lane.key[0]}", step)
+                stop_hidden(state, lease, step)
                 if worker.n_live < worker.slots:
                     # Only this stop frees a slot: the leases stopped before it were still waiting for one.
                     wanted -= 1
@@ -85,7 +85,7 @@ def clear(state: State, lane: Lane, case_set: CaseSet | None, avoided: str | Non
         lasting = any(not may_stop(state, lease.job) for lease in playing)
         for lease in playing:
             if not lasting or lease.job.priority != HELDOUT:
-                stop_hidden(state, lease, f"preempted for {lane.key[0]}", step)
+                stop_hidden(state, lease, step)
         if not lasting:
             slots += room
     return slots
@@ -97,7 +97,7 @@ def may_stop(state: State, job: JobState) -> bool:
     return not bounded or job.preemptions < state.settings.preemptions_max
 
 
-def stop_hidden(state: State, lease: Lease, why: str, step: Step) -> None:
+def stop_hidden(state: State, lease: Lease, step: Step) -> None:
     """Stop a hidden job for train jobs; it goes back into the queue."""
     lease.job.preemptions += 1
-    leases.put_off(state, lease, why, step)
+    leases.put_off(state, lease, step)

@@ -60,7 +60,7 @@ def take(state: State, news: ResultsPersisted, step: Step) -> None:
     if result.kind != "done":
         _keep_begun(job, lease, result, step, silent=silent)
     if lease is not None:
-        leases.release(state, worker, lease, step, f"reported: {result.kind}", sure=True)
+        leases.release(state, worker, lease, step, sure=True)
     if result.kind == "done":
         silent = silent or not counts
         _done(state, worker, job, result, step, live=live, silent=silent, leased_s=leased_s)
@@ -100,7 +100,7 @@ def _closed(
     """Process a result of a job that is done or was cancelled, or of a lease that this worker was not granted."""
     if lease is not None:
         live = lease.live
-        leases.release(state, worker, lease, step, f"reported late: {result.kind}", sure=True)
+        leases.release(state, worker, lease, step, sure=True)
         if live:
             error = f"its result is said to be of {result.job_id[:80]!r}, attempt {result.attempt}"
             fleet.failed(state, worker, step)
@@ -195,7 +195,6 @@ def _done(
             leases.give_back(state, job, "failed", worker, step, ran=True, error=fault)
         return
     if silent and any(_limit_verdict(outcome) for outcome in result.episodes):
-        state.trace.add(step.now, step.stimulus_id, result.lease_id, "late limit verdict, not counted")
         if live:
             leases.give_back(
                 state, job, "unlisted", worker, step, ran=True, error="limit verdict after a silence"
@@ -210,7 +209,7 @@ def _commit(
 ) -> None:
     """Make the outcomes durable, and close the job. `leased_s`: how long the worker has had it; None: unknown."""
     group = job.group
-    groups.close_job(state, job, step, "done by another attempt")
+    groups.close_job(state, job, step)
     if job.begun is not None:
         step.persist(BegunRow(group=group.id, first=job.first, attempt=result.attempt, begun=None))
     for outcome in result.episodes:
@@ -232,9 +231,6 @@ def _commit(
         if group.kind != "audit" and leased_s is not None:
             # The fair share counts in this time, so a worker must not be able to make it up.
             group.flow.observe(min(outcome.wall_s, max(leased_s, 1.0)))
-    state.trace.add(
-        step.now, step.stimulus_id, job.job_id, f"committed attempt {result.attempt} of {worker.name}"
-    )
     if group.kind != "audit":
         state.rate.count(len(result.episodes), step.now)
     step.tell(EpisodesDone(group, worker, result.episodes))

@@ -58,7 +58,6 @@ def _reserve(state: State, job: JobState, worker: Worker, step: Step) -> None:
     """Start to empty a busy worker for a suspect; a train job stops the hidden jobs there rather than wait for them."""
     job.reserved = worker.name
     worker.reserved = job
-    state.trace.add(step.now, step.stimulus_id, job.job_id, f"{worker.name} is emptied for it")
     if job.priority == TRAIN:
         for lease in list(worker.leases.values()):
             first = conflicts.goes_first(lease)
@@ -68,7 +67,7 @@ def _reserve(state: State, job: JobState, worker: Worker, step: Step) -> None:
                 and not first
                 and preemption.may_stop(state, lease.job)
             ):
-                preemption.stop_hidden(state, lease, f"preempted for {job.job_id}", step)
+                preemption.stop_hidden(state, lease, step)
 
 
 def _alone(state: State, job: JobState, worker: Worker, step: Step) -> wire.Lease:

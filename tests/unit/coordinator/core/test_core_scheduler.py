@@ -463,7 +463,6 @@ def test_what_waits_too_long_is_named_with_what_it_waits_for() -> None:
     (stall,) = rig.status().stalls
     assert "r1/s0/train" in stall
     assert "a worker that offers toy/line" in stall
-    assert rig.core.trace("r1/s0/train")
 
 
 def test_a_run_waits_for_its_connected_workers_description_only() -> None:

@@ -10,8 +10,8 @@ import pytest
 
 import evopolicy_coordinator.core
 from evopolicy_coordinator.core.machine import NEWS, POLLS, TIMERS
+from evopolicy_coordinator.core.structures.faults import InvariantError
 from evopolicy_coordinator.core.structures.polls import PollKind
-from evopolicy_coordinator.core.structures.trace import InvariantError
 from evopolicy_coordinator.core.tables import step
 from evopolicy_coordinator.core.tables.model import GroupKind
 from evopolicy_coordinator.core.tables.transitions import AUDIT, JOB, RUN, SUBMIT, Table, check, has_successor

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
+from evopolicy_coordinator.core.structures.faults import InvariantError
 from evopolicy_coordinator.core.structures.ledger import Ledger, refusal
-from evopolicy_coordinator.core.structures.trace import InvariantError
 
 GRANTED = 40
 

@@ -6,7 +6,6 @@ import hypothesis.strategies as st
 from hypothesis import given
 
 from evopolicy_coordinator.core.structures.timers import TimerKey, Timers
-from evopolicy_coordinator.core.structures.trace import Trace
 
 STEPS = st.lists(
     st.tuples(st.sampled_from(["arm", "once", "disarm", "due"]), st.integers(0, 8), st.integers(0, 50)),
@@ -44,10 +43,3 @@ def test_moving_one_deadline_for_ever_takes_no_memory() -> None:
     for at in range(10_000):
         timers.arm(("t", 0), float(at))
     assert len(timers._heap) < 200
-
-
-def test_a_trace_keeps_the_last_lines_about_a_key() -> None:
-    trace = Trace(lines=3)
-    for at, key in enumerate(("r1/s0/train/0", "r2", "r1/s0/train/0#1", "w1")):
-        trace.add(float(at), "s", key, "leased" if key != "w1" else "lost r1/s0/train/0#1")
-    assert [line.at for line in trace.of("r1")] == [2.0, 3.0]
