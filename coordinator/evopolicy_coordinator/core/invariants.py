@@ -23,7 +23,6 @@ def check(state: State) -> None:
         run.ledger.validate()
         phase = run.state.phase
         want(
-            state,
             run.id,
             transitions.has_successor(transitions.RUN, phase),
             "a finished run is not among the open ones",
@@ -34,28 +33,21 @@ def check(state: State) -> None:
             if transitions.has_successor(transitions.SUBMIT, row.status or "open")
         ]
         want(
-            state,
             run.id,
             unsettled == ([] if run.open is None else [run.open]),
             "only the open submit has no verdict",
         )
         want(
-            state,
             run.id,
             (run.open is not None) == (run.ledger.reserved > 0),
             "episodes are reserved exactly while a submit is open",
         )
         if run.open is not None:
-            want(state, run.id, train_group(run.id, run.open) in state.groups, "an open submit has its group")
+            want(run.id, train_group(run.id, run.open) in state.groups, "an open submit has its group")
         settled = sum(
             len(row.env_instances) for row in run.submits if row.status is not None and not row.refunded
         )
-        want(
-            state,
-            run.id,
-            settled == run.ledger.settled,
-            "the settled episodes are those of the ended submits",
-        )
+        want(run.id, settled == run.ledger.settled, "the settled episodes are those of the ended submits")
 
 
 def _isolation(state: State) -> None:
@@ -70,16 +62,13 @@ def _isolation(state: State) -> None:
             # every job that it plays.
             train = any(each.lease is not None or each.worker != occupancy.worker for each in beside)
             apart = not train and not any(related(there.permits, occupancy.case_set) for there in others)
-            want(
-                state, occupancy.id, apart, "a hidden job shares no kernel with related agents and train jobs"
-            )
-            want(state, occupancy.id, kernel is not state.everywhere, "a hidden job's kernel is known")
+            want(occupancy.id, apart, "a hidden job shares no kernel with related agents and train jobs")
+            want(occupancy.id, kernel is not state.everywhere, "a hidden job's kernel is known")
     for worker in state.workers.values():
         for lease in worker.leases.values():
             group = lease.job.group
             wanted = group.hidden or group.kind == "train"
             want(
-                state,
                 lease.id,
                 (lease.occupancy is not None) == wanted,
                 "each hidden or train lease has an occupancy",
@@ -91,9 +80,9 @@ def _isolation(state: State) -> None:
         for index in (kernel.permits, kernel.asks, kernel.hidden, kernel.train, kernel.reversals):
             users.update({case_set: len(there) for case_set, there in index.items() if case_set is not None})
     for case_set in state.case_sets.known():
-        want(state, "", case_set.users == users[case_set], "a case set is kept while it has users")
+        want("", case_set.users == users[case_set], "a case set is kept while it has users")
     for group in state.held:
-        want(state, group.id, group.held_since is not None and not group.closed, "only open groups are held")
+        want(group.id, group.held_since is not None and not group.closed, "only open groups are held")
 
 
 def _audits(state: State) -> None:
@@ -108,15 +97,14 @@ def _audits(state: State) -> None:
             )
             playing = [k for k in range(1, n + 2) if f"{row.audit}.{k}" in state.groups]
             want(
-                state,
                 row.audit,
                 playing == ([n + 1] if waits else []),
                 f"exactly the due audit is played: {playing}",
             )
-            want(state, row.audit, row.player not in row.replayed_by, "no worker audits its own episode")
+            want(row.audit, row.player not in row.replayed_by, "no worker audits its own episode")
 
 
-def want(state: State, key: str, holds: bool, what: str) -> None:
+def want(key: str, holds: bool, what: str) -> None:
     """Raises InvariantError when `holds` is false. `key` names the record concerned."""
     if not holds:
         raise InvariantError(f"{key}: violated: {what}")
@@ -128,16 +116,16 @@ def _jobs(state: State) -> None:
     for flow in {group.flow for group in state.groups.values()}:
         ready |= {job: None for line in flow.ready for ticket, job in line if ticket == job.ticket}
     ends = not state.adopting or ("adopt", "") in state.timers
-    want(state, "", ends, "a job that waits for adoption has a deadline")
+    want("", ends, "a job that waits for adoption has a deadline")
     for group in state.groups.values():
         left = sum(job.n for job in group.jobs.values())
-        want(state, group.id, left + group.done == group.n, "each episode is open or done")
+        want(group.id, left + group.done == group.n, "each episode is open or done")
         leased = sum(job.lease is not None for job in group.jobs.values())
-        want(state, group.id, leased == group.n_leased, "leased jobs are counted")
+        want(group.id, leased == group.n_leased, "leased jobs are counted")
         live += leased
         for job in group.jobs.values():
             key = job.job_id
-            want(state, key, state.jobs.get(key) is job, "an open job is known by its id")
+            want(key, state.jobs.get(key) is job, "an open job is known by its id")
             found = {
                 "queued": job in (state.suspects if job.alone else ready),
                 "leased": job.lease is not None,
@@ -146,11 +134,8 @@ def _jobs(state: State) -> None:
                 "adopting": job in state.adopting,
             }
             places = [place for place, there in found.items() if there]
+            want(key, places == [job.place], f"the job is where its field says ({job.place}): {places}")
             want(
-                state, key, places == [job.place], f"the job is where its field says ({job.place}): {places}"
-            )
-            want(
-                state,
                 key,
                 transitions.has_successor(transitions.JOB, job.place),
                 "an open job has a further transition",
@@ -158,7 +143,6 @@ def _jobs(state: State) -> None:
             if job.reserved is not None:
                 emptied = state.workers.get(job.reserved)
                 want(
-                    state,
                     key,
                     emptied is not None and emptied.reserved is job,
                     "the worker that is emptied for the suspect reserves it",
@@ -167,42 +151,38 @@ def _jobs(state: State) -> None:
             if stopped is not None:
                 there = state.workers[stopped.worker].leases.get(stopped.id) is stopped
                 want(
-                    state,
-                    key,
-                    there and not stopped.live,
-                    "the worker still holds the lease that the job waits for",
+                    key, there and not stopped.live, "the worker still holds the lease that the job waits for"
                 )
             lease = job.lease
             if lease is not None:
                 worker = state.workers.get(lease.worker)
                 held = worker is not None and worker.leases.get(lease.id) is lease
-                want(state, key, held and lease.live, "the job's lease is live and held by its worker")
-                want(state, key, lease.attempt in job.held_attempts, "the attempt is among the held ones")
+                want(key, held and lease.live, "the job's lease is live and held by its worker")
+                want(key, lease.attempt in job.held_attempts, "the attempt is among the held ones")
     want(
-        state,
         "",
         len(state.jobs) == sum(len(group.jobs) for group in state.groups.values()),
         "every job belongs to an open group",
     )
-    want(state, "", live == state.n_live, "live leases are counted")
+    want("", live == state.n_live, "live leases are counted")
 
 
 def _queue(state: State) -> None:
     flows = {group.flow for group in state.groups.values()}
     for job in state.suspects:
-        want(state, job.job_id, job.queued and job.alone, "a suspect waits")
+        want(job.job_id, job.queued and job.alone, "a suspect waits")
     for flow in flows:
         leased = sum(group.n_leased for group in state.groups.values() if group.flow is flow)
-        want(state, flow.id, leased == flow.n_leased, "a flow counts its leased jobs")
+        want(flow.id, leased == flow.n_leased, "a flow counts its leased jobs")
         unpinned = state.unpinned.get(flow.id) is flow
-        want(state, flow.id, unpinned == (flow.pin is None), "a flow without a pin waits for one")
+        want(flow.id, unpinned == (flow.pin is None), "a flow without a pin waits for one")
         for priority in range(N_PRIORITIES):
             valid = [job for ticket, job in flow.ready[priority] if job.ticket == ticket]
-            want(state, flow.id, len(valid) == flow.n_ready[priority], "ready jobs are counted")
+            want(flow.id, len(valid) == flow.n_ready[priority], "ready jobs are counted")
             stray = [job for job in valid if not job.queued or job.priority != priority or job.alone]
-            want(state, flow.id, not stray, "only queued jobs of that priority are in the queue")
+            want(flow.id, not stray, "only queued jobs of that priority are in the queue")
             if flow.lane is not None and flow.n_ready[priority]:
-                want(state, flow.id, flow.in_heap[priority], "a flow with ready jobs is in its lane's heap")
+                want(flow.id, flow.in_heap[priority], "a flow with ready jobs is in its lane's heap")
     stopping = Counter(
         lease.stopped_for.key
         for worker in state.workers.values()
@@ -210,34 +190,27 @@ def _queue(state: State) -> None:
         if lease.stopped_for is not None
     )
     for lane in state.lanes.values():
-        want(state, str(lane.key), lane.stopping == stopping[lane.key], "stopping jobs are counted")
+        want(str(lane.key), lane.stopping == stopping[lane.key], "stopping jobs are counted")
         hidden = any(any(profile.hidden) for profile in lane.profiles)
         checked_at = ("lane", lane.key) in state.timers
         want(
-            state,
             str(lane.key),
             checked_at or not (lane.n_ready[TRAIN] and hidden),
             "a lane whose train jobs wait beside hidden ones has a deadline",
         )
         for priority in range(N_PRIORITIES):
             total = sum(flow.n_ready[priority] for flow in flows if flow.lane is lane)
-            want(state, str(lane.key), total == lane.n_ready[priority], "a lane counts its flows' ready jobs")
+            want(str(lane.key), total == lane.n_ready[priority], "a lane counts its flows' ready jobs")
         waiting = [job for job in state.jobs.values() if job.queued and job.group.flow.lane is lane]
         for priority in range(N_PRIORITIES):
             case_sets = Counter(job.group.flow.case_set for job in waiting if job.priority == priority)
-            want(
-                state,
-                str(lane.key),
-                dict(case_sets) == lane.waiting[priority],
-                "waiting case sets are counted",
-            )
+            want(str(lane.key), dict(case_sets) == lane.waiting[priority], "waiting case sets are counted")
         backlog = Counter(
             job.group.flow.case_set for job in waiting if job.group.hidden and job.group.flow.closed
         )
-        want(state, str(lane.key), dict(backlog) == lane.backlog, "hidden jobs of closed runs are counted")
+        want(str(lane.key), dict(backlog) == lane.backlog, "hidden jobs of closed runs are counted")
         for profile in lane.profiles:
             want(
-                state,
                 str(lane.key),
                 (lane in profile.busy) == any(lane.n_ready),
                 "profiles list the lanes with waiting jobs",
@@ -248,16 +221,14 @@ def _workers(state: State) -> None:
     for profile in state.profiles.values():
         workers = [state.workers[name] for name in profile.workers]
         want(
-            state,
             str(sorted(profile.classes.items())),
             sum(w.slots for w in workers) == profile.slots,
             "slots are counted",
         )
         for name in profile.parked:
-            want(state, name, state.workers[name].poll is not None, "a parked worker has a poll")
+            want(name, state.workers[name].poll is not None, "a parked worker has a poll")
         for names in profile.warm.values():
             want(
-                state,
                 str(sorted(profile.classes.items())),
                 names.keys() <= profile.parked.keys(),
                 "warm workers are parked",
@@ -265,35 +236,27 @@ def _workers(state: State) -> None:
         for priority, hidden in enumerate(profile.hidden):
             for lease in hidden:
                 fits = lease.live and lease.job.priority == priority != TRAIN
-                want(state, lease.id, fits, "preemptible leases are live and hidden")
+                want(lease.id, fits, "preemptible leases are live and hidden")
     for worker in state.workers.values():
-        want(state, worker.name, worker.state != "lost" or not worker.leases, "a lost worker holds nothing")
+        want(worker.name, worker.state != "lost" or not worker.leases, "a lost worker holds nothing")
         timed = ("worker", worker.name) in state.timers or worker.state == "lost"
-        want(state, worker.name, timed, "a connected worker has a deadline")
+        want(worker.name, timed, "a connected worker has a deadline")
         live = [lease.job.priority for lease in worker.leases.values() if lease.live]
         held = [live.count(priority) for priority in range(N_PRIORITIES)]
         want(
-            state,
             worker.name,
             (len(live), held) == (worker.n_live, worker.held),
             "the worker's live leases are counted",
         )
-        want(
-            state,
-            worker.name,
-            state.sessions.get(worker.session) == worker.name,
-            "the worker's session is known",
-        )
+        want(worker.name, state.sessions.get(worker.session) == worker.name, "the worker's session is known")
         if worker.reserved is not None:
             want(
-                state,
                 worker.name,
                 worker.reserved.reserved == worker.name,
                 "the suspect that the worker is emptied for knows the worker",
             )
         if worker.alone is not None:
             want(
-                state,
                 worker.name,
                 worker.alone.id in worker.leases,
                 "the suspect that the worker plays alone is leased to it",
