@@ -45,11 +45,14 @@ def _whole(least: int) -> Callable[[Any], int]:
     return take
 
 
-def _seconds(value: Any) -> float:
-    number = float(value)
-    if isinstance(value, str | bool) or not 1 <= number < math.inf:
-        raise ValueError
-    return number
+def _least(least: float) -> Callable[[Any], float]:
+    def take(value: Any) -> float:
+        number = float(value)
+        if isinstance(value, str | bool) or not least <= number < math.inf:
+            raise ValueError
+        return number
+
+    return take
 
 
 def _flag(value: Any) -> bool:
@@ -99,11 +102,16 @@ def _or_none(rule: Rule) -> Rule:
 _FILE = Rule(_path, "the path of a file")
 _FOLDER = Rule(_path, "the path of a folder")
 _NAME = Rule(_text, "a text")
+_NUMBER = Rule(_least(0.0), "a number")
 _COUNT = Rule(_whole(1), "a whole number of at least 1")
 
 RULES: dict[str, Rule] = {
     "agent": Rule(_agent, "a function of one Workspace, or a text as for --agent, such as 'evolve'"),
-    "agent_wall_s": Rule(_seconds, "a number of seconds, at least 1"),
+    "agent_cpus": _or_none(_NUMBER),
+    "agent_disk": _or_none(_NUMBER),
+    "agent_memory": _or_none(_NUMBER),
+    "agent_pids": _or_none(_COUNT),
+    "agent_wall_s": Rule(_least(1.0), "a number of seconds, at least 1"),
     "agents_md": _or_none(_FILE),
     "budget": _or_none(_COUNT),
     "cases": Rule(_cases, "train ids, such as range(8) or [0, 3]"),

@@ -37,7 +37,13 @@ from evopolicy_gateway.jail.settings import JailSettings
 from evopolicy_gateway.operator import cluster as operator
 from evopolicy_gateway.operator.trials import policy_bundle
 from evopolicy_gateway.run.lifecycle import RunLifecycle
-from evopolicy_gateway.run.options import default_exp_id, limits_from, one_environment, packages_for
+from evopolicy_gateway.run.options import (
+    agent_limits,
+    default_exp_id,
+    limits_from,
+    one_environment,
+    packages_for,
+)
 from evopolicy_gateway.run.plan import Plan
 from evopolicy_gateway.run.watch import RunView
 from evopolicy_gateway.run_folder.listener import Listener
@@ -336,6 +342,7 @@ def plan_of(
         silence_s=given.agent_silence_s,
         overwrite=given.overwrite,
         jail=JailSettings() if listener is None else JailSettings(mode="none"),
+        limits=agent_limits(given),
         listener=listener,
     )
 
@@ -395,7 +402,8 @@ def run(
     `runs`: the folder of run directories. `policy_packages`: installed packages that policies may import besides numpy,
     such as `("scipy",)`. Further `options`, as the options of `evopolicy run` with these names:
     `exp_id`, `entry`, `model`, `repeat`, `validation`, `heldout`, `profile`, `replays`, `tier`, `feedback`, `prompts` and
-    `agents_md` (files), `agent_wall_s` (seconds), `overwrite`, `progress`.
+    `agents_md` (files), `agent_wall_s` (seconds), `agent_cpus` (cores), `agent_memory` and `agent_disk` (bytes),
+    `agent_pids`, `overwrite`, `progress`.
 
     Raises ConfigError, with the remedy, for wrong arguments and for missing requirements on this machine. Ctrl-C
     cancels the run, and its folder records that.

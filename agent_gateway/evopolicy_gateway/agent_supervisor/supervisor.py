@@ -36,10 +36,12 @@ from evopolicy_gateway.processes.child_messages import (
     AgentSurvives,
     AgentTime,
     AgentTurn,
+    AgentUsed,
     Orders,
     StartAgent,
 )
 from evopolicy_gateway.processes.clock import Activity, AgentClock
+from evopolicy_gateway.processes.resources import Resources
 from evopolicy_gateway.workspace.prompts import Prompts
 
 END_GRACE_S = 3.0
@@ -70,6 +72,7 @@ async def keep(order: StartAgent, orders: Orders) -> AgentEnded:
     redact = Redaction.of(secrets_in(environment, config), order.urls).knowing(on_command_line)
     agent_log = AgentLog(Path(order.agent_log), redact)
     clock = AgentClock(order.wall_limit_s)
+    resources = _resources(order)
     activity = None if order.silence_s is None else Activity(order.silence_s, Path(order.workspace))
     stage = Stage(
         workspace=Path(order.workspace),
@@ -82,15 +85,19 @@ async def keep(order: StartAgent, orders: Orders) -> AgentEnded:
         clock=clock,
         activity=activity,
         prompts=msgspec.convert(order.prompts, Prompts),
+        joins=resources.joins,
     )
-    play = asyncio.create_task(_play(order, stage, config))
+    play = asyncio.create_task(_play(order, stage, config, resources))
     stopped = asyncio.create_task(_stopped(orders, clock, activity))
     late = asyncio.create_task(clock.run_out())
-    telling = asyncio.create_task(_tell_time(clock))
+    full = asyncio.create_task(resources.too_large())
+    telling = asyncio.create_task(_tell_use(clock, resources))
     log.info("agent started", agent=shown)
     try:
-        await asyncio.wait([play, stopped, late], return_when=asyncio.FIRST_COMPLETED)
-        reason = None if play.done() else "told" if stopped.done() else "wall_limit"
+        await asyncio.wait([play, stopped, late, full], return_when=asyncio.FIRST_COMPLETED)
+        ends = {"told": stopped, "wall_limit": late, "disk_limit": full}
+        reason = None if play.done() else next(name for name, task in ends.items() if task.done())
+        detail = full.result() if reason == "disk_limit" else ""
         stage.over.set()
         await _until_gone(stage.started)
         # Once its programs have ended, a harness returns by itself with its facts (turns, tokens).
@@ -98,18 +105,33 @@ async def keep(order: StartAgent, orders: Orders) -> AgentEnded:
         play.cancel()
         ending = (await asyncio.gather(play, return_exceptions=True))[0]
     finally:
-        for task in (stopped, late, telling):
+        for task in (stopped, late, full, telling):
             task.cancel()
         child_messages.emit(AgentTime(used_s=clock.used_s()))
+        child_messages.emit(AgentUsed(resources=resources.used()))
+        resources.remove()
         agent_log.close()
     if isinstance(ending, AgentEnded):
         if reason is not None:
-            return msgspec.structs.replace(ending, reason=reason, detail="")
-        failed = ending.reason == "agent_failed"
-        return msgspec.structs.replace(ending, stderr_tail=_stderr_tail(agent_log)) if failed else ending
+            return msgspec.structs.replace(ending, reason=reason, detail=detail)
+        if ending.reason != "agent_failed":
+            return ending
+        why = "; ".join(filter(None, (ending.detail, resources.reached())))
+        return msgspec.structs.replace(ending, detail=why, stderr_tail=_stderr_tail(agent_log))
     if isinstance(ending, EvopolicyError) or reason is not None:
-        return AgentEnded(reason=reason or "agent_failed", detail=str(ending))
+        return AgentEnded(reason=reason or "agent_failed", detail=detail or str(ending))
     raise ending
+
+
+def _resources(order: StartAgent) -> Resources:
+    """Binds this process to cores, or makes the agent's cgroup; tells the operator what its limits are."""
+    workspace, folders = Path(order.workspace), [Path(order.workspace)]
+    if order.jail is not None:
+        folders += [Path(order.jail.private, name) for name in ("home", "tmp")]
+    made = Resources(order.limits, folders, workspace / "feedback", jailed=order.jail is not None)
+    if words := made.words():
+        child_messages.emit(AgentDoing(note=f"agent limits: {words}"))
+    return made
 
 
 def _stderr_tail(agent_log: AgentLog) -> tuple[str, ...]:
@@ -117,7 +139,9 @@ def _stderr_tail(agent_log: AgentLog) -> tuple[str, ...]:
     return tuple(line for line in lines if line)[-_LINES_SHOWN:]
 
 
-async def _play(order: StartAgent, stage: Stage, config: AgentConfig | None) -> AgentEnded:
+async def _play(
+    order: StartAgent, stage: Stage, config: AgentConfig | None, resources: Resources
+) -> AgentEnded:
     harness = make(order.agent, Path(order.started_in), config)
     urls, relayed = order.urls, bool(order.model_url)
     if relayed:
@@ -148,6 +172,8 @@ async def _play(order: StartAgent, stage: Stage, config: AgentConfig | None) -> 
             workspace=stage.workspace,
             urls=urls,
             started_in=Path(order.started_in),
+            pids=resources.own_pids,
+            fixed_cores=resources.fixed_cores,
         )
         inside = jail.environment(stage.environment, {**order.urls, **order.variables})
         stage = msgspec.structs.replace(stage, environment=inside, jail=jail)
@@ -170,9 +196,16 @@ def _tell(doing: AgentDoing) -> None:
     child_messages.emit(msgspec.structs.replace(doing, **shown))
 
 
-async def _tell_time(clock: AgentClock) -> None:
-    """Reports the used time periodically, so that an agent that is killed and resumed gets no extra time."""
+async def _tell_use(clock: AgentClock, resources: Resources) -> None:
+    """Reports the used time and resources periodically, so that an agent that is killed and resumed gets no extra time; and each
+    limit when it is reached first."""
+    told = ""
     while True:
+        child_messages.emit(AgentUsed(resources=resources.used()))
+        reached = resources.reached()
+        if reached and not told:
+            told = reached
+            child_messages.emit(AgentDoing(note=reached))
         await asyncio.sleep(_TELL_TIME_S)
         child_messages.emit(AgentTime(used_s=clock.used_s()))
 

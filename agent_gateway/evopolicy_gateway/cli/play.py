@@ -23,7 +23,14 @@ from evopolicy_gateway.cli.option_groups import spread
 from evopolicy_gateway.cli.run_options import JailOptions, ListenerOptions, RunOptions
 from evopolicy_gateway.jail.settings import JailSettings
 from evopolicy_gateway.operator.cluster import Cluster
-from evopolicy_gateway.run.options import cases_of, default_exp_id, limits_of, one_environment, packages_for
+from evopolicy_gateway.run.options import (
+    agent_limits,
+    cases_of,
+    default_exp_id,
+    limits_of,
+    one_environment,
+    packages_for,
+)
 from evopolicy_gateway.run.plan import Plan
 from evopolicy_gateway.run_folder import listener
 from evopolicy_gateway.run_folder.layout import folder_of
@@ -344,6 +351,7 @@ def _plans(
             overwrite=given.overwrite,
             resume=given.resume,
             jail=jail,
+            limits=agent_limits(given),
             listener=where,
         )
         for env_id in env_ids

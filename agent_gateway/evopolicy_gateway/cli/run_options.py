@@ -193,6 +193,26 @@ class RunOptions(msgspec.Struct, frozen=True, kw_only=True):
             rich_help_panel=AGENT,
         ),
     ] = SILENCE_S
+    agent_cpus: Annotated[
+        float | None,
+        typer.Option(help="Processor time for the agent's programs, in cores.", rich_help_panel=AGENT),
+    ] = None
+    agent_memory: Annotated[
+        float | None,
+        typer.Option(help="Memory for the agent's programs, in bytes, such as 8e9.", rich_help_panel=AGENT),
+    ] = None
+    agent_pids: Annotated[
+        int | None,
+        typer.Option(help="Greatest number of the agent's processes and threads.", rich_help_panel=AGENT),
+    ] = None
+    agent_disk: Annotated[
+        float | None,
+        typer.Option(
+            help="Space for the agent's workspace, home, and /tmp, in bytes: with more, it is ended. Default: 2e10.",
+            rich_help_panel=AGENT,
+            show_default=False,
+        ),
+    ] = None
 
     def texts(self, started_in: Path) -> Texts:
         """The agent's texts. ConfigError naming the file that is wrong."""

@@ -1,14 +1,15 @@
 """Runs inside the jail before the agent's program: listens on loopback ports, sends the sockets out, executes the
 program.
 
-`python -I -S entry.py FD PORT,PORT,… PROGRAM…`. FD is a unix socket to the agent supervisor, `-` where the network is
-open. A socket stays in the network namespace in which it was created, so the agent supervisor serves these ports, while
+`python -I -S entry.py FD PORT,PORT,… PROCESSES PROGRAM…`. FD is a unix socket to the agent supervisor, `-` where the network
+is open. PROCESSES is the greatest number of processes, which the kernel counts in this user namespace; `-` for no limit. A socket stays in the network namespace in which it was created, so the agent supervisor serves these ports, while
 the agent has no route out itself.
 """
 
 from __future__ import annotations
 
 import os
+import resource
 import signal
 import socket
 import sys
@@ -18,9 +19,11 @@ BACKLOG = 128
 
 
 def main(arguments: list[str]) -> None:
-    control, ports, program = arguments[0], arguments[1], arguments[2:]
+    control, ports, processes, program = arguments[0], arguments[1], arguments[2], arguments[3:]
     if control != "-":
         hand_out(int(control), ports)
+    if processes != "-":
+        resource.setrlimit(resource.RLIMIT_NPROC, (int(processes), int(processes)))
     # Ignored around bubblewrap, so that the program receives the signals before its jail is torn down.
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGPIPE):
         signal.signal(number, signal.SIG_DFL)

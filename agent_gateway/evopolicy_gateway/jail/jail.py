@@ -57,8 +57,16 @@ class JailOrder(msgspec.Struct, frozen=True, kw_only=True):
 class Way:
     """One start of a program: the complete command, and the socket through which it sends its listening sockets."""
 
-    def __init__(self, jail: Sequence[str], program: Sequence[str], proxy: JailProxy | None) -> None:
-        """`proxy` None: the network is open."""
+    def __init__(
+        self,
+        jail: Sequence[str],
+        program: Sequence[str],
+        proxy: JailProxy | None,
+        *,
+        pids: int | None = None,
+        fixed_cores: bool = False,
+    ) -> None:
+        """`proxy` None: the network is open. `pids`, `fixed_cores`: as for `Jail`."""
         self._proxy = proxy
         self._supervisor: socket.socket | None = None
         self._child: socket.socket | None = None
@@ -67,7 +75,7 @@ class Way:
         # folders.
         self._files = [_readable(b"".join(os.fsencode(word) + b"\0" for word in jail[1:]))]
         self.words = [*_PATIENT, jail[0], "--args", str(self._files[0])]
-        self._files.append(_readable(filter_program()))
+        self._files.append(_readable(filter_program(fixed_cores=fixed_cores)))
         self.words += ["--seccomp", str(self._files[1])]
         self.words += ["--", _base_python(), "-I", "-S", ENTRY]
         if proxy is None:
@@ -75,7 +83,7 @@ class Way:
         else:
             self._supervisor, self._child = socket.socketpair()
             self.words += [str(self._child.fileno()), ",".join(map(str, proxy.ports))]
-        self.words += program
+        self.words += ["-" if pids is None else str(pids), *program]
 
     @property
     def pass_fds(self) -> tuple[int, ...]:
@@ -143,16 +151,20 @@ class Jail:
         packages: Sequence[str] = (),
         inputs: Sequence[tuple[str, str]] = (),
         more_programs: Sequence[Sequence[str]] = (),
+        pids: int | None = None,
+        fixed_cores: bool = False,
     ) -> None:
         """`command`: words that the operator gave, never the agent's. `variables`, `hosts`: names that the agent's settings
         pass on and let it reach. `packages`: distributions of our Python that it imports. `inputs`: folders and files, each
         with its place in the jail, which starts with `~/` in the agent's home. `more_programs`: command lines of programs
-        that the agent starts.
+        that the agent starts. `pids`: greatest number of processes, by a resource limit. `fixed_cores`: programs cannot
+        change their affinity.
 
         `started_in`: folder to which the operator's paths are relative.
         """
         settings = order.settings
         self._open_network = settings.mode == "open-network"
+        self._pids, self._fixed_cores = pids, fixed_cores
         self._variables = frozenset(
             (*_PASSED, *settings.environment, *variables, *HARNESS_VARIABLES.get(harness, ()))
         )
@@ -196,7 +208,8 @@ class Jail:
 
     def way(self, program: Sequence[str]) -> Way:
         """Prepares one start of a program."""
-        return Way(self._view.arguments(), program, None if self._open_network else self._proxy())
+        proxy = None if self._open_network else self._proxy()
+        return Way(self._view.arguments(), program, proxy, pids=self._pids, fixed_cores=self._fixed_cores)
 
     def sealed(self, program: Sequence[str]) -> Way:
         """One start of a program without network access, such as a CLI that prints its version."""

@@ -8,6 +8,7 @@ Rules that this module owns:
 - Keyrings belong to a login, not to a namespace: none can be read or written.
 - No file gets a set-id bit, capabilities or an access control list: the program outlives the jail, and would run with
   the operator's rights for whoever reaches it. The sticky bit is harmless.
+- Where affinity limits an agent's cores, no program may choose its own.
 - No program may read the kernel's log, measure other processes' performance, or run programs in the kernel.
 """
 
@@ -31,7 +32,7 @@ from evopolicy_common.seccomp import (
     program,
     refuse,
 )
-from evopolicy_common.seccomp.numbers import ATTRIBUTES, MODES, REFUSED, SOCKET
+from evopolicy_common.seccomp.numbers import ATTRIBUTES, MODES, REFUSED, SET_AFFINITY, SOCKET
 
 GIVE_UP = "or give the jail up by name with --jail none, which run.json then says"
 _REFUSED = {
@@ -48,8 +49,8 @@ _MAKES_A_FILE = os.O_CREAT | (os.O_TMPFILE & ~os.O_DIRECTORY)
 """Flags of `open` with which its mode counts; without them it may be anything."""
 
 
-def filter_program() -> bytes:
-    """The filter, 8 bytes an instruction. Raises ConfigError on a processor without a table of calls."""
+def filter_program(*, fixed_cores: bool = False) -> bytes:
+    """The filter, 8 bytes an instruction. `fixed_cores`: affinity cannot be changed. Raises ConfigError on a processor without a table of calls."""
     machine = os.uname().machine
     if machine not in AUDIT_ARCH:
         known = " and ".join(sorted(AUDIT_ARCH))
@@ -60,6 +61,8 @@ def filter_program() -> bytes:
     for number, calls in _REFUSED.items():
         for call in calls:
             body += [(JUMP_EQUAL, 0, 1, REFUSED[machine][call]), refuse(number)]
+    if fixed_cores:
+        body += [(JUMP_EQUAL, 0, 1, SET_AFFINITY[machine]), refuse(errno.EPERM)]
     # As on a file system without them, which programs that copy files expect.
     for call_number in ATTRIBUTES[machine]:
         body += [(JUMP_EQUAL, 0, 1, call_number), refuse(errno.ENOTSUP)]

@@ -26,6 +26,10 @@ _ETC = (
     *("localtime", "magic", "mime.types", "nsswitch.conf", "os-release", "passwd", "pki", "profile"),
     *("protocols", "services", "ssl", "terminfo", "timezone"),
 )
+SHM_BYTES = 1 << 30
+"""Size of the agent's shared memory."""
+_COVER_BYTES = 1 << 20
+"""Size of an empty folder that covers another; programs can write to it."""
 _PRIVATE = ("/etc/ssl/private", "/etc/pki/tls/private")
 """The machine's own private keys, which root may read."""
 _PROC_SHOWN = frozenset(("cpuinfo", "filesystems", "meminfo", "sys", "version"))
@@ -109,6 +113,7 @@ class View(msgspec.Struct, frozen=True, kw_only=True):
 
     def _proc(self) -> list[str]:
         words = ["--proc", "/proc", "--dev", "/dev", "--ro-bind", "/proc/sys", "/proc/sys"]
+        words += ["--size", str(SHM_BYTES), "--tmpfs", "/dev/shm", "--remount-ro", "/dev"]
         for path in _COUNTERS:
             words += _covered(path)
         for name in sorted(os.listdir("/proc")):
@@ -224,14 +229,14 @@ def _system(open_network: bool) -> list[str]:
         words += ["--ro-bind-try", f"/etc/{name}", f"/etc/{name}"]
     for path in _PRIVATE:
         if os.path.isdir(path):
-            words += ["--tmpfs", path]
+            words += _covered(path)
     return words
 
 
 def _covered(path: str) -> list[str]:
     """Covers `path` with an empty folder or file, if it exists."""
     if os.path.isdir(path):
-        return ["--tmpfs", path]
+        return ["--size", str(_COVER_BYTES), "--tmpfs", path]
     return ["--ro-bind", "/dev/null", path] if os.path.exists(path) else []
 
 

@@ -34,10 +34,12 @@ class AgentProcess:
         *,
         talks: bool,
         pass_fds: Sequence[int] = (),
+        joins: Sequence[str] = (),
     ) -> AgentProcess:
-        """Starts the program; raises OSError when that fails. `talks`: its stdin is a pipe."""
+        """Starts the program; raises OSError when that fails. `talks`: its stdin is a pipe. `joins`: as in
+        `ending_with_parent`."""
         process = await asyncio.create_subprocess_exec(
-            *ending_with_parent(program, signal.SIGKILL),
+            *ending_with_parent(program, signal.SIGKILL, joins),
             cwd=cwd,
             env=dict(environment),
             stdin=asyncio.subprocess.PIPE if talks else asyncio.subprocess.DEVNULL,

@@ -15,7 +15,7 @@ from typing import Any
 import msgspec
 
 from evopolicy_common.errors import DECODE_ERRORS, ProtocolError
-from evopolicy_common.records.run_record import AgentInput
+from evopolicy_common.records.run_record import AgentInput, AgentLimits, AgentResources
 from evopolicy_gateway.jail.jail import JailOrder
 
 
@@ -107,7 +107,7 @@ class AgentEnded(Event, frozen=True, kw_only=True, tag="agent_ended"):
     """The agent and all its children are gone."""
 
     reason: str
-    """`agent_stopped`, `agent_failed`, `wall_limit`, `silent`, or `told` when the parent ended it."""
+    """`agent_stopped`, `agent_failed`, `wall_limit`, `silent`, `disk_limit`, or `told` when the parent ended it."""
     detail: str = ""
     turns: int = 0
     """Prompts that it answered."""
@@ -142,6 +142,12 @@ class AgentTime(Event, frozen=True, kw_only=True, tag="agent_time"):
     used_s: float
 
 
+class AgentUsed(Event, frozen=True, kw_only=True, tag="agent_used"):
+    """What the agent has used of its machine since it was started."""
+
+    resources: AgentResources
+
+
 class StartAgent(Order, frozen=True, kw_only=True, tag="start_agent"):
     """The first line to an agent supervisor."""
 
@@ -173,6 +179,7 @@ class StartAgent(Order, frozen=True, kw_only=True, tag="start_agent"):
     """A program without activity for this long is ended, seconds; None: no such limit."""
     jail: JailOrder | None = None
     """None: not jailed."""
+    limits: AgentLimits = AgentLimits()
     lock: str | None = None
     """Lock file that the agent supervisor holds while the agent may be alive; it first waits for an earlier holder."""
 
@@ -210,6 +217,7 @@ AnyEvent = (
     | AgentTurn
     | AgentDoing
     | AgentTime
+    | AgentUsed
     | AgentSurvives
     | AgentEnded
     | ModelBudgetSpent

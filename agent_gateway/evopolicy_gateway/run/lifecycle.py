@@ -47,6 +47,7 @@ from evopolicy_gateway.processes.child_messages import (
     AgentSurvives,
     AgentTime,
     AgentTurn,
+    AgentUsed,
     CloseRun,
     HeldTime,
     Progress,
@@ -350,7 +351,7 @@ class RunLifecycle:
         facts = without_keys(ended.facts)
         about = {"turns": ended.turns, "retries": ended.retries, "detail": ended.detail, **facts}
         try:
-            about["record"] = record.told_at_close(self._folder, self._plan, about)
+            about["record"] = record.told_at_close(self._folder, self._plan, about, self._stopwatch.times)
         except Exception as error:  # the agent has ended: no bug in this costs the run
             why = record.why_failed(error, self._folder.harness_log)
             self._watch.note(self._name, f"the coordinator does not commit to this side of run.json: {why}")
@@ -544,6 +545,7 @@ class RunLifecycle:
                 passed_file=str(self._folder.passed),
                 lock=str(self._folder.supervisor_lock),
                 jail=self._jail(),
+                limits=self._plan.limits,
             )
         )
         await self._supervisor.tell(self._submits)
@@ -557,6 +559,8 @@ class RunLifecycle:
                 self._watch.doing(self._name, event)
             elif isinstance(event, AgentTime):
                 self._stopwatch.agent_reported(event.used_s)
+            elif isinstance(event, AgentUsed):
+                self._stopwatch.agent_used(event.resources)
             elif isinstance(event, AgentSurvives):
                 self._survivors = list(event.pids)
                 self._tell_survivors()

@@ -17,8 +17,16 @@ from evopolicy_common.messages.gateway import Profile
 from evopolicy_common.messages.run_settings import HIDDEN_COUNTS, PUBLISHED, RunSettings, episode_counts
 from evopolicy_common.processes.packages import checked_names, packages_in, policy_versions
 from evopolicy_common.records.run_files import read_record
+from evopolicy_common.records.run_record import AgentLimits
 from evopolicy_gateway.submits.submit_request import Bounds, ids_in
 
+AGENT_LIMITS: dict[str, tuple[str, float, float]] = {
+    "cpus": ("cpus", 0.1, 1e4),
+    "memory": ("memory_bytes", 1e8, 1e15),
+    "pids": ("pids", 16, 1 << 22),
+    "disk": ("disk_bytes", 1e6, 1e18),
+}
+"""Options `--agent-NAME`: the field of `AgentLimits`, the least value with which programs still start, the greatest."""
 OWN = {
     "policy_scope": "episode",
     "observations": "arrays",
@@ -91,6 +99,19 @@ def run_settings(given: Any, limits: ResourceLimits, **named: Any) -> RunSetting
     )
     episode_counts(settings, catalogue.suite_of(settings.env))
     return settings
+
+
+def agent_limits(given: Any) -> AgentLimits:
+    """What the agent may take of its machine; `given` as for `run_settings`. Raises ConfigError that names the option."""
+    chosen: dict[str, Any] = {}
+    for name, (field, least, most) in AGENT_LIMITS.items():
+        value = getattr(given, f"agent_{name}")
+        if value is None:
+            continue
+        if not least <= value <= most:
+            raise ConfigError(f"--agent-{name} {value:g}: give a number from {least:g} to {most:g}")
+        chosen[field] = value if name == "cpus" else int(value)
+    return AgentLimits(**chosen)
 
 
 def default_exp_id() -> str:

@@ -15,6 +15,7 @@ from evopolicy_common.messages.run_settings import RunSettings
 from evopolicy_common.processes.preflight import check_installed, check_loopback, check_text, check_writable
 from evopolicy_common.processes.scratch import remove_tree
 from evopolicy_common.records.open_run import IntendedRun
+from evopolicy_common.records.run_record import AgentLimits
 from evopolicy_gateway import harnesses
 from evopolicy_gateway.harnesses.interface.agent_config import AgentConfig
 from evopolicy_gateway.jail.settings import JailSettings
@@ -56,6 +57,7 @@ class Plan(msgspec.Struct, frozen=True, kw_only=True):
     parallel: int | None = None
     """Maximum number of simultaneous runs of its entry; None: no limit of its own."""
     jail: JailSettings = JailSettings()
+    limits: AgentLimits = AgentLimits()
     listener: Listener | None = None
     """The address that serves a remote agent; None for an agent that is started here."""
 
@@ -99,6 +101,8 @@ class Plan(msgspec.Struct, frozen=True, kw_only=True):
         }
         if self.silence_s != SILENCE_S:
             found["agent_silence_s"] = self.silence_s
+        if unusual := _unusual(msgspec.to_builtins(self.limits), msgspec.to_builtins(AgentLimits())):
+            found["agent_limits"] = unusual
         # The jail's `read` names the places of programs, which differ from host to host.
         reached = {name: value for name, value in self.jail.chosen().items() if name != "read"}
         if reached or self.jail.mode != JailSettings().mode:
@@ -129,6 +133,10 @@ class Plan(msgspec.Struct, frozen=True, kw_only=True):
         if self.listener is None:
             check_loopback()
         check_agent(self.agent, self.listener)
+        if self.listener is not None and self.limits != AgentLimits():
+            raise ConfigError(
+                "--agent-cpus, --agent-memory, --agent-pids and --agent-disk limit an agent that is started here; leave them out"
+            )
         harnesses.make(self.agent, self.started_in, self.config).check(self.settings.env)
         self.jail.check()
         if self.texts.inputs and self.jail.mode == "none":

@@ -177,7 +177,7 @@ def run_record(
         repeat=settings.repeat,
         attempt=settings.attempt,
         run=finished.run,
-        agent=_agent(plan, finished.agent),
+        agent=_agent(plan, finished.agent, times),
         sandbox_tier=settings.sandbox_tier,
         jail=plan.jail.recorded,
         hidden_isolation=finished.hidden_isolation,
@@ -235,9 +235,9 @@ def run_record(
     )
 
 
-def told_at_close(folder: RunFolder, plan: Plan, facts: dict[str, Any]) -> dict[str, Any]:
+def told_at_close(folder: RunFolder, plan: Plan, facts: dict[str, Any], times: Times) -> dict[str, Any]:
     """The `GATEWAY_SIDE` of `run.json`, which the coordinator commits to when the run ends."""
-    agent = msgspec.to_builtins(_agent(plan, _complete(folder, plan, facts)))
+    agent = msgspec.to_builtins(_agent(plan, _complete(folder, plan, facts), times))
     settings = {name: value for name, value in agent["settings"].items() if name in PUBLISHED_SETTINGS}
     told = {f"agent.{name}": value for name, value in agent.items()}
     told |= {"jail": plan.jail.recorded, "agent.settings": settings}
@@ -288,7 +288,7 @@ def _complete(folder: RunFolder, plan: Plan, facts: dict[str, Any]) -> dict[str,
     return found
 
 
-def _agent(plan: Plan, facts: dict[str, Any]) -> Agent:
+def _agent(plan: Plan, facts: dict[str, Any], times: Times) -> Agent:
     tokens = facts.get("tokens")
     return Agent(
         entry=plan.settings.entry,
@@ -310,6 +310,7 @@ def _agent(plan: Plan, facts: dict[str, Any]) -> Agent:
         turns=int(facts.get("turns", 0)),
         tokens=None if tokens is None else msgspec.convert(tokens, Tokens),
         model_use=facts.get("model_use"),
+        resources=times.resources,
     )
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 import msgspec
 
 from evopolicy_common.errors import DECODE_ERRORS, StorageError
+from evopolicy_common.records.run_record import AgentResources
 from evopolicy_gateway.run_folder.layout import save
 
 
@@ -30,6 +31,8 @@ class Times(msgspec.Struct, frozen=True, kw_only=True):
     """Submits waited because hidden episodes used the machines; not counted in `agent_s`."""
     permit_s: float = 0.0
     """The agent's start waited for hidden episodes on its machine; not counted in any other field."""
+    resources: AgentResources | None = None
+    """What the agent used of its machine."""
 
 
 class Stopwatch:
@@ -41,6 +44,7 @@ class Stopwatch:
         self._now = now
         self._base = _load(path)
         self._agent_s = self._in_flight_s = self._feedback_s = 0.0
+        self._resources: AgentResources | None = None
         self._opened: float | None = None
 
     @property
@@ -53,6 +57,7 @@ class Stopwatch:
             feedback_s=base.feedback_s + self._feedback_s,
             held_s=base.held_s,
             permit_s=base.permit_s,
+            resources=self._resources.after(base.resources) if self._resources else base.resources,
         )
 
     def opened(self) -> None:
@@ -63,17 +68,23 @@ class Stopwatch:
         """The agent's side is closed from now on."""
         self._base, self._opened = self.times, None
         self._agent_s = self._in_flight_s = self._feedback_s = 0.0
+        self._resources = None
         self.keep()
 
     def agent_begins(self) -> None:
         """A new agent supervisor starts: its agent's clock counts from zero."""
-        self._base = msgspec.structs.replace(self._base, agent_s=self.times.agent_s)
-        self._agent_s = 0.0
+        now = self.times
+        self._base = msgspec.structs.replace(self._base, agent_s=now.agent_s, resources=now.resources)
+        self._agent_s, self._resources = 0.0, None
 
     def agent_reported(self, seconds: float) -> None:
         """Sets the clock of the current agent, seconds."""
         self._agent_s = seconds
         self.keep()
+
+    def agent_used(self, resources: AgentResources) -> None:
+        """Sets what the current agent has used."""
+        self._resources = resources
 
     def gateway_begins(self) -> None:
         """A new gateway starts: its counts begin at zero."""

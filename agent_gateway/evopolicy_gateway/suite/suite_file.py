@@ -33,7 +33,7 @@ from evopolicy_gateway.harnesses.interface.agent_config import AgentConfig
 from evopolicy_gateway.jail.settings import JailSettings
 from evopolicy_gateway.processes.clock import SILENCE_S
 from evopolicy_gateway.run import texts
-from evopolicy_gateway.run.options import limits_from, run_settings
+from evopolicy_gateway.run.options import agent_limits, limits_from, run_settings
 from evopolicy_gateway.run.plan import WALL_S, Plan
 
 Positive = Annotated[int, Meta(ge=1)]
@@ -66,6 +66,13 @@ class RunTable(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     limits: dict[str, float] | None = None
     agent_wall_s: Annotated[float, Meta(gt=0)] | None = None
     agent_silence_s: Annotated[float, Meta(gt=0)] | None = None
+    agent_cpus: float | None = None
+    """Cores."""
+    agent_memory: float | None = None
+    """Bytes."""
+    agent_pids: int | None = None
+    agent_disk: float | None = None
+    """Bytes."""
     repeats: Positive | None = None
 
 
@@ -274,4 +281,5 @@ def _plan(
         texts=agent_texts,
         parallel=agent.parallel,
         jail=agent.jail,
+        limits=agent_limits(table),
     )

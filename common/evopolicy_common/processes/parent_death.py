@@ -1,6 +1,6 @@
-"""Starts a program that ends with its parent: `python -I -S parent_death.py PARENT_PID SIGNAL PROGRAM…`.
+"""Starts a program that ends with its parent: `python -I -S parent_death.py PARENT_PID SIGNAL JOINS PROGRAM…`.
 
-Sets the parent-death signal, which survives exec, and then executes the program. It is a program of its own because
+Joins cgroups (`JOINS`: their `cgroup.procs`, separated by colons), sets the parent-death signal, which survives exec, and then executes the program. It is a program of its own because
 code between fork and exec is not safe in a process with threads or a Zenoh session.
 """
 
@@ -15,12 +15,15 @@ from collections.abc import Sequence
 _PR_SET_PDEATHSIG = 1
 
 
-def ending_with_parent(program: Sequence[str], death_signal: signal.Signals = signal.SIGTERM) -> list[str]:
-    """The command that starts `program` so that it ends with this process.
+def ending_with_parent(
+    program: Sequence[str], death_signal: signal.Signals = signal.SIGTERM, joins: Sequence[str] = ()
+) -> list[str]:
+    """The command that starts `program` so that it ends with this process, in the cgroups of which `joins` are the files.
 
     The child must be started from this process's main thread: the signal is bound to the parent's thread.
     """
-    return [sys.executable, "-I", "-S", __file__, str(os.getpid()), str(int(death_signal)), *program]
+    parent, number = str(os.getpid()), str(int(death_signal))
+    return [sys.executable, "-I", "-S", __file__, parent, number, ":".join(joins), *program]
 
 
 def end_with_parent(death_signal: signal.Signals) -> None:
@@ -29,9 +32,13 @@ def end_with_parent(death_signal: signal.Signals) -> None:
 
 
 def main(arguments: list[str]) -> None:
-    """Executes the program; exit code 1 when the parent is gone already, 127 when the program cannot be started."""
-    parent, death_signal, program = int(arguments[0]), signal.Signals(int(arguments[1])), arguments[2:]
+    """Executes the program; exit code 1 when the parent is gone already, or a cgroup; 127 when the program cannot be
+    started."""
+    parent, death_signal, program = int(arguments[0]), signal.Signals(int(arguments[1])), arguments[3:]
     end_with_parent(death_signal)
+    for path in filter(None, arguments[2].split(":")):
+        with open(path, "w") as file:
+            file.write(str(os.getpid()))
     if os.getppid() != parent:
         # It died before the signal was set.
         print(f"not starting {program[0]}: process {parent}, which wanted it, is gone", file=sys.stderr)

@@ -138,6 +138,7 @@ GATEWAY_SIDE = (
     "agent.turns",
     "agent.tokens",
     "agent.model_use",
+    "agent.resources",
     "agent.settings",
     "versions.agents_md_hash",
     "versions.rules_hash",

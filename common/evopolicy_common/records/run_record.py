@@ -104,6 +104,49 @@ class ModelUse(msgspec.Struct, frozen=True, kw_only=True):
         return abs(self.reported.total - tokens.total) / tokens.total
 
 
+class AgentLimits(msgspec.Struct, frozen=True, kw_only=True):
+    """What an agent may take of its machine. None: unlimited."""
+
+    cpus: float | None = None
+    """Processor time in cores."""
+    memory_bytes: int | None = None
+    pids: int | None = None
+    """Processes and threads at once."""
+    disk_bytes: int = 20_000_000_000
+    """Space of its workspace without feedback, its home and /tmp."""
+
+
+class AgentResources(msgspec.Struct, frozen=True, kw_only=True):
+    """An agent's share of its machine."""
+
+    limits: AgentLimits
+    """Those that something kept; a limit that this machine could not keep is None."""
+    kept_by: dict[str, str] = {}
+    """`cgroup 1`, `cgroup 2`, `affinity` or `rlimit`, by name of the limit."""
+    cpu_s: float = 0.0
+    """Processor time of all its programs, seconds."""
+    memory_peak_bytes: int = 0
+    """Most memory at once: as a cgroup counts it, with cached files; else the greatest sum of resident sizes, seen every 5 s."""
+    disk_bytes: int = 0
+    """Most space of its files that was seen."""
+    ended_for_memory: int = 0
+    """Processes that the kernel ended at the memory limit."""
+    refused_forks: int = 0
+    """Processes that the kernel did not start at the limit of their number."""
+
+    def after(self, before: AgentResources | None) -> AgentResources:
+        """Together with what earlier programs of the agent used, whose limits were the same."""
+        if before is None:
+            return self
+        added = ("cpu_s", "ended_for_memory", "refused_forks")
+        most = ("memory_peak_bytes", "disk_bytes")
+        return msgspec.structs.replace(
+            self,
+            **{name: round(getattr(before, name) + getattr(self, name), 3) for name in added},
+            **{name: max(getattr(before, name), getattr(self, name)) for name in most},
+        )
+
+
 PUBLISHED_SETTINGS = frozenset({"wall_limit_s", "silence_limit_s", "effort"})
 """Those of an agent's settings that are published: numbers and words of the project's own options."""
 
@@ -148,6 +191,8 @@ class Agent(msgspec.Struct, frozen=True, kw_only=True):
     """None when nothing counted them."""
     model_use: ModelUse | None = None
     """None for agents without a model, and in files before version 3."""
+    resources: AgentResources | None = None
+    """None for agents that were not started here, and in older files."""
 
 
 class ExperimentDimensions(msgspec.Struct, frozen=True, kw_only=True):
@@ -260,7 +305,7 @@ class Outcome(msgspec.Struct, frozen=True, kw_only=True):
     random_reference: ReferenceScore | None = None
     closed_reason: str = ""
     """Why submits ended: `budget_spent`, `agent_stopped`, `agent_failed`, `silent`, `wall_limit`,
-    `model_budget_spent`, `cancelled`."""
+    `model_budget_spent`, `disk_limit`, `cancelled`."""
     budget_used: int = 0
     """Episodes charged."""
     auxiliary: dict[str, Any] = {}

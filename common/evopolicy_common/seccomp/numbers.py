@@ -86,6 +86,8 @@ REACHING_OUT: dict[str, dict[str, int]] = {
     "aarch64": _parsed("kill=129 tkill=130 rt_sigqueueinfo=138 rt_tgsigqueueinfo=240 pidfd_open=434"),
 }
 """Calls that affect other processes of the same user."""
+SET_AFFINITY = {"x86_64": 203, "aarch64": 122}
+"""`sched_setaffinity`."""
 SOCKET = {"x86_64": 41, "aarch64": 198}
 SECCOMP = {"x86_64": 317, "aarch64": 277}
 MODES: dict[str, dict[str, int]] = {

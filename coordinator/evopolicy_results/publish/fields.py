@@ -51,7 +51,8 @@ _RUN: dict[Cover, str] = {
     """,
     "committed": f"""
         jail hidden_isolation env_title env_family agent.harness agent.cli_version agent.model_string agent.retries
-        agent.turns {_all("agent.tokens", Tokens)} agent.model_use.** agent.settings.wall_limit_s agent.settings.silence_limit_s agent.settings.effort
+        agent.turns {_all("agent.tokens", Tokens)} agent.model_use.** agent.resources.**
+        agent.settings.wall_limit_s agent.settings.silence_limit_s agent.settings.effort
         timing.queue_s timing.rollout_s timing.finalise_s outcome.closed_reason outcome.random_reference.seeded_by
         versions.env versions.env_deterministic versions.fingerprint.* versions.fingerprint_overrides.*
         versions.installations.* versions.data_train_hash versions.data_valid_hash versions.data_heldout_hash

@@ -115,6 +115,12 @@ _MODEL_LIMITS = {
         lambda run: _model_limits(run), "the same max_requests, max_tokens, and max_cost in the agents' files"
     )
 }
+_AGENT_LIMITS = {
+    "agent limits": _Setting(
+        lambda run: _agent_limits(run),
+        "the same --agent-cpus, --agent-memory, --agent-pids, and --agent-disk, on machines that can keep them",
+    )
+}
 _BY_ENTRY = {
     "prompts": _Setting(
         lambda run: _text(run.record.agent.prompts), "the same --prompts, or another --entry for each"
@@ -136,7 +142,7 @@ _BY_ENVIRONMENT = {
 }
 REMEDIES = {
     what: setting.remedy
-    for what, setting in (_BY_SUITE | _BY_ENTRY | _MODEL_LIMITS | _BY_ENVIRONMENT).items()
+    for what, setting in (_BY_SUITE | _BY_ENTRY | _MODEL_LIMITS | _AGENT_LIMITS | _BY_ENVIRONMENT).items()
     if setting.remedy
 }
 """By `Mixture.what`: how to play runs that agree in it."""
@@ -165,6 +171,12 @@ def _model_limits(run: Run) -> str:
     return " ".join(f"{k}={v}" for k, v in msgspec.to_builtins(use.limits).items() if v is not None)
 
 
+def _agent_limits(run: Run) -> str:
+    resources = run.record.agent.resources
+    assert resources is not None
+    return " ".join(f"{k}={v}" for k, v in msgspec.to_builtins(resources.limits).items() if v is not None)
+
+
 def _limits(run: Run) -> str:
     """As `name=value` words; empty if the run has no record of them."""
     limits = run.record.experiment_dimensions.limits
@@ -184,6 +196,8 @@ def mixtures(runs: Iterable[Run]) -> list[Mixture]:
         # Agents without a model have no limits, and stand beside those with any.
         limited = [run for run in together if run.record.agent.model_use is not None]
         out += _differences(_MODEL_LIMITS, suite, limited)
+        measured = [run for run in together if run.record.agent.resources is not None]
+        out += _differences(_AGENT_LIMITS, suite, measured)
         for entry in sorted({run.entry for run in together}):
             out += _differences(
                 _BY_ENTRY, f"{suite}, {entry}", [run for run in together if run.entry == entry]

@@ -17,7 +17,8 @@ from typing import NoReturn
 
 import pytest
 
-ROOT = Path("/sys/fs/cgroup")
+from evopolicy_common.processes.cgroups import ROOT, hierarchies
+
 TIMEOUT_S = 10.0
 _numbers = itertools.count()
 
@@ -102,14 +103,13 @@ def freezer() -> Iterator[Freezer]:
 @contextlib.contextmanager
 def _group(controller: str, first: dict[str, str], second: dict[str, str]) -> Iterator[Cgroup]:
     """A cgroup with the settings of version 1 (`first`) or 2 (`second`), whichever this machine has."""
-    unified = (ROOT / "cgroup.controllers").exists()
-    if unified:
-        with contextlib.suppress(OSError):  # then the settings below fail, and say why
-            (ROOT / "cgroup.subtree_control").write_text(f"+{controller}")
-    group = Cgroup(_folder(ROOT if unified else ROOT / controller))
+    found = hierarchies().get(controller)
+    if found is None:
+        _skip(f"no {controller} controller")
+    group = Cgroup(_folder(found.folder))
     try:
         try:
-            for name, value in (second if unified else first).items():
+            for name, value in (first if found.version == 1 else second).items():
                 group.set(name, value)
         except OSError as error:
             _skip(f"the {controller} controller is not available: {error}")

@@ -330,16 +330,24 @@ def test_runs_whose_agents_had_other_means_are_refused(tmp_path: Path, change: d
     assert [mixture.what for mixture in mixtures(load_runs([tmp_path]).runs)] == [what]
 
 
-def test_model_limits_must_agree_among_agents_with_a_model(tmp_path: Path) -> None:
-    limits = {"max_requests": 5000, "max_tokens": 10**8}
-    for entry, given in (("A", limits), ("B", limits), ("C", {**limits, "max_requests": 9}), ("D", None)):
+@pytest.mark.parametrize(
+    ("what", "field", "limits", "other"),
+    [
+        ("model limits", "model_use", {"max_requests": 5000, "max_tokens": 10**8}, {"max_requests": 9}),
+        ("agent limits", "resources", {"cpus": 2.0, "disk_bytes": 10**10}, {"cpus": None}),
+    ],
+)
+def test_limits_must_agree_among_agents_that_have_any(
+    tmp_path: Path, what: str, field: str, limits: dict[str, Any], other: dict[str, Any]
+) -> None:
+    for entry, given in (("A", limits), ("B", limits), ("C", {**limits, **other}), ("D", None)):
         run = write_run(tmp_path, VERSIONS, entry=entry)
         record = json.loads((run / "run.json").read_text())
-        record["agent"]["model_use"] = given and {"metering": "relay", "limits": given}
+        record["agent"][field] = given and {"metering": "relay", "limits": given}
         (run / "run.json").write_text(json.dumps(record))
     runs = load_runs([tmp_path]).runs
     (mixture,) = mixtures(runs)
-    assert (mixture.what, list(mixture.values.values())) == ("model limits", [2, 1])
+    assert (mixture.what, list(mixture.values.values())) == (what, [2, 1])
     assert mixtures([run for run in runs if run.entry != "C"]) == []
 
 

@@ -67,6 +67,8 @@ class Stage(msgspec.Struct, frozen=True, kw_only=True):
     prompts: Prompts = Prompts()
     jail: Jail | None = None
     """The jail of every program that `start` starts."""
+    joins: Sequence[str] = ()
+    """The agent's cgroups, as in `ending_with_parent`."""
 
     def with_environment(self, more: Mapping[str, str]) -> Stage:
         """A copy with more variables."""
@@ -89,6 +91,7 @@ class Stage(msgspec.Struct, frozen=True, kw_only=True):
                 self.log,
                 talks=talks,
                 pass_fds=() if way is None else way.pass_fds,
+                joins=self.joins,
             )
         except OSError as error:
             if way is not None:

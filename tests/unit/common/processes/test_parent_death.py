@@ -37,7 +37,7 @@ time.sleep(1000)
 
 def test_a_program_whose_parent_is_gone_does_not_start() -> None:
     done = subprocess.run(
-        [sys.executable, parent_death.__file__, "1", "9", "/bin/echo", "started"],
+        [sys.executable, parent_death.__file__, "1", "9", "", "/bin/echo", "started"],
         capture_output=True,
         check=False,
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from evopolicy_common.records.run_record import AgentLimits, AgentResources
 from evopolicy_gateway.run.times import Stopwatch, Times
 
 
@@ -55,3 +56,22 @@ def test_times_that_cannot_be_read_or_written_stop_nothing(tmp_path: Path) -> No
     path.write_text("{")
     assert Stopwatch(path).times == Times()
     Stopwatch(tmp_path / "gone" / "times.json").keep()
+
+
+def test_what_killed_and_resumed_agents_used_is_added_up(tmp_path: Path) -> None:
+    path = tmp_path / "times.json"
+    first = Stopwatch(path)
+    limits = AgentLimits(pids=9)
+    for cpu_s, peak in ((1.0, 50), (2.0, 70)):
+        first.agent_begins()
+        first.agent_used(AgentResources(limits=limits, cpu_s=cpu_s / 2))
+        first.agent_used(
+            AgentResources(limits=limits, cpu_s=cpu_s, memory_peak_bytes=peak, disk_bytes=100 - peak)
+        )
+    first.agent_reported(1.0)
+    second = Stopwatch(path)  # the command is killed here
+    second.agent_begins()
+    second.agent_used(AgentResources(limits=limits, cpu_s=0.5, refused_forks=3))
+    second.closed()
+    whole = AgentResources(limits=limits, cpu_s=3.5, memory_peak_bytes=70, disk_bytes=50, refused_forks=3)
+    assert second.times.resources == Stopwatch(path).times.resources == whole

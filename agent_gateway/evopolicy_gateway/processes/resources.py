@@ -1,0 +1,148 @@
+"""An agent's share of its machine: its limits, by what they are kept, and what its programs have used.
+
+Cgroups keep the limits where the agent supervisor may make one. Elsewhere a jailed agent has a number of cores, by affinity,
+and a number of processes, by a resource limit that Linux counts in each user namespace since 5.14, though never for root. What
+nothing keeps is recorded as unlimited. No quota keeps the size of files: the supervisor measures it, and ends the agent.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import os
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import msgspec
+
+from evopolicy_common.processes import cgroups, proc
+from evopolicy_common.records.run_record import AgentLimits, AgentResources
+from evopolicy_gateway.processes import trees
+from evopolicy_gateway.processes.disk_use import MAX_DEPTH, TooDeepError, used_bytes
+
+_LOOK_S = 1.0
+_LOOK_SHARE = 10
+"""A look at the files is followed by a pause of at least this many times its length."""
+_QUOTA_US = 100_000
+_COUNTED_BY_NAMESPACE = (5, 14)
+_WORDS = {"cpus": "{:g} cores", "memory_bytes": "{:,} bytes of memory", "pids": "{:,} processes"}
+_CONTROLLERS = {"cpus": "cpu", "memory_bytes": "memory", "pids": "pids"}
+
+
+class Resources:
+    """The limits and the use of one agent, from its supervisor's start to its end."""
+
+    def __init__(self, asked: AgentLimits, folders: Sequence[Path], skipped: Path, *, jailed: bool) -> None:
+        """`folders`: with the agent's files, without `skipped`. Where no cgroup holds the cores, this thread and the programs
+        that it starts are bound to some."""
+        self._asked = asked
+        self._folders, self._skipped = folders, skipped
+        wanted = {
+            "cpu": asked.cpus and max(1000, round(asked.cpus * _QUOTA_US)),
+            "memory": asked.memory_bytes,
+            "pids": asked.pids,
+        }
+        self._group = cgroups.Group({name: value for name, value in wanted.items() if value})
+        self.joins = self._group.procs
+        """Files into which a program of the agent writes its id before it starts."""
+        held = self._group.held
+        by = {
+            name: f"cgroup {held[controller]}"
+            for name, controller in _CONTROLLERS.items()
+            if controller in held and getattr(asked, name) is not None
+        }
+        limits = msgspec.structs.replace(asked, **{name: None for name in _CONTROLLERS if name not in by})
+        self.fixed_cores = False
+        """Whether the programs may not choose their cores."""
+        if asked.cpus and "cpus" not in by and jailed:
+            cores = _bind(math.ceil(asked.cpus))
+            limits, by["cpus"] = msgspec.structs.replace(limits, cpus=float(cores)), "affinity"
+            self.fixed_cores = True
+        self.own_pids: int | None = None
+        """Resource limit for the programs themselves."""
+        if asked.pids and "pids" not in by and jailed and os.getuid() and _counts_by_namespace():
+            limits, by["pids"] = msgspec.structs.replace(limits, pids=asked.pids), "rlimit"
+            self.own_pids = asked.pids
+        self._now = AgentResources(limits=limits, kept_by=by)
+
+    def words(self) -> str:
+        """For the operator: the limits that were asked for, and by what they are kept; empty without any."""
+        found = []
+        for name, form in _WORDS.items():
+            if (asked := getattr(self._asked, name)) is not None:
+                kept = getattr(self._now.limits, name)
+                by = self._now.kept_by.get(name, "no cgroup can be made here: unlimited")
+                found.append(f"{form.format(kept or asked)} ({by})")
+        return ", ".join(found)
+
+    def used(self) -> AgentResources:
+        """The present state."""
+        now, group = self._now, self._group
+        cpu_s, peak = group.cpu_s(), group.peak_bytes()
+        if peak is None:
+            sizes = [proc.sizes(pid) for pid in proc.descendants(os.getpid())]
+            peak = sum(size[1] for size in sizes if size is not None)
+        self._now = msgspec.structs.replace(
+            now,
+            cpu_s=round(max(now.cpu_s, trees.cpu_below() if cpu_s is None else cpu_s), 3),
+            memory_peak_bytes=max(now.memory_peak_bytes, peak),
+            ended_for_memory=max(now.ended_for_memory, group.hits("memory")),
+            refused_forks=max(now.refused_forks, group.hits("pids")),
+        )
+        return self._now
+
+    def reached(self) -> str:
+        """Which limits the kernel has applied so far, for the operator; empty for none."""
+        now, limits = self.used(), self._now.limits
+        found = []
+        if now.ended_for_memory and limits.memory_bytes:
+            found.append(
+                f"its memory limit of {limits.memory_bytes:,} bytes (--agent-memory): the kernel has ended"
+                f" {now.ended_for_memory} of its processes"
+            )
+        if now.refused_forks and limits.pids:
+            found.append(f"its limit of {limits.pids:,} processes (--agent-pids)")
+        return "the agent reached " + ", and ".join(found) if found else ""
+
+    async def too_large(self) -> str:
+        """Watches the space that the agent's files take; returns why the agent has to end."""
+        before = ""
+        while True:
+            begun = time.monotonic()
+            found = await asyncio.to_thread(self._measured)
+            if found and before:  # seen twice: files that move meanwhile may count twice
+                return found
+            before = found
+            await asyncio.sleep(max(_LOOK_S, _LOOK_SHARE * (time.monotonic() - begun)))
+
+    def remove(self) -> None:
+        """Call it when all processes of the agent are gone."""
+        self._group.remove()
+
+    def _measured(self) -> str:
+        try:
+            n_bytes = used_bytes(self._folders, self._skipped, proc.descendants(os.getpid()))
+        except TooDeepError:
+            return f"its folders are nested deeper than {MAX_DEPTH}, so that their size is unknown"
+        self._now = msgspec.structs.replace(self._now, disk_bytes=max(self._now.disk_bytes, n_bytes))
+        most = self._asked.disk_bytes
+        return (
+            f"its files take {n_bytes:,} bytes; {most:,} are allowed (--agent-disk)" if n_bytes > most else ""
+        )
+
+
+def _bind(n_cores: int) -> int:
+    """Binds this thread to that many of its cores, others for each process; returns their number."""
+    cores = sorted(os.sched_getaffinity(0))
+    first = os.getpid() % len(cores)
+    chosen = (cores[first:] + cores[:first])[:n_cores]
+    os.sched_setaffinity(0, chosen)
+    return len(chosen)
+
+
+def _counts_by_namespace() -> bool:
+    release = os.uname().release.split(".")
+    return (
+        tuple(int("".join(filter(str.isdecimal, part)) or 0) for part in release[:2]) >= _COUNTED_BY_NAMESPACE
+    )
