@@ -20,9 +20,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import anyio.to_thread
+import inspect_ai
 from inspect_ai import Task, task
 from inspect_ai.dataset import Sample
 from inspect_ai.model import ChatMessageUser, get_model
+from inspect_ai.model._model import sample_model_usage
 from inspect_ai.scorer import Score, Target, grouped, mean, scorer
 from inspect_ai.solver import Generate, Solver, TaskState, solver
 from inspect_ai.tool import Tool, ToolError, tool
@@ -34,6 +36,8 @@ from evopolicy._runs import Run
 from evopolicy_common import catalogue
 from evopolicy_common.processes import host
 from evopolicy_gateway.agents.client import Client, ProtocolError, Refusal
+from evopolicy_gateway.harnesses.coding_agents import session
+from evopolicy_gateway.relay.usage import Usage
 from evopolicy_gateway.run.lifecycle import RunLifecycle
 from evopolicy_gateway.run.options import default_exp_id
 from evopolicy_gateway.run.plan import Plan
@@ -199,6 +203,7 @@ def heldout_return() -> Callable[[TaskState, Target], Awaitable[Score]]:
 
     async def score(state: TaskState, target: Target) -> Score:
         live = _of_sample()
+        _count(live)
         run = await awaited(_end(live))
         del _live[str(live.folder.root)]
         summary = run.summary
@@ -216,6 +221,7 @@ async def _clean_up(state: TaskState) -> None:
     """Cancels the run of a sample that ended before it was scored."""
     live = _live.pop(state.store.get(_KEY, ""), None)
     if live is not None:
+        _count(live)
         await awaited(_cancel(live))
 
 
@@ -290,6 +296,7 @@ def submit_episodes() -> Tool:
             env_instances: Train ids, such as [0, 1, 2, 3].
         """
         live = _of_sample()
+        _count(live)
         try:
             # Inspect's time limit must not wait for a busy cluster.
             verdict = await anyio.to_thread.run_sync(
@@ -311,6 +318,23 @@ def _of_sample() -> _Live:
     if found is None:
         raise RuntimeError("this sample has no open run: its task's setup opens one")
     return found
+
+
+def _count(live: _Live) -> None:
+    """Gives the sample's tokens, as Inspect counts them so far, to the run's record."""
+    used = {
+        model: Usage(
+            input_noncached=usage.input_tokens,
+            cache_read=usage.input_tokens_cache_read or 0,
+            cache_creation=usage.input_tokens_cache_write or 0,
+            output=usage.output_tokens,
+            reasoning=usage.reasoning_tokens,
+        )
+        for model, usage in sample_model_usage().items()
+    }
+    if live.folder.state.exists():  # else the run is over
+        version = f"inspect_ai {inspect_ai.__version__}"
+        session.save(live.folder.session, session.SessionState(cli_version=version, used=used))
 
 
 def _inside(path: str, below: str) -> Path:

@@ -11,6 +11,7 @@ import logging
 import signal
 import socket
 import sys
+from collections.abc import Awaitable, Callable
 
 import msgspec
 
@@ -18,11 +19,28 @@ from evopolicy_common.cli.conventions import setup_logging
 from evopolicy_common.wire.http import serving
 from evopolicy_gateway.processes import child_messages
 from evopolicy_gateway.processes.child_messages import AgentDoing, ModelBudgetSpent, Orders, StartRelay
+from evopolicy_gateway.relay.limits import Used
 from evopolicy_gateway.relay.service import Order, Relay
+from evopolicy_gateway.relay.usage import Prices
 
 _PR_SET_DUMPABLE = 4
 _TELL_S = 60.0
 """How often the operator is told what was used."""
+
+
+async def tell(
+    used: Used,
+    prices: Prices | None,
+    say: Callable[[str], None],
+    sleep: Callable[[float], Awaitable[None]] = asyncio.sleep,
+) -> None:
+    """Says what was used so far, once a minute in which there were requests."""
+    told = used.requests
+    while True:
+        await sleep(_TELL_S)
+        if used.requests != told:
+            told = used.requests
+            say(used.words(prices))
 
 
 async def _main(fd: int) -> None:
@@ -35,14 +53,6 @@ async def _main(fd: int) -> None:
     def counted(note: str = "") -> None:
         child_messages.emit(AgentDoing(tokens=relay.used.recorded(order.prices), note=note))
 
-    async def tell() -> None:
-        told = relay.used.requests
-        while True:
-            await asyncio.sleep(_TELL_S)
-            if relay.used.requests != told:
-                told = relay.used.requests
-                counted(relay.used.words(order.prices))
-
     def spent(what: str) -> None:
         child_messages.emit(ModelBudgetSpent(what=what))
 
@@ -53,7 +63,7 @@ async def _main(fd: int) -> None:
     async with serving(relay, socket.socket(fileno=fd)):
         # A stream that breaks off is no error of this program.
         logging.getLogger("uvicorn.error").disabled = True
-        telling = asyncio.create_task(tell())
+        telling = asyncio.create_task(tell(relay.used, order.prices, counted))
         while await orders.next() is not None:
             pass
         telling.cancel()

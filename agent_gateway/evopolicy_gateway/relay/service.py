@@ -69,12 +69,15 @@ class Relay:
         counted: Callable[[], None],
         note: Callable[[str], None],
         spent: Callable[[str], None],
+        now: Callable[[], float] = time.time,
     ) -> None:
-        """`counted` is called after each request, `note` with a line for the operator, `spent` with the limit that is used up."""
+        """`counted` is called after each request, `note` with a line for the operator, `spent` with the limit that is used up. `now`:
+        Unix time, seconds."""
         self._order = order
         self._upstream = order.upstream
         self._ledger = Ledger(Path(order.ledger), order.model)
         self._counted, self._note, self._spent = counted, note, spent
+        self.now = now
         self.in_flight = 0
         self._troubles = 0
         """Failed requests since the last answered one."""
@@ -261,7 +264,7 @@ class Relay:
         wait_s = stated_s if stated_s is not None else min(MAX_RETRY_S, _FIRST_RETRY_S * 2.0**self._troubles)
         self._troubles = min(self._troubles + 1, 10)
         if self._troubles == 1:
-            at = time.strftime("%H:%M:%S UTC", time.gmtime(time.time() + wait_s))
+            at = time.strftime("%H:%M:%S UTC", time.gmtime(self.now() + wait_s))
             self._note(f"{self._upstream.shown} {what}; next try in {wait_s:.0f} s, at {at}")
         return wait_s
 
@@ -272,7 +275,7 @@ class _Exchange:
     def __init__(self, relay: Relay, api: str, asked: str, body: bytes, *, drops_usage: bool) -> None:
         self._relay = relay
         self._api, self._asked, self._body, self._drops_usage = api, asked, body, drops_usage
-        self._at, self._begun = time.time(), time.monotonic()
+        self._at, self._begun = relay.now(), time.monotonic()
         self._first_s: float | None = None
         self._written = False
         self._status = 0
@@ -318,7 +321,7 @@ class _Exchange:
             return relay.refused(apis.INVALID, f"{came}; the base URL of a model API answers with JSON")
         headers, wait_s = relay.headers_of(got), 0.0
         if status in (408, 429) or status >= 500:
-            wait_s = relay.trouble(f"answered {status}", _stated_s(got.headers))
+            wait_s = relay.trouble(f"answered {status}", _stated_s(got.headers, relay.now()))
             headers["retry-after"] = f"{wait_s:.0f}"
             if wait_s > MAX_RETRY_S:
                 headers["x-should-retry"] = "false"
@@ -441,12 +444,12 @@ async def _unpacked(answer: httpx.Response) -> AsyncIterator[bytes]:
 _NUMBER = re.compile(r"\d{1,9}(\.\d{1,6})?")
 
 
-def _stated_s(headers: Mapping[str, str]) -> float | None:
-    """Seconds of `retry-after`, which is a number or a date; None without."""
+def _stated_s(headers: Mapping[str, str], now: float) -> float | None:
+    """Seconds from `now` to `retry-after`, which is a number or a date; None without."""
     text = headers.get("retry-after", "").strip()
     if _NUMBER.fullmatch(text):
         return float(text)
     try:
-        return max(0.0, parsedate_to_datetime(text).timestamp() - time.time())
+        return max(0.0, parsedate_to_datetime(text).timestamp() - now)
     except (ValueError, TypeError, OverflowError):
         return None

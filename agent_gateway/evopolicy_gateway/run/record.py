@@ -262,6 +262,9 @@ def _complete(folder: RunFolder, plan: Plan, facts: dict[str, Any]) -> dict[str,
     found |= {name: max(getattr(state, name), int(facts.get(name, 0))) for name in ("turns", "retries")}
     found["settings"] = {**harness.known().get("settings", {}), **facts.get("settings", {})}
     if (terms := harness.model) is None:
+        if state.used:  # a remote agent's own count, by model
+            found["model_string"] = max(state.used, key=lambda model: state.used[model].total)
+            found |= {"tokens": state.usage.recorded(None), "model_use": ModelUse(metering="agent")}
         return found
     limits = ModelLimits(**msgspec.structs.asdict(terms.limits))
     own = facts.get("tokens") or (state.usage.recorded(terms.prices) if state.usage.total else None)

@@ -79,7 +79,8 @@ class ModelUse(msgspec.Struct, frozen=True, kw_only=True):
     metering: Literal["relay", "agent"]
     """`relay`: every request of the run was counted at the wire, and the agent did not have the key. `agent`: `tokens` are the
     agent's own count, and `requests` and what follows are unknown."""
-    limits: ModelLimits
+    limits: ModelLimits | None = None
+    """None: this software sets none."""
     requests: int | None = None
     """Requests that went to the provider."""
     requests_failed: int = 0

@@ -167,20 +167,22 @@ def _step_limit(run: Run) -> str:
 
 def _model_limits(run: Run) -> str:
     use = run.record.agent.model_use
-    assert use is not None
-    return " ".join(f"{k}={v}" for k, v in msgspec.to_builtins(use.limits).items() if v is not None)
+    return _words(use and use.limits)
 
 
 def _agent_limits(run: Run) -> str:
     resources = run.record.agent.resources
-    assert resources is not None
-    return " ".join(f"{k}={v}" for k, v in msgspec.to_builtins(resources.limits).items() if v is not None)
+    return _words(resources and resources.limits)
 
 
 def _limits(run: Run) -> str:
+    return _words(run.record.experiment_dimensions.limits)
+
+
+def _words(limits: msgspec.Struct | None) -> str:
     """As `name=value` words; empty if the run has no record of them."""
-    limits = run.record.experiment_dimensions.limits
-    return "" if limits is None else " ".join(f"{k}={v}" for k, v in msgspec.to_builtins(limits).items())
+    given = {} if limits is None else msgspec.to_builtins(limits)
+    return " ".join(f"{name}={value}" for name, value in given.items() if value is not None)
 
 
 def mixtures(runs: Iterable[Run]) -> list[Mixture]:

@@ -129,6 +129,15 @@ def test_a_model_of_inspect_plays_a_run_and_gets_its_score(inspect: Path, tmp_pa
     assert (outcome["status"], outcome["budget_used"]) == ("completed", 4)
     assert (record["agent"]["harness"], record["jail"]) == ("remote", "none")
     assert record["hidden_isolation"] == "exclusive"
+    (usage,) = sample["model_usage"].values()
+    use, tokens = record["agent"]["model_use"], record["agent"]["tokens"]
+    assert (use["metering"], use["limits"], use["requests"]) == ("agent", None, None)
+    assert (record["agent"]["model_string"], record["agent"]["cli_version"][:11]) == (
+        "mockllm/model",
+        "inspect_ai ",
+    )
+    counts = ("input_noncached", "input_tokens"), ("output", "output_tokens")
+    assert all(tokens[ours] == usage[theirs] > 0 for ours, theirs in counts)
     (score,) = sample["scores"].values()
     assert score["value"] == outcome["heldout_mean_return"] > 80
     assert score["metadata"]["run"] == str(folder)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import time
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -16,12 +17,15 @@ from stages.model_api import CACHED, CREATED, INPUT, OUTPUT, REASONING, ModelApi
 
 from evopolicy_common.wire.http import bound, serving
 from evopolicy_gateway.relay import service
+from evopolicy_gateway.relay.__main__ import tell
 from evopolicy_gateway.relay.apis import Protocol, Upstream
 from evopolicy_gateway.relay.ledger import read
-from evopolicy_gateway.relay.limits import Limits, Used
+from evopolicy_gateway.relay.limits import Limits, Request, Used
 from evopolicy_gateway.relay.service import Order, Relay
-from evopolicy_gateway.relay.usage import Prices
+from evopolicy_gateway.relay.usage import Prices, Usage
 
+NOON = 1768564800.0
+"""2026-01-16 12:00:00 UTC."""
 KEY = "sk-the-real-key-0123456789"
 TOKEN = "token-of-the-run-0123456789"
 TOOLS = [{"type": "function", "function": {"name": "bash"}, "name": "bash"}]
@@ -55,7 +59,9 @@ async def relay(
     base = f"{api.base_url}/v1" if protocol == "openai" else api.base_url
     upstream = Upstream(protocol=protocol, base_url=base, key=KEY, **more.pop("upstream", {}))
     order = Order(upstream=upstream, token=TOKEN, ledger=str(served.ledger), **more)
-    app = Relay(order, counted=lambda: None, note=served.notes.append, spent=served.spent.append)
+    app = Relay(
+        order, counted=lambda: None, note=served.notes.append, spent=served.spent.append, now=lambda: NOON
+    )
     sock = bound("127.0.0.1", 0)
     served.port = sock.getsockname()[1]
     async with serving(app, sock):
@@ -218,23 +224,28 @@ def test_a_web_page_is_an_error_that_names_the_base_url(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("odd", "wait", "final"),
+    ("status", "retry_after", "wait", "final"),
     [
-        (odd_answers.busy(429, retry_after="7"), "7", False),
-        (odd_answers.busy(429, retry_after="3600"), "3600", True),
-        (odd_answers.busy(429), "1", False),
-        (odd_answers.busy(500, retry_after="soon"), "1", False),
+        (429, "7", "7", False),
+        (429, "3600", "3600", True),
+        (429, None, "1", False),
+        (500, None, "1", False),
+        (500, "soon", "1", False),
+        (503, "Fri, 16 Jan 2026 12:00:20 GMT", "20", False),
     ],
 )
 def test_the_operator_is_told_of_the_first_failure_with_the_next_try(
-    tmp_path: Path, odd: odd_answers.Odd, wait: str, final: bool
+    tmp_path: Path, status: int, retry_after: str | None, wait: str, final: bool
 ) -> None:
+    odd = odd_answers.busy(status, **({} if retry_after is None else {"retry_after": retry_after}))
+
     async def act(served: Served) -> None:
         answer = await served.ask()
         assert (answer.headers["retry-after"], "x-should-retry" in answer.headers) == (wait, final)
         await served.ask()
         assert len(served.notes) == 1
-        assert f"next try in {wait} s, at" in served.notes[0]
+        at = time.strftime("%H:%M:%S UTC", time.gmtime(NOON + int(wait)))
+        assert served.notes[0].endswith(f"answered {status}; next try in {wait} s, at {at}")
         await served.ask()
         await served.ask()
 
@@ -403,3 +414,25 @@ def test_a_ledger_with_half_a_line_goes_on(tmp_path: Path) -> None:
     whole = (tmp_path / "ledger.jsonl").read_bytes()
     (tmp_path / "ledger.jsonl").write_bytes(whole + whole[:30])
     assert played(tmp_path, [], act).used.requests == 2
+
+
+def test_a_line_a_minute_has_requests_tokens_and_cost() -> None:
+    used = Used()
+    said: list[str] = []
+    slept: list[float] = []
+    requests = iter([2, 0, 1])
+
+    async def sleep(seconds: float) -> None:
+        slept.append(seconds)
+        for _ in range(next(requests)):
+            usage = Usage(input_noncached=1000, output=100)
+            used.take(Request(at=NOON, api="responses", asked="m", status=200, usage=usage))
+
+    with pytest.raises(RuntimeError, match="StopIteration"):
+        asyncio.run(tell(used, Prices(input=1000.0, output=10000.0), said.append, sleep))
+    # A minute without requests has no line.
+    assert said == [
+        "2 requests, 2,200 tokens, 4.00 dollars so far",
+        "3 requests, 3,300 tokens, 6.00 dollars so far",
+    ]
+    assert slept == [60.0] * 4
