@@ -132,6 +132,7 @@ RULES: dict[str, Rule] = {
     "policy_packages": Rule(_names, "a sequence of names, such as ('scipy',)"),
     "profile": _or_none(Rule(_text, "'published' or 'published-data'")),
     "progress": Rule(_flag, "True or False"),
+    "prices": _or_none(_FILE),
     "prompts": _or_none(_FILE),
     "repeat": Rule(_whole(0), "a whole number of at least 0"),
     "replays": _choice(VideoOption, optional=True),

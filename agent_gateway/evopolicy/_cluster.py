@@ -30,12 +30,13 @@ from evopolicy_common.processes.preflight import check_installed
 from evopolicy_common.processes.scratch import scratch_folder
 from evopolicy_common.records.policies.bundles import Bundle
 from evopolicy_common.wire.credentials import local_state_dir
-from evopolicy_gateway import shipped
+from evopolicy_gateway import harnesses, shipped
 from evopolicy_gateway.agents.function import Workspace
 from evopolicy_gateway.cli.run_options import RunOptions
 from evopolicy_gateway.jail.settings import JailSettings
 from evopolicy_gateway.operator import cluster as operator
 from evopolicy_gateway.operator.trials import policy_bundle
+from evopolicy_gateway.run import prices
 from evopolicy_gateway.run.lifecycle import RunLifecycle
 from evopolicy_gateway.run.options import (
     agent_limits,
@@ -335,6 +336,7 @@ def plan_of(
     return Plan(
         settings=given.settings(env, given.exp_id or "", agent_host, texts),
         texts=texts,
+        prices=prices.read(given.prices, harnesses.config_of(agent, Path.cwd()), Path.cwd()),
         agent=agent,
         runs=given.runs,
         started_in=Path.cwd(),
@@ -401,8 +403,8 @@ def run(
     returns a JSON-serialisable value, which `Run.value` reads back. `budget`: train episodes, by default the suite's.
     `runs`: the folder of run directories. `policy_packages`: installed packages that policies may import besides numpy,
     such as `("scipy",)`. Further `options`, as the options of `evopolicy run` with these names:
-    `exp_id`, `entry`, `model`, `repeat`, `validation`, `heldout`, `profile`, `replays`, `tier`, `feedback`, `prompts` and
-    `agents_md` (files), `agent_wall_s` (seconds), `agent_cpus` (cores), `agent_memory` and `agent_disk` (bytes),
+    `exp_id`, `entry`, `model`, `repeat`, `validation`, `heldout`, `profile`, `replays`, `tier`, `feedback`, `prompts`,
+    `prices` and `agents_md` (files), `agent_wall_s` (seconds), `agent_cpus` (cores), `agent_memory` and `agent_disk` (bytes),
     `agent_pids`, `overwrite`, `progress`.
 
     Raises ConfigError, with the remedy, for wrong arguments and for missing requirements on this machine. Ctrl-C

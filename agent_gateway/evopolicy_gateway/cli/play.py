@@ -17,12 +17,13 @@ from evopolicy_common.messages.environment import Split
 from evopolicy_common.processes.preflight import LOCAL, check_installed
 from evopolicy_common.records.run_difference import differences, left_out, shortened
 from evopolicy_common.terminal import say_json, say_lines
-from evopolicy_gateway import shipped
+from evopolicy_gateway import harnesses, shipped
 from evopolicy_gateway.cli import options
 from evopolicy_gateway.cli.option_groups import spread
 from evopolicy_gateway.cli.run_options import JailOptions, ListenerOptions, RunOptions
 from evopolicy_gateway.jail.settings import JailSettings
 from evopolicy_gateway.operator.cluster import Cluster
+from evopolicy_gateway.run import prices
 from evopolicy_gateway.run.options import (
     agent_limits,
     cases_of,
@@ -338,11 +339,13 @@ def _plans(
     served = served or ListenerOptions()
     where, agent_host = served.listener(), served.host_of(given.agent)
     texts = given.texts(started_in)
+    agent_prices = prices.read(given.prices, harnesses.config_of(given.agent, started_in), started_in)
     plans = [
         Plan(
             name=env_id,
             settings=given.settings(env_id, exp_id, agent_host, texts),
             texts=texts,
+            prices=agent_prices,
             agent=given.agent,
             runs=given.runs,
             started_in=started_in,

@@ -166,6 +166,14 @@ class RunOptions(msgspec.Struct, frozen=True, kw_only=True):
             rich_help_panel=AGENT,
         ),
     ] = None
+    prices: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE.toml",
+            help="Prices by model, in US dollars per million tokens: the run's cost is recorded, and `max_cost` limits it.",
+            rich_help_panel=AGENT,
+        ),
+    ] = None
     simulation: Annotated[
         SimulationRule | None,
         typer.Option(

@@ -145,6 +145,12 @@ def config_of(agent: str, started_in: Path) -> AgentConfig | None:
 
 def _cli_agent(config: AgentConfig, started_in: Path) -> CliAgent:
     config.check()
+    # Not in `check`: the operator's option may give the prices that an agent's file lacks.
+    if config.max_cost is not None and config.prices is None:
+        raise ConfigError(
+            "max_cost needs prices in US dollars per million tokens: give a file with --prices, or write"
+            " prices = { input = 1.0, output = 10.0 } beside it"
+        )
     if config.program:
         config = msgspec.structs.replace(config, program=tuple(_absolute(config.program, started_in)))
     if config.acp is not None:

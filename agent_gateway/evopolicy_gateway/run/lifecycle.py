@@ -38,7 +38,6 @@ from evopolicy_common.records.run_record import RunRecord
 from evopolicy_common.records.secrets import without_keys
 from evopolicy_common.wire import credentials
 from evopolicy_common.wire.credentials import Credentials
-from evopolicy_gateway import harnesses
 from evopolicy_gateway.jail.jail import JailOrder
 from evopolicy_gateway.processes import child_messages, child_rpc
 from evopolicy_gateway.processes.child_messages import (
@@ -378,7 +377,7 @@ class RunLifecycle:
     def _new_relay(self) -> ModelRelay | None:
         """The relay for the agent's model; None for an agent without one, or one that cannot use it. Tells the operator the limits."""
         plan, name = self._plan, self._name
-        terms = harnesses.make(plan.agent, plan.started_in, plan.config).model
+        terms = plan.harness().model
         if terms is None:
             return None
         if terms.upstream is None:
@@ -515,8 +514,7 @@ class RunLifecycle:
             self._watch.note(
                 self._name, "the agent's supervisor died; starting it again, and the agent with it"
             )
-        plan = self._plan
-        known = harnesses.make(plan.agent, plan.started_in, plan.config).known()
+        known = self._plan.harness().known()
         return AgentEnded(reason="agent_failed", detail="its agent supervisor died", facts=known)
 
     async def _keep_agent_once(self, ready: Ready) -> AgentEnded | None:
@@ -525,6 +523,7 @@ class RunLifecycle:
         self._held_before = self._stopwatch.times.held_s
         left_s = max(1.0, self._plan.wall_limit_s - self._stopwatch.times.agent_s)
         program = [sys.executable, "-P", "-m", "evopolicy_gateway.agent_supervisor.supervisor"]
+        config = self._plan.agent_config
         self._supervisor = await Child.start(program, self._folder.harness_log, talks=True)
         await self._supervisor.tell(
             StartAgent(
@@ -538,7 +537,7 @@ class RunLifecycle:
                 silence_s=self._plan.silence_s,
                 prompts=msgspec.to_builtins(self._plan.texts.prompts),
                 inputs=self._plan.texts.inputs,
-                config=None if self._plan.config is None else msgspec.to_builtins(self._plan.config),
+                config=None if config is None else msgspec.to_builtins(config),
                 model_url="" if self._relay is None else self._relay.url,
                 model_token="" if self._relay is None else self._relay.token,
                 session_file=str(self._folder.session),

@@ -18,8 +18,10 @@ from evopolicy_common.records.open_run import IntendedRun
 from evopolicy_common.records.run_record import AgentLimits
 from evopolicy_gateway import harnesses
 from evopolicy_gateway.harnesses.interface.agent_config import AgentConfig
+from evopolicy_gateway.harnesses.interface.base import Harness
 from evopolicy_gateway.jail.settings import JailSettings
 from evopolicy_gateway.processes.clock import SILENCE_S
+from evopolicy_gateway.relay.usage import Prices
 from evopolicy_gateway.run.texts import Texts
 from evopolicy_gateway.run_folder.layout import RunFolder, run_folder, saved
 from evopolicy_gateway.run_folder.listener import Listener, check_agent
@@ -52,6 +54,8 @@ class Plan(msgspec.Struct, frozen=True, kw_only=True):
     """Whether to resume the run that the folder holds."""
     config: AgentConfig | None = None
     """A coding agent's settings, from a suite's file."""
+    prices: Prices | None = None
+    """In place of those in the settings."""
     texts: Texts = Texts()
     """`settings` has their digests."""
     parallel: int | None = None
@@ -69,6 +73,18 @@ class Plan(msgspec.Struct, frozen=True, kw_only=True):
     def entry(self) -> str:
         """Leaderboard entry."""
         return self.settings.entry
+
+    @property
+    def agent_config(self) -> AgentConfig | None:
+        """A coding agent's settings with the operator's prices; None where the agent's own text says all."""
+        if self.prices is None:
+            return self.config
+        config = self.config or harnesses.config_of(self.agent, self.started_in)
+        return config and msgspec.structs.replace(config, prices=self.prices)
+
+    def harness(self) -> Harness:
+        """The agent's harness. Raises ConfigError for an invalid agent."""
+        return harnesses.make(self.agent, self.started_in, self.agent_config)
 
     @property
     def provider(self) -> str:
@@ -137,7 +153,7 @@ class Plan(msgspec.Struct, frozen=True, kw_only=True):
             raise ConfigError(
                 "--agent-cpus, --agent-memory, --agent-pids and --agent-disk limit an agent that is started here; leave them out"
             )
-        harnesses.make(self.agent, self.started_in, self.config).check(self.settings.env)
+        self.harness().check(self.settings.env)
         self.jail.check()
         if self.texts.inputs and self.jail.mode == "none":
             raise ConfigError("skills and [mcp] servers are shown by the agent's jail; leave out --jail none")

@@ -56,7 +56,6 @@ from evopolicy_common.records.run_record import (
 )
 from evopolicy_common.records.secrets import without_keys
 from evopolicy_common.records.summary import utc_text
-from evopolicy_gateway import harnesses
 from evopolicy_gateway.harnesses.coding_agents import session
 from evopolicy_gateway.relay import ledger
 from evopolicy_gateway.run import replays
@@ -252,7 +251,7 @@ def told_at_close(folder: RunFolder, plan: Plan, facts: dict[str, Any], times: T
 def _complete(folder: RunFolder, plan: Plan, facts: dict[str, Any]) -> dict[str, Any]:
     """The facts about the agent, with those of its settings, its session's file and the relay's ledger: however the run ended."""
     try:
-        harness = harnesses.make(plan.agent, plan.started_in, plan.config)
+        harness = plan.harness()
     except EvopolicyError:  # its file or its key has gone meanwhile
         return facts
     state = session.load(folder.session)

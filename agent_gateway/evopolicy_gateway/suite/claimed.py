@@ -32,7 +32,6 @@ from evopolicy_common.records.open_run import OpenedRun
 from evopolicy_common.records.run_files import read_record
 from evopolicy_common.records.suite_folder import FINISHED, INDEX, PAUSED, Entry, Index
 from evopolicy_common.wire.credentials import Credentials
-from evopolicy_gateway import harnesses
 from evopolicy_gateway.harnesses.coding_agents import session
 from evopolicy_gateway.processes.child_messages import AgentDoing
 from evopolicy_gateway.run.operations import Operations
@@ -324,7 +323,7 @@ async def look(run: Plan, index: Index, operations: Operations) -> Found:
     if opened:
         identity = saved(folder.opened, OpenedRun).run
         phase = await operations.phase(identity)
-        resumable = harnesses.make(run.agent, run.started_in, run.config).resumable
+        resumable = run.harness().resumable
         has_session = resumable and session.load(folder.session).session is not None
     entry = index.runs.get(run.name)
     intended = None if status is not None or opened else run.intended()

@@ -32,7 +32,7 @@ from evopolicy_gateway import harnesses
 from evopolicy_gateway.harnesses.interface.agent_config import AgentConfig
 from evopolicy_gateway.jail.settings import JailSettings
 from evopolicy_gateway.processes.clock import SILENCE_S
-from evopolicy_gateway.run import texts
+from evopolicy_gateway.run import prices, texts
 from evopolicy_gateway.run.options import agent_limits, limits_from, run_settings
 from evopolicy_gateway.run.plan import WALL_S, Plan
 
@@ -60,6 +60,8 @@ class RunTable(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     """File with the text in place of `AGENTS.md`."""
     prompts: str | None = None
     """File with prompts in place of the standard ones."""
+    prices: str | None = None
+    """File with a table of prices for each model."""
     tier: Tier | None = None
     video: VideoOption | None = None
     replays: VideoOption | None = None
@@ -198,10 +200,8 @@ def expand(suite: SuiteFile, root: Path, started_in: Path, only: tuple[str, ...]
         runs = [run for run in runs if any(fnmatch.fnmatch(run.name, pattern) for pattern in only)]
         if not runs:
             raise ConfigError(f"--only {' '.join(only)} matches no run of the suite")
-    taking_part = {run.entry for run in runs}
-    for agent in suite.agents:
-        if agent.name in taking_part:
-            _check_agent(agent, started_in)
+    for run in {run.entry: run for run in runs}.values():
+        _check_agent(run)
     return runs
 
 
@@ -209,20 +209,20 @@ def check_agents_start(runs: Iterable[Plan]) -> None:
     """Raises ConfigError when an agent of these runs cannot start on this machine, such as a missing CLI."""
     for run in {(run.entry, run.settings.env): run for run in runs}.values():
         try:
-            harnesses.make(run.agent, run.started_in, run.config).check(run.settings.env)
+            run.harness().check(run.settings.env)
         except ConfigError as error:
             error.args = (f"agent {run.entry!r}: {error}",)
             raise
 
 
-def _check_agent(agent: AgentTable, started_in: Path) -> None:
-    if not agent.name or "/" in agent.name:
-        raise ConfigError(f"agent {agent.name!r}: a name without '/' is needed")
+def _check_agent(run: Plan) -> None:
+    if not run.entry or "/" in run.entry:
+        raise ConfigError(f"agent {run.entry!r}: a name without '/' is needed")
     try:
-        harnesses.make(agent.agent, started_in, agent.config)
-        agent.jail.check()
+        run.harness()
+        run.jail.check()
     except ConfigError as error:
-        error.args = (f"agent {agent.name!r}: {error}",)
+        error.args = (f"agent {run.entry!r}: {error}",)
         raise
 
 
@@ -278,6 +278,7 @@ def _plan(
         wall_limit_s=table.agent_wall_s or WALL_S,
         silence_s=table.agent_silence_s or SILENCE_S,
         config=agent.config,
+        prices=prices.read(table.prices, known, started_in),
         texts=agent_texts,
         parallel=agent.parallel,
         jail=agent.jail,

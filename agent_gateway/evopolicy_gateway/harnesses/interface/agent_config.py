@@ -184,7 +184,7 @@ class AgentConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     max_tokens: Annotated[int, Meta(ge=1)] | None = None
     """Limit per run, all kinds of tokens together."""
     max_cost: Annotated[float, Meta(gt=0)] | None = None
-    """Limit per run, US dollars; needs `prices`."""
+    """Limit per run, US dollars; needs `prices`, here or from `--prices`."""
     prices: Prices | None = None
     prompts: Prompts | None = None
     """Texts in place of the standard prompts; those of the run's own options win."""
@@ -229,10 +229,6 @@ class AgentConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
                 raise ConfigError(f"{name} = {getattr(self, name)}: must be a number of seconds above 0")
         if self.retries < 0 or self.reprompts < 0:
             raise ConfigError("retries and reprompts must be at least 0")
-        if self.max_cost is not None and self.prices is None:
-            raise ConfigError(
-                "max_cost needs prices in US dollars per million tokens, such as prices = { input = 1.0, output = 10.0 }"
-            )
         if self.prompts is not None:
             self.prompts.check("prompts")
         if self.skills_at and not re.fullmatch(r"(~|/inputs)(/[\w.-]*\w)+", self.skills_at):
