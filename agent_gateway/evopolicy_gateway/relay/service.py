@@ -8,13 +8,11 @@ import hmac
 import re
 import time
 import zlib
-from collections.abc import AsyncIterator, Callable, Coroutine, Mapping
+from collections.abc import AsyncIterator, Callable, Mapping
 from email.utils import parsedate_to_datetime
 from pathlib import Path
 from typing import Any
-from urllib.parse import urlsplit
 
-import httpx
 import msgspec
 import orjson
 from starlette.requests import ClientDisconnect, Request
@@ -26,6 +24,7 @@ from evopolicy_gateway.relay.answers import SHAPES, AnswerReader, Cleaner
 from evopolicy_gateway.relay.apis import Refusal, Upstream
 from evopolicy_gateway.relay.ledger import Ledger
 from evopolicy_gateway.relay.limits import Limits
+from evopolicy_gateway.relay.provider import FAILED, Answer, Provider
 from evopolicy_gateway.relay.usage import Prices
 
 MAX_REQUEST_BYTES = 32 << 20
@@ -87,10 +86,8 @@ class Relay:
             for value in (order.upstream.key, *order.upstream.headers.values())
             if len(value) >= 8
         )
-        wait = httpx.Timeout(order.timeout_s, connect=min(30.0, order.timeout_s))
-        local = urlsplit(order.upstream.base_url).hostname in ("localhost", "127.0.0.1")
-        # The operator's proxy does not lead to this machine.
-        self._client = httpx.AsyncClient(timeout=wait, trust_env=not local)
+        self._provider = Provider(order.upstream.base_url, order.timeout_s)
+        self._authorization = order.upstream.authorization()
 
     @property
     def shown(self) -> str:
@@ -102,18 +99,16 @@ class Relay:
         return self._ledger.used
 
     async def close(self) -> None:
-        await self._client.aclose()
+        await self._provider.close()
         self._ledger.close()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
             return
         request = Request(scope, receive)
-        try:
+        with contextlib.suppress(ClientDisconnect):
             response = await self._answer(request)
-        except ClientDisconnect:
-            return
-        await response(scope, receive, send)
+            await response(scope, receive, send)
 
     async def _answer(self, request: Request) -> Response:
         if not self._is_agents(request.headers):
@@ -149,9 +144,9 @@ class Relay:
         try:
             async with self.sent(request, path, body) as answer:
                 data = await _all(answer, MAX_ERROR_BYTES)
-        except (httpx.HTTPError, ValueError, zlib.error) as error:
+        except (*FAILED, ValueError, zlib.error) as error:
             return self.refused(apis.UNREACHABLE, self.unreachable(error))
-        return Response(self.clean(data), answer.status_code, self.headers_of(answer))
+        return Response(self.clean(data), answer.status, self.headers_of(answer))
 
     async def _metered(self, request: Request, api: str, path: str, body: bytes) -> Response:
         order, used = self._order, self.used
@@ -206,13 +201,11 @@ class Relay:
 
     def sent(
         self, request: Request, path: str, body: bytes
-    ) -> contextlib.AbstractAsyncContextManager[httpx.Response]:
+    ) -> contextlib.AbstractAsyncContextManager[Answer]:
         """The request to the provider, built anew."""
-        headers = apis.passed_up(request.headers) | self._upstream.authorization()
-        # Compressed answers would have to be unpacked to be counted.
-        headers["accept-encoding"] = "identity"
+        headers = apis.passed_up(request.headers) | self._authorization
         url = self._upstream.url(path, request.query_params)
-        return self._client.stream(request.method, url, headers=headers, content=body)
+        return self._provider.sent(request.method, url, headers, body)
 
     def refused(
         self, refusal: Refusal, message: str, *, retry_after: str = "", more: Mapping[str, str] = {}
@@ -232,7 +225,7 @@ class Relay:
         """The provider has answered: the next failure is a first one."""
         self._troubles = 0
 
-    def headers_of(self, answer: httpx.Response) -> dict[str, str]:
+    def headers_of(self, answer: Answer) -> dict[str, str]:
         return {
             name: self.clean(value.encode()).decode("latin-1")
             for name, value in apis.passed_down(answer.headers).items()
@@ -240,8 +233,9 @@ class Relay:
 
     def clean(self, data: bytes) -> bytes:
         """The bytes without the key, which some servers repeat in their errors."""
-        cleaner = self.cleaner()
-        return cleaner.feed(data) + cleaner.end()
+        for secret in self._secrets:
+            data = data.replace(secret, b"[key]")
+        return data
 
     def cleaner(self) -> Cleaner:
         """Takes the key out of an answer that comes in pieces."""
@@ -286,23 +280,22 @@ class _Exchange:
     async def answer(self, request: Request, path: str) -> Response:
         relay = self._relay
         try:
-            got = await _unless_gone(
-                request, self._opened.enter_async_context(relay.sent(request, path, self._body))
-            )
-        except httpx.HTTPError as error:
+            async with _while_there(request.receive):
+                got = await self._opened.enter_async_context(relay.sent(request, path, self._body))
+        except FAILED as error:
             wait_s = relay.trouble("gives no answer", None)
             self._write(wait_s=wait_s)
             return relay.refused(apis.UNREACHABLE, relay.unreachable(error), retry_after=f"{wait_s:.0f}")
-        self._status = got.status_code
+        self._status = got.status
         kind = got.headers.get("content-type", "").partition(";")[0].strip().lower()
         events = kind == "text/event-stream"
-        if 200 <= got.status_code < 300 and (events or kind.endswith("json")):
+        if 200 <= got.status < 300 and (events or kind.endswith("json")):
             relay.answered()
             self._reader = AnswerReader(SHAPES[self._api], events=events, drops_usage=self._drops_usage)
-            return _Streamed(self, self._passed(got, self._reader), got.status_code, relay.headers_of(got))
+            return _Streamed(self, self._passed(got, self._reader), got.status, relay.headers_of(got))
         try:
             data = await _all(got, MAX_ERROR_BYTES)
-        except (httpx.HTTPError, ValueError, zlib.error):
+        except (*FAILED, ValueError, zlib.error):
             data = b""
         return self._failed(got, kind, data)
 
@@ -311,9 +304,9 @@ class _Exchange:
         self._write_read(broken=True)
         await self._opened.aclose()
 
-    def _failed(self, got: httpx.Response, kind: str, data: bytes) -> Response:
+    def _failed(self, got: Answer, kind: str, data: bytes) -> Response:
         """The answer for one that is no success of this API."""
-        relay, status = self._relay, got.status_code
+        relay, status = self._relay, got.status
         shown = relay.clean(data[:_SHOWN]).decode("utf-8", "replace").strip()
         came = f"base_url {relay.shown} answered {status} with {kind or 'no content type'}: {shown!r}"
         if status < 400:
@@ -331,7 +324,7 @@ class _Exchange:
         same = msgspec.structs.replace(apis.UNREACHABLE, status=status)
         return relay.refused(same, came, more=headers)
 
-    async def _passed(self, got: httpx.Response, reader: AnswerReader) -> AsyncIterator[bytes]:
+    async def _passed(self, got: Answer, reader: AnswerReader) -> AsyncIterator[bytes]:
         """The answer's bytes, the last of them after the request is in the ledger."""
         cleaner = self._relay.cleaner()
         async for data in _unpacked(got):
@@ -380,24 +373,35 @@ class _Streamed(StreamingResponse):
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         try:
-            await super().__call__(scope, receive, send)
+            async with _while_there(receive):
+                await self.stream_response(send)
         finally:
             await self._exchange.close()
 
 
-async def _unless_gone(request: Request, opening: Coroutine[Any, Any, httpx.Response]) -> httpx.Response:
-    """What `opening` returns. Raises ClientDisconnect, and cancels it, when the agent goes meanwhile."""
-    waits, gone = asyncio.ensure_future(opening), asyncio.ensure_future(request.receive())
-    try:
-        # The body is read: the next message is the end of the connection.
-        await asyncio.wait([waits, gone], return_when=asyncio.FIRST_COMPLETED)
-        if not waits.done():
-            raise ClientDisconnect
-        return waits.result()
-    finally:
-        for task in (waits, gone):
+@contextlib.asynccontextmanager
+async def _while_there(receive: Receive) -> AsyncIterator[None]:
+    """Ends what is inside when the agent goes, and raises ClientDisconnect then. The request's body has to be read before."""
+    task, watching = asyncio.current_task(), True
+    assert task is not None
+
+    def left(_: asyncio.Future[Any]) -> None:
+        if watching:
             task.cancel()
-        await asyncio.gather(waits, gone, return_exceptions=True)
+
+    # After the body, the next message is the end of the connection.
+    gone = asyncio.ensure_future(receive())
+    gone.add_done_callback(left)
+    try:
+        yield
+    except asyncio.CancelledError:
+        if not gone.done():
+            raise
+        task.uncancel()
+        raise ClientDisconnect from None
+    finally:
+        watching = False
+        gone.cancel()
 
 
 async def _read(request: Request) -> bytes:
@@ -409,7 +413,7 @@ async def _read(request: Request) -> bytes:
     return bytes(body)
 
 
-async def _all(answer: httpx.Response, limit: int) -> bytes:
+async def _all(answer: Answer, limit: int) -> bytes:
     data = bytearray()
     async for chunk in _unpacked(answer):
         data += chunk
@@ -418,7 +422,7 @@ async def _all(answer: httpx.Response, limit: int) -> bytes:
     return bytes(data)
 
 
-async def _unpacked(answer: httpx.Response) -> AsyncIterator[bytes]:
+async def _unpacked(answer: Answer) -> AsyncIterator[bytes]:
     """The answer's bytes, unpacked in pieces of bounded size: a small compressed answer may hold very many. Raises ValueError."""
     coding = answer.headers.get("content-encoding", "identity").strip().lower()
     if coding not in ("identity", "gzip", "x-gzip", "deflate"):
@@ -427,7 +431,7 @@ async def _unpacked(answer: httpx.Response) -> AsyncIterator[bytes]:
         )
     unpack = None if coding == "identity" else zlib.decompressobj(wbits=zlib.MAX_WBITS | 32)
     n_bytes = 0
-    async for data in answer.aiter_raw():
+    async for data in answer.pieces():
         rest = data
         while rest:
             if unpack is None:
