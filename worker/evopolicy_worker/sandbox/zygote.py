@@ -119,19 +119,16 @@ class Zygote:
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         ours.settimeout(ANSWER_TIMEOUT_S)
         try:
-            with theirs:
-                socket.send_fds(self._control, [b"fk"], [theirs.fileno()])
-            reply, fds, _, _ = socket.recv_fds(ours, _MAX_MESSAGE, 5, socket.MSG_CMSG_CLOEXEC)
+            with ours:
+                with theirs:
+                    socket.send_fds(self._control, [b"fk"], [theirs.fileno()])
+                reply, fds, _, _ = socket.recv_fds(ours, _MAX_MESSAGE, 5, socket.MSG_CMSG_CLOEXEC)
             if not reply:
                 raise ConnectionResetError("the policy's process was not created")
-            if len(fds) != 5:
-                raise SandboxError(f"cannot create the policy's process: {reply.decode('utf-8', 'replace')}")
         except OSError as error:
-            ours.close()
             raise SlotDiedError(f"the sandbox's zygote is gone: {error}") from error
-        except SandboxError:
-            ours.close()
-            raise
+        if len(fds) != 5:
+            raise SandboxError(f"cannot create the policy's process: {reply.decode('utf-8', 'replace')}")
         pidfd, requests, replies, stdout, stderr = fds
         return Child(
             host_pid=pid_of(pidfd),
