@@ -26,6 +26,7 @@ from evopolicy_gateway.run_folder.layout import RunFolder, folder_of
 from evopolicy_gateway.run_folder.listener import AgentPlace, place_of
 from evopolicy_gateway.run_folder.locks import alone
 from evopolicy_gateway.submits.pipeline import SubmitPipeline
+from evopolicy_gateway.submits.tickets import TicketMachine
 from evopolicy_gateway.workspace import staging as workspace
 from evopolicy_gateway.workspace.agents_md import Urls
 
@@ -112,14 +113,14 @@ async def _serve(
     def ready(urls: Urls, pipeline: SubmitPipeline) -> None:
         variables = urls.environment() | workspace.variables(folder)
         if controlled:
-            opened = pipeline.run
+            opened = pipeline.machine.run
             undrawn = opened.video != "off" and not opened.env.renders
             notes = (f"--video {opened.video}: {opened.env.env} does not render; there are no videos",)
             child_messages.emit(
                 Ready(
                     variables=urls.environment(),
                     notes=notes if undrawn else (),
-                    held_s=round(pipeline.held_s, 3),
+                    held_s=round(pipeline.machine.held_s, 3),
                     permit_s=round(gateway.permit_s, 3),
                 )
             )
@@ -130,7 +131,7 @@ async def _serve(
 
     def changed(pipeline: SubmitPipeline) -> None:
         if controlled:
-            child_messages.emit(progress_of(pipeline))
+            child_messages.emit(progress_of(pipeline.machine))
 
     last_wait = ""
 
@@ -181,16 +182,16 @@ async def _listen(gateway: Gateway) -> None:
             gateway.tell(Close(reason=order.reason, agent=order.agent))
 
 
-def progress_of(pipeline: SubmitPipeline) -> Progress:
+def progress_of(machine: TicketMachine) -> Progress:
     """A run in the operator's live view."""
-    settled = [ticket for ticket in pipeline.tickets if ticket.status is not None]
+    settled = [ticket for ticket in machine.tickets if ticket.status is not None]
     means = [ticket.mean for ticket in settled if ticket.mean is not None]
-    running = pipeline.in_flight
+    running = machine.in_flight
     return Progress(
-        episode_budget=pipeline.run.episode_budget,
-        remaining_budget=pipeline.state.remaining_budget,
-        n_submits=pipeline.state.n_submits,
-        n_rejected=pipeline.n_rejected,
+        episode_budget=machine.run.episode_budget,
+        remaining_budget=machine.state.remaining_budget,
+        n_submits=machine.state.n_submits,
+        n_rejected=machine.n_rejected,
         submit_id=None if running is None else running.submit_id,
         n_episodes=0 if running is None else running.n_episodes,
         n_done=0 if running is None else running.n_done,
@@ -199,11 +200,11 @@ def progress_of(pipeline: SubmitPipeline) -> Progress:
         last_status=settled[-1].status if settled else None,
         last_mean=settled[-1].mean if settled else None,
         best_mean=max(means, default=None),
-        in_flight_s=round(pipeline.in_flight_s, 3),
-        feedback_s=round(pipeline.feedback_s, 3),
-        held_s=round(pipeline.held_s, 3),
-        spent=pipeline.spent,
-        cancelled=pipeline.cancelled,
+        in_flight_s=round(machine.in_flight_s, 3),
+        feedback_s=round(machine.feedback_s, 3),
+        held_s=round(machine.held_s, 3),
+        spent=machine.spent,
+        cancelled=machine.cancelled,
     )
 
 

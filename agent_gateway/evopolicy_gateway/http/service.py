@@ -11,6 +11,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import hmac
 from typing import Any
 
@@ -28,9 +29,9 @@ from evopolicy_common.messages.gateway import CANCELLED
 from evopolicy_gateway.http import published
 from evopolicy_gateway.http.info import info_document, progress_document
 from evopolicy_gateway.http.task import task_markdown
-from evopolicy_gateway.submits.pipeline import RUN_CLOSED, SubmitPipeline
+from evopolicy_gateway.submits.pipeline import SubmitPipeline
 from evopolicy_gateway.submits.submit_request import MAX_BODY_BYTES, refuse_size
-from evopolicy_gateway.submits.tickets import ConflictError, Ticket
+from evopolicy_gateway.submits.tickets import RUN_CLOSED, ConflictError, Ticket
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
@@ -47,12 +48,13 @@ STRANGER_LINGER = (MAX_BODY_BYTES, 10.0)
 
 def make_app(pipeline: SubmitPipeline, token: str, bearer: str = "") -> ASGIApp:
     """Builds the service of one run. An empty `bearer` means that no bearer token is required."""
-    task = task_markdown(pipeline.run).encode()
+    machine = pipeline.machine
+    task = task_markdown(machine.run).encode()
 
     async def info(request: Request) -> Response:
         state = await pipeline.refresh()
         return _json(
-            200, info_document(pipeline.run, state, pipeline.spent, pipeline.in_flight, pipeline.last_warning)
+            200, info_document(machine.run, state, machine.spent, machine.in_flight, machine.last_warning)
         )
 
     async def task_text(request: Request) -> Response:
@@ -74,13 +76,15 @@ def make_app(pipeline: SubmitPipeline, token: str, bearer: str = "") -> ASGIApp:
             raise
         ticket = await pipeline.submit(body, key)
         if wait == "true":
-            await ticket.done.wait()
+            await pipeline.until(lambda: ticket.done)
         else:
-            await _within(ticket.decided, DECIDED_WAIT_S)
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(DECIDED_WAIT_S):
+                    await pipeline.until(lambda: ticket.decided)
         return _of_ticket(ticket, pipeline)
 
     async def ask_submit(request: Request) -> Response:
-        ticket = pipeline.find(request.path_params["submit_id"])
+        ticket = machine.find(request.path_params["submit_id"])
         if ticket is None:
             raise HTTPException(404)
         return _of_ticket(ticket, pipeline)
@@ -105,7 +109,7 @@ def make_app(pipeline: SubmitPipeline, token: str, bearer: str = "") -> ASGIApp:
         },
     )
     app.router.redirect_slashes = False
-    if pipeline.run.profile == "own":
+    if machine.run.profile == "own":
         return _TokenGate(app, token, bearer)
     app.add_exception_handler(HTTPException, _published_http_error)
     return _TokenGate(_PublishedMethods(app), token, bearer)
@@ -135,19 +139,17 @@ def _of_ticket(ticket: Ticket, pipeline: SubmitPipeline) -> Response:
     """The answer to a submit: its summary as in the file, byte for byte, or its progress. Raises its refusal."""
     if ticket.error is not None:
         raise ticket.error
-    summary = ticket.summary()
+    summary = pipeline.summary(ticket)
     if summary is None:
         return _json(202, progress_document(ticket))
     if ticket.request.rejected is not None:
         head = orjson.dumps({"submit_id": ticket.index, "status": ticket.status})
         return Response(head[:-1] + b',"summary":' + summary + b"}", 400, media_type="application/json")
-    played = (each for each in reversed(pipeline.tickets) if each.request.rejected is None)
-    last = pipeline.spent and ticket is next(played)
     head = orjson.dumps(
         {
             "submit_id": ticket.index,
             "status": ticket.status,
-            "is_finalized": last,
+            "is_finalized": pipeline.machine.finalizes(ticket),
             "feedback": f"feedback/{ticket.submit_id}",
             "policy_failures": ticket.policy_failures,
             "warning": ticket.warning,
@@ -174,14 +176,6 @@ async def _read_body(request: Request) -> bytes:
     return bytes(body)
 
 
-async def _within(event: asyncio.Event, seconds: float) -> None:
-    try:
-        async with asyncio.timeout(seconds):
-            await event.wait()
-    except TimeoutError:
-        pass
-
-
 def _json(status: int, document: dict[str, Any]) -> Response:
     return Response(orjson.dumps(document), status_code=status, media_type="application/json")
 
@@ -194,18 +188,8 @@ _STRANGER = Response(
 )
 
 
-_STOPPING = Response(
-    orjson.dumps(
-        {
-            "status": "closed",
-            "error": {
-                "message": "the gateway stops; what it has accepted goes on: ask again, with the same Idempotency-Key"
-            },
-        }
-    ),
-    status_code=503,
-    media_type="application/json",
-)
+_GOES_ON = "the gateway stops; what it has accepted goes on: ask again, with the same Idempotency-Key"
+_STOPPING = _json(503, {"status": "closed", "error": {"message": _GOES_ON}})
 
 
 async def _request_error(request: Request, error: Exception) -> Response:

@@ -174,14 +174,14 @@ class Gateway:
                 return self._orders.result()
             self._changed.clear()
             self._on_change(pipeline)
-            if self._alone and (pipeline.spent or self._folder.finish.exists()):
-                return Close(reason="budget_spent" if pipeline.spent else "agent_stopped")
+            if self._alone and (pipeline.machine.spent or self._folder.finish.exists()):
+                return Close(reason="budget_spent" if pipeline.machine.spent else "agent_stopped")
 
     async def _close(
         self, session: CoordinatorClient, journal: Journal, pipeline: SubmitPipeline, close: Close
     ) -> bool:
         # The agent is gone, but its last submit is still played and written.
-        pipeline.closed = True
+        pipeline.machine.close()
         await pipeline.idle()
         if not await self._agent_gone(pipeline):
             return False
@@ -193,7 +193,9 @@ class Gateway:
     async def _agent_gone(self, pipeline: SubmitPipeline) -> bool:
         """True once the agent has ended as far as anyone can tell; False when first ordered to leave the run open."""
         unseen = self._alone or ends_unseen(self._folder)
-        while unseen and not (pipeline.cancelled or self._folder.finish.exists() or self._stopped.is_set()):
+        while unseen and not (
+            pipeline.machine.cancelled or self._folder.finish.exists() or self._stopped.is_set()
+        ):
             self._on_wait(f"the agent's end; when it has ended: evopolicy finish {self._folder.root}")
             with contextlib.suppress(TimeoutError):
                 await asyncio.wait_for(self._stopped.wait(), _LOOK_S)

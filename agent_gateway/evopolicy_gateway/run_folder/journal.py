@@ -31,15 +31,15 @@ class AtWork:
     def __init__(self, path: Path) -> None:
         """Reads the last process's records into `died_over`; journal them before the first call of `on`."""
         self._fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
-        self.died_over: list[tuple[str, int]] = []
-        """Pairs of a submit's key and a request index."""
+        self.died_over: dict[str, list[int]] = {}
+        """Request indices of episodes, by the key of their submit."""
         data = os.pread(self._fd, 1 << 16, 0)
         for at in range(0, len(data), self._RECORD):
             key, _, index = (
                 data[at : at + self._RECORD].rstrip(b"\0").decode("ascii", "replace").partition(" ")
             )
             if key and index.isdecimal():
-                self.died_over.append((key, int(index)))
+                self.died_over.setdefault(key, []).append(int(index))
         self._lock = threading.Lock()
         self._free: list[int] = []
         self._n_records = 0
@@ -96,7 +96,7 @@ class Journal:
         """
         start = self._file.seek(0, os.SEEK_END)
         try:
-            _write_all(self._file.fileno(), msgspec.json.encode(entry) + b"\n")
+            write_all(self._file.fileno(), msgspec.json.encode(entry) + b"\n")
             os.fsync(self._file.fileno())
         except OSError as error:
             os.ftruncate(self._file.fileno(), start)
@@ -133,7 +133,8 @@ class Journal:
             os.ftruncate(self._file.fileno(), whole)
 
 
-def _write_all(fd: int, data: bytes) -> None:
+def write_all(fd: int, data: bytes) -> None:
+    """Writes all bytes, in as many calls as it takes."""
     view = memoryview(data)
     while view:
         view = view[os.write(fd, view) :]

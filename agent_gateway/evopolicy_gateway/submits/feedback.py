@@ -16,6 +16,7 @@ from pathlib import Path
 
 from evopolicy_common.processes.scratch import give_back_rights, remove_tree
 from evopolicy_common.records.blobs import fsync_directory, sync_filesystem
+from evopolicy_gateway.run_folder.journal import write_all
 
 SUMMARY = "summary.json"
 
@@ -30,11 +31,7 @@ class SubmitTree:
         self._feedback = feedback
         self._partial = feedback / f"{submit_id}.partial"
         self._episodes = str(self._partial / "episodes")
-        self._final = feedback / submit_id
-
-    @property
-    def final(self) -> Path:
-        return self._final
+        self.final = feedback / submit_id
 
     def begin(self) -> None:
         """Creates an empty `.partial` folder, replacing an earlier one."""
@@ -74,17 +71,15 @@ class SubmitTree:
         _write(self._partial / SUMMARY, summary)
         sync_filesystem(self._partial)
         # Left by a gateway that died between the rename and its journal entry, or put there by the agent.
-        _remove(self._final)
-        self._partial.rename(self._final)
+        _remove(self.final)
+        self._partial.rename(self.final)
         fsync_directory(self._feedback)
 
 
 def _write(path: Path | str, data: bytes) -> None:
     fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o444)
     try:
-        view = memoryview(data)
-        while view:
-            view = view[os.write(fd, view) :]
+        write_all(fd, data)
     finally:
         os.close(fd)
 

@@ -1,17 +1,51 @@
-"""The state of one submit, for everyone who waits for it."""
+"""The submits of one run as a pure machine: outcomes in, next effect out. No clock, disk, network or await.
+
+    machine = TicketMachine(run, entries)         # the journal's: the state that the last gateway left
+    ticket = machine.ask(body, client_key, key)   # raises RequestError
+    effect = machine.next()                       # for the ticket in flight: a new one, or the last gateway's
+
+The pipeline performs one effect at a time and passes its outcome to the method that returns the next effect:
+
+| the ticket in flight | effect       | outcome                                                        |
+|----------------------|--------------|----------------------------------------------------------------|
+| is new               | "snapshot"   | `took`: the entry `Requested`                                  |
+| is journalled        | "send"       | `sent`: the entry `Accepted`; `refused`: `Refused`, its end    |
+| is accepted          | "collect"    | `collected`: the entry `Settled`, its end                      |
+| has an entry         | the entry    | `noted`: the effect that its next state needs                  |
+| met an error         | entry `Died` | `noted`: the error, which ends the process. If that happens to |
+|                      |              | the next gateway too: the entry `SetAside`, its end            |
+
+State that survives the process changes in `noted` alone, when its entry is durable. A request that plays
+nothing skips the snapshot, and without a folder also the collecting.
+"""
 
 from __future__ import annotations
 
-import asyncio
 import math
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Iterable
+from typing import Literal
 
 import msgspec
 
-from evopolicy_common.errors import RequestError
-from evopolicy_common.records.open_run import Accepted, Requested
+from evopolicy_common.errors import RefusedError, RequestError
+from evopolicy_common.messages import gateway as messages
+from evopolicy_common.messages.gateway import CANCELLED, RunOpened, RunState
+from evopolicy_common.records import open_run
+from evopolicy_common.records.blobs import digest_of
+from evopolicy_common.records.open_run import AnyEntry, Requested
+from evopolicy_common.refusals import RUN_OVER, Refusal
 from evopolicy_gateway.run_folder.names import submit_id
+from evopolicy_gateway.submits import published_requests
 from evopolicy_gateway.submits.snapshots import Snapshot
+from evopolicy_gateway.submits.submit_request import Bounds, parse
+
+MAX_REJECTED_KEPT = 1000
+RUN_CLOSED = "run_closed"
+"""The published protocol's status for a submit after the last possible one."""
+MAX_DEATHS = 2
+"""Number of gateway crashes over one submit, or over one episode's files, after which it is abandoned."""
+_REQUEST_STATUSES = (Refusal.BUDGET_INVALID, Refusal.INVALID_ENV_INSTANCE)
 
 
 class ConflictError(RequestError):
@@ -23,6 +57,11 @@ class ConflictError(RequestError):
         """Index of the earlier submit."""
 
 
+Do = Literal["snapshot", "send", "collect"]
+Effect = Do | AnyEntry | Exception
+"""A task for the ticket in flight, an entry to be journalled, or the error that ends the process."""
+
+
 class _SummaryPart(msgspec.Struct):
     """The stored fields of a summary."""
 
@@ -31,73 +70,305 @@ class _SummaryPart(msgspec.Struct):
     warning: str | None = None
 
 
-class Ticket:
-    """A submit that passed the checks."""
+class Ticket(msgspec.Struct, kw_only=True, eq=False):
+    """The state of a submit that passed the checks."""
 
-    def __init__(self, request: Requested, index: int, episode_budget: int) -> None:
-        """`index`: its future number, known because this gateway is the run's only submitter."""
-        self.request = request
-        self.index = index
-        self.submit_id = submit_id(index, episode_budget)
-        """Its folder's name."""
-        self.n_done = 0
-        """Episodes whose feedback is written."""
-        self.waits_for = ""
-        self.held_s = 0.0
-        """Seconds in which none of its episodes ran because hidden episodes used the machines."""
-        self.accepted: Accepted | None = None
-        self.decided = asyncio.Event()
-        """Set once it is accepted, or certainly will not be."""
-        self.done = asyncio.Event()
-        """Set once `status` and the summary, or `error`, are available."""
-        self.status: str | None = None
-        self.mean: float | None = None
-        """Mean of its returns once it is settled; None without returns, or when the mean is not finite."""
-        self.policy_failures: int | None = None
-        """Episodes in which the policy failed; None unless it is ok."""
-        self.warning: str | None = None
-        """The warning to the agent about policy failures."""
-        self.error: RequestError | None = None
-        """The reason for its failure or refusal."""
-        self.n_episodes = len(request.env_instances)
-        self._episode_budget = episode_budget
-        self._load: Callable[[], bytes] | None = None
+    request: Requested
+    requested: bool = False
+    """Whether `request` is in the journal, with its snapshot."""
+    index: int
+    """Known before it is accepted, because this gateway is the run's only submitter."""
+    submit_id: str
+    """Its folder's name."""
+    n_episodes: int
+    n_done: int = 0
+    """Episodes whose feedback is written."""
+    waits_for: str = ""
+    held_s: float = 0.0
+    """Seconds in which none of its episodes ran because hidden episodes used the machines."""
+    accepted: open_run.Accepted | None = None
+    place: int | None = None
+    """Offset of the journal's entry with its summary; None before its feedback is committed."""
+    status: str | None = None
+    mean: float | None = None
+    """Mean of its returns once it is settled; None without returns, or when the mean is not finite."""
+    policy_failures: int | None = None
+    """Episodes in which the policy failed; None unless it is ok."""
+    warning: str | None = None
+    """The warning to the agent about policy failures."""
+    error: RequestError | None = None
+    """The reason for its failure or refusal."""
 
-    def attach(self, taken: Snapshot) -> None:
-        """Stores the bundle's digest, or the reason for its absence."""
-        self.request = msgspec.structs.replace(
-            self.request, bundle=taken.digest, bundle_error=taken.error, kept=taken.kept
+    @property
+    def done(self) -> bool:
+        """Whether its summary or `error` is available."""
+        return self.place is not None or self.error is not None
+
+    @property
+    def decided(self) -> bool:
+        """Whether it is accepted, or certainly will not be."""
+        return self.accepted is not None or self.done
+
+
+class TicketMachine:
+    """All submits of one run, of which at most one is in flight."""
+
+    def __init__(self, run: RunOpened, entries: Iterable[tuple[AnyEntry, int]] = ()) -> None:
+        """`entries`: the journal's, oldest first, with their offsets."""
+        self.run = run
+        self.state: RunState = run.state
+        """The state known to this gateway; `hear` updates it."""
+        self.closed = run.state.is_finalized
+        self.cancelled = run.state.cancelled
+        """The operator has cancelled the run."""
+        self.in_flight: Ticket | None = None
+        self.tickets: list[Ticket] = []
+        """Accepted submits by index, followed by at most one that is not accepted yet."""
+        self.n_rejected = 0
+        self.in_flight_s = 0.0
+        """Seconds in which a submit was in flight, in this process."""
+        self.feedback_s = 0.0
+        """Of `in_flight_s`, seconds from the last result's arrival to the committed feedback."""
+        self.held_s = run.state.held_s
+        """Seconds for which submits of the run waited because hidden episodes used the machines."""
+        self.deaths: Counter[tuple[str, int | None]] = Counter()
+        """Number of gateways that died over an episode of a submit, or (None) over the submit as a whole."""
+        self._failure: Exception | None = None
+        """The unexpected error of the ticket in flight."""
+        for entry, place in entries:
+            self.noted(entry, place)
+        # `run.state` is newer than the entries, except for an open submit's acceptance.
+        if not any(each.accepted and not each.done for each in self.tickets):
+            self.state = run.state
+
+    @property
+    def spent(self) -> bool:
+        """Whether no further submit is possible, and none runs."""
+        too_little = self.state.remaining_budget < max(1, self.run.min_episodes_per_submit)
+        return self.in_flight is None and (too_little or self.closed)
+
+    @property
+    def last_warning(self) -> str | None:
+        """The warning of the last answered submit about its policy; None when the policy did not fail."""
+        answered = (ticket.warning for ticket in reversed(self.tickets) if ticket.status is not None)
+        return next(answered, None)
+
+    def finalizes(self, ticket: Ticket) -> bool:
+        """Whether the run is spent, and `ticket` is the last that played."""
+        played = (each for each in reversed(self.tickets) if each.request.rejected is None)
+        return self.spent and ticket is next(played)
+
+    def find(self, name: str) -> Ticket | None:
+        """Returns the submit with that index or folder name; None when there is none."""
+        return next((each for each in self.tickets if name in (str(each.index), each.submit_id)), None)
+
+    # Requests.
+
+    def repeated(self, body: bytes, client_key: str | None) -> Ticket | None:
+        """Returns the ticket that a request repeats. Raises ConflictError: its key belongs to another body."""
+        keyed = (each for each in self.tickets if each.request.client_key == client_key is not None)
+        ticket = next(keyed, None)
+        if ticket is not None and ticket.request.body_digest != digest_of(body):
+            why = f"this Idempotency-Key was used for {ticket.submit_id} with another body; use a new key"
+            raise ConflictError(ticket.index, why)
+        return ticket
+
+    def ask(self, body: bytes, client_key: str | None, key: str) -> Ticket:
+        """Puts a request in flight under the new `key`. Raises RequestError: refused, nothing is charged."""
+        if self.in_flight is not None:
+            index, name = self.in_flight.index, self.in_flight.submit_id
+            raise ConflictError(index, f"{name} is running; wait for it, or ask GET /submit/{index}")
+        rejected = None
+        try:
+            ids = self._ids(body)
+        except published_requests.OddRequestError as error:
+            if not error.answer.counts:
+                raise
+            status, ids = error.answer.status, error.ids
+            assert status != "bad_request"
+            rejected = open_run.Rejection(status=status, message=error.message, folder=error.answer.folder)
+        return self._begin(
+            Requested(
+                key=key,
+                client_key=client_key,
+                body_digest=digest_of(body),
+                env_instances=() if rejected else tuple(map(int, ids)),
+                bundle=None,
+                bundle_error=None,
+                echoed=ids if rejected or any(type(each) is bool for each in ids) else None,
+                rejected=rejected,
+            )
         )
 
-    def accept(self, accepted: Accepted) -> None:
-        """The coordinator has accepted it; from now on its name is fixed."""
-        self.accepted = accepted
-        self.index = accepted.submit_index
-        self.submit_id = submit_id(accepted.submit_index, self._episode_budget)
-        self.decided.set()
+    def _ids(self, body: bytes) -> tuple[int, ...]:
+        """The train ids of a request to be played. Raises RequestError for any other."""
+        run = self.run
+        asked = None if run.profile == "own" else published_requests.read(body)
+        if self.spent:
+            raise self._refusal()
+        bounds = Bounds(
+            n_env_instances=run.n_env_instances,
+            min_episodes=run.min_episodes_per_submit,
+            max_episodes=run.max_episodes_per_submit,
+            remaining_budget=self.state.remaining_budget,
+        )
+        return parse(body, bounds) if asked is None else published_requests.check(asked, bounds)
 
-    def settle(self, status: str, summary: bytes, load: Callable[[], bytes]) -> None:
-        """Its feedback is committed. `load` returns the summary's bytes again.
+    def _begin(self, request: Requested) -> Ticket:
+        index, n = len(self.tickets), len(request.env_instances)
+        name = submit_id(index, self.run.episode_budget)
+        self.in_flight = Ticket(request=request, index=index, submit_id=name, n_episodes=n)
+        self.tickets.append(self.in_flight)
+        return self.in_flight
 
-        Its list of episodes is dropped to save memory: a run has thousands.
-        """
-        self.status, self._load = status, load
-        decoded = msgspec.json.decode(summary, type=_SummaryPart)
-        self.policy_failures, self.warning = decoded.policy_failures, decoded.warning
-        mean = decoded.mean_return
-        self.mean = mean if isinstance(mean, float | int) and math.isfinite(mean) else None
-        self.request = msgspec.structs.replace(self.request, env_instances=())
-        self.n_done = self.n_episodes
-        self.waits_for = ""
-        self.decided.set()
-        self.done.set()
+    def reject(self, error: RequestError, now: float) -> open_run.Rejected | None:
+        """Counts a refused request; returns its entry, up to a maximum number. `now`: Unix time, seconds."""
+        self.n_rejected += 1
+        if self.n_rejected > MAX_REJECTED_KEPT:
+            return None
+        n = self.state.n_submits
+        return open_run.Rejected(status=error.status, message=error.message, at=now, after_submits=n)
 
-    def summary(self) -> bytes | None:
-        """The bytes of `summary.json`, read from the disk; None before it is settled."""
-        return None if self._load is None else self._load()
+    # Effects, and their outcomes.
 
-    def fail(self, error: RequestError) -> None:
-        """Ends it with an error."""
-        self.error = error
-        self.decided.set()
-        self.done.set()
+    @property
+    def _open(self) -> Ticket:
+        assert self.in_flight is not None
+        return self.in_flight
+
+    def next(self) -> Effect | None:
+        """The effect that the ticket in flight needs in its state; None without one."""
+        if self.in_flight is None:
+            return None
+        request, rejected = self.in_flight.request, self.in_flight.request.rejected
+        if not self.in_flight.requested:
+            return request if rejected else "snapshot"
+        if self.in_flight.accepted is None:
+            return "send"
+        if rejected and not rejected.folder:
+            return open_run.Settled(key=request.key, status=rejected.status, summary="")
+        return "collect"
+
+    def took(self, taken: Snapshot) -> Effect:
+        digest, error, kept = taken.digest, taken.error, taken.kept
+        return msgspec.structs.replace(self._open.request, bundle=digest, bundle_error=error, kept=kept)
+
+    def sent(self, reply: messages.SubmitAccepted) -> Effect:
+        return open_run.Accepted(
+            key=self._open.request.key,
+            submit_index=reply.submit_index,
+            first_global_episode=reply.first_global_episode,
+            remaining_budget=reply.remaining_budget,
+        )
+
+    def paged(self, page: messages.ResultsPage, n_done: int, held_before: float) -> None:
+        """A page is written, `n_done` episodes in all. `held_before`: `held_s` before the first page."""
+        ticket, self.held_s = self._open, max(self.held_s, page.held_s)
+        ticket.n_done, ticket.waits_for, ticket.held_s = n_done, page.waits_for, self.held_s - held_before
+
+    def collected(self, done: messages.SubmitDone, summary: bytes) -> Effect:
+        if done.status == CANCELLED:
+            self.state = msgspec.structs.replace(self.state, remaining_budget=done.remaining_budget)
+            self.close(cancelled=True)
+        return open_run.Settled(key=self._open.request.key, status=done.status, summary=summary.decode())
+
+    def refused(self, error: RefusedError) -> Effect | None:
+        """The coordinator refused the submit, or to give its results."""
+        request, over = self._open.request, error.status in RUN_OVER
+        if over:
+            self.close(cancelled=error.status == Refusal.RUN_CANCELLED)
+        if self._open.accepted is None and (over or error.status in _REQUEST_STATUSES):
+            return open_run.Refused(key=request.key, status=error.status, message=error.message)
+        if not over:
+            return self.failed(error)
+        # Without an entry: if the coordinator opens the run once more, the next gateway collects the results.
+        self._end(self._refusal("closed"))
+        return None
+
+    def failed(self, error: Exception) -> Effect:
+        """An effect failed unexpectedly."""
+        if self._failure is not None:
+            return error
+        self._failure = error
+        return open_run.Died(key=self._open.request.key)
+
+    def noted(self, entry: AnyEntry, place: int) -> Effect | None:
+        """The entry is durable at that offset of the journal; returns the next effect."""
+        match entry:
+            case Requested():
+                ticket = self.in_flight or self._begin(entry)
+                ticket.request, ticket.requested = entry, True
+            case open_run.Accepted():
+                ticket = self._open
+                ticket.accepted, ticket.index = entry, entry.submit_index
+                ticket.submit_id = submit_id(ticket.index, self.run.episode_budget)
+                left, n, over = entry.remaining_budget, entry.submit_index + 1, self.state.is_finalized
+                self.state = RunState(remaining_budget=left, n_submits=n, is_finalized=over)
+            case open_run.Settled():
+                self._settle(self._open, entry, place)
+            case open_run.Refused():
+                over = entry.status in RUN_OVER
+                self._end(self._refusal() if over else RequestError(entry.status, entry.message))
+            case open_run.Died():
+                self.deaths.update((entry.key, index) for index in entry.episodes or (None,))
+                if self._failure is not None:
+                    return self._after_death(self._open, self._failure)
+            case open_run.SetAside():
+                self._end(RequestError("gateway_failed", entry.message))
+            case open_run.Rejected():
+                self.n_rejected += 1
+            case open_run.Closed():
+                self.closed = True
+        return self.next()
+
+    def _settle(self, ticket: Ticket, entry: open_run.Settled, place: int) -> None:
+        error = None
+        if entry.summary:
+            decoded = msgspec.json.decode(entry.summary, type=_SummaryPart)
+            ticket.status, ticket.place, ticket.waits_for = entry.status, place, ""
+            ticket.policy_failures, ticket.warning = decoded.policy_failures, decoded.warning
+            mean, ticket.n_done = decoded.mean_return, ticket.n_episodes
+            ticket.mean = mean if isinstance(mean, float | int) and math.isfinite(mean) else None
+            # To save memory: a run has thousands of episodes.
+            ticket.request = msgspec.structs.replace(ticket.request, env_instances=())
+        elif ticket.request.rejected is not None:
+            error = RequestError(entry.status, ticket.request.rejected.message)
+        self._end(error)
+
+    def _after_death(self, ticket: Ticket, failure: Exception) -> Effect:
+        if self.deaths[ticket.request.key, None] < MAX_DEATHS:
+            return failure
+        charged = "it was not accepted" if ticket.accepted is None else "its episodes are charged and count"
+        text = f"the gateway failed {MAX_DEATHS} times on this submit and gives it no feedback; {charged}"
+        return open_run.SetAside(key=ticket.request.key, message=text)
+
+    def _end(self, error: RequestError | None) -> None:
+        """Ends the ticket in flight. Without acceptance it takes no index."""
+        self._open.error = error
+        if self._open.accepted is None:
+            self.tickets.pop()
+        self.in_flight = self._failure = None
+
+    # The run's state.
+
+    def hear(self, state: RunState) -> bool:
+        """The coordinator's state of the run. Returns whether it closes the run, which is news."""
+        # While a submit is being sent, this may be older than its acceptance.
+        if state.n_submits < self.state.n_submits:
+            return False
+        self.state = state
+        self.held_s = max(self.held_s, state.held_s)
+        return state.is_finalized and self.close(cancelled=state.cancelled)
+
+    def close(self, *, cancelled: bool = False) -> bool:
+        """Takes no more submits; `cancelled`: by the operator. Returns whether that is news."""
+        before = self.closed, self.cancelled
+        self.closed, self.cancelled = True, self.cancelled or cancelled
+        return before != (self.closed, self.cancelled)
+
+    def _refusal(self, status: str = RUN_CLOSED) -> RequestError:
+        """The refusal of a submit to a closed or spent run."""
+        if self.cancelled:
+            return RequestError(CANCELLED, "the operator cancelled the run: no more submits are taken")
+        why = "the run is closed" if self.closed else "the episode budget is spent"
+        return RequestError(status, f"{why}: no more submits are taken")

@@ -177,7 +177,7 @@ def test_a_client_that_hangs_up_loses_nothing(tmp_path: Path) -> None:
     async def script(s: Served) -> None:
         s.double.go.clear()
         request = asyncio.create_task(s.http.post(s.urls.submit, json={"env_instances": [0, 1]}))
-        while s.pipeline.in_flight is None:
+        while s.pipeline.machine.in_flight is None:
             await asyncio.sleep(0.01)
         request.cancel()
         await asyncio.gather(request, return_exceptions=True)
@@ -211,7 +211,7 @@ def test_a_rejected_request_costs_no_budget_and_changes_nothing(tmp_path: Path) 
             state = (await s.http.get(s.urls.info)).json()["state"]
             assert state == {"remaining_budget": 12, "n_submits": 0, "is_finalized": False}
             assert files_below(s.folder.feedback) == []
-            assert s.pipeline.n_rejected == number
+            assert s.pipeline.machine.n_rejected == number
 
     double = play(tmp_path, script)
     assert double.submits == []
@@ -353,7 +353,7 @@ def test_the_budget_is_spent_to_the_last_episode_and_then_refused(tmp_path: Path
     async def script(s: Served) -> None:
         for _ in range(2):
             assert (await s.http.post(s.urls.submit, json={"env_instances": "0-5"})).status_code == 200
-        assert s.pipeline.spent
+        assert s.pipeline.machine.spent
         answer = await s.http.post(s.urls.submit, json={"env_instances": [0]})
         assert answer.status_code == 409
         assert answer.json()["status"] == "run_closed"

@@ -205,7 +205,7 @@ def test_a_run_that_the_operator_cancelled_takes_no_more_submits(tmp_path: Path)
                 assert answer.json()["status"] == "cancelled"
                 assert "cancelled" in answer.json()["error"]["message"]
                 assert double.run_id not in answer.text
-            assert s.pipeline.spent
+            assert s.pipeline.machine.spent
             assert (await s.http.get(s.urls.info)).json()["state"]["is_finalized"] is True
 
     asyncio.run(main())

@@ -177,7 +177,7 @@ def test_a_remote_agents_run_closes_on_its_operators_word(tmp_path: Path) -> Non
                 await until(lambda: len(service.waits) > 1)
                 assert "evopolicy finish" in service.waits[1]
                 assert double.closed is None
-                assert service.pipeline.closed
+                assert service.pipeline.machine.closed
                 listener.finish(folder)
                 assert await service.task
         assert [message.reason for message in asked(double, CloseRun) if isinstance(message, CloseRun)] == [
@@ -241,15 +241,15 @@ def test_time_held_by_hidden_episodes_counts_against_no_limit(tmp_path: Path) ->
         double.held_s = 5.0
         double.go.clear()
         async with served(tmp_path, double) as service:
-            assert service.pipeline.held_s == 5.0
+            assert service.pipeline.machine.held_s == 5.0
             await service.http.post(service.urls.submit + "?wait=false", json={"env_instances": [1]})
             double.held_s = 7.5
-            await until(lambda: service.pipeline.held_s == 7.5)
+            await until(lambda: service.pipeline.machine.held_s == 7.5)
             running = (await service.http.get(service.urls.info)).json()["submit_in_flight"]
             assert running["waits_for"] == "a free slot"
             assert running["held_s"] >= 2.5
             double.go.set()
             await service.pipeline.idle()
-            assert service.pipeline.tickets[0].held_s == 2.5
+            assert service.pipeline.machine.tickets[0].held_s == 2.5
 
     asyncio.run(main())

@@ -88,7 +88,7 @@ def test_without_the_bearer_token_everything_is_the_same_401(tmp_path: Path) -> 
         assert answers[0].headers["WWW-Authenticate"] == "Bearer"
         assert not any(secret in answers[0].text for secret in (token, s.double.capability, str(tmp_path)))
         assert s.double.submits == []
-        assert s.pipeline.n_rejected == 0
+        assert s.pipeline.machine.n_rejected == 0
 
     play(tmp_path, script)
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import pytest
 
-from evopolicy_gateway.submits.pipeline import LONGEST_LINGER_S, _Linger
+from evopolicy_gateway.submits.collecting import LONGEST_LINGER_S, Linger
 
 
 def play(n: int, episode_s: float, round_trip_s: float = 0.002) -> tuple[int, float]:
     """Pages until the last of `n` episodes is here, one every `episode_s`, and seconds by which it came late."""
-    linger, now, pages, n_done = _Linger(n, 0.0), 0.0, 0, 0
+    linger, now, pages, n_done = Linger(n, 0.0), 0.0, 0, 0
     while n_done < n:
         now = max(now, (n_done + 1) * episode_s) + round_trip_s
         n_done = min(n, int(now / episode_s))
@@ -33,4 +33,4 @@ def test_long_episodes_are_shown_within_the_longest_pause() -> None:
 
 
 def test_no_pause_before_the_first_result() -> None:
-    assert _Linger(128, 0.0).pause_s(0, 5.0) == 0.0
+    assert Linger(128, 0.0).pause_s(0, 5.0) == 0.0

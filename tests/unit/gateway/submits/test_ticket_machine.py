@@ -1,0 +1,311 @@
+"""The ticket machine under any order of requests, refusals, errors and crashes, and with bugs planted in it."""
+
+from __future__ import annotations
+
+import inspect
+import json
+import textwrap
+from collections import Counter
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import pytest
+from gateway_double import opened
+from hypothesis import Phase, given, settings
+from hypothesis import strategies as st
+
+from evopolicy_common.errors import RefusedError, RequestError
+from evopolicy_common.messages.gateway import RunState, SubmitAccepted, SubmitDone
+from evopolicy_common.records.blobs import digest_of
+from evopolicy_common.records.open_run import (
+    Accepted,
+    AnyEntry,
+    Died,
+    Refused,
+    Rejected,
+    Requested,
+    SetAside,
+    Settled,
+)
+from evopolicy_common.refusals import Refusal
+from evopolicy_gateway.submits import tickets
+from evopolicy_gateway.submits.snapshots import Snapshot
+from evopolicy_gateway.submits.tickets import ConflictError, Effect, Ticket, TicketMachine
+
+BUDGET = 12
+BODIES = (b'{"env_instances": [1, 2]}', b'{"env_instances": [3]}', b'{"env_instances": [99]}')
+CLIENT_KEYS = (None, "a", "b")
+REFUSALS = {
+    "refuse": Refusal.BUDGET_INVALID,
+    "end run": Refusal.RUN_CLOSED,
+    "cancel run": Refusal.RUN_CANCELLED,
+    "refuse oddly": Refusal.DAMAGED,
+}
+ACTIONS = (*["ask"] * 4, *["ok"] * 8, *["fail"] * 3, "crash", "crash after", "state", *REFUSALS)
+
+
+class World:
+    """A journal, a coordinator that accepts each key once, and the machine between them."""
+
+    def __init__(self, profile: str) -> None:
+        self.profile = profile
+        self.journal: list[AnyEntry] = []
+        self.accepted: dict[str, SubmitAccepted] = {}
+        self.sent: dict[str, Requested] = {}
+        self.heard: list[RunState] = []
+        """The coordinator's states, oldest first."""
+        self.n_asked = 0
+        self.refusals: list[tuple[type, Ticket | None]] = []
+        """Refused requests: the error, and the ticket that was in flight."""
+        self.ends = False
+        """Whether the run has accepted its last submit."""
+        self.start()
+
+    @property
+    def state(self) -> RunState:
+        left = min([each.remaining_budget for each in self.accepted.values()], default=BUDGET)
+        return RunState(remaining_budget=left, n_submits=len(self.accepted), is_finalized=False)
+
+    def start(self) -> None:
+        """A gateway starts on the journal."""
+        run = opened(state=self.state, profile=self.profile, episode_budget=BUDGET)
+        self.machine = TicketMachine(run, zip(self.journal, range(len(self.journal)), strict=True))
+        self.effect: Effect | None = self.machine.next()
+        self.ends = False
+
+    def ask(self, n: int) -> None:
+        body, client_key = BODIES[n % 3], CLIENT_KEYS[n // 3 % 3]
+        try:
+            earlier = self.machine.repeated(body, client_key)
+        except ConflictError as error:
+            other = self.machine.tickets[error.index].request
+            assert (other.client_key, other.body_digest != digest_of(body)) == (client_key, True)
+            return
+        if earlier is not None:
+            assert (earlier.request.client_key, earlier.request.body_digest) == (client_key, digest_of(body))
+            return
+        before = self.machine.in_flight
+        self.n_asked += 1
+        try:
+            ticket = self.machine.ask(body, client_key, f"key-{self.n_asked}")
+        except RequestError as refusal:
+            self.refusals.append((type(refusal), before))
+            if (entry := self.machine.reject(refusal, 0.0)) is not None:
+                self.journal.append(entry)
+            return
+        assert before is None
+        assert not self.ends
+        self.effect = self.machine.next()
+        assert self.effect == "snapshot" or ticket.request.rejected is not None
+
+    def perform(self, outcome: str) -> None:
+        """Performs the effect, or lets it fail."""
+        effect, machine = self.effect, self.machine
+        if isinstance(effect, Exception):
+            died = [entry.key for entry in self.journal if isinstance(entry, Died)]
+            assert died.count(died[-1]) == 1
+            self.start()
+        elif outcome == "crash":
+            self.start()
+        elif effect is None:
+            pass
+        elif isinstance(effect, str):
+            self.effect = self.fulfil(effect, outcome)
+            if outcome == "crash after":
+                self.start()
+        else:
+            self.journal.append(effect)
+            if outcome == "crash after":
+                self.start()
+            else:
+                self.effect = machine.noted(effect, len(self.journal) - 1)
+
+    def fulfil(self, task: str, outcome: str) -> Effect | None:
+        ticket, machine = self.machine.in_flight, self.machine
+        assert ticket is not None
+        if ticket.accepted is None and ticket.request.key in self.accepted:
+            outcome = "ok"  # a repeated key gets its acceptance
+        if outcome == "fail":
+            return machine.failed(KeyError("a bug"))
+        if task == "snapshot":
+            assert ticket.request not in self.journal
+            return machine.took(Snapshot(digest=f"bundle-{ticket.request.key}", error=None))
+        key = ticket.request.key
+        assert ticket.request in self.journal
+        assert self.sent.setdefault(key, ticket.request) == ticket.request
+        assert ticket.request.bundle or ticket.request.rejected
+        if task == "send":
+            assert ticket.accepted is None
+            if outcome in REFUSALS:
+                self.ends |= outcome in ("end run", "cancel run")
+                return machine.refused(RefusedError(REFUSALS[outcome], "no"))
+            if key not in self.accepted:
+                before = self.state
+                self.accepted[key] = SubmitAccepted(
+                    submit_index=before.n_submits,
+                    first_global_episode=BUDGET - before.remaining_budget,
+                    remaining_budget=before.remaining_budget - len(ticket.request.env_instances),
+                )
+            return machine.sent(self.accepted[key])
+        assert ticket.accepted in self.journal
+        if outcome in REFUSALS:
+            self.ends |= outcome in ("end run", "cancel run")
+            return machine.refused(RefusedError(REFUSALS[outcome], "no"))
+        summary = json.dumps({"mean_return": ticket.index + 0.5, "policy_failures": 0}).encode()
+        return machine.collected(done(ticket), summary)
+
+    def check(self) -> None:
+        machine, open_ticket = self.machine, self.machine.in_flight
+        assert [ticket.index for ticket in machine.tickets] == list(range(len(machine.tickets)))
+        assert open_ticket is None or open_ticket is machine.tickets[-1]
+        assert sum(not ticket.done for ticket in machine.tickets) == (open_ticket is not None)
+        assert all(ticket.accepted for ticket in machine.tickets if ticket is not open_ticket)
+        assert (self.effect is None) == (open_ticket is None)
+        assert all((kind is ConflictError) == (before is not None) for kind, before in self.refusals)
+        for kinds in (Requested, Accepted, Settled | Refused | SetAside):
+            keys = [entry.key for entry in self.journal if isinstance(entry, kinds)]
+            assert len(keys) == len(set(keys))
+        charged = sum(ticket.n_episodes for ticket in machine.tickets if ticket.accepted)
+        # An acceptance may be known from the coordinator's state before its reply arrives.
+        assert self.state.remaining_budget <= machine.state.remaining_budget <= BUDGET - charged
+        assert open_ticket or machine.state.remaining_budget == BUDGET - charged
+        assert machine.closed >= self.ends
+        assert machine.n_rejected == sum(isinstance(entry, Rejected) for entry in self.journal)
+        named = Counter(self.sent[key].client_key for key in self.accepted)
+        assert all(n == 1 for client_key, n in named.items() if client_key is not None)
+        noted = [ticket for ticket in machine.tickets if not ended_without_an_entry(ticket)]
+        again = TicketMachine(machine.run, zip(self.journal, range(len(self.journal)), strict=True))
+        assert [look(ticket) for ticket in noted if ticket.done] == [
+            look(ticket) for ticket in again.tickets if ticket.done
+        ]
+
+
+def done(ticket: Ticket) -> SubmitDone:
+    return SubmitDone(
+        status="ok",
+        n_episodes=ticket.n_episodes,
+        env_instances=ticket.request.env_instances,
+        first_global_episode=0,
+        remaining_budget=0,
+        started_at=0.0,
+        completed_at=1.0,
+        failure=None,
+        n_kept=ticket.n_episodes,
+    )
+
+
+def ended_without_an_entry(ticket: Ticket) -> bool:
+    return ticket.error is not None and ticket.error.status in ("closed", "cancelled")
+
+
+def look(ticket: Ticket) -> dict[str, Any]:
+    """The ticket without the identity of its error, and without what is told of a submit in flight only."""
+    values = {name: getattr(ticket, name) for name in ticket.__struct_fields__}
+    error = ticket.error
+    return values | {"error": None if error is None else (error.status, error.message)}
+
+
+def play(actions: list[tuple[str, int]], profile: str) -> None:
+    """Plays the actions, then a gateway without faults, which ends every submit."""
+    world = World(profile)
+    for action, n in actions:
+        if action == "ask":
+            world.ask(n)
+        elif action == "state":
+            world.heard.append(world.state)
+            world.machine.hear(world.heard[n % len(world.heard)])
+        else:
+            world.perform(action)
+        world.check()
+    world.start()
+    for _ in range(10):
+        if world.effect is not None:
+            world.perform("ok")
+            world.check()
+    assert world.effect is None
+    assert all(ticket.done for ticket in world.machine.tickets)
+    assert len(world.machine.tickets) == len(world.accepted)
+
+
+ANY = st.lists(st.tuples(st.sampled_from(ACTIONS), st.integers(0, 8)), min_size=10, max_size=60)
+
+
+@given(ANY, st.sampled_from(("own", "published")))
+@settings(deadline=None, max_examples=300)
+def test_submits_survive_any_order_of_requests_errors_and_crashes(
+    actions: list[tuple[str, int]], profile: str
+) -> None:
+    play(actions, profile)
+
+
+class Bug(NamedTuple):
+    """In the method `name`, `old` becomes `new`."""
+
+    title: str
+    name: str
+    old: str
+    new: str
+
+
+BUGS = (
+    Bug(
+        "a key answers for another body", "repeated", "ticket.request.body_digest != digest_of(body)", "False"
+    ),
+    Bug("a key is forgotten", "repeated", "next(keyed, None)", "None"),
+    Bug("two submits at once", "ask", "self.in_flight is not None", "False"),
+    Bug("sent before it is journalled", "next", "not self.in_flight.requested", "False"),
+    Bug("sent after it is accepted", "next", "self.in_flight.accepted is None", "True"),
+    Bug("journalled without its bundle", "took", "bundle=digest", "bundle=None"),
+    Bug(
+        "snapshot again after a crash",
+        "noted",
+        "ticket.requested = entry, True",
+        "ticket.requested = entry, False",
+    ),
+    Bug("nothing charged", "noted", "remaining_budget=left", "remaining_budget=self.state.remaining_budget"),
+    Bug("a refused submit takes an index", "_end", "self._open.accepted is None", "False"),
+    Bug("an accepted submit loses its index", "_end", "self._open.accepted is None", "True"),
+    Bug("a crash not counted", "noted", "self.deaths.update", "list"),
+    Bug("given up too late", "_after_death", "< MAX_DEATHS", "<= MAX_DEATHS"),
+    Bug("an old failure ends the next submit", "_end", "self._failure = None", "None"),
+    Bug("a closed run takes submits", "close", "self.cancelled = True", "self.cancelled = False"),
+    Bug("a state older than the acceptance", "hear", "state.n_submits < self.state.n_submits", "False"),
+    Bug("refused requests counted twice", "noted", "self.n_rejected += 1", "self.n_rejected += 2"),
+    Bug("an end without its summary", "_settle", "entry.status, place", "entry.status, None"),
+)
+
+
+def with_bug(bug: Bug) -> Callable[..., Any]:
+    """The method with the bug in it."""
+    source = textwrap.dedent(inspect.getsource(getattr(TicketMachine, bug.name)))
+    assert source.count(bug.old) == 1, f"{bug.title}: {bug.old!r} is not once in {bug.name}"
+    made: dict[str, Any] = {}
+    exec(source.replace(bug.old, bug.new), vars(tickets), made)
+    planted: Callable[..., Any] = made[bug.name]
+    return planted
+
+
+@pytest.mark.parametrize("bug", BUGS, ids=lambda bug: bug.title)
+def test_a_bug_in_the_machine_is_found(bug: Bug, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(TicketMachine, bug.name, with_bug(bug))
+
+    @given(ANY, st.sampled_from(("own", "published")))
+    @settings(deadline=None, max_examples=1000, derandomize=True, database=None, phases=[Phase.generate])
+    def search(actions: list[tuple[str, int]], profile: str) -> None:
+        play(actions, profile)
+
+    with pytest.raises((AssertionError, AttributeError, IndexError, KeyError)):
+        search()
+
+
+def test_the_last_played_submit_of_a_spent_run_finalizes_it() -> None:
+    world = World("published")
+    for n in (0, 1, 0):
+        world.ask(n)
+        while world.effect is not None:
+            world.perform("ok")
+    assert [world.machine.finalizes(ticket) for ticket in world.machine.tickets] == [False] * 3
+    assert isinstance(world.journal[-1], Settled)
+    world.machine.close()
+    world.ask(2)
+    assert [world.machine.finalizes(ticket) for ticket in world.machine.tickets] == [False, False, True]
