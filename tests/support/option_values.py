@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import datetime as dt
+import functools
 import gc
 import importlib
 import json
@@ -151,6 +152,7 @@ class Outcome(NamedTuple):
     changes: tuple[str, ...]
 
 
+@functools.cache
 def cases() -> list[Case]:
     """Every parameter with every value, in a stable order."""
     return [
@@ -243,7 +245,7 @@ class _Server:
         return [*options, "--", *arguments, *values]
 
     def _run(self, words: list[str]) -> Outcome:
-        before = _tree(self._folder / "w")
+        before = self._before
         with contextlib.ExitStack() as stack:
             files = [stack.enter_context(tempfile.TemporaryFile()) for _ in range(3)]
             pid = os.fork()
@@ -326,6 +328,7 @@ class _Server:
     def _renew(self) -> None:
         shutil.rmtree(self._folder / "w", ignore_errors=True)
         subprocess.run(["cp", "-a", self._folder / "template", self._folder / "w"], check=True)
+        self._before = _tree(self._folder / "w")
 
     def _make(self, template: Path) -> None:
         from invented.run_dirs import write_run
@@ -459,6 +462,8 @@ def _main(program: str) -> Any:
 
 
 def _serve(folder: Path) -> None:
+    # The forks find the commands made: each would spend most of its time on making them anew.
+    typer.main.get_command = functools.cache(typer.main.get_command)
     _commands()
     gc.collect()
     gc.freeze()
