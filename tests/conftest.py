@@ -9,17 +9,22 @@ import re
 import shutil
 import signal
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import hypothesis
 import pytest
+
+if TYPE_CHECKING:
+    from forked import Forks
+    from slots import Slots
 
 _LAYER = re.compile(rb"^pytestmark = \[?\s*pytest\.mark\.(system|families)\b", re.MULTILINE)
 """A file of another layer than `make test` says so in its first mark."""
 
 
-_ONE_BY_ONE = ("tests/families/test_proof_of_life.py::", "tests/integration/test_every_bad_value.py::")
+_ONE_BY_ONE = ("tests/families/test_proof_of_life.py::",)
 """Their tests share nothing and take minutes together: each is played where there is room."""
 
 
@@ -93,6 +98,26 @@ def pytest_collection_finish() -> None:
     """What is imported and collected stays: each collection of garbage would look through all of it again."""
     gc.collect()
     gc.freeze()
+
+
+@pytest.fixture(scope="session")
+def forked() -> Iterator[Forks]:
+    """Plays commands without the start of Python."""
+    from forked import Forks
+
+    forks = Forks()
+    yield forks
+    forks.close()
+
+
+@pytest.fixture(scope="session")
+def slots(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Slots]:
+    """Shared by all tests of a process: each slot has to be healthy after what another test or attack did to it."""
+    from slots import Slots
+
+    found = Slots(tmp_path_factory.mktemp("slots"))
+    yield found
+    found.close()
 
 
 def pytest_configure(config: pytest.Config) -> None:

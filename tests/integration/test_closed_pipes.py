@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import json
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 from commands import SMALL
 from documents import commands
+from forked import Forks
 from waiting import wait_until
 
 from evopolicy_common.terminal import READER_GONE
-from evopolicy_gateway.cli.main import PLACES
 
 MODULES = {
     "evopolicy": "evopolicy_gateway.cli",
@@ -24,34 +22,6 @@ MODULES = {
     "evopolicy-worker": "evopolicy_worker.cli",
 }
 TIMEOUT_S = 300
-FORKING = """
-import gc, importlib, json, os, runpy, sys
-
-for module in json.loads(sys.argv[1]):
-    importlib.import_module(module)
-gc.collect()
-gc.freeze()  # or each child would look through, and so copy, all of it at its end
-for line in sys.stdin:
-    module, *words = json.loads(line)
-    reader, writer = os.pipe()
-    os.close(reader)
-    stderr = os.memfd_create("stderr")
-    child = os.fork()
-    if not child:
-        os.dup2(writer, 1)
-        os.dup2(stderr, 2)
-        sys.argv = [module, *words]
-        if not hasattr(sys.modules[module], "__path__"):
-            del sys.modules[module]  # it is not imported but run
-        runpy.run_module(module, run_name="__main__", alter_sys=True)
-        break
-    os.close(writer)
-    status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
-    os.lseek(stderr, 0, 0)
-    print(json.dumps([status, os.read(stderr, 1 << 16).decode()]), flush=True)
-    os.close(stderr)
-"""
-"""Plays each command as a process of its own, forked when all that commands import is imported; its stdout has no reader."""
 
 
 def closed(*words: str, lines: int = 0, cwd: Path | None = None) -> tuple[int, str]:
@@ -71,34 +41,9 @@ def closed(*words: str, lines: int = 0, cwd: Path | None = None) -> tuple[int, s
     return process.returncode, "".join(lines_shown)
 
 
-@pytest.fixture(scope="module")
-def forked() -> Iterator[Callable[..., tuple[int, str]]]:
-    """As `closed`, without the start of Python and its imports."""
-    modules = sorted({*MODULES.values(), *(place.app.partition(":")[0] for place in PLACES.values())})
-    modules += ["evopolicy_coordinator.cli.main", "evopolicy_gateway.cli.main"]
-    with subprocess.Popen(
-        [sys.executable, "-c", FORKING, json.dumps(modules)],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-    ) as process:
-
-        def play(*words: str) -> tuple[int, str]:
-            assert process.stdin is not None
-            assert process.stdout is not None
-            process.stdin.write(json.dumps([MODULES[words[0]], *words[1:]]) + "\n")
-            process.stdin.flush()
-            status, errors = json.loads(process.stdout.readline())
-            return status, errors
-
-        yield play
-
-
 @pytest.mark.parametrize("name", [name for name, _ in commands() if " " in name])
-def test_every_command_ends_quietly_when_nobody_reads_it(
-    name: str, forked: Callable[..., tuple[int, str]]
-) -> None:
-    assert forked(*name.split(), "--help") == (READER_GONE, "")
+def test_every_command_ends_quietly_when_nobody_reads_it(name: str, forked: Forks) -> None:
+    assert forked([*name.split(), "--help"], unread=True) == (READER_GONE, "", "")
 
 
 @pytest.mark.parametrize("name", MODULES)

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 from documents import APPS, commands
+from forked import BIN, Forks
 from invented.run_dirs import write_run
 
 from evopolicy_common import installation
@@ -18,7 +19,6 @@ from evopolicy_gateway.harnesses import FORMS
 
 pytestmark = pytest.mark.slow
 
-BIN = Path(sys.executable).parent
 PROGRAMS = sorted(APPS)
 GROUPS = [
     ["evopolicy"],
@@ -60,20 +60,6 @@ getattr(importlib.import_module(module), function)()
 """Starts a program in which some modules cannot be imported, as where their extra is not installed."""
 
 
-def started(
-    words: list[str], cwd: Path | None = None, **environment: str
-) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [BIN / words[0], *words[1:]],
-        cwd=cwd,
-        capture_output=True,
-        text=True,
-        check=False,
-        env=os.environ | environment,
-        timeout=120,
-    )
-
-
 def without(modules: str, words: list[str], folder: Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
         [sys.executable, "-c", WITHOUT, modules, MODULES[words[0]], *words[1:]],
@@ -87,8 +73,8 @@ def without(modules: str, words: list[str], folder: Path) -> subprocess.Complete
 
 
 @pytest.mark.parametrize("words", GROUPS, ids=" ".join)
-def test_a_group_without_a_command_shows_its_help(words: list[str]) -> None:
-    done = started(words)
+def test_a_group_without_a_command_shows_its_help(words: list[str], forked: Forks) -> None:
+    done = forked(words)
     assert done.returncode == 2
     assert done.stderr.startswith(f"Usage: {' '.join(words)} [OPTIONS] COMMAND [ARGS]...\n\n  ")
     assert ("\nPlay:\n" if words == ["evopolicy"] else "\nCommands:\n") in done.stderr
@@ -96,21 +82,21 @@ def test_a_group_without_a_command_shows_its_help(words: list[str]) -> None:
 
 
 @pytest.mark.parametrize("program", PROGRAMS)
-def test_a_program_tells_its_version_and_how_a_line_goes_on(program: str) -> None:
-    assert started([program, "--version"]).stdout.startswith("evopolicy 0.")
+def test_a_program_tells_its_version_and_how_a_line_goes_on(program: str, forked: Forks) -> None:
+    assert forked([program, "--version"]).stdout.startswith("evopolicy 0.")
     variable = f"_{program.upper().replace('-', '_')}_COMPLETE"
     asked = {variable: "complete_bash", "COMP_WORDS": f"{program} --ver", "COMP_CWORD": "1"}
-    assert started([program], **asked).stdout.split() == ["--version"]
+    assert forked([program], **asked).stdout.split() == ["--version"]
 
 
-def test_completion_knows_the_commands_and_choices_of_all_rooms() -> None:
+def test_completion_knows_the_commands_and_choices_of_all_rooms(forked: Forks) -> None:
     asked = {"_EVOPOLICY_COMPLETE": "complete_bash"}
-    assert started(["evopolicy"], **asked, COMP_WORDS="evopolicy wor", COMP_CWORD="1").stdout.split() == [
+    assert forked(["evopolicy"], **asked, COMP_WORDS="evopolicy wor", COMP_CWORD="1").stdout.split() == [
         "workers"
     ]
-    words = started(["evopolicy"], **asked, COMP_WORDS="evopolicy workers pa", COMP_CWORD="2").stdout.split()
+    words = forked(["evopolicy"], **asked, COMP_WORDS="evopolicy workers pa", COMP_CWORD="2").stdout.split()
     assert words == ["pause"]
-    words = started(
+    words = forked(
         ["evopolicy"], **asked, COMP_WORDS="evopolicy local --tier b", COMP_CWORD="3"
     ).stdout.split()
     assert words == ["bwrap"]
@@ -125,11 +111,11 @@ def test_every_command_knows_h_and_shows_no_python_types() -> None:
             assert kind not in output, (name, kind)
 
 
-def test_a_wrong_choice_is_reported_with_the_choices() -> None:
-    output = started(["evopolicy", "local", "--help"]).stdout
+def test_a_wrong_choice_is_reported_with_the_choices(forked: Forks) -> None:
+    output = forked(["evopolicy", "local", "--help"]).stdout
     for choices in ("<bwrap|landlock|none>", "<bwrap|open-network|none>", "<off|first|all>"):
         assert choices in output
-    done = started(["evopolicy", "run", "--env", "toy", "--agent", "evolve", "--tier", "x"])
+    done = forked(["evopolicy", "run", "--env", "toy", "--agent", "evolve", "--tier", "x"])
     assert done.returncode == 2
     assert done.stderr == (
         "error: Invalid value for '--tier': 'x' is not one of 'bwrap', 'landlock', 'none'; see"
@@ -177,14 +163,16 @@ LOCAL = ["evopolicy", "local", "--env", "toy", "--agent"]
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )
-def test_a_wrong_value_is_named_with_the_remedy(words: list[str], problem: str, tmp_path: Path) -> None:
+def test_a_wrong_value_is_named_with_the_remedy(
+    words: list[str], problem: str, tmp_path: Path, forked: Forks
+) -> None:
     write_run(tmp_path / "RUNS", [])
     (tmp_path / "EMPTY").mkdir()
     (tmp_path / "FILE").write_text("text\n")
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = str(taken.getsockname()[1])
         words = [word.replace("IN USE", port) for word in words]
-        done = started(words, cwd=tmp_path, XDG_STATE_HOME=str(tmp_path / "state"))
+        done = forked(words, cwd=tmp_path, XDG_STATE_HOME=str(tmp_path / "state"))
     assert done.returncode in (1, 2), done.stdout
     assert problem in done.stderr
     lines = [line for line in done.stderr.splitlines() if line not in FORMS]
@@ -209,15 +197,15 @@ def test_a_command_in_a_deleted_folder_says_so(tmp_path: Path) -> None:
     assert done.stderr == "error: the folder in which this command was started is gone: change to another\n"
 
 
-def test_a_long_value_is_shortened_and_the_remedy_stays() -> None:
-    done = started(["evopolicy", "workers", "drain", "x" * 100_000])
+def test_a_long_value_is_shortened_and_the_remedy_stays(forked: Forks) -> None:
+    done = forked(["evopolicy", "workers", "drain", "x" * 100_000])
     assert done.returncode == 2
     assert len(done.stderr) < 1_000
     assert "has 100,000 characters, and 32,768 are the limit" in done.stderr
 
 
-def test_the_help_of_local_is_in_groups_and_fits_a_narrow_terminal() -> None:
-    output = started(["evopolicy", "local", "--help"], COLUMNS="60").stdout
+def test_the_help_of_local_is_in_groups_and_fits_a_narrow_terminal(forked: Forks) -> None:
+    output = forked(["evopolicy", "local", "--help"], COLUMNS="60").stdout
     headings = [line[:-1] for line in output.splitlines() if line.endswith(":") and not line.startswith(" ")]
     assert headings[0] == "Run"
     assert headings[-1] == "Other options"
@@ -238,8 +226,8 @@ run_app(app)
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "error: interrupted\n")
 
 
-def test_a_mistyped_command_is_answered_with_the_nearest() -> None:
-    assert "Did you mean 'status'?" in started(["evopolicy", "statsu"]).stderr
+def test_a_mistyped_command_is_answered_with_the_nearest(forked: Forks) -> None:
+    assert "Did you mean 'status'?" in forked(["evopolicy", "statsu"]).stderr
 
 
 @pytest.mark.parametrize(

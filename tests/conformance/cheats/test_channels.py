@@ -5,8 +5,6 @@ Open ones are why hidden episodes and agents never share a kernel.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import pytest
 from attacks import channels
 from slots import Slots
@@ -16,13 +14,6 @@ OPEN = {"opens a library": "opens"}
 """Heard on a busy machine too. The other numbers are moved by whatever else runs there."""
 PATIENT_PERIOD_S = 0.15
 TRIES = 4
-
-
-@pytest.fixture(scope="module")
-def slots(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Slots]:
-    found = Slots(tmp_path_factory.mktemp("channels"))
-    yield found
-    found.close()
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -26,13 +25,6 @@ SECRETS = (
 )
 OWN = ("curious.py", "helpers.py", "parts/inner.py", "parts/table.json", "parts/maps/1.txt")
 both_tiers = pytest.mark.parametrize("tier", ["bwrap", "landlock"])
-
-
-@pytest.fixture(scope="module")
-def slots(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Slots]:
-    found = Slots(tmp_path_factory.mktemp("slots"))
-    yield found
-    found.close()
 
 
 @pytest.fixture

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -13,13 +12,6 @@ from slots import Slots
 
 CHANCE = 0.001
 """A test like this one fails this often where there is nothing to find. It asks again before it does."""
-
-
-@pytest.fixture(scope="module")
-def slots(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Slots]:
-    found = Slots(tmp_path_factory.mktemp("gaps"))
-    yield found
-    found.close()
 
 
 def collected(slots: Slots, env: str, action: Any, seed: int, **options: Any) -> gaps.Gaps:

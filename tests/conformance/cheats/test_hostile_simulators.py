@@ -31,13 +31,6 @@ NOT_OF_THE_MACHINE = ("makes a namespace", "mounts", "reads the session keyring"
 """What the control may not be able to do either, for reasons of this machine's."""
 
 
-@pytest.fixture(scope="module")
-def slots(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Slots]:
-    found = Slots(tmp_path_factory.mktemp("slots"))
-    yield found
-    found.close()
-
-
 @pytest.fixture
 def targets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[str, Any]]:
     """A worker's surroundings, each with something in it, and the simulator that is told where they are."""

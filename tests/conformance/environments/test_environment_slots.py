@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -48,13 +48,6 @@ class Policy:
             return int(self.rng.integers(self.space["n"]))
         return self.rng.uniform(-1, 1, self.space["shape"]).astype(self.space["dtype"])
 """
-
-
-@pytest.fixture(scope="module")
-def slots(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Slots]:
-    found = Slots(tmp_path_factory.mktemp("slots"))
-    yield found
-    found.close()
 
 
 @pytest.mark.parametrize("env_id", IDS)

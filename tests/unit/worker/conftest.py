@@ -1,7 +1,4 @@
-"""Slots are started once per test run and shared: that each is healthy after what another test did is part of the test.
-
-A file or socket that nobody closed fails the test in which it is found.
-"""
+"""A file or socket that nobody closed fails the test in which it is found."""
 
 from __future__ import annotations
 
@@ -11,7 +8,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from slots import Slots
 
 UNCLOSED = ("error::ResourceWarning", "error::pytest.PytestUnraisableExceptionWarning")
 
@@ -31,10 +27,3 @@ def _own_garbage() -> Iterator[None]:
         gc.collect()
     yield
     gc.collect()
-
-
-@pytest.fixture(scope="session")
-def slots(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Slots]:
-    found = Slots(tmp_path_factory.mktemp("slots"))
-    yield found
-    found.close()

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -134,18 +132,6 @@ def test_a_wrong_host_leaves_the_old_certificate(state: Path) -> None:
     with pytest.raises(SystemExit):
         certs_cli.init(state=state, renew=True, host=["a b"])
     assert (state / "certs" / "coordinator.pem").read_bytes() == before
-
-
-@pytest.mark.parametrize("name", ["init", "issue", "revoke", "list"])
-def test_every_command_has_an_example(name: str) -> None:
-    ended = subprocess.run(
-        [sys.executable, "-m", "evopolicy_coordinator.cli", "certs", name, "--help"],
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=True,
-    )
-    assert f"Example: evopolicy-coordinator certs {name}" in ended.stdout
 
 
 class StateFolderOf:
