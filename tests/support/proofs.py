@@ -12,7 +12,7 @@ import msgspec
 from evopolicy_common.catalogue import installs
 
 FOLDER = Path(__file__).resolve().parents[1] / "families"
-N_CASES = 32
+N_CASES = 16
 
 
 class Proof(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -26,8 +26,6 @@ class Proof(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     """The environments that `check-env` plays."""
     check_steps: int = 100
     """Steps of each of these."""
-    budget: int = 4
-    """Train episodes of the whole run."""
 
     @property
     def policy(self) -> Path:

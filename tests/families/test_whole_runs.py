@@ -1,0 +1,54 @@
+"""`evolve` plays a whole run in each family of environments, through gateway, coordinator and worker, with videos where the
+family renders. One local cluster plays them all."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import proofs
+import pytest
+from commands import Command, command, record_in, run_dir
+from proofs import Proof
+
+from evopolicy_worker.environments import describe, missing
+
+pytestmark = [pytest.mark.families, pytest.mark.slow, pytest.mark.timeout(1200)]
+
+BUDGET = 2
+
+
+@pytest.fixture(scope="module")
+def played(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Command]:
+    """The folder of the runs, and the ended command."""
+    folder = tmp_path_factory.mktemp("runs")
+    environments = [
+        word for each in proofs.together() if not missing(each.env) for word in ("--env", each.env)
+    ]
+    counts = ["--budget", str(BUDGET), "--validation", "2", "--heldout", "2", "--hidden-isolation", "off"]
+    more = ["--agent", "evolve", "--exp-id", "t", "--video", "all", "--parallel", "3"]
+    with command(folder, "local", *environments, *counts, *more) as running:
+        running.wait(1100)
+    return folder, running
+
+
+@pytest.mark.parametrize("proof", proofs.together(), ids=lambda proof: proof.family)
+def test_evolve_plays_a_whole_run(played: tuple[Path, Command], proof: Proof) -> None:
+    if lacking := missing(proof.env):
+        pytest.skip(f"{proof.env} needs {lacking}")
+    root, done = played
+    folder = run_dir(root, env=proof.env.replace("/", "_"))
+    assert (folder / "run.json").is_file(), done.text[-4000:]
+    outcome = record_in(folder).outcome
+    assert outcome.status == "completed", done.text[-4000:]
+    assert outcome.budget_used == BUDGET
+    assert len(outcome.heldout_returns) == 2
+    episodes = [each.parent for each in (folder / "workspace" / "feedback").rglob("trajectory.jsonl")]
+    assert len(episodes) == BUDGET
+    videos = [each for each in episodes if (each / "video.mp4").is_file()]
+    assert len(videos) == (BUDGET if describe(proof.env).renders else 0)
+    for each in videos:
+        assert (each / "video.mp4").read_bytes()[4:8] == b"ftyp"
+
+
+def test_the_command_ends_well(played: tuple[Path, Command]) -> None:
+    assert played[1].wait() == 0, played[1].err
