@@ -69,12 +69,12 @@ class _Vector(NamedTuple):
 
     def apply(self, values: NDArray[Any]) -> NDArray[Any]:
         changed = values[self.order] * self.scale + self.shift
-        return np.clip(changed, self.low, self.high).astype(values.dtype)
+        return np.asarray(np.clip(changed, self.low, self.high), values.dtype)
 
     def undo(self, values: NDArray[Any]) -> NDArray[Any]:
         found = np.empty_like(values)
         found[self.order] = (values - self.shift) / self.scale
-        return np.clip(found, self.low, self.high).astype(values.dtype)
+        return np.asarray(np.clip(found, self.low, self.high), values.dtype)
 
 
 class Rules:
