@@ -9,11 +9,62 @@ import reprlib
 from collections.abc import Callable, Iterable, Mapping
 from operator import index
 from pathlib import Path
-from typing import Any, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, TypedDict, get_args, get_origin
 
 from evopolicy_common.errors import ConfigError
-from evopolicy_common.messages.episode import Tier
-from evopolicy_common.messages.gateway import FeedbackDetail, VideoOption
+from evopolicy_common.messages.environment import FailedEpisodes, ObservationForm, PolicyScope, StepLimit
+from evopolicy_common.messages.episode import ResourceLimits, Tier
+from evopolicy_common.messages.gateway import (
+    FeedbackDetail,
+    FinishRule,
+    Profile,
+    SimulationRule,
+    VideoOption,
+)
+from evopolicy_gateway.declared import Declared, declared
+from evopolicy_gateway.run import run_options
+from evopolicy_gateway.run.options import limits_from
+
+AnyPath = str | os.PathLike[str]
+
+
+class RunOptions(TypedDict, total=False):
+    """Further keywords of `evopolicy.run`, as the options of `evopolicy run` with these names:"""
+
+    # For type checkers and editors, which cannot see the declarations in `run_options`. A test compares them.
+    budget: int | None
+    profile: Profile | None
+    runs: AnyPath
+    exp_id: str | None
+    overwrite: bool
+    entry: str | None
+    model: str | None
+    repeat: int
+    validation: int | None
+    heldout: int | None
+    hidden_cases: Literal["shared", "per-run"] | None
+    replays: VideoOption | None
+    min_episodes: int | None
+    max_episodes: int | None
+    policy_scope: PolicyScope | None
+    observations: ObservationForm | None
+    step_limit: StepLimit | None
+    failed_episodes: FailedEpisodes | None
+    tier: Tier
+    limits: Mapping[str, float] | None
+    video: VideoOption
+    feedback: FeedbackDetail | None
+    agents_md: AnyPath | None
+    prompts: AnyPath | None
+    prices: AnyPath | None
+    simulation: SimulationRule | None
+    finish: FinishRule | None
+    agent_wall_s: float
+    agent_silence_s: float
+    agent_cpus: float | None
+    agent_memory: float | None
+    agent_pids: int | None
+    agent_disk: float | None
 
 
 class Rule(NamedTuple):
@@ -75,15 +126,15 @@ def _names(value: Any) -> tuple[str, ...]:
     return tuple(sorted({_text(name) for name in value}))
 
 
-def _limits(value: Any) -> dict[str, float]:
+def _limits(value: Any) -> ResourceLimits:
     if not isinstance(value, Mapping):
         raise TypeError
     if any(isinstance(number, str | bool) for number in value.values()):
         raise ValueError
-    return {_text(name): float(number) for name, number in value.items()}
+    return limits_from({_text(name): float(number) for name, number in value.items()}, "limits: ")
 
 
-def _choice(kind: Any, *, optional: bool = False) -> Rule:
+def _choice(kind: Any) -> Rule:
     allowed = get_args(kind)
 
     def take(value: Any) -> Any:
@@ -91,56 +142,67 @@ def _choice(kind: Any, *, optional: bool = False) -> Rule:
             raise ValueError
         return value
 
-    rule = Rule(take, " or ".join(map(repr, allowed)))
-    return _or_none(rule) if optional else rule
+    return Rule(take, " or ".join(map(repr, allowed)))
 
 
 def _or_none(rule: Rule) -> Rule:
     return Rule(lambda value: None if value is None else rule.take(value), f"{rule.words}, or None")
 
 
-_FILE = Rule(_path, "the path of a file")
 _FOLDER = Rule(_path, "the path of a folder")
+_FLAG = Rule(_flag, "True or False")
 _NAME = Rule(_text, "a text")
-_NUMBER = Rule(_least(0.0), "a number")
-_COUNT = Rule(_whole(1), "a whole number of at least 1")
 
+
+_KINDS = {
+    bool: _FLAG,
+    ResourceLimits: Rule(_limits, "a mapping of names to numbers, such as {'act_wall_s': 5}"),
+    str: _NAME,
+}
+
+
+def _rule(one: Declared) -> Rule:
+    """The rule of an option of a run."""
+    optional = type(None) in get_args(one.type)
+    kind = get_args(one.type)[0] if optional else one.type
+    if get_origin(kind) is Literal:
+        rule = _choice(kind)
+    elif kind is int:
+        least = 1 if one.bounds.ge is None else int(one.bounds.ge)
+        rule = Rule(_whole(least), f"a whole number of at least {least}")
+    elif kind is float:
+        words = "a number" if one.bounds.ge is None else "a number of seconds, at least 1"
+        rule = Rule(_least(one.bounds.ge or 0.0), words)
+    elif kind is Path:
+        rule = Rule(_path, "the path of a file") if one.option.metavar else _FOLDER
+    else:
+        rule = _KINDS[kind]
+    return _or_none(rule) if optional or kind is ResourceLimits else rule
+
+
+OPTIONS = {one.name: one for one in declared(run_options.RunOptions).values() if one.option.python}
+"""The options of a run that Python has."""
+RunOptions.__doc__ = "\n".join(
+    [
+        f"{RunOptions.__doc__}\n",
+        *(f"`{one.name}`: {one.help}" for one in OPTIONS.values() if one.name != "agent"),
+    ]
+)
 RULES: dict[str, Rule] = {
+    **{name: _rule(one) for name, one in OPTIONS.items()},
     "agent": Rule(_agent, "a function of one Workspace, or a text as for --agent, such as 'evolve'"),
-    "agent_cpus": _or_none(_NUMBER),
-    "agent_disk": _or_none(_NUMBER),
-    "agent_memory": _or_none(_NUMBER),
-    "agent_pids": _or_none(_COUNT),
-    "agent_wall_s": Rule(_least(1.0), "a number of seconds, at least 1"),
-    "agents_md": _or_none(_FILE),
-    "budget": _or_none(_COUNT),
     "cases": Rule(_cases, "train ids, such as range(8) or [0, 3]"),
     "credentials": _or_none(_FOLDER),
     "data": _or_none(_FOLDER),
     "endpoint": Rule(_text, "a text such as 'tls/host:7447'"),
-    "entry": _or_none(_NAME),
     "env": Rule(_text, "the id of an environment, such as 'gym/acrobot'"),
-    "exp_id": _or_none(_NAME),
-    "feedback": _choice(FeedbackDetail, optional=True),
     "folder": _FOLDER,
-    "fresh": Rule(_flag, "True or False"),
-    "heldout": _or_none(_COUNT),
-    "limits": _or_none(Rule(_limits, "a mapping of names to numbers, such as {'act_wall_s': 5}")),
-    "model": _or_none(_NAME),
-    "overwrite": Rule(_flag, "True or False"),
+    "fresh": _FLAG,
     "policy": _FOLDER,
     "policy_packages": Rule(_names, "a sequence of names, such as ('scipy',)"),
-    "profile": _or_none(Rule(_text, "'published' or 'published-data'")),
-    "progress": Rule(_flag, "True or False"),
-    "prices": _or_none(_FILE),
-    "prompts": _or_none(_FILE),
-    "repeat": Rule(_whole(0), "a whole number of at least 0"),
-    "replays": _choice(VideoOption, optional=True),
-    "runs": _FOLDER,
-    "slots": _COUNT,
+    "progress": _FLAG,
+    "slots": Rule(_whole(1), "a whole number of at least 1"),
     "state": _or_none(_FOLDER),
-    "tier": _choice(Tier),
-    "validation": _or_none(_COUNT),
 }
 """By the name of the argument."""
 

@@ -12,39 +12,32 @@ import sys
 import uuid
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, Self, TypeVar
+from typing import Any, NamedTuple, Self, TypeVar, Unpack
 
 from rich.progress import Progress
 
-from evopolicy._arguments import RULES, check_names, take, taken
+from evopolicy._arguments import OPTIONS, RunOptions, check_names, take, taken
 from evopolicy._evaluation import Episode, Evaluation, episode_of
 from evopolicy._loop import awaited, call, loop
 from evopolicy._runs import Run, read_run
 from evopolicy_common.console import terminal
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.local.cluster import unless_failed
-from evopolicy_common.messages.episode import EpisodeOutcome, Tier
+from evopolicy_common.messages.episode import EpisodeOutcome, ResourceLimits, Tier
 from evopolicy_common.messages.operator import Evaluate
 from evopolicy_common.processes.packages import policy_versions
 from evopolicy_common.processes.preflight import check_installed
 from evopolicy_common.processes.scratch import scratch_folder
 from evopolicy_common.records.policies.bundles import Bundle
 from evopolicy_common.wire.credentials import local_state_dir
-from evopolicy_gateway import harnesses, shipped
+from evopolicy_gateway import shipped
 from evopolicy_gateway.agents.function import Workspace
-from evopolicy_gateway.cli.run_options import RunOptions
 from evopolicy_gateway.jail.settings import JailSettings
 from evopolicy_gateway.operator import cluster as operator
 from evopolicy_gateway.operator.trials import policy_bundle
-from evopolicy_gateway.run import prices
+from evopolicy_gateway.run import run_options
 from evopolicy_gateway.run.lifecycle import RunLifecycle
-from evopolicy_gateway.run.options import (
-    agent_limits,
-    default_exp_id,
-    limits_from,
-    one_environment,
-    packages_for,
-)
+from evopolicy_gateway.run.options import one_environment, packages_for
 from evopolicy_gateway.run.plan import Plan
 from evopolicy_gateway.run.watch import RunView
 from evopolicy_gateway.run_folder.listener import Listener
@@ -97,14 +90,13 @@ class Cluster:
                 f"data {given['data']} is not a folder: give one that `evopolicy data make` wrote"
             )
         policy_versions(given["policy_packages"])
-        return cls(
-            operator.Cluster(
-                local_slots=given["slots"],
-                state=None if fresh else given["state"] or local_state_dir(),
-                data=given["data"],
-                policy_packages=given["policy_packages"],
-            )
+        chosen = run_options.ClusterOptions(
+            slots=given["slots"],
+            state=None if fresh else given["state"] or local_state_dir(),
+            data=given["data"],
+            policy_package=list(given["policy_packages"]),
         )
+        return cls(operator.Cluster(local=chosen))
 
     @classmethod
     def connect(cls, *endpoints: str, credentials: str | os.PathLike[str] | None = None) -> Cluster:
@@ -175,13 +167,27 @@ class Cluster:
         trial = trial_of(policy, env, cases, tier, limits)
         return await awaited(self._evaluate(trial, take("progress", progress)))
 
-    def run(self, *, env: str, agent: str | AgentFunction, **options: Any) -> Run:
+    def run(
+        self,
+        *,
+        env: str,
+        agent: str | AgentFunction,
+        progress: bool = True,
+        **options: Unpack[RunOptions],
+    ) -> Run:
         """Plays one run on this cluster; arguments as for `evopolicy.run` without `slots` and `policy_packages`."""
-        return call(self._run(env, agent, **options))
+        return call(self._run(env, agent, progress, options))
 
-    async def run_async(self, *, env: str, agent: str | AgentFunction, **options: Any) -> Run:
+    async def run_async(
+        self,
+        *,
+        env: str,
+        agent: str | AgentFunction,
+        progress: bool = True,
+        **options: Unpack[RunOptions],
+    ) -> Run:
         """Async twin of `run`."""
-        return await awaited(self._run(env, agent, **options))
+        return await awaited(self._run(env, agent, progress, options))
 
     # The methods below run on the package's event loop.
 
@@ -222,10 +228,10 @@ class Cluster:
         async def kept() -> None:
             results.append(await work(reached))
 
-        if reached.local is not None and self._where.local_slots is not None:
+        if reached.local is not None and self._where.local is not None:
             async with self._offering:
                 if env not in self._offered:
-                    await reached.local.start_workers([env], slots=self._where.local_slots, tiers={tier})
+                    await reached.local.start_workers([env], slots=self._where.local.slots, tiers={tier})
                     self._offered.add(env)
         failed = None if reached.local is None else reached.local.failed
         await unless_failed(asyncio.create_task(kept()), failed)
@@ -252,22 +258,20 @@ class Cluster:
 
         return await self._on(env, trial.message.sandbox_tier, work)
 
-    async def _run(
-        self, env: str, agent: str | AgentFunction, *, progress: bool = True, **options: Any
-    ) -> Run:
+    async def _run(self, env: str, agent: str | AgentFunction, progress: bool, options: RunOptions) -> Run:
         take("progress", progress)
         with contextlib.ExitStack() as stack:
             plan = await self._planned(stack, env, agent, options)
             return await self._play(plan, progress)
 
     async def _planned(
-        self, stack: contextlib.ExitStack, env: str, agent: str | AgentFunction, options: dict[str, Any]
+        self, stack: contextlib.ExitStack, env: str, agent: str | AgentFunction, options: RunOptions
     ) -> Plan:
         """The checked plan of a run; `stack` holds the folder of an agent's function."""
         check_installed("gateway")
         take("agent", agent)
         if callable(agent):
-            options["entry"] = options.get("entry") or _name_of(agent)
+            options = {**options, "entry": options.get("entry") or _name_of(agent)}
             folder = stack.enter_context(scratch_folder("function"))
             agent = await asyncio.to_thread(_pickled, agent, folder / "function.pickle")
         plan = plan_of(env, agent, **options)
@@ -314,39 +318,24 @@ def trial_of(
         split="train",
         cases=given["cases"],
         sandbox_tier=tier,
-        limits=limits_from(given["limits"] or {}, "limits: "),
+        limits=given["limits"] or ResourceLimits(),
         step_limit="published",
     )
     return Trial(bundle, message)
-
-
-OPTIONS = (RULES.keys() & RunOptions.__struct_fields__) - {"agent"}
-"""The options of a run, by their names in `RunOptions`."""
 
 
 def plan_of(
     env: str, agent: str, *, listener: Listener | None = None, agent_host: str = "", **options: Any
 ) -> Plan:
     """The plan of a run; arguments as for `run`, and for an agent that is started elsewhere as in `Plan`. Raises ConfigError."""
-    check_names(options, OPTIONS)
+    check_names(options, OPTIONS.keys() - {"agent"})
     env = one_environment(take("env", env))
-    chosen = {name: value for name, value in taken(**options).items() if value is not None}
-    given = RunOptions(agent=agent, **({"exp_id": default_exp_id()} | chosen))
-    texts = given.texts(Path.cwd())
-    return Plan(
-        settings=given.settings(env, given.exp_id or "", agent_host, texts),
-        texts=texts,
-        prices=prices.read(given.prices, harnesses.config_of(agent, Path.cwd()), Path.cwd()),
-        agent=agent,
-        runs=given.runs,
-        started_in=Path.cwd(),
-        wall_limit_s=given.agent_wall_s,
-        silence_s=given.agent_silence_s,
-        overwrite=given.overwrite,
-        jail=JailSettings() if listener is None else JailSettings(mode="none"),
-        limits=agent_limits(given),
-        listener=listener,
+    given = run_options.RunOptions(
+        agent=agent, **{name: value for name, value in taken(**options).items() if value is not None}
     )
+    jail = JailSettings() if listener is None else JailSettings(mode="none")
+    (plan,) = given.plans([env], Path.cwd(), agent_host, jail=jail, listener=listener)
+    return plan
 
 
 def evaluate(
@@ -390,41 +379,35 @@ def run(
     *,
     env: str,
     agent: str | AgentFunction,
-    budget: int | None = None,
-    runs: str | os.PathLike[str] = "runs",
     slots: int = 2,
     policy_packages: Iterable[str] = (),
-    **options: Any,
+    progress: bool = True,
+    **options: Unpack[RunOptions],
 ) -> Run:
     """Plays one whole run, up to its score, on a temporary local cluster.
 
     `agent`: a function of one `Workspace`, or a text as for `--agent` of `evopolicy run`. A function runs in its own
     process in the agent's jail, where it can import the standard library and numpy; its own module is sent with it. It
-    returns a JSON-serialisable value, which `Run.value` reads back. `budget`: train episodes, by default the suite's.
-    `runs`: the folder of run directories. `policy_packages`: installed packages that policies may import besides numpy,
-    such as `("scipy",)`. Further `options`, as the options of `evopolicy run` with these names:
-    `exp_id`, `entry`, `model`, `repeat`, `validation`, `heldout`, `profile`, `replays`, `tier`, `feedback`, `prompts`,
-    `prices` and `agents_md` (files), `agent_wall_s` (seconds), `agent_cpus` (cores), `agent_memory` and `agent_disk` (bytes),
-    `agent_pids`, `overwrite`, `progress`.
+    returns a JSON-serialisable value, which `Run.value` reads back. `slots`, `policy_packages`: as for `Cluster.local`.
+    `progress`: show the run's progress. `options`: as in `RunOptions`, such as `budget` (train episodes) and `exp_id`.
 
     Raises ConfigError, with the remedy, for wrong arguments and for missing requirements on this machine. Ctrl-C
     cancels the run, and its folder records that.
     """
-    return call(_ran(slots, policy_packages, env, agent, budget=budget, runs=runs, **options))
+    return call(_ran(slots, policy_packages, env, agent, progress, options))
 
 
 async def run_async(
     *,
     env: str,
     agent: str | AgentFunction,
-    budget: int | None = None,
-    runs: str | os.PathLike[str] = "runs",
     slots: int = 2,
     policy_packages: Iterable[str] = (),
-    **options: Any,
+    progress: bool = True,
+    **options: Unpack[RunOptions],
 ) -> Run:
     """Async twin of `run`."""
-    return await awaited(_ran(slots, policy_packages, env, agent, budget=budget, runs=runs, **options))
+    return await awaited(_ran(slots, policy_packages, env, agent, progress, options))
 
 
 async def _evaluated(
@@ -440,9 +423,8 @@ async def _ran(
     packages: Iterable[str],
     env: str,
     agent: str | AgentFunction,
-    *,
-    progress: bool = True,
-    **options: Any,
+    progress: bool,
+    options: RunOptions,
 ) -> Run:
     take("progress", progress)
     cluster = Cluster.local(slots, policy_packages=packages)

@@ -28,6 +28,8 @@ from typing import Any, NamedTuple
 
 import typer
 
+from evopolicy_gateway.harnesses import FORMS
+
 VALUES = {
     "empty": "",
     "blanks": "   ",
@@ -379,7 +381,7 @@ def _judged(case: Case, parameter: Any, given: str, base: Outcome, done: Outcome
             yield f"is not named: {shown!r}"
     refused = done.code not in (0, BEGAN)
     if refused and not _same(parameter, base, done):
-        lines = done.err.splitlines() or [""]
+        lines = [line for line in done.err.splitlines() if line not in FORMS] or [""]
         errors = [line for line in lines if line.startswith("error: ")]
         if len(errors) != 1 or lines[-1] != errors[0]:
             yield f"not one line: {done.out[-200:]!r} {shown!r}"

@@ -213,14 +213,12 @@ def test_every_page_is_in_the_site_s_menu() -> None:
     assert [page for page in pages if f": {page}\n" not in menu] == []
 
 
-def test_the_list_of_commands_is_that_of_the_commands() -> None:
-    page = subprocess.run(
-        [sys.executable, str(ROOT / "docs" / "_site" / "commands.py")],
-        capture_output=True,
-        text=True,
-        check=True,
-    ).stdout
-    assert text_of("docs/reference/cli.md") == page, "python docs/_site/commands.py > docs/reference/cli.md"
+@pytest.mark.parametrize(("script", "page"), [("commands", "cli"), ("options", "options")])
+def test_pages_of_options_are_those_of_the_code(script: str, page: str) -> None:
+    words = [sys.executable, str(ROOT / f"docs/_site/{script}.py")]
+    written = subprocess.run(words, capture_output=True, text=True, check=True).stdout
+    command = f"python docs/_site/{script}.py > docs/reference/{page}.md"
+    assert text_of(f"docs/reference/{page}.md") == written, command
 
 
 def test_the_runs_of_the_readme_fit_into_one_report() -> None:

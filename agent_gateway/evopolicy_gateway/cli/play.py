@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import msgspec
 import typer
@@ -14,25 +14,18 @@ from evopolicy_common.cli.frame import App
 from evopolicy_common.console import terminal
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.environment import Split
+from evopolicy_common.messages.episode import ResourceLimits, Tier
 from evopolicy_common.processes.preflight import LOCAL, check_installed
 from evopolicy_common.records.run_difference import differences, left_out, shortened
 from evopolicy_common.terminal import say_json, say_lines
-from evopolicy_gateway import harnesses, shipped
+from evopolicy_gateway import shipped
 from evopolicy_gateway.cli import options
-from evopolicy_gateway.cli.option_groups import spread
-from evopolicy_gateway.cli.run_options import JailOptions, ListenerOptions, RunOptions
+from evopolicy_gateway.cli.option_groups import Of, Shown, spread
 from evopolicy_gateway.jail.settings import JailSettings
 from evopolicy_gateway.operator.cluster import Cluster
-from evopolicy_gateway.run import prices
-from evopolicy_gateway.run.options import (
-    agent_limits,
-    cases_of,
-    default_exp_id,
-    limits_of,
-    one_environment,
-    packages_for,
-)
+from evopolicy_gateway.run.options import cases_of, one_environment, packages_for
 from evopolicy_gateway.run.plan import Plan
+from evopolicy_gateway.run.run_options import ClusterOptions, ListenerOptions, RunOptions
 from evopolicy_gateway.run_folder import listener
 from evopolicy_gateway.run_folder.layout import folder_of
 from evopolicy_gateway.suite import runs as plain_runs
@@ -60,15 +53,9 @@ def run(
         ),
     ] = False,
     given: RunOptions,
-    jail: JailOptions,
+    jail: JailSettings,
     served: ListenerOptions,
-    slots: options.Slots = 2,
-    state: options.StateFolder = None,
-    fresh: options.Fresh = False,
-    data: options.DataFolder = None,
-    hidden_isolation: options.Isolation = None,
-    policy_package: options.PolicyPackages = None,
-    browser: options.Browser = None,
+    cluster: Annotated[ClusterOptions, Shown(without=("audit", "env_timeout", "env_memory"))],
     web: options.Web = False,
     as_json: options.Json = False,
 ) -> None:
@@ -81,35 +68,24 @@ def run(
             raise ConfigError(
                 "--local starts a cluster of its own; it cannot be combined with --connect or --credentials"
             )
-        if (data is not None or state is not None or fresh) and not local:
+        if not local and (cluster.data is not None or cluster.state is not None or cluster.fresh):
             raise ConfigError(
                 "--data, --state and --fresh apply only with --local; otherwise set them at the coordinator: evopolicy-coordinator"
                 " --data, --state"
             )
         if local:
             check_installed(LOCAL)
-        options.check_isolation(hidden_isolation, local=local)
-        options.check_packages(policy_package, local=local)
-        options.check_browser(browser, local=local)
-        held = jail.of_remote_agent() if given.agent == listener.AGENT else jail.settings()
-        plans = _plans(given, [one_environment(env)], held, served)
-        where = Cluster(connect=tuple(connect or ()), file=credentials_file, patient=given.resume)
-        if local:
-            where = Cluster(
-                local_slots=slots,
-                state=options.state_of(state, fresh=fresh),
-                unjailed=_unjailed(plans),
-                data=data,
-                hidden_isolation=hidden_isolation,
-                policy_packages=options.check_packages(policy_package, local=True),
-                browser=options.check_browser(browser, local=True),
-            )
-        _play(plans, where, 1, as_json, web=web)
+        where = options.cluster_of(cluster, connect, credentials_file, local=local)
+        held = jail.of_remote_agent() if given.agent == listener.AGENT else jail
+        agent_host = served.host_of(given.agent)
+        plans = _plans(given, [one_environment(env)], agent_host, jail=held, listener=served.listener())
+        _play(plans, msgspec.structs.replace(where, patient=given.resume and not local), 1, as_json, web=web)
 
 
 @app.command(epilog="Example: evopolicy local --env core16 --agent evolve --budget 8 --parallel 2")
 @spread
 def local(
+    *,
     env: Annotated[
         list[str],
         typer.Option(
@@ -119,20 +95,11 @@ def local(
         ),
     ],
     given: RunOptions,
-    jail: JailOptions,
+    jail: JailSettings,
     parallel: Annotated[
         int, typer.Option(min=1, max=64, help="Runs at once.", rich_help_panel=options.RUN)
     ] = 1,
-    slots: options.Slots = 2,
-    state: options.StateFolder = None,
-    fresh: options.Fresh = False,
-    data: options.DataFolder = None,
-    audit: options.Audit = 0.0,
-    hidden_isolation: options.Isolation = None,
-    policy_package: options.PolicyPackages = None,
-    browser: options.Browser = None,
-    env_timeout: options.EnvTimeout = None,
-    env_memory: options.EnvMemory = None,
+    cluster: ClusterOptions,
     web: options.Web = False,
     as_json: options.Json = False,
 ) -> None:
@@ -142,26 +109,17 @@ def local(
     """
     with fail_on_our_errors():
         check_installed(LOCAL)
-        plans = _plans(given, catalogue.resolve(env), jail.settings())
-        where = Cluster(
-            local_slots=slots,
-            state=options.state_of(state, fresh=fresh),
-            unjailed=_unjailed(plans),
-            data=data,
-            audit=audit,
-            hidden_isolation=hidden_isolation,
-            policy_packages=options.check_packages(policy_package, local=True),
-            browser=options.check_browser(browser, local=True),
-            env_timeout=env_timeout,
-            env_memory=env_memory,
-        )
+        plans = _plans(given, catalogue.resolve(env), jail=jail)
+        where = options.cluster_of(cluster, None, None, local=True)
         _play(plans, where, parallel, as_json, web=web)
 
 
 @app.command(epilog="Example: evopolicy demo")
+@spread
 def demo(
+    *,
     runs: Annotated[Path, typer.Option(help="Folder of run directories.")] = Path("runs"),
-    slots: options.Slots = 2,
+    slots: Annotated[int, Of(ClusterOptions)],
     as_json: options.Json = False,
 ) -> None:
     """Play one run on this machine: the agent evolve on gym/continuouscar, 32 episodes. Takes about a minute.
@@ -171,15 +129,17 @@ def demo(
     with fail_on_our_errors():
         check_installed(LOCAL)
         given = RunOptions(agent="evolve", budget=32, exp_id="demo", overwrite=True, runs=runs)
-        plans = _plans(given, ["gym/continuouscar"], JailOptions().settings())
-        where = Cluster(local_slots=slots, state=options.state_of(None, fresh=False))
+        plans = _plans(given, ["gym/continuouscar"])
+        where = options.cluster_of(ClusterOptions(slots=slots), None, None, local=True)
         _play(plans, where, 1, as_json)
 
 
 @app.command(
     "try", epilog="Example: evopolicy try examples/policies/gym_acrobot --env gym/acrobot --cases 0-3"
 )
+@spread
 def try_policy(
+    *,
     policy_dir: Annotated[Path, typer.Argument(help="Folder with a policy.py.", show_default=False)],
     env: Annotated[str, typer.Option(help="Suite id, such as gym/acrobot.", show_default=False)],
     cases: Annotated[
@@ -193,16 +153,9 @@ def try_policy(
     ] = Path("tries"),
     connect: Connect = None,
     credentials_file: CredentialsFile = None,
-    tier: options.TierName = "bwrap",
-    limit: options.Limits = None,
-    slots: options.Slots = 2,
-    state: options.StateFolder = None,
-    fresh: options.Fresh = False,
-    data: options.DataFolder = None,
-    policy_package: options.PolicyPackages = None,
-    browser: options.Browser = None,
-    env_timeout: options.EnvTimeout = None,
-    env_memory: options.EnvMemory = None,
+    tier: Annotated[Tier, Of(RunOptions)],
+    limits: Annotated[ResourceLimits, Of(RunOptions)],
+    cluster: Annotated[ClusterOptions, Shown(without=("audit", "hidden_isolation"))],
     as_json: options.Json = False,
 ) -> None:
     """Play a policy on train cases, without a run or an agent.
@@ -221,28 +174,22 @@ def try_policy(
             cases=cases_of(cases),
             out=out,
             tier=tier,
-            limits=limits_of(limit or ()),
+            limits=limits,
         )
-        where = _trial_cluster(
-            connect,
-            credentials_file,
-            slots,
-            options.state_of(state, fresh=fresh),
-            data,
-            browser,
-            policy_package,
-            trial.policy,
-        )
-        options.check_env_limits(env_timeout, env_memory, local=where.local_slots is not None)
-        where = msgspec.structs.replace(
-            where, unjailed=tier == "none", env_timeout=env_timeout, env_memory=env_memory
-        )
+        local = not (connect or credentials_file)
+        if local:
+            packages = list(packages_for(trial.policy, cluster.policy_package))
+            cluster = msgspec.structs.replace(cluster, policy_package=packages)
+        where = options.cluster_of(cluster, connect, credentials_file, local=local)
+        where = msgspec.structs.replace(where, unjailed=tier == "none")
         where.check_ids([trial.env], trial.split, trial.cases)
         _exit(run_to_end(trials.try_policy(trial, where, as_json=as_json)))
 
 
 @app.command("random", epilog="Example: evopolicy random --env gym/acrobot --split heldout")
+@spread
 def play_random(
+    *,
     env: Annotated[
         list[str],
         typer.Option(
@@ -253,12 +200,9 @@ def play_random(
     cases: Annotated[str | None, typer.Option(help="Ids and ranges in the split; default: all.")] = None,
     connect: Connect = None,
     credentials_file: CredentialsFile = None,
-    slots: options.Slots = 2,
-    state: options.StateFolder = None,
-    fresh: options.Fresh = False,
-    data: options.DataFolder = None,
-    policy_package: options.PolicyPackages = None,
-    browser: options.Browser = None,
+    cluster: Annotated[
+        ClusterOptions, Shown(without=("audit", "hidden_isolation", "env_timeout", "env_memory"))
+    ],
     as_json: options.Json = False,
 ) -> None:
     """Play uniform random actions on a split, as a reference for scores.
@@ -269,8 +213,8 @@ def play_random(
 
     with fail_on_our_errors():
         chosen = None if cases is None else cases_of(cases)
-        kept = options.state_of(state, fresh=fresh)
-        where = _trial_cluster(connect, credentials_file, slots, kept, data, browser, policy_package)
+        local = not (connect or credentials_file)
+        where = options.cluster_of(cluster, connect, credentials_file, local=local)
         env_ids = catalogue.resolve(env)
         where.check_ids(env_ids, split, chosen or ())
         _exit(run_to_end(trials.play_random(env_ids, split, chosen, where, as_json=as_json)))
@@ -328,45 +272,19 @@ def finish(
         listener.finish(folder_of(run_directory))
 
 
-def _plans(
-    given: RunOptions, env_ids: list[str], jail: JailSettings, served: ListenerOptions | None = None
-) -> list[Plan]:
+def _plans(given: RunOptions, env_ids: list[str], agent_host: str = "", **more: Any) -> list[Plan]:
     """A plan for each environment. Raises ConfigError for any error before anything is started."""
     if given.resume and (given.overwrite or given.exp_id is None):
         raise ConfigError("--resume needs --exp-id, and cannot be combined with --overwrite")
-    started_in = Path.cwd()
-    exp_id = given.exp_id or default_exp_id()
-    served = served or ListenerOptions()
-    where, agent_host = served.listener(), served.host_of(given.agent)
-    texts = given.texts(started_in)
-    agent_prices = prices.read(given.prices, harnesses.config_of(given.agent, started_in), started_in)
-    plans = [
-        Plan(
-            name=env_id,
-            settings=given.settings(env_id, exp_id, agent_host, texts),
-            texts=texts,
-            prices=agent_prices,
-            agent=given.agent,
-            runs=given.runs,
-            started_in=started_in,
-            wall_limit_s=given.agent_wall_s,
-            silence_s=given.agent_silence_s,
-            overwrite=given.overwrite,
-            resume=given.resume,
-            jail=jail,
-            limits=agent_limits(given),
-            listener=where,
-        )
-        for env_id in env_ids
-    ]
+    plans = given.plans(env_ids, Path.cwd(), agent_host, **more)
     for plan in plans:
         plan.check()
     return plans
 
 
 def _play(plans: list[Plan], where: Cluster, parallel: int, as_json: bool, *, web: bool = False) -> None:
-    if web:
-        where = msgspec.structs.replace(where, web=plans[0].runs)
+    found = {"unjailed": _unjailed(plans), "web": plans[0].runs if web else None}
+    where = msgspec.structs.replace(where, **found)
     console = terminal(stderr=as_json)
     try:
         played = run_to_end(plain_runs.play(plans, where, parallel, console))
@@ -377,24 +295,6 @@ def _play(plans: list[Plan], where: Cluster, parallel: int, as_json: bool, *, we
     else:
         plain_runs.report(played, plans[0].runs, console)
     _exit(exit_code(plans, played.index))
-
-
-def _trial_cluster(
-    connect: list[str] | None,
-    file: Path | None,
-    slots: int,
-    state: Path | None,
-    data: Path | None,
-    browser: Path | None,
-    packages: list[str] | None,
-    policy: Path | None = None,
-) -> Cluster:
-    chosen = options.check_browser(browser, local=not (connect or file))
-    if connect or file:
-        options.check_packages(packages, local=False)
-        return Cluster(connect=tuple(connect or ()), file=file)
-    found = options.check_packages(packages, local=True) if policy is None else packages_for(policy, packages)
-    return Cluster(local_slots=slots, state=state, data=data, policy_packages=found, browser=chosen)
 
 
 def _unjailed(plans: list[Plan]) -> bool:

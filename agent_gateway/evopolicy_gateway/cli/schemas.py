@@ -6,10 +6,6 @@ schema, the code and `docs/reference/files.md` cannot disagree.
 
 from __future__ import annotations
 
-import ast
-import functools
-import inspect
-import textwrap
 from typing import Any, NamedTuple
 
 import msgspec
@@ -19,6 +15,7 @@ from evopolicy_common.records import suite_folder
 from evopolicy_common.records.code_metrics import PUBLISHED_SCHEMA
 from evopolicy_common.records.run_record import RECORD_VERSION, RunRecord
 from evopolicy_common.records.summary import Summary
+from evopolicy_gateway.declared import field_texts
 from evopolicy_gateway.harnesses.interface.agent_config import AgentConfig
 from evopolicy_gateway.suite.suite_file import SuiteFile
 
@@ -65,7 +62,7 @@ def schema(name: str) -> dict[str, Any]:
     (root,), components = msgspec.json.schema_components([kind.type], ref_template="#/$defs/{name}")
     for each in _structs(kind.type):
         described = components[each.__name__]
-        for field, text in _field_texts(each).items():
+        for field, text in field_texts(each).items():
             if field in described["properties"]:
                 described["properties"][field]["description"] = text
     return {
@@ -98,27 +95,6 @@ def _structs(root: type[msgspec.Struct]) -> list[type[msgspec.Struct]]:
 
     look(msgspec.inspect.type_info(root))
     return list(found)
-
-
-@functools.cache
-def _field_texts(struct: type[msgspec.Struct]) -> dict[str, str]:
-    """The docstrings below a struct's fields, inherited fields included."""
-    texts: dict[str, str] = {}
-    for each in reversed(struct.__mro__):
-        if not issubclass(each, msgspec.Struct) or each is msgspec.Struct:
-            continue
-        (tree,) = ast.parse(textwrap.dedent(inspect.getsource(each))).body
-        assert isinstance(tree, ast.ClassDef)
-        for field, text in zip(tree.body, tree.body[1:], strict=False):
-            if (
-                isinstance(field, ast.AnnAssign)
-                and isinstance(field.target, ast.Name)
-                and isinstance(text, ast.Expr)
-                and isinstance(text.value, ast.Constant)
-                and isinstance(text.value.value, str)
-            ):
-                texts[field.target.id] = " ".join(text.value.value.split())
-    return texts
 
 
 def page() -> str:

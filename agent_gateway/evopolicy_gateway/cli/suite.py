@@ -26,14 +26,17 @@ from evopolicy_common.cli.frame import App
 from evopolicy_common.console import Terminal, terminal
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.local.cluster import unless_failed
+from evopolicy_common.messages.gateway import Profile
 from evopolicy_common.processes.preflight import check_installed, check_loopback, check_writable
 from evopolicy_common.records.run_files import read_record
 from evopolicy_common.records.suite_folder import FINISHED, INDEX, Index
 from evopolicy_common.wire.credentials import SWEEP_STATE
 from evopolicy_gateway.cli import options
+from evopolicy_gateway.cli.option_groups import Of, Shown, spread
 from evopolicy_gateway.operator.cluster import Cluster, connected
 from evopolicy_gateway.run.options import settings_of
 from evopolicy_gateway.run.plan import Plan
+from evopolicy_gateway.run.run_options import ClusterOptions, RunOptions
 from evopolicy_gateway.run_folder.locks import alone
 from evopolicy_gateway.suite import decisions, suite_file, suite_index
 from evopolicy_gateway.suite.claimed import ClaimedSweep, look
@@ -58,7 +61,9 @@ class Order(msgspec.Struct, frozen=True, kw_only=True):
 
 
 @app.command("suite", epilog="Example: evopolicy suite smoke.toml --local")
+@spread
 def suite(
+    *,
     file: Annotated[
         str,
         typer.Argument(
@@ -80,7 +85,7 @@ def suite(
         list[str] | None,
         typer.Option(help="Play only runs whose names match this glob, such as 'evolve/*'; may be repeated."),
     ] = None,
-    profile: options.ProfileOption = None,
+    profile: Annotated[Profile | None, Of(RunOptions)],
     parallel: Annotated[
         int | None, typer.Option(min=1, max=256, help="Runs at the same time; overrides the file.")
     ] = None,
@@ -88,19 +93,13 @@ def suite(
         Changed, typer.Option(help="Treatment of runs whose settings have changed in the file.")
     ] = "refuse",
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Print the plan, and stop.")] = False,
-    slots: options.Slots = 2,
-    state: Annotated[
-        Path | None,
-        typer.Option(
-            help="State folder of the local cluster; default: .cluster in the sweep's folder.",
-            rich_help_panel=options.CLUSTER,
+    cluster: Annotated[
+        ClusterOptions,
+        Shown(
+            without=("fresh", "env_timeout", "env_memory"),
+            help={"state": "State folder of the local cluster; default: .cluster in the sweep's folder."},
         ),
-    ] = None,
-    data: options.DataFolder = None,
-    audit: options.Audit = 0.0,
-    hidden_isolation: options.Isolation = None,
-    policy_package: options.PolicyPackages = None,
-    browser: options.Browser = None,
+    ],
     web: options.Web = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print events as JSON lines.")] = False,
 ) -> None:
@@ -111,13 +110,7 @@ def suite(
     with fail_on_our_errors():
         if local and (connect or credentials_file):
             raise ConfigError("--local starts a cluster of its own; it cannot be combined with --connect")
-        if audit and not local:
-            raise ConfigError(
-                "--audit applies only with --local; otherwise set it at the coordinator: evopolicy-coordinator --audit"
-            )
-        options.check_isolation(hidden_isolation, local=local)
-        options.check_packages(policy_package, local=local)
-        options.check_browser(browser, local=local)
+        where = options.cluster_of(cluster, connect, credentials_file, local=local)
         wanted = suite_file.read(file)
         if parallel is not None:
             limits = msgspec.structs.replace(wanted.parallel, machine=parallel)
@@ -128,21 +121,13 @@ def suite(
             wanted = msgspec.structs.replace(wanted, defaults=defaults)
         root = (runs or Path("runs") / wanted.name).absolute()
         expanded = suite_file.expand(wanted, root, Path.cwd(), tuple(only or ()))
-        where = Cluster(connect=tuple(connect or ()), file=credentials_file, patient=(root / INDEX).exists())
-        if local:
-            kept = state or root / SWEEP_STATE
-            new = not kept.exists()  # then a dry run keeps none
-            where = Cluster(
-                local_slots=slots,
-                state=None if new and dry_run else kept,
-                data=data,
-                audit=audit,
-                hidden_isolation=hidden_isolation,
-                policy_packages=options.check_packages(policy_package, local=True),
-                browser=options.check_browser(browser, local=True),
-            )
-        if web:
-            where = msgspec.structs.replace(where, web=root)
+        kept = cluster.state or root / SWEEP_STATE
+        new = not kept.exists()  # then a dry run keeps none
+        if where.local is not None:
+            chosen = msgspec.structs.replace(where.local, state=None if new and dry_run else kept)
+            where = msgspec.structs.replace(where, local=chosen)
+        patient = not local and (root / INDEX).exists()
+        where = msgspec.structs.replace(where, patient=patient, web=root if web else None)
         where.check_cases(run.settings for run in expanded)
         order = Order(
             suite=wanted,

@@ -6,14 +6,16 @@ import os
 import re
 import shutil
 import subprocess
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Annotated, Any, ClassVar, Literal, get_args
 
 import msgspec
 
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.processes import distribution
 from evopolicy_common.records.open_run import STATE
+from evopolicy_gateway.declared import Option, Several
 from evopolicy_gateway.jail.syscalls import GIVE_UP, filter_program
 
 Mode = Literal["bwrap", "open-network", "none"]
@@ -27,19 +29,29 @@ _TIMEOUT_S = 30.0
 _STATE_FOLDERS = tuple("*/" * depth + STATE for depth in range(4))
 
 
+def _several(flag: str, metavar: str, parse: Callable[[list[str]], tuple[str, ...]] = tuple) -> Option:
+    return Option(flag=flag, metavar=metavar, command=Several, parse=parse)
+
+
+def _here(paths: list[str]) -> tuple[str, ...]:
+    return tuple(absolute(path, Path.cwd()) for path in paths)
+
+
 class JailSettings(msgspec.Struct, frozen=True, kw_only=True):
     """The jail of one run's agent."""
 
-    mode: Mode = "bwrap"
-    """`open-network`: jailed, with this machine's network. `none`: not jailed."""
-    read: tuple[str, ...] = ()
-    """Files and folders that it also sees, at their own paths."""
-    write: tuple[str, ...] = ()
-    """Files and folders that it may also change."""
-    environment: tuple[str, ...] = ()
-    """Names of variables that are passed on."""
-    hosts: tuple[str, ...] = ()
-    """`HOST` (port 443) or `HOST:PORT` that it may reach besides its harness's own hosts."""
+    group: ClassVar[str] = "Agent's jail"
+
+    mode: Annotated[Mode, Option(flag="--jail")] = "bwrap"
+    """Jail of the agent; open-network: a jail with this machine's network. Recorded in run.json."""
+    read: Annotated[tuple[str, ...], _several("--jail-bind", "PATH", _here)] = ()
+    """File or folder that the agent may read."""
+    write: Annotated[tuple[str, ...], _several("--jail-bind-rw", "PATH", _here)] = ()
+    """File or folder that the agent may also change."""
+    environment: Annotated[tuple[str, ...], _several("--jail-env", "NAME")] = ()
+    """Environment variable that the agent gets, such as an API key."""
+    hosts: Annotated[tuple[str, ...], _several("--allow-host", "HOST[:PORT]")] = ()
+    """Host that the agent may connect to, in addition to its model's."""
 
     @property
     def recorded(self) -> str:
@@ -50,6 +62,14 @@ class JailSettings(msgspec.Struct, frozen=True, kw_only=True):
         """The operator's additions to the jail, for `run.json`."""
         kept = {"read": self.read, "write": self.write, "environment": self.environment, "hosts": self.hosts}
         return {name: list(value) for name, value in kept.items() if value}
+
+    def of_remote_agent(self) -> JailSettings:
+        """No jail, since the operator starts a remote agent. Raises ConfigError when one is requested."""
+        if self.mode == "open-network" or self.chosen():
+            raise ConfigError(
+                "--agent remote is not started by this command, so --jail and its options do not apply"
+            )
+        return JailSettings(mode="none")
 
     def check(self) -> None:
         """Raises ConfigError that names the wrong option, or what this machine lacks."""

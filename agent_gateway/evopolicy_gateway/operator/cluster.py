@@ -22,42 +22,34 @@ from evopolicy_common.wire import transport
 from evopolicy_common.wire.credentials import Credentials
 from evopolicy_gateway.operator.live_view import live_view
 from evopolicy_gateway.run.operations import Operations, find_credentials
+from evopolicy_gateway.run.run_options import ClusterOptions
 
 CONNECT_S = 10.0
 """Patience with a coordinator that was not reached yet, seconds."""
 
 
 class Cluster(msgspec.Struct, frozen=True, kw_only=True):
-    """Which cluster a command uses: a local one with `local_slots` slots, the named one, or this machine's own."""
+    """Which cluster a command uses: a local one, the named one, or this machine's own."""
 
     connect: tuple[str, ...] = ()
     file: Path | None = None
     """The operator's credentials."""
-    local_slots: int | None = None
-    state: Path | None = None
-    """State folder of a local cluster; None for a temporary one."""
+    local: ClusterOptions | None = None
+    """Of a cluster that is started here: `state` None is a temporary one."""
     unjailed: bool = False
     """For a local cluster with a state: its agents have no jail and could read that state."""
-    data: Path | None = None
-    audit: float = 0.0
-    """For a local cluster: share of the episodes, 0 to 1, that a second worker replays."""
-    hidden_isolation: str | None = None
-    """For a local cluster: as `--hidden-isolation` of `evopolicy-coordinator`; None for its default."""
-    policy_packages: tuple[str, ...] = ()
-    """For a local cluster: packages that policies may import besides numpy."""
-    browser: Path | None = None
-    """For a local cluster: Chromium's program; None for the machine's own."""
-    env_timeout: float | None = None
-    env_memory: int | None = None
-    """For a local cluster: as `--env-timeout` (seconds) and `--env-memory` (MiB) of `evopolicy-worker`; None for their defaults."""
     patient: bool = False
     """The command continues earlier work, and waits for a coordinator that is away."""
     web: Path | None = None
     """Folder of runs that a live view shows meanwhile; None for no view."""
 
+    @property
+    def _without_data(self) -> bool:
+        return self.local is not None and self.local.data is None
+
     def check_cases(self, runs: Iterable[RunSettings]) -> None:
         """Raises ConfigError when a local cluster lacks the case files that a run plays."""
-        if self.local_slots is not None and self.data is None and any(run.profile != "own" for run in runs):
+        if self._without_data and any(run.profile != "own" for run in runs):
             raise ConfigError(
                 "--profile published plays the published case files: give --data FOLDER, the folder data/main-128 of the"
                 " published software, which holds gym/acrobot/train.json and so on"
@@ -65,9 +57,7 @@ class Cluster(msgspec.Struct, frozen=True, kw_only=True):
 
     def check_ids(self, env_ids: Iterable[str], split: Split, cases: Sequence[int]) -> None:
         """Raises ConfigError for cases that a local cluster does not have. How many others have, their files say."""
-        for suite in (
-            map(catalogue.suite_of, env_ids) if self.local_slots is not None and self.data is None else ()
-        ):
+        for suite in map(catalogue.suite_of, env_ids) if self._without_data else ():
             n = {"train": suite.n_train, "validation": suite.n_validation, "heldout": suite.n_heldout}[split]
             if cases and max(cases) >= n:
                 raise ConfigError(
@@ -91,20 +81,20 @@ async def reached(where: Cluster, workers: Workers | None = None) -> AsyncIterat
     async with contextlib.AsyncExitStack() as stack:
         local: LocalCluster | None = None
         file, opened = where.file, None
-        if where.local_slots is not None:
+        if (chosen := where.local) is not None:
             local = await stack.enter_async_context(
                 local_cluster(
                     "local",
-                    state=where.state,
-                    data=where.data,
-                    audit=where.audit,
-                    hidden_isolation=where.hidden_isolation,
+                    state=chosen.state,
+                    data=chosen.data,
+                    audit=chosen.audit,
+                    hidden_isolation=chosen.hidden_isolation,
                     unjailed=where.unjailed,
                     workers=workers,
-                    policy_packages=where.policy_packages,
-                    browser=where.browser,
-                    env_timeout=where.env_timeout,
-                    env_memory=where.env_memory,
+                    policy_packages=tuple(chosen.policy_package or ()),
+                    browser=chosen.browser,
+                    env_timeout=chosen.env_timeout,
+                    env_memory=chosen.env_memory,
                 )
             )
             if local.note:
@@ -128,6 +118,6 @@ async def connected(
     `tiers`: sandbox tiers that will be requested; a local cluster without them fails.
     """
     end_on_sigterm()
-    workers = None if where.local_slots is None else Workers(env_ids, where.local_slots, tiers)
+    workers = None if where.local is None else Workers(env_ids, where.local.slots, tiers)
     async with reached(where, workers) as (operations, gateway, local):
         yield operations, gateway, None if local is None else local.failed

@@ -148,7 +148,7 @@ async def play_random(
                 cases=cases,
                 record="actions",
                 # Without a policy no sandbox is needed, but a worker of another cluster may not offer the tier `none`.
-                sandbox_tier="bwrap" if where.local_slots is None else "none",
+                sandbox_tier="bwrap" if where.local is None else "none",
                 step_limit="published",
                 definition=catalogue.pinned(env_id),
             )
@@ -261,7 +261,9 @@ def _result(
         n_failed=sum(one.failure is not None for one in episodes),
         episodes=tuple(episodes),
         folder=None if folder is None else str(folder),
-        other_cases_next_time=where.local_slots is not None and where.state is None and where.data is None,
+        other_cases_next_time=where.local is not None
+        and where.local.state is None
+        and where.local.data is None,
     )
 
 

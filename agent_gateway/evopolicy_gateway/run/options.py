@@ -56,9 +56,8 @@ def settings_of(profile: str | None, **given: str | None) -> dict[str, str]:
     return usual | {name: value for name, value in given.items() if value is not None} | {"profile": chosen}
 
 
-def run_settings(given: Any, limits: ResourceLimits, **named: Any) -> RunSettings:
-    """The settings of one run. `given`: the options of `run`, or a table of a suite, which have the same names; None
-    for options that were not given. Raises ConfigError that names the invalid option."""
+def run_settings(given: Any, **named: Any) -> RunSettings:
+    """The settings of one run. `given`: `RunOptions`. Raises ConfigError that names the invalid option."""
     names = (
         "policy_scope",
         "observations",
@@ -73,7 +72,7 @@ def run_settings(given: Any, limits: ResourceLimits, **named: Any) -> RunSetting
         hidden_cases=hidden_cases_of(given.hidden_cases),
         **{name: getattr(given, name) for name in names},
     )
-    if chosen["feedback"] != "pictures" and given.video not in (None, "off"):
+    if chosen["feedback"] != "pictures" and given.video != "off":
         raise ConfigError(
             f"feedback {chosen['feedback']} shows no videos, and video {given.video} is asked for: leave out one of them"
         )
@@ -89,10 +88,10 @@ def run_settings(given: Any, limits: ResourceLimits, **named: Any) -> RunSetting
         min_episodes_per_submit=given.min_episodes,
         max_episodes_per_submit=given.max_episodes,
         **counts,
-        sandbox_tier=given.tier or "bwrap",
-        video=given.video or "off",
+        sandbox_tier=given.tier,
+        video=given.video,
         replays=given.replays,
-        limits=limits,
+        limits=given.limits,
         definition=catalogue.pinned(named["env"]),
         **chosen,
         **named,

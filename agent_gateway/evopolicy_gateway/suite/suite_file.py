@@ -10,72 +10,36 @@ import fnmatch
 from collections.abc import Iterable
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import msgspec
 from msgspec import Meta
 
 from evopolicy_common import catalogue
 from evopolicy_common.errors import ConfigError
-from evopolicy_common.messages.environment import FailedEpisodes, ObservationForm, PolicyScope, StepLimit
-from evopolicy_common.messages.episode import Tier
-from evopolicy_common.messages.gateway import (
-    FeedbackDetail,
-    FinishRule,
-    Profile,
-    SimulationRule,
-    VideoOption,
-)
 from evopolicy_common.regular_files import read_given
 from evopolicy_common.wire import keys
-from evopolicy_gateway import harnesses
+from evopolicy_gateway.declared import Count, suite_keys
 from evopolicy_gateway.harnesses.interface.agent_config import AgentConfig
 from evopolicy_gateway.jail.settings import JailSettings
-from evopolicy_gateway.processes.clock import SILENCE_S
-from evopolicy_gateway.run import prices, texts
-from evopolicy_gateway.run.options import agent_limits, limits_from, run_settings
-from evopolicy_gateway.run.plan import WALL_S, Plan
+from evopolicy_gateway.run.options import limits_from
+from evopolicy_gateway.run.plan import Plan
+from evopolicy_gateway.run.run_options import RunOptions
 
-Positive = Annotated[int, Meta(ge=1)]
+if TYPE_CHECKING:
 
+    class RunTable(msgspec.Struct, frozen=True):
+        """As below; only the names of its fields are used."""
 
-class RunTable(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Settings of a run; None: not set here."""
-
-    budget: Positive | None = None
-    min_episodes: Positive | None = None
-    max_episodes: Positive | None = None
-    validation: Positive | None = None
-    heldout: Positive | None = None
-    profile: Profile | None = None
-    hidden_cases: Literal["shared", "per-run"] | None = None
-    policy_scope: PolicyScope | None = None
-    observations: ObservationForm | None = None
-    simulation: SimulationRule | None = None
-    finish: FinishRule | None = None
-    step_limit: StepLimit | None = None
-    feedback: FeedbackDetail | None = None
-    failed_episodes: FailedEpisodes | None = None
-    agents_md: str | None = None
-    """File with the text in place of `AGENTS.md`."""
-    prompts: str | None = None
-    """File with prompts in place of the standard ones."""
-    prices: str | None = None
-    """File with a table of prices for each model."""
-    tier: Tier | None = None
-    video: VideoOption | None = None
-    replays: VideoOption | None = None
-    limits: dict[str, float] | None = None
-    agent_wall_s: Annotated[float, Meta(gt=0)] | None = None
-    agent_silence_s: Annotated[float, Meta(gt=0)] | None = None
-    agent_cpus: float | None = None
-    """Cores."""
-    agent_memory: float | None = None
-    """Bytes."""
-    agent_pids: int | None = None
-    agent_disk: float | None = None
-    """Bytes."""
-    repeats: Positive | None = None
+else:
+    RunTable = msgspec.defstruct(
+        "RunTable",
+        [*suite_keys(RunOptions), ("repeats", Count | None, None)],
+        namespace={"__doc__": "Settings of a run; None: not set here."},
+        frozen=True,
+        kw_only=True,
+        forbid_unknown_fields=True,
+    )
 
 
 class Override(RunTable, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -96,7 +60,7 @@ class AgentTable(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     """A coding agent's settings."""
     environments: tuple[str, ...] = ()
     """In place of the suite's."""
-    parallel: Positive | None = None
+    parallel: Count | None = None
     """Maximum number of its simultaneous runs."""
     run: RunTable = RunTable()
     jail: JailSettings = JailSettings()
@@ -106,11 +70,11 @@ class AgentTable(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
 class Parallel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Maximum numbers of simultaneous runs; an agent's own limit is in its table."""
 
-    machine: Positive = 4
+    machine: Count = 4
     """On each participating host."""
-    agent: Positive | None = None
+    agent: Count | None = None
     """Of each agent, on each host."""
-    providers: dict[str, Positive] = {}
+    providers: dict[str, Count] = {}
     """Of each provider, on each host."""
     claim_ttl_s: Annotated[float, Meta(ge=1, le=3600)] = 60.0
     """A host that is silent for this long loses its runs to the others, seconds."""
@@ -119,9 +83,9 @@ class Parallel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 class Caps(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Joint limits of all runs of this host. A used-up limit stops coding agents and prevents further runs."""
 
-    max_requests: Positive | None = None
+    max_requests: Count | None = None
     """To the models, as far as the relay counts them."""
-    max_tokens: Positive | None = None
+    max_tokens: Count | None = None
     max_cost: Annotated[float, Meta(gt=0)] | None = None
     """US dollars, over the agents that have `prices`."""
 
@@ -189,12 +153,12 @@ def expand(suite: SuiteFile, root: Path, started_in: Path, only: tuple[str, ...]
     tables = {
         (agent.name, env): _table(suite, agent, env) for agent in suite.agents for env in chosen[agent.name]
     }
-    most = max((table.repeats or 1 for table in tables.values()), default=0)
+    most = max((table.get("repeats", 1) for table in tables.values()), default=0)
     for repeat in range(most):
         for env in everything:
             for agent in suite.agents:
                 table = tables.get((agent.name, env))
-                if table is not None and repeat < (table.repeats or 1):
+                if table is not None and repeat < table.get("repeats", 1):
                     runs.append(_plan(suite, agent, env, repeat, table, root, started_in))
     if only:
         runs = [run for run in runs if any(fnmatch.fnmatch(run.name, pattern) for pattern in only)]
@@ -226,20 +190,20 @@ def _check_agent(run: Plan) -> None:
         raise
 
 
-def _table(suite: SuiteFile, agent: AgentTable, env: str) -> RunTable:
-    found = suite.defaults
+def _table(suite: SuiteFile, agent: AgentTable, env: str) -> dict[str, Any]:
+    """The settings of the agent's runs on `env`, as far as the file has them."""
     fitting = [
         one
         for one in suite.overrides
         if any(fnmatch.fnmatch(agent.name, glob) for glob in one.agents)
         and any(fnmatch.fnmatch(env, glob) or env in _resolved(glob) for glob in one.environments)
     ]
-    for table in (agent.run, *fitting):
-        values = {
-            name: value for name in RunTable.__struct_fields__ if (value := getattr(table, name)) is not None
-        }
-        found = msgspec.structs.replace(found, **values)
-    return found
+    return {
+        name: value
+        for table in (suite.defaults, agent.run, *fitting)
+        for name in RunTable.__struct_fields__
+        if (value := getattr(table, name)) is not None
+    }
 
 
 def _resolved(name: str) -> list[str]:
@@ -250,37 +214,33 @@ def _resolved(name: str) -> list[str]:
 
 
 def _plan(
-    suite: SuiteFile, agent: AgentTable, env: str, repeat: int, table: RunTable, root: Path, started_in: Path
+    suite: SuiteFile,
+    agent: AgentTable,
+    env: str,
+    repeat: int,
+    table: dict[str, Any],
+    root: Path,
+    started_in: Path,
 ) -> Plan:
     if (agent.config is None) == (not agent.agent):
         raise ConfigError(f"agent {agent.name!r} needs either `agent` or `[agents.config]`")
-    harness = agent.agent or agent.config.harness if agent.config else agent.agent
-    model = agent.config.model if agent.config is not None else None
-    known = agent.config or harnesses.config_of(agent.agent, started_in)
-    agent_texts = texts.read(table.agents_md, table.prompts, known, started_in)
-    settings = run_settings(
-        table,
-        limits_from(table.limits or {}, "limits."),
-        env=env,
+    given = RunOptions(
+        agent=agent.config.harness if agent.config is not None else agent.agent,
         entry=agent.name,
-        model=model or agent.name,
+        model=agent.config.model if agent.config is not None else None,
         exp_id=f"{suite.name}-{repeat}",
         repeat=repeat,
-        notes={"suite": suite.name},
-        **agent_texts.digests,
-    )
-    return Plan(
-        name=f"{agent.name}/{env}/{repeat}",
-        settings=settings,
-        agent=harness,
         runs=root,
-        started_in=started_in,
-        wall_limit_s=table.agent_wall_s or WALL_S,
-        silence_s=table.agent_silence_s or SILENCE_S,
+        **{name: value for name, value in table.items() if name != "repeats"}
+        | {"limits": limits_from(table.get("limits", {}), "limits.")},
+    )
+    agent_texts = given.texts(started_in, agent.config)
+    return given.plan(
+        given.settings(env, given.exp_id or "", texts=agent_texts, suite=suite.name),
+        started_in,
+        name=f"{agent.name}/{env}/{repeat}",
         config=agent.config,
-        prices=prices.read(table.prices, known, started_in),
         texts=agent_texts,
         parallel=agent.parallel,
         jail=agent.jail,
-        limits=agent_limits(table),
     )

@@ -24,7 +24,6 @@ from evopolicy_common.messages.run_settings import PUBLISHED, off_profile
 from evopolicy_common.records.open_run import Rejected
 from evopolicy_common.records.run_record import decode_run_record, encode_run_record
 from evopolicy_gateway.cli.play import _unjailed
-from evopolicy_gateway.cli.run_options import RunOptions
 from evopolicy_gateway.jail.settings import JailSettings
 from evopolicy_gateway.operator.cluster import Cluster
 from evopolicy_gateway.processes import child_messages
@@ -32,6 +31,7 @@ from evopolicy_gateway.processes.child_messages import AgentDoing, Progress
 from evopolicy_gateway.run.options import cases_of, limits_of, one_environment, packages_for
 from evopolicy_gateway.run.plan import Plan
 from evopolicy_gateway.run.record import run_record
+from evopolicy_gateway.run.run_options import ClusterOptions, RunOptions
 from evopolicy_gateway.run.times import Times
 from evopolicy_gateway.run.transitions import Transitions
 from evopolicy_gateway.run.watch import RunView
@@ -205,9 +205,9 @@ def test_profile_published_makes_every_published_choice_and_takes_no_other() -> 
     with pytest.raises(ConfigError, match="profile published has n_heldout = 32, but 256 was given"):
         RunOptions(agent="evolve", profile="published", heldout=256).settings("toy/line", "t")
     with pytest.raises(ConfigError, match="give --data FOLDER"):
-        Cluster(local_slots=1).check_cases([published])
-    Cluster(local_slots=1).check_cases([own])
-    Cluster(local_slots=1, data=Path("data")).check_cases([published])
+        Cluster(local=ClusterOptions()).check_cases([published])
+    Cluster(local=ClusterOptions()).check_cases([own])
+    Cluster(local=ClusterOptions(data=Path("data"))).check_cases([published])
 
 
 def test_control_lines_come_back_as_they_were_and_nothing_else_does() -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import inspect
+import typing
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +12,8 @@ import numpy as np
 import pytest
 
 import evopolicy as evp
-from evopolicy import _arguments, _cluster
+from evopolicy import _arguments
+from evopolicy_common.messages.episode import ResourceLimits
 
 RUN: dict[str, Any] = {"env": "toy/line", "agent": "random"}
 WRONG_RUNS: list[dict[str, Any]] = [
@@ -114,5 +117,15 @@ def test_every_argument_has_its_rule() -> None:
     functions = (evp.run, evp.evaluate, evp.Cluster.local, evp.Cluster.connect, evp.Cluster.evaluate)
     named = {name for each in functions for name in inspect.signature(each).parameters}
     assert named - {"self", "endpoints", "options"} <= _arguments.RULES.keys()
-    for option in _cluster.OPTIONS:
-        assert f"`{option}`" in (evp.run.__doc__ or ""), option
+
+
+def test_keywords_for_type_checkers_are_the_declared_options() -> None:
+    paths = {Path: _arguments.AnyPath, ResourceLimits: Mapping[str, float] | None}
+    given = typing.get_type_hints(evp.RunOptions)
+    assert [*given] == [name for name in _arguments.OPTIONS if name != "agent"]
+    for name, kind in given.items():
+        declared = _arguments.OPTIONS[name].type
+        optional = type(None) in typing.get_args(declared)
+        plain = typing.get_args(declared)[0] if optional else declared
+        assert kind == (paths.get(plain, plain) | None if optional else paths.get(plain, plain)), name
+        assert f"`{name}`: " in (evp.RunOptions.__doc__ or "")

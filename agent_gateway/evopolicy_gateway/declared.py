@@ -1,0 +1,124 @@
+"""Options declared once: a class of options has a field for each, with its type, default, bounds (`msgspec.Meta`) and `Option`.
+
+Made from it: options of commands (`cli/option_groups.py`), tables of suite files (`suite/suite_file.py`), keywords of the package
+`evopolicy`, JSON Schemas, and `docs/reference/options.md`. The docstring below a field is its help; `group` is its heading.
+"""
+
+from __future__ import annotations
+
+import ast
+import functools
+import inspect
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple, get_args, get_origin, get_type_hints
+
+import msgspec
+from msgspec import Meta
+
+Several = list[str] | None
+"""An option that may be repeated."""
+Count = Annotated[int, Meta(ge=1)]
+SAME = object()
+"""A surface has the field's own type."""
+
+
+class Option(msgspec.Struct, frozen=True, kw_only=True):
+    """An option's surfaces, as far as the field's name and type do not give them."""
+
+    flag: str | None = None
+    """On the command line, if it is not named as the field."""
+    metavar: str | None = None
+    command: Any = SAME
+    """Type on the command line."""
+    parse: Callable[[Any], Any] | None = None
+    """Makes the field's value of that type's. Raises ConfigError."""
+    exists: bool = False
+    """The command line takes the path of an existing file only."""
+    suite: Any = SAME
+    """Type of the key in suite files, None: no key. A path is a text there."""
+    python: bool = True
+    """Whether it is a keyword of `evopolicy.run`."""
+
+
+class Declared(NamedTuple):
+    """A field of a class of options."""
+
+    name: str
+    type: Any
+    """Without bounds."""
+    bounded: Any
+    """The type with them."""
+    bounds: Meta
+    default: Any
+    """`msgspec.NODEFAULT` if it must be given."""
+    help: str
+    group: str
+    option: Option
+
+
+@functools.cache
+def declared(options: type[msgspec.Struct]) -> dict[str, Declared]:
+    """The options that a class declares, by name."""
+    found, plain, noted = {}, get_type_hints(options), get_type_hints(options, include_extras=True)
+    helps = field_texts(options)
+    for field in msgspec.structs.fields(options):
+        notes = _notes(noted[field.name])
+        (own,) = (each for each in options.__mro__ if field.name in inspect.get_annotations(each))
+        found[field.name] = Declared(
+            field.name,
+            plain[field.name],
+            noted[field.name],
+            next((note for note in notes if isinstance(note, Meta)), Meta()),
+            field.default,
+            helps[field.name],
+            vars(own)["group"],
+            next((note for note in notes if isinstance(note, Option)), Option()),
+        )
+    return found
+
+
+def _notes(kind: Any) -> list[Any]:
+    """What a type is annotated with, the types of a union included."""
+    if get_origin(kind) is Annotated:
+        return [*kind.__metadata__, *_notes(kind.__origin__)]
+    return [note for each in get_args(kind) if get_origin(each) is Annotated for note in _notes(each)]
+
+
+def suite_keys(options: type[msgspec.Struct]) -> list[tuple[str, Any, None]]:
+    """The fields of a table in a suite file: name, type, and the default None for a setting that is left out."""
+    keys = []
+    for one in declared(options).values():
+        kind = one.bounded if one.option.suite is SAME else one.option.suite
+        if kind is not None:
+            kind = str if one.type == Path | None else kind
+            keys.append((one.name, Annotated[kind | None, Meta(description=one.help)], None))
+    return keys
+
+
+def field_texts(struct: type[msgspec.Struct]) -> dict[str, str]:
+    """The docstrings below a struct's fields, inherited fields included."""
+    texts: dict[str, str] = {}
+    for each in reversed(struct.__mro__):
+        if issubclass(each, msgspec.Struct) and each is not msgspec.Struct:
+            texts |= _texts_in(each.__module__).get(each.__name__, {})
+    return texts
+
+
+@functools.cache
+def _texts_in(module: str) -> dict[str, dict[str, str]]:
+    """Docstrings below fields, by class and field."""
+    return {
+        each.name: {
+            field.target.id: " ".join(text.value.value.split())
+            for field, text in zip(each.body, each.body[1:], strict=False)
+            if isinstance(field, ast.AnnAssign)
+            and isinstance(field.target, ast.Name)
+            and isinstance(text, ast.Expr)
+            and isinstance(text.value, ast.Constant)
+            and isinstance(text.value.value, str)
+        }
+        for each in ast.parse(inspect.getsource(sys.modules[module])).body
+        if isinstance(each, ast.ClassDef)
+    }

@@ -1,0 +1,232 @@
+"""Every option of a run, declared once as `evopolicy_gateway/declared.py` describes; those of its jail are in `jail/settings.py`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal
+
+import msgspec
+from msgspec import Meta
+
+from evopolicy_common.errors import ConfigError
+from evopolicy_common.messages.environment import FailedEpisodes, ObservationForm, PolicyScope, StepLimit
+from evopolicy_common.messages.episode import ResourceLimits, Tier
+from evopolicy_common.messages.gateway import (
+    FeedbackDetail,
+    FinishRule,
+    Profile,
+    SimulationRule,
+    VideoOption,
+)
+from evopolicy_common.messages.run_settings import RunSettings
+from evopolicy_gateway import harnesses
+from evopolicy_gateway.declared import Count, Option, Several
+from evopolicy_gateway.harnesses.interface.agent_config import AgentConfig
+from evopolicy_gateway.processes.clock import SILENCE_S
+from evopolicy_gateway.run import prices, texts
+from evopolicy_gateway.run.options import agent_limits, default_exp_id, limits_of, run_settings
+from evopolicy_gateway.run.plan import WALL_S, Plan
+from evopolicy_gateway.run.texts import Texts
+from evopolicy_gateway.run_folder.listener import Listener, agent_host_of, listener_of
+
+Seconds = Annotated[float, Meta(ge=1.0)]
+OF_ONE_RUN = Option(suite=None)
+
+
+class RunPart(msgspec.Struct, frozen=True, kw_only=True):
+    group: ClassVar[str] = "Run"
+
+    agent: Annotated[str, OF_ONE_RUN]
+    """evolve, random, replay:DIR, command:PROGRAM…, codex, claude-code, llm:openai/MODEL, acp:PROGRAM…, file:AGENT.toml, remote"""
+    budget: Count | None = None
+    """Train episodes; default: the suite's."""
+    profile: Annotated[Profile, Option(command=Literal["published", "published-data"] | None)] | None = None
+    """published: all settings of the published protocol (docs/reference/protocol.md), with its case files in --data and the
+    paper's 16 validation and 32 held-out cases; published-data: with all 64 and 256 of the files."""
+    runs: Annotated[Path, OF_ONE_RUN] = Path("runs")
+    """Folder of run directories."""
+    exp_id: Annotated[str | None, OF_ONE_RUN] = None
+    """Name of the experiment; default: the time."""
+    overwrite: Annotated[bool, OF_ONE_RUN] = False
+    """Replace the run with this --exp-id."""
+    resume: Annotated[bool, Option(suite=None, python=False)] = False
+    """Continue the run with this --exp-id after its command was killed."""
+    entry: Annotated[str | None, OF_ONE_RUN] = None
+    """Name of the leaderboard entry; default: the agent's."""
+    model: Annotated[str | None, OF_ONE_RUN] = None
+    """Name of the model behind the agent; default: the entry's."""
+    repeat: Annotated[int, Meta(ge=0), OF_ONE_RUN] = 0
+    """Number of this repeat of the same agent and environment."""
+
+
+class ScorePart(RunPart, frozen=True, kw_only=True):
+    group: ClassVar[str] = "Score"
+
+    validation: Count | None = None
+    """Hidden validation cases."""
+    heldout: Count | None = None
+    """Hidden held-out cases."""
+    hidden_cases: Literal["shared", "per-run"] | None = None
+    """shared: the same for all runs of an environment (default); per-run: the run's own, so that runs cannot be paired."""
+    replays: VideoOption | None = None
+    """Videos of the held-out episodes; default: as --video."""
+
+
+class PolicyPart(ScorePart, frozen=True, kw_only=True):
+    group: ClassVar[str] = "Policy and feedback"
+
+    min_episodes: Count | None = None
+    """Least number of episodes in a submit."""
+    max_episodes: Count | None = None
+    """Greatest number of episodes in a submit."""
+    policy_scope: PolicyScope | None = None
+    """episode: a new Policy object for each episode (default); submit: one for all episodes of a submit."""
+    observations: ObservationForm | None = None
+    """Form of observations: arrays (default), or lists as published."""
+    step_limit: StepLimit | None = None
+    """published: the step limits of the published software (default); natural: those of the environment."""
+    failed_episodes: FailedEpisodes | None = None
+    """An episode in which the policy fails: play-on with random actions (default), or end-submit, as published: it ends, and the
+    submit is not eligible."""
+    tier: Tier = "bwrap"
+    """Sandbox around the policy."""
+    limits: Annotated[
+        ResourceLimits,
+        Option(
+            flag="--limit", metavar="NAME=VALUE", command=Several, parse=limits_of, suite=dict[str, float]
+        ),
+    ] = ResourceLimits()
+    """Limit for the policy, such as act_wall_s=5 or memory_bytes=2e9."""
+    video: VideoOption = "off"
+    """Videos in the feedback."""
+    feedback: FeedbackDetail | None = None
+    """Feedback to the agent: scores, trajectories as well, or also pictures and videos (default)."""
+
+
+class RunOptions(PolicyPart, frozen=True, kw_only=True):
+    """The options of a run and, in this class, of its agent."""
+
+    group: ClassVar[str] = "Agent"
+
+    agents_md: Annotated[Path | None, Option(metavar="FILE")] = None
+    """Replacement for AGENTS.md; `evopolicy texts` prints the standard one."""
+    prompts: Annotated[Path | None, Option(metavar="FILE.toml")] = None
+    """Replacements for prompts; `evopolicy texts` prints the standard ones."""
+    prices: Annotated[Path | None, Option(metavar="FILE.toml")] = None
+    """Prices by model, in US dollars per million tokens: the run's cost is recorded, and `max_cost` limits it."""
+    simulation: SimulationRule | None = None
+    """Whether AGENTS.md allows the agent to simulate the environment itself; default: forbidden."""
+    finish: FinishRule | None = None
+    """early: the agent may stop before it has spent its budget (default); budget: that is an error, as published."""
+    agent_wall_s: Annotated[Seconds, Option(suite=Annotated[float, Meta(gt=0)])] = WALL_S
+    """Time limit for the agent, in seconds."""
+    agent_silence_s: Annotated[Seconds, Option(suite=Annotated[float, Meta(gt=0)])] = SILENCE_S
+    """End an agent that submits nothing, changes no file and uses no processor time for this long, in seconds."""
+
+    agent_cpus: float | None = None
+    """Processor time for the agent's programs, in cores."""
+    agent_memory: float | None = None
+    """Memory for the agent's programs, in bytes, such as 8e9."""
+    agent_pids: int | None = None
+    """Greatest number of the agent's processes and threads."""
+    agent_disk: float | None = None
+    """Space for the agent's workspace, home, and /tmp, in bytes: with more, it is ended. Default: 2e10."""
+
+    def texts(self, started_in: Path, config: AgentConfig | None = None) -> Texts:
+        """The texts of the agent, which may have its settings from a suite file. ConfigError naming the file that is wrong."""
+        known = config or harnesses.config_of(self.agent, started_in)
+        return texts.read(self.agents_md, self.prompts, known, started_in)
+
+    def settings(
+        self, env: str, exp_id: str, agent_host: str = "", texts: Texts | None = None, **notes: str
+    ) -> RunSettings:
+        """The settings of one run, `agent_host` as it has it. ConfigError naming the option that is wrong."""
+        entry = self.entry or harnesses.entry_name(self.agent)
+        named = {"env": env, "entry": entry, "model": self.model or entry, "exp_id": exp_id, "notes": notes}
+        named |= (texts or Texts()).digests
+        return run_settings(self, repeat=self.repeat, agent_host=agent_host, **named)
+
+    def plan(
+        self, settings: RunSettings, started_in: Path, config: AgentConfig | None = None, **more: Any
+    ) -> Plan:
+        """The run with these settings. `config`: as for `texts`; `more`: further fields of the plan. Raises ConfigError."""
+        known = config or harnesses.config_of(self.agent, started_in)
+        return Plan(
+            settings=settings,
+            config=config,
+            prices=prices.read(self.prices, known, started_in),
+            limits=agent_limits(self),
+            agent=self.agent,
+            runs=self.runs,
+            started_in=started_in,
+            wall_limit_s=self.agent_wall_s,
+            silence_s=self.agent_silence_s,
+            overwrite=self.overwrite,
+            resume=self.resume,
+            **more,
+        )
+
+    def plans(self, env_ids: list[str], started_in: Path, agent_host: str = "", **more: Any) -> list[Plan]:
+        """A plan for each environment, named after it. ConfigError naming the option or file that is wrong."""
+        texts, exp_id = self.texts(started_in), self.exp_id or default_exp_id()
+        return [
+            self.plan(
+                self.settings(env, exp_id, agent_host, texts), started_in, name=env, texts=texts, **more
+            )
+            for env in env_ids
+        ]
+
+
+class ListenerOptions(msgspec.Struct, frozen=True, kw_only=True):
+    """A remote agent's HTTP address."""
+
+    group: ClassVar[str] = "Remote agent (--agent remote)"
+
+    http: Annotated[str | None, Option(metavar="HOST:PORT")] = None
+    """Address of this machine at which the agent connects; every request needs the token."""
+    http_url: Annotated[str | None, Option(metavar="URL")] = None
+    """URL for the agent, if it differs from --http, such as that of a TLS proxy."""
+    agent_host: Annotated[str | None, Option(metavar="BOOT_ID|elsewhere")] = None
+    """Boot id of the agent's machine (there: cat /proc/sys/kernel/random/boot_id): no hidden episode is played on it while the agent
+    is alive. elsewhere: you vouch that the agent is on no machine of the cluster. Default: the agent may be on any machine, so no
+    hidden episode is played before it has ended."""
+
+    def host_of(self, agent: str) -> str:
+        """`RunSettings.agent_host`. ConfigError for what names no kernel, or an agent that is started here."""
+        return "" if self.agent_host is None else agent_host_of(agent, self.agent_host)
+
+    def listener(self) -> Listener | None:
+        """None without `--http`. ConfigError naming the option that is wrong."""
+        if self.http is None and self.http_url is not None:
+            raise ConfigError("--http-url needs --http HOST:PORT")
+        return None if self.http is None else listener_of(self.http, self.http_url)
+
+
+class ClusterOptions(msgspec.Struct, frozen=True, kw_only=True):
+    """A cluster that is started for the command or the block."""
+
+    group: ClassVar[str] = "Local cluster"
+
+    slots: Annotated[int, Meta(ge=1, le=1024)] = 2
+    """Episodes that the local worker plays at the same time. Environments in a virtual environment of their own have a worker with
+    as many."""
+    state: Path | None = None
+    """State folder of the local cluster. Default: $XDG_STATE_HOME/evopolicy/local, which all your local runs share, so that they have
+    the same cases."""
+    fresh: bool = False
+    """Use a temporary state folder: new cases, and no later comparison or `verify`."""
+    data: Path | None = None
+    """Folder of split files (`evopolicy data make`); default: derived from the state's secret."""
+    audit: Annotated[float, Meta(ge=0.0, le=1.0), Option(metavar="SHARE")] = 0.0
+    """Share of the episodes whose actions a second local worker replays, compared bit for bit."""
+    hidden_isolation: Literal["related", "strict", "off"] | None = None
+    """Agents beside which no hidden episode is played on a kernel: those of runs with the same hidden cases (related, the default),
+    all (strict), or none (off)."""
+    policy_package: Annotated[Several, Option(metavar="NAME")] = None
+    """Package that policies may import in addition to numpy."""
+    browser: Annotated[Path | None, Option(exists=True)] = None
+    """Chromium's program for the local worker's web pages; default: the machine's own."""
+    env_timeout: Annotated[float | None, Meta(ge=1.0)] = None
+    """Time limit for one call of an environment, in seconds, as of evopolicy-worker; default: 300."""
+    env_memory: Annotated[int | None, Meta(ge=64)] = None
+    """Memory limit of an environment's process, in MiB, as of evopolicy-worker; default: 4096."""
