@@ -116,6 +116,12 @@ def _agent(value: Any) -> Any:
     return value if callable(value) else _text(value)
 
 
+def _policy(value: Any) -> Any:
+    if isinstance(value, type):
+        raise TypeError
+    return value if callable(value) else _path(value)
+
+
 def _cases(value: Any) -> tuple[int, ...]:
     return tuple(map(index, value))
 
@@ -198,7 +204,7 @@ RULES: dict[str, Rule] = {
     "env": Rule(_text, "the id of an environment, such as 'gym/acrobot'"),
     "folder": _FOLDER,
     "fresh": _FLAG,
-    "policy": _FOLDER,
+    "policy": Rule(_policy, "the path of a folder, or a function of an observation"),
     "policy_packages": Rule(_names, "a sequence of names, such as ('scipy',)"),
     "progress": _FLAG,
     "slots": Rule(_whole(1), "a whole number of at least 1"),

@@ -7,17 +7,16 @@ import atexit
 import contextlib
 import importlib.util
 import os
-import shlex
-import sys
 import uuid
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Mapping, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple, Self, TypeVar, Unpack
 
 from rich.progress import Progress
 
-from evopolicy._arguments import OPTIONS, RunOptions, check_names, take, taken
+from evopolicy._arguments import OPTIONS, AnyPath, RunOptions, check_names, take, taken
 from evopolicy._evaluation import Episode, Evaluation, episode_of
+from evopolicy._functions import agent_of, name_of, policy_of
 from evopolicy._loop import awaited, call, loop
 from evopolicy._runs import Run, read_run
 from evopolicy_common.console import terminal
@@ -45,6 +44,8 @@ from evopolicy_gateway.run_folder.listener import Listener
 T = TypeVar("T")
 
 AgentFunction = Callable[[Workspace], Any]
+PolicyFunction = Callable[[Any], Any]
+"""Returns the action for an observation."""
 Limits = Mapping[str, float]
 
 
@@ -134,7 +135,7 @@ class Cluster:
 
     def evaluate(
         self,
-        policy: str | os.PathLike[str],
+        policy: AnyPath | PolicyFunction,
         *,
         env: str,
         cases: Iterable[int] = range(4),
@@ -144,7 +145,9 @@ class Cluster:
     ) -> Evaluation:
         """Plays the policy in a folder on train cases, in a sandbox, outside any run and without a budget.
 
-        `policy`: a folder with a `policy.py`. `env`: an environment's id, such as `gym/acrobot`. `cases`: train ids;
+        `policy`: a folder with a `policy.py`, or a function of an observation that returns an action. The function is
+        sent by value, with its own module, and begins each episode anew; it can import the standard library, numpy, and
+        `policy_packages`. `env`: an environment's id, such as `gym/acrobot`. `cases`: train ids;
         equal ids name equal cases in every call on the same state. `tier`: sandbox tier, `bwrap`, `landlock` or `none`.
         `limits`: of the policy, such as `{"act_wall_s": 5}`. `progress`: show a progress bar on a terminal, or in a
         notebook with ipywidgets.
@@ -155,7 +158,7 @@ class Cluster:
 
     async def evaluate_async(
         self,
-        policy: str | os.PathLike[str],
+        policy: AnyPath | PolicyFunction,
         *,
         env: str,
         cases: Iterable[int] = range(4),
@@ -271,9 +274,9 @@ class Cluster:
         check_installed("gateway")
         take("agent", agent)
         if callable(agent):
-            options = {**options, "entry": options.get("entry") or _name_of(agent)}
+            options = {**options, "entry": options.get("entry") or name_of(agent)}
             folder = stack.enter_context(scratch_folder("function"))
-            agent = await asyncio.to_thread(_pickled, agent, folder / "function.pickle")
+            agent = await asyncio.to_thread(agent_of, agent, folder / "function.pickle")
         plan = plan_of(env, agent, **options)
         self._where.check_cases([plan.settings])
         await asyncio.to_thread(plan.check)
@@ -302,14 +305,15 @@ class Trial(NamedTuple):
 
 
 def trial_of(
-    policy: str | os.PathLike[str], env: str, cases: Iterable[int], tier: Tier, limits: Limits | None
+    policy: AnyPath | PolicyFunction, env: str, cases: Iterable[int], tier: Tier, limits: Limits | None
 ) -> Trial:
     """Reads the policy; arguments as for `evaluate`. Raises ConfigError."""
     given = taken(policy=policy, env=env, cases=cases, tier=tier, limits=limits)
     if not given["cases"]:
         raise ConfigError("cases is empty: name train ids, such as range(8)")
     env = one_environment(env)
-    bundle = policy_bundle(shipped.found(given["policy"], Path.cwd()))
+    folder = given["policy"]
+    bundle = policy_of(folder) if callable(folder) else policy_bundle(shipped.found(folder, Path.cwd()))
     message = Evaluate(
         token="",
         key=uuid.uuid4().hex,
@@ -339,7 +343,7 @@ def plan_of(
 
 
 def evaluate(
-    policy: str | os.PathLike[str],
+    policy: AnyPath | PolicyFunction,
     *,
     env: str,
     cases: Iterable[int] = range(4),
@@ -358,7 +362,7 @@ def evaluate(
 
 
 async def evaluate_async(
-    policy: str | os.PathLike[str],
+    policy: AnyPath | PolicyFunction,
     *,
     env: str,
     cases: Iterable[int] = range(4),
@@ -411,9 +415,11 @@ async def run_async(
 
 
 async def _evaluated(
-    trial: Trial, policy: Path, slots: int, packages: Iterable[str], progress: bool
+    trial: Trial, policy: Path | PolicyFunction, slots: int, packages: Iterable[str], progress: bool
 ) -> Evaluation:
-    found = packages_for(shipped.found(policy, Path.cwd()), take("policy_packages", packages))
+    found: Iterable[str] = take("policy_packages", packages)
+    if isinstance(policy, Path):
+        found = packages_for(shipped.found(policy, Path.cwd()), tuple(found))
     async with _opened(Cluster.local(slots, policy_packages=found)) as cluster:
         return await cluster._evaluate(trial, progress)
 
@@ -450,35 +456,3 @@ def _bar(wanted: bool) -> Progress:
     return Progress(
         console=console, transient=True, disable=not wanted or not (console.is_terminal or widgets)
     )
-
-
-def _name_of(function: AgentFunction) -> str:
-    name = getattr(function, "__name__", type(function).__name__)
-    return name if name.isidentifier() else "function"
-
-
-def _pickled(function: AgentFunction, file: Path) -> str:
-    """Writes the function to `file` for the jail. Returns the agent that calls it there, in the form of `--agent`."""
-    import cloudpickle
-
-    # The jail cannot import modules from outside site-packages, so the function's module is pickled with it.
-    module = sys.modules.get(getattr(function, "__module__", None) or "")
-    by_value = module is not None and module.__name__ != "__main__" and not _is_installed(module)
-    if by_value:
-        cloudpickle.register_pickle_by_value(module)
-    try:
-        file.write_bytes(cloudpickle.dumps(function))
-    except Exception as error:
-        raise ConfigError(f"agent {_name_of(function)} cannot be sent to its jail: {error}") from error
-    finally:
-        if by_value:
-            cloudpickle.unregister_pickle_by_value(module)
-    file.chmod(0o644)
-    words: Sequence[str] = (sys.executable, "-P", "-m", "evopolicy_gateway.agents.function", str(file))
-    return f"command:{shlex.join(words)}"
-
-
-def _is_installed(module: Any) -> bool:
-    """Whether the module is part of Python or of a package in site-packages."""
-    place = getattr(module, "__file__", None)
-    return place is None or any(part in ("site-packages", "dist-packages") for part in Path(place).parts)

@@ -62,6 +62,19 @@ def test_a_policy_is_played_and_its_trajectories_are_arrays(cluster: evp.Cluster
     assert "<svg" in result._repr_html_()
 
 
+def test_a_function_plays_as_a_folder_with_its_code_does(cluster: evp.Cluster, policy: Path) -> None:
+    gain, calls = 0.3, []
+
+    def act(obs: np.ndarray) -> list[float]:
+        calls.append(obs)
+        return [gain * (obs[2] - obs[0])]
+
+    played = cluster.evaluate(act, env="toy/line", cases=[3, 1])
+    written = cluster.evaluate(policy, env="toy/line", cases=[3, 1])
+    assert [*played.returns] == [*written.returns]
+    assert calls == []
+
+
 def test_async_twins_play_at_once_and_give_the_same(cluster: evp.Cluster, policy: Path) -> None:
     async def both() -> list[evp.Evaluation]:
         calls = (cluster.evaluate_async(policy, env="toy/line", cases=[case]) for case in (0, 1))

@@ -14,10 +14,10 @@ from evopolicy_common.errors import ConfigError
 from evopolicy_common.records.open_run import IntendedRun
 from evopolicy_common.records.run_record import inputs_digest
 from evopolicy_gateway import harnesses
-from evopolicy_gateway.run.run_options import RunOptions
 from evopolicy_gateway.inputs.declared import read
 from evopolicy_gateway.jail.settings import JailSettings
 from evopolicy_gateway.run.plan import Plan
+from evopolicy_gateway.run.run_options import RunOptions
 from evopolicy_gateway.run_folder.layout import save
 
 SUBMIT = "curl -s -X POST -d '{\"env_instances\": [0, 1]}' $EVOPOLICYGYM_SUBMIT_URL"

@@ -41,6 +41,7 @@ WRONG_RUNS: list[dict[str, Any]] = [
 ]
 WRONG_EVALUATIONS: list[dict[str, Any]] = [
     {"policy": None},
+    {"policy": dict},
     {"env": 3},
     {"cases": 3},
     {"cases": "0-3"},

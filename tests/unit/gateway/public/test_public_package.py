@@ -17,7 +17,8 @@ import cloudpickle
 import pytest
 
 import evopolicy as evp
-from evopolicy import _cluster, _loop
+from evopolicy import _functions, _loop
+from evopolicy_common.records.policies import bundles
 
 EARLIER = Path(__file__).parents[3] / "conformance" / "protocol" / "earlier_run" / "run"
 
@@ -137,13 +138,29 @@ def test_a_functions_own_module_goes_with_it_to_the_jail(tmp_path: Path) -> None
     def agent(workspace: evp.Workspace) -> int:
         return helper() + 1
 
-    words = _cluster._pickled(agent, tmp_path / "function.pickle")
+    words = _functions.agent_of(agent, tmp_path / "function.pickle")
     assert words.endswith(str(tmp_path / "function.pickle"))
     # Where the module of this test cannot be imported; the type that is only named must not be needed.
     asked = "import cloudpickle, pathlib, sys; print(cloudpickle.loads(pathlib.Path(sys.argv[1]).read_bytes())(None))"
     command = [sys.executable, "-c", asked, str(tmp_path / "function.pickle")]
     done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)
     assert done.stdout == "42\n", done.stderr
+
+
+@pytest.mark.parametrize("version", [sys.version_info[:2], (2, 7)])
+def test_a_function_is_a_policy_where_only_the_standard_library_is(
+    version: tuple[int, int], tmp_path: Path
+) -> None:
+    gain = 2
+    bundles.unpack(
+        _functions.policy_of(lambda observation: gain * observation + helper()), tmp_path / "policy"
+    )
+    code = tmp_path / "policy" / "policy.py"
+    code.write_text(code.read_text().replace(str(sys.version_info[:2]), str(version)))
+    asked = f"import sys; sys.path.append({str(code.parent)!r}); import policy; print(policy.Policy(0, 0, 0).act(3))"
+    done = subprocess.run([sys.executable, "-ISc", asked], capture_output=True, text=True, check=False)
+    assert done.stdout == ("47\n" if version == sys.version_info[:2] else ""), done.stderr
+    assert ("evaluate a folder with a policy.py" in done.stderr) == (version == (2, 7))
 
 
 def test_what_cannot_be_sent_is_reported(tmp_path: Path) -> None:
@@ -153,7 +170,12 @@ def test_what_cannot_be_sent_is_reported(tmp_path: Path) -> None:
         lock.acquire()
 
     with pytest.raises(evp.ConfigError, match="agent agent cannot be sent to its jail"):
-        _cluster._pickled(agent, tmp_path / "function.pickle")
+        _functions.agent_of(agent, tmp_path / "function.pickle")
+    with pytest.raises(evp.ConfigError, match="policy agent cannot be sent to the sandbox"):
+        _functions.policy_of(agent)
+    weights = os.urandom(bundles.MAX_BYTES)
+    with pytest.raises(evp.ConfigError, match="with the values that it uses: bundle holds"):
+        _functions.policy_of(lambda observation: weights[0])
 
 
 def test_wrong_arguments_are_reported_before_anything_starts(tmp_path: Path) -> None:
