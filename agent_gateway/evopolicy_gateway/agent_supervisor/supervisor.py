@@ -197,8 +197,8 @@ def _tell(doing: AgentDoing) -> None:
 
 
 async def _tell_use(clock: AgentClock, resources: Resources) -> None:
-    """Reports the used time and resources periodically, so that an agent that is killed and resumed gets no extra time; and each
-    limit when it is reached first."""
+    """Reports the used time and resources periodically, so that an agent that is killed and resumed gets no
+    extra time; and each limit when it is reached first."""
     told = ""
     while True:
         child_messages.emit(AgentUsed(resources=resources.used()))

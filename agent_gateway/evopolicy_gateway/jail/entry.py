@@ -1,9 +1,10 @@
 """Runs inside the jail before the agent's program: listens on loopback ports, sends the sockets out, executes the
 program.
 
-`python -I -S entry.py FD PORT,PORT,… PROCESSES PROGRAM…`. FD is a unix socket to the agent supervisor, `-` where the network
-is open. PROCESSES is the greatest number of processes, which the kernel counts in this user namespace; `-` for no limit. A socket stays in the network namespace in which it was created, so the agent supervisor serves these ports, while
-the agent has no route out itself.
+`python -I -S entry.py FD PORT,PORT,… PROCESSES PROGRAM…`. FD is a unix socket to the agent supervisor, `-`
+where the network is open. PROCESSES is the greatest number of processes, which the kernel counts in this
+user namespace; `-` for no limit. A socket stays in the network namespace in which it was created, so the
+agent supervisor serves these ports, while the agent has no route out itself.
 """
 
 from __future__ import annotations

@@ -50,7 +50,8 @@ _MAKES_A_FILE = os.O_CREAT | (os.O_TMPFILE & ~os.O_DIRECTORY)
 
 
 def filter_program(*, fixed_cores: bool = False) -> bytes:
-    """The filter, 8 bytes an instruction. `fixed_cores`: affinity cannot be changed. Raises ConfigError on a processor without a table of calls."""
+    """The filter, 8 bytes an instruction. `fixed_cores`: affinity cannot be changed. Raises ConfigError on a
+    processor without a table of calls."""
     machine = os.uname().machine
     if machine not in AUDIT_ARCH:
         known = " and ".join(sorted(AUDIT_ARCH))

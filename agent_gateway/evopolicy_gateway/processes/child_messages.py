@@ -107,7 +107,8 @@ class AgentEnded(Event, frozen=True, kw_only=True, tag="agent_ended"):
     """The agent and all its children are gone."""
 
     reason: str
-    """`agent_stopped`, `agent_failed`, `wall_limit`, `silent`, `disk_limit`, or `told` when the parent ended it."""
+    """`agent_stopped`, `agent_failed`, `wall_limit`, `silent`, `disk_limit`, or `told` when the parent ended
+    it."""
     detail: str = ""
     turns: int = 0
     """Prompts that it answered."""

@@ -1,7 +1,8 @@
 """The disk space that an agent's files take, which the agent may change meanwhile.
 
-Space counts, not length: a sparse file takes little. Each file and folder counts at least `LEAST_BYTES`, since file systems have
-a bounded number of them. Deleted files count while a process of the agent has them open.
+Space counts, not length: a sparse file takes little. Each file and folder counts at least `LEAST_BYTES`,
+since file systems have a bounded number of them. Deleted files count while a process of the agent has them
+open.
 """
 
 from __future__ import annotations
@@ -23,7 +24,8 @@ class TooDeepError(Exception):
 
 
 def used_bytes(folders: Iterable[Path], skipped: Path, pids: Iterable[int]) -> int:
-    """Space of all in `folders` without `skipped`, and of deleted files that `pids` have open. Raises TooDeepError."""
+    """Space of all in `folders` without `skipped`, and of deleted files that `pids` have open. Raises
+    TooDeepError."""
     counted: set[tuple[int, int]] = set()
     total, devices = 0, set()
     for folder in folders:
@@ -41,7 +43,8 @@ def used_bytes(folders: Iterable[Path], skipped: Path, pids: Iterable[int]) -> i
 
 
 def _below(root: Path, skipped: Path, counted: set[tuple[int, int]]) -> int:
-    """Enters folders by descriptors: a path may be longer than the system takes, or lead elsewhere a moment later."""
+    """Enters folders by descriptors: a path may be longer than the system takes, or lead elsewhere a moment
+    later."""
     total = 0
     stack: list[tuple[int, list[str]]] = []
     try:

@@ -1,8 +1,9 @@
 """An agent's share of its machine: its limits, by what they are kept, and what its programs have used.
 
-Cgroups keep the limits where the agent supervisor may make one. Elsewhere a jailed agent has a number of cores, by affinity,
-and a number of processes, by a resource limit that Linux counts in each user namespace since 5.14, though never for root. What
-nothing keeps is recorded as unlimited. No quota keeps the size of files: the supervisor measures it, and ends the agent.
+Cgroups keep the limits where the agent supervisor may make one. Elsewhere a jailed agent has a number of
+cores, by affinity, and a number of processes, by a resource limit that Linux counts in each user namespace
+since 5.14, though never for root. What nothing keeps is recorded as unlimited. No quota keeps the size of
+files: the supervisor measures it, and ends the agent.
 """
 
 from __future__ import annotations
@@ -34,8 +35,8 @@ class Resources:
     """The limits and the use of one agent, from its supervisor's start to its end."""
 
     def __init__(self, asked: AgentLimits, folders: Sequence[Path], skipped: Path, *, jailed: bool) -> None:
-        """`folders`: with the agent's files, without `skipped`. Where no cgroup holds the cores, this thread and the programs
-        that it starts are bound to some."""
+        """`folders`: with the agent's files, without `skipped`. Where no cgroup holds the cores, this thread
+        and the programs that it starts are bound to some."""
         self._asked = asked
         self._folders, self._skipped = folders, skipped
         wanted = {

@@ -1,7 +1,8 @@
 """Connections to the provider: a request goes out, and its answer comes in as bytes.
 
-httpcore, the part of httpx below its client, does the work. The client would build, copy and check every request and answer once
-more, for redirects, cookies and logins that a relay does not want; that took a third of the relay's processor time.
+httpcore, the part of httpx below its client, does the work. The client would build, copy and check every
+request and answer once more, for redirects, cookies and logins that a relay does not want; that took a sixth
+of the relay's processor time.
 """
 
 from __future__ import annotations
@@ -47,8 +48,8 @@ class Provider:
     """Connections to one API, which stay open between requests."""
 
     def __init__(self, base_url: str, timeout_s: float) -> None:
-        """`timeout_s`: longest time without a byte. The proxy of the variables (`HTTPS_PROXY`, …) is used, unless `NO_PROXY` names
-        the host; it does not lead to this machine."""
+        """`timeout_s`: longest time without a byte. The proxy of the variables (`HTTPS_PROXY`, …) is used,
+        unless `NO_PROXY` names the host; it does not lead to this machine."""
         parts = urlsplit(base_url)
         host = parts.hostname or ""
         proxies = {} if host in _HERE or proxy_bypass(host) else getproxies()

@@ -70,8 +70,8 @@ class Relay:
         spent: Callable[[str], None],
         now: Callable[[], float] = time.time,
     ) -> None:
-        """`counted` is called after each request, `note` with a line for the operator, `spent` with the limit that is used up. `now`:
-        Unix time, seconds."""
+        """`counted` is called after each request, `note` with a line for the operator, `spent` with the
+        limit that is used up. `now`: Unix time, seconds."""
         self._order = order
         self._upstream = order.upstream
         self._ledger = Ledger(Path(order.ledger), order.model)
@@ -381,7 +381,8 @@ class _Streamed(StreamingResponse):
 
 @contextlib.asynccontextmanager
 async def _while_there(receive: Receive) -> AsyncIterator[None]:
-    """Ends what is inside when the agent goes, and raises ClientDisconnect then. The request's body has to be read before."""
+    """Ends what is inside when the agent goes, and raises ClientDisconnect then. The request's body has to
+    be read before."""
     task, watching = asyncio.current_task(), True
     assert task is not None
 

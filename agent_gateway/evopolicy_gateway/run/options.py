@@ -26,7 +26,8 @@ AGENT_LIMITS: dict[str, tuple[str, float, float]] = {
     "pids": ("pids", 16, 1 << 22),
     "disk": ("disk_bytes", 1e6, 1e18),
 }
-"""Options `--agent-NAME`: the field of `AgentLimits`, the least value with which programs still start, the greatest."""
+"""Options `--agent-NAME`: the field of `AgentLimits`, the least value with which programs still start, the
+greatest."""
 OWN = {
     "policy_scope": "episode",
     "observations": "arrays",
@@ -101,7 +102,8 @@ def run_settings(given: Any, **named: Any) -> RunSettings:
 
 
 def agent_limits(given: Any) -> AgentLimits:
-    """What the agent may take of its machine; `given` as for `run_settings`. Raises ConfigError that names the option."""
+    """What the agent may take of its machine; `given` as for `run_settings`. Raises ConfigError that names
+    the option."""
     chosen: dict[str, Any] = {}
     for name, (field, least, most) in AGENT_LIMITS.items():
         value = getattr(given, f"agent_{name}")

@@ -151,7 +151,8 @@ class Plan(msgspec.Struct, frozen=True, kw_only=True):
         check_agent(self.agent, self.listener)
         if self.listener is not None and self.limits != AgentLimits():
             raise ConfigError(
-                "--agent-cpus, --agent-memory, --agent-pids and --agent-disk limit an agent that is started here; leave them out"
+                "--agent-cpus, --agent-memory, --agent-pids and --agent-disk limit an agent that is started here;"
+                " leave them out"
             )
         self.harness().check(self.settings.env)
         self.jail.check()

@@ -14,8 +14,8 @@ from evopolicy_gateway.relay.usage import Prices
 
 
 def read(file: str | Path | None, config: AgentConfig | None, started_in: Path) -> Prices | None:
-    """The prices of an agent's model; None without a file, or for an agent without a model. Raises ConfigError that names the file
-    and the fault."""
+    """The prices of an agent's model; None without a file, or for an agent without a model. Raises
+    ConfigError that names the file and the fault."""
     if file is None or config is None:
         return None
     path = shipped.found(file, started_in)
@@ -29,7 +29,7 @@ def read(file: str | Path | None, config: AgentConfig | None, started_in: Path) 
         )
     if config.model not in tables:
         raise ConfigError(
-            f'--prices {path} has no prices for {config.model}: add a table ["{config.model}"] with input and output, in US dollars'
-            " per million tokens"
+            f'--prices {path} has no prices for {config.model}: add a table ["{config.model}"] with input and'
+            " output, in US dollars per million tokens"
         )
     return tables[config.model]

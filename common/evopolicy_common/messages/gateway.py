@@ -258,8 +258,8 @@ class CloseRun(Message, frozen=True, kw_only=True, tag="close_run"):
     run: Word
     token: Word
     reason: Text
-    """`budget_spent`, `agent_stopped`, `agent_failed`, `silent`, `wall_limit`, `model_budget_spent`, `disk_limit`,
-    `cancelled`."""
+    """`budget_spent`, `agent_stopped`, `agent_failed`, `silent`, `wall_limit`, `model_budget_spent`,
+    `disk_limit`, `cancelled`."""
     agent: Plain = {}
     """The gateway's facts about the agent for `run.json`: turns, retries, tokens, version."""
 

@@ -1,11 +1,12 @@
 """Cgroups of this process's own making, which limit and count other processes. Linux only, versions 1 and 2.
 
 Rules:
-- Each controller (`cpu`, `memory`, `pids`) is used where the machine has it: in a hierarchy of version 1, or in version 2.
+- Each controller (`cpu`, `memory`, `pids`) is used where the machine has it: in a hierarchy of version 1, or
+  in version 2.
 - A new group lies below the cgroup of this process, so that the limits of that one hold too.
-- Version 2 is used only where it is this process's own: in a cgroup that systemd has delegated (`user.delegate`), or at the
-  root of the cgroup namespace. A group with controllers for groups below it may not hold processes, so those of the delegated
-  one move to a group `SIBLINGS` below it.
+- Version 2 is used only where it is this process's own: in a cgroup that systemd has delegated
+  (`user.delegate`), or at the root of the cgroup namespace. A group with controllers for groups below it may
+  not hold processes, so those of the delegated one move to a group `SIBLINGS` below it.
 - What cannot be made is left out: without rights there is no group, and `Group.held` says what holds.
 """
 
@@ -64,7 +65,8 @@ class Group:
     """A group of processes, in every hierarchy that this process may use. Empty where it may use none."""
 
     def __init__(self, limits: Mapping[str, int]) -> None:
-        """`limits` by controller: `cpu` in microseconds of processor time in 0.1 s, `memory` in bytes, `pids` in tasks."""
+        """`limits` by controller: `cpu` in microseconds of processor time in 0.1 s, `memory` in bytes,
+        `pids` in tasks."""
         self.held: dict[str, int] = {}
         """Version of the cgroup that counts, and limits where a limit was given, by controller."""
         self._folders: dict[str, Path] = {}
@@ -98,7 +100,8 @@ class Group:
         return first if first is not None else self._number("memory", "memory.peak")
 
     def hits(self, controller: str) -> int:
-        """How often the limit was reached: processes that the kernel ended for memory, forks that it refused."""
+        """How often the limit was reached: processes that the kernel ended for memory, forks that it
+        refused."""
         if controller not in self.held:
             return 0
         return self._number(controller, *_FILES[controller, self.held[controller]].hits) or 0

@@ -1,7 +1,9 @@
-"""Starts a program that ends with its parent: `python -I -S parent_death.py PARENT_PID SIGNAL JOINS PROGRAM…`.
+"""Starts a program that ends with its parent: `python -I -S parent_death.py PARENT_PID SIGNAL JOINS
+PROGRAM…`.
 
-Joins cgroups (`JOINS`: their `cgroup.procs`, separated by colons), sets the parent-death signal, which survives exec, and then executes the program. It is a program of its own because
-code between fork and exec is not safe in a process with threads or a Zenoh session.
+Joins cgroups (`JOINS`: their `cgroup.procs`, separated by colons), sets the parent-death signal, which
+survives exec, and then executes the program. It is a program of its own because code between fork and exec
+is not safe in a process with threads or a Zenoh session.
 """
 
 from __future__ import annotations
@@ -18,7 +20,8 @@ _PR_SET_PDEATHSIG = 1
 def ending_with_parent(
     program: Sequence[str], death_signal: signal.Signals = signal.SIGTERM, joins: Sequence[str] = ()
 ) -> list[str]:
-    """The command that starts `program` so that it ends with this process, in the cgroups of which `joins` are the files.
+    """The command that starts `program` so that it ends with this process, in the cgroups of which `joins`
+    are the files.
 
     The child must be started from this process's main thread: the signal is bound to the parent's thread.
     """
@@ -32,8 +35,8 @@ def end_with_parent(death_signal: signal.Signals) -> None:
 
 
 def main(arguments: list[str]) -> None:
-    """Executes the program; exit code 1 when the parent is gone already, or a cgroup; 127 when the program cannot be
-    started."""
+    """Executes the program; exit code 1 when the parent is gone already, or a cgroup; 127 when the program
+    cannot be started."""
     parent, death_signal, program = int(arguments[0]), signal.Signals(int(arguments[1])), arguments[3:]
     end_with_parent(death_signal)
     for path in filter(None, arguments[2].split(":")):

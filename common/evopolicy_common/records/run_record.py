@@ -127,7 +127,8 @@ class AgentResources(msgspec.Struct, frozen=True, kw_only=True):
     cpu_s: float = 0.0
     """Processor time of all its programs, seconds."""
     memory_peak_bytes: int = 0
-    """Most memory at once: as a cgroup counts it, with cached files; else the greatest sum of resident sizes, seen every 5 s."""
+    """Most memory at once: as a cgroup counts it, with cached files; else the greatest sum of resident
+    sizes, seen every 5 s."""
     disk_bytes: int = 0
     """Most space of its files that was seen."""
     ended_for_memory: int = 0

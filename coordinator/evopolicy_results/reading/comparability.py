@@ -118,7 +118,8 @@ _MODEL_LIMITS = {
 _AGENT_LIMITS = {
     "agent limits": _Setting(
         lambda run: _agent_limits(run),
-        "the same --agent-cpus, --agent-memory, --agent-pids, and --agent-disk, on machines that can keep them",
+        "the same --agent-cpus, --agent-memory, --agent-pids, and --agent-disk, on machines that can keep"
+        " them",
     )
 }
 _BY_ENTRY = {

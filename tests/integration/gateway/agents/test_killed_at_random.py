@@ -1,4 +1,5 @@
-"""Runs whose processes are killed at random instants: what is recorded of the model is what its API has counted."""
+"""Runs whose processes are killed at random instants: what is recorded of the model is what its API has
+counted."""
 
 from __future__ import annotations
 
@@ -41,7 +42,8 @@ def test_kills_at_random_lose_at_most_the_requests_in_flight(
 ) -> None:
     chance = random.Random(f"{seed} {end}")
     monkeypatch.setenv("MODEL_ACCESS", "key-of-the-test-0123456789")
-    # Each answer in flight may be lost, and its step with it: there are more steps than a run without kills needs.
+    # Each answer in flight may be lost, and its step with it: there are more steps than a run without kills
+    # needs.
     script = [*[Step(command=f"sleep 0.0{n % 4}") for n in range(40)], *[SUBMIT] * 20]
     lost = 0
     with ModelApi(script) as api, contextlib.ExitStack() as stack:
@@ -71,7 +73,8 @@ def test_kills_at_random_lose_at_most_the_requests_in_flight(
     assert use.requests is not None
     assert tokens is not None
     assert n_asked - lost <= use.requests <= n_asked
-    # Requests that reached the API, but whose agent was killed before their end, are counted without tokens or with some.
+    # Requests that reached the API, but whose agent was killed before their end, are counted without tokens
+    # or with some.
     whole = use.requests - use.requests_failed
     assert whole <= n_answered <= n_asked
     assert whole * CACHED <= tokens.cache_read <= n_answered * CACHED

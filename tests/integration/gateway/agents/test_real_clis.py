@@ -158,7 +158,7 @@ def test_the_real_cli_plays_and_resumes_a_jailed_run(tmp_path: Path, harness: st
     assert policy.read_text().count("# better") == 2
 
 
-@pytest.mark.parametrize("harness", ["codex", "claude-code", "qwen"])
+@pytest.mark.parametrize("harness", ["codex", "claude-code", "qwen", "qwen-acp"])
 def test_the_relay_counts_for_a_real_cli_which_never_has_the_key(
     tmp_path: Path, harness: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -174,14 +174,19 @@ def test_the_relay_counts_for_a_real_cli_which_never_has_the_key(
         vendor = "ANTHROPIC" if anthropic else "OPENAI"
         monkeypatch.setenv(f"{vendor}_API_KEY", "sk-wild-0123456789abcdef")
         monkeypatch.setenv(f"{vendor}_BASE_URL", api.base_url if anthropic else f"{api.base_url}/v1")
-        program = Path(CLIS) / {"claude-code": "claude"}.get(harness, harness)
-        lines = [f'harness = "{harness}"\nmodel = "gpt-5.5"\nprogram = ["{program}"]\nbackoff_s = 0.01\n']
-        if harness == "qwen":
+        name = harness.removesuffix("-acp")
+        program = [f"{CLIS}/{ {'claude-code': 'claude'}.get(name, name) }"]
+        if name == "qwen":
             rest = (AGENTS / "qwen.toml").read_text()
-            lines += [
-                f'[api]\nprotocol = "openai"\nbase_url = "{api.base_url}/v1"\n',
-                rest[rest.index("[cli]") :],
-            ]
+            table = rest[rest.index("[cli]") :]
+        if harness == "qwen-acp":
+            program += ["--acp", "--model", "gpt-5.5", "--auth-type", "openai"]
+            table = "[acp]\n"
+        lines = [
+            f'harness = "{harness}"\nmodel = "gpt-5.5"\nprogram = {json.dumps(program)}\nbackoff_s = 0.01\n'
+        ]
+        if name == "qwen":
+            lines += [f'[api]\nprotocol = "openai"\nbase_url = "{api.base_url}/v1"\n', table]
         (tmp_path / "agent.toml").write_text("".join(lines))
         arguments = ("--env", "toy/line", "--agent", "file:agent.toml", "--exp-id", "t", "--budget", "4")
         with command(tmp_path, "local", *arguments, *SMALL_HIDDEN) as running:
@@ -194,6 +199,7 @@ def test_the_relay_counts_for_a_real_cli_which_never_has_the_key(
     assert (use.metering, use.requests, use.requests_failed) == ("relay", api.n_asked, 2), running.text
     assert (tokens.output, tokens.cache_read) == (api.n_answered * OUTPUT, api.n_answered * CACHED)
     assert record.agent.cli_version is not None
+    assert (record.agent.model_string, use.other_models) == ("gpt-5.5", {})
     assert all("sk-wild" in key for key in api.keys)
     assert "sk-wild" not in json.dumps(api.requests)
     assert "next try in 1 s" in running.text

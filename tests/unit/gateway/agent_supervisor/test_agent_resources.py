@@ -200,7 +200,8 @@ def test_without_cgroups_cores_and_processes_are_limited_in_the_jail(
 
 
 def test_processes_are_counted_in_the_jail_alone() -> None:
-    program = "import os, time\nn = 0\ntry:\n while True:\n  os.fork() or time.sleep(5)\n  n += 1\nexcept OSError: print(n)"
+    program = "import os, time\nn = 0\ntry:\n while True:\n  os.fork() or time.sleep(5)\n  n += 1\n"
+    program += "except OSError: print(n)"
     command = ["bwrap", "--unshare-user", "--unshare-pid", "--die-with-parent", "--ro-bind", "/", "/"]
     command += ["--dev", "/dev", "/usr/bin/python3", "-I", "-S", entry.__file__, "-", "-", "16"]
     user: dict[str, Any] = {"user": 65534} if os.getuid() == 0 else {}

@@ -10,7 +10,8 @@ from evopolicy_gateway.relay.provider import Provider
 
 
 def asked(monkeypatch: pytest.MonkeyPatch, base: str, proxy: str, no_proxy: str = "") -> list[bytes]:
-    """The head of a request to `base`, as the server on loopback gets it that stands at `{}` in both addresses."""
+    """The head of a request to `base`, as the server on loopback gets it that stands at `{}` in both
+    addresses."""
     heads: list[bytes] = []
 
     async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
