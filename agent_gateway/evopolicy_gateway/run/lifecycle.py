@@ -34,7 +34,7 @@ from evopolicy_common.processes.notices import Waiting
 from evopolicy_common.processes.scratch import remove_tree
 from evopolicy_common.records.open_run import IntendedRun, OpenedRun
 from evopolicy_common.records.run_files import read_record
-from evopolicy_common.records.run_record import RunRecord
+from evopolicy_common.records.run_record import AgentLimits, RunRecord
 from evopolicy_common.records.secrets import without_keys
 from evopolicy_common.wire import credentials
 from evopolicy_common.wire.credentials import Credentials
@@ -77,6 +77,8 @@ _MAX_QUICK_DEATHS = 5
 _MAX_SUPERVISOR_DEATHS = 5
 _USAGE_ERROR = 2
 _SURVIVORS_PAUSE_S = 1.0
+_ENDLESS = 1 << 62
+"""Bytes that a remote agent's workspace may take: its files may be elsewhere, and are its operator's."""
 
 
 class RunError(EvopolicyError):
@@ -523,7 +525,7 @@ class RunLifecycle:
         self._held_before = self._stopwatch.times.held_s
         left_s = max(1.0, self._plan.wall_limit_s - self._stopwatch.times.agent_s)
         program = [sys.executable, "-P", "-m", "evopolicy_gateway.agent_supervisor.supervisor"]
-        config = self._plan.agent_config
+        config, here = self._plan.agent_config, self._plan.listener is None
         self._supervisor = await Child.start(program, self._folder.harness_log, talks=True)
         await self._supervisor.tell(
             StartAgent(
@@ -544,7 +546,7 @@ class RunLifecycle:
                 passed_file=str(self._folder.passed),
                 lock=str(self._folder.supervisor_lock),
                 jail=self._jail(),
-                limits=self._plan.limits,
+                limits=self._plan.limits if here else AgentLimits(disk_bytes=_ENDLESS),
             )
         )
         await self._supervisor.tell(self._submits)
@@ -558,7 +560,7 @@ class RunLifecycle:
                 self._watch.doing(self._name, event)
             elif isinstance(event, AgentTime):
                 self._stopwatch.agent_reported(event.used_s)
-            elif isinstance(event, AgentUsed):
+            elif isinstance(event, AgentUsed) and here:
                 self._stopwatch.agent_used(event.resources)
             elif isinstance(event, AgentSurvives):
                 self._survivors = list(event.pids)

@@ -85,6 +85,7 @@ class Stopwatch:
     def agent_used(self, resources: AgentResources) -> None:
         """Sets what the current agent has used."""
         self._resources = resources
+        self.keep()
 
     def gateway_begins(self) -> None:
         """A new gateway starts: its counts begin at zero."""
