@@ -13,7 +13,7 @@ import os
 import re
 import signal
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
 from evopolicy_common.installation import as_called
@@ -58,6 +58,22 @@ def csv_cell(value: Any) -> Any:
     text = harmless(value)
     formula = text.lstrip().startswith(("=", "+", "-", "@")) and not _NUMBERS.fullmatch(text)
     return f"'{text}" if formula else text
+
+
+_REASONS = ("why", "error", "detail")
+
+
+def event_text(event: str, values: Mapping[str, Any]) -> str:
+    """An event of a log as people read it: `slot was stopped from outside (2 s): …`. Values named `why`, `error` or `detail` are
+    its reason, seconds (`…_s`) need no name, and empty ones are left out."""
+    given = {name: value for name, value in values.items() if value not in ("", None)}
+    details = ", ".join(
+        f"{value} s" if name.endswith("_s") else f"{name.replace('_', ' ')} {value}"
+        for name, value in given.items()
+        if name not in _REASONS
+    )
+    reasons = [str(given[name]) for name in _REASONS if name in given]
+    return ": ".join([event + (f" ({details})" if details else ""), *reasons])
 
 
 def number(value: float | None) -> str:

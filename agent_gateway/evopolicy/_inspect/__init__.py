@@ -35,6 +35,7 @@ from evopolicy._loop import awaited
 from evopolicy._runs import Run
 from evopolicy_common import catalogue
 from evopolicy_common.processes import host
+from evopolicy_common.records.words import in_words
 from evopolicy_gateway.agents.client import Client, ProtocolError, Refusal
 from evopolicy_gateway.harnesses.coding_agents import session
 from evopolicy_gateway.relay.usage import Usage
@@ -210,7 +211,7 @@ def heldout_return() -> Callable[[TaskState, Target], Awaitable[Score]]:
         names = ("status", "best_submit", "budget_used", "random_score", "run")
         return Score(
             value=float("nan") if run.score is None else run.score,
-            explanation=f"{summary.status}; run directory {live.folder.root}",
+            explanation=f"{in_words(summary.status)}; run directory {live.folder.root}",
             metadata={name: getattr(summary, name) for name in names},
         )
 

@@ -23,6 +23,7 @@ from evopolicy_common.errors import ConfigError, EvopolicyError
 from evopolicy_common.records.blobs import write_atomically
 from evopolicy_common.records.open_run import IntendedRun
 from evopolicy_common.records.run_files import read_record
+from evopolicy_common.records.words import in_words
 from evopolicy_gateway.harbor.task import task_files, task_name
 from evopolicy_gateway.run_folder.layout import RunFolder, folder_of, saved
 from evopolicy_gateway.run_folder.listener import finish
@@ -106,6 +107,6 @@ def _score(folder: RunFolder) -> Response:
         return PlainTextResponse("the run is being scored\n", 202)
     outcome = read_record(folder.root).outcome
     if outcome.score is None:
-        why = outcome.error or outcome.status
+        why = outcome.error or in_words(outcome.status)
         return PlainTextResponse(f"the run {folder.root} has no score: {why}\n", 409)
     return PlainTextResponse(f"{outcome.score!r}\n")

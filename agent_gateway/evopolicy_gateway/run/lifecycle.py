@@ -36,6 +36,7 @@ from evopolicy_common.records.open_run import IntendedRun, OpenedRun
 from evopolicy_common.records.run_files import read_record
 from evopolicy_common.records.run_record import AgentLimits, RunRecord
 from evopolicy_common.records.secrets import without_keys
+from evopolicy_common.records.words import in_words
 from evopolicy_common.wire import credentials
 from evopolicy_common.wire.credentials import Credentials
 from evopolicy_gateway.jail.jail import JailOrder
@@ -343,12 +344,13 @@ class RunLifecycle:
         if self._model_spent.is_set() and reason in ("agent_stopped", "agent_failed", "told"):
             reason = "model_budget_spent"
         reason = CANCELLED if self._cancelled else reason
-        how = f"agent ended: {reason.replace('_', ' ')}"
+        how = f"agent ended: {in_words(reason)}"
         self._watch.note(self._name, f"{how}, {ended.detail}" if ended.detail else how)
         if reason == "agent_failed":
-            for line in ended.stderr_tail or ("nothing",):
+            for line in ended.stderr_tail:
                 self._watch.note(self._name, f"stderr: {line}")
-            self._watch.note(self._name, f"full log: {self._folder.agent_log}")
+            without = "" if ended.stderr_tail else "the agent printed no errors; "
+            self._watch.note(self._name, f"{without}full log: {self._folder.agent_log}")
         facts = without_keys(ended.facts)
         about = {"turns": ended.turns, "retries": ended.retries, "detail": ended.detail, **facts}
         try:

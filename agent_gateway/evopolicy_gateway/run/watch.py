@@ -18,6 +18,7 @@ from rich.text import Text
 
 from evopolicy_common.console import NarrowTable, Terminal
 from evopolicy_common.messages.operator import RunProgress
+from evopolicy_common.records.words import in_words
 from evopolicy_common.terminal import harmless
 from evopolicy_gateway.processes.child_messages import AgentDoing, Progress
 
@@ -198,7 +199,7 @@ class RunView(View[Row]):
             assert progress is not None
             mean = "" if details["mean"] is None else f", mean return {details['mean']:.4g}"
             left = f"{details['budget_left']} of {progress.episode_budget} episodes left"
-            return f"{details['submit']} {details['status']}{mean}; {left}"
+            return f"{details['submit']} {in_words(details['status'])}{mean}; {left}"
         if kind == "paused":
             return f"{details['why']} (for {details['seconds']} s)"
         return "" if details.get("phase") == "finished" else super().words(kind, run, details)
@@ -221,7 +222,7 @@ def _cells(row: Row) -> tuple[str, ...]:
     return (
         f"{_bar(used, progress.episode_budget)} {used}/{progress.episode_budget}",
         str(progress.n_submits),
-        "" if progress.last_submit_id is None else f"{progress.last_status}{mean}",
+        "" if progress.last_submit_id is None else f"{in_words(progress.last_status or '')}{mean}",
         "" if progress.best_mean is None else f"{progress.best_mean:.4g}",
         _now(row, progress),
     )

@@ -12,7 +12,7 @@ from evopolicy_gateway.run.plan import Plan
 
 EXIT_CODES = {"error": 1, "cancelled": 5, "agent_failed": 4, "no_ok_submit": 3}
 """Exit codes of a command that plays runs, most severe first; 0 when every run completed."""
-_AGENT_FAILED = ("agent_failed", "silent")
+_AGENT_FAILED = {"agent_failed": "its agent failed", "silent": "its agent was silent for too long"}
 
 
 def exit_code(runs: Sequence[Plan], index: Index) -> int:
@@ -37,8 +37,8 @@ def _why(run: Plan, entry: Entry | None) -> str:
     if entry is None or entry.state == "pending":
         return f"{run.name}: it was not begun"
     reasons = {
-        "agent_failed": f"its agent stopped: {entry.closed_reason}",
-        "no_ok_submit": "no submit of it was ok",
+        "agent_failed": _AGENT_FAILED.get(entry.closed_reason),
+        "no_ok_submit": "no submit had a working policy",
         "cancelled": "it was cancelled",
     }
     why = entry.error or reasons.get(_kind(entry), f"it was left {entry.state}")

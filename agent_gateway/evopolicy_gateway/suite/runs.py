@@ -14,6 +14,7 @@ from evopolicy_common.errors import ConfigError
 from evopolicy_common.local.cluster import unless_failed
 from evopolicy_common.records.run_record import Outcome, RunRecord
 from evopolicy_common.records.suite_folder import Entry, Index
+from evopolicy_common.records.words import in_words
 from evopolicy_common.terminal import number
 from evopolicy_common.wire.credentials import Credentials
 from evopolicy_gateway.operator.cluster import Cluster, connected
@@ -149,7 +150,7 @@ def report(played: PlayedRuns, runs: Path, console: Terminal) -> None:
     results = documents(played)
     for one in results:
         best = "" if one["best_submit_index"] is None else f"submit {one['best_submit_index']}"
-        shown = one["closed_reason"].replace("_", " ") if one["status"] == "completed" else one["status"]
+        shown = in_words(one["closed_reason"] if one["status"] == "completed" else one["status"])
         score, random = number(one["final_score"]), number(one["random_score"])
         made.add_row(one["env"], score, random, best, str(one["budget_used"]), shown)
     console.print(made)

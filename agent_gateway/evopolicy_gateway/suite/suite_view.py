@@ -16,6 +16,7 @@ from rich.text import Text
 from evopolicy_common.console import Terminal, table
 from evopolicy_common.messages.gateway import FREE_SLOT
 from evopolicy_common.records.suite_folder import FINISHED, Entry
+from evopolicy_common.records.words import in_words
 from evopolicy_common.terminal import number, say_json
 from evopolicy_gateway.processes.child_messages import AgentDoing
 from evopolicy_gateway.relay.usage import tokens_in
@@ -150,10 +151,10 @@ class SuiteView(View[SuiteRow]):
             if details["state"] == "cancelled":
                 return str(details["error"] or "cancelled")
             why = f": {details['error']}" if details["error"] else ""
-            return str(details["state"]).replace("_", " ") + why
+            return in_words(details["state"]) + why
         if kind == "submit":
             mean = "" if details["mean"] is None else f", mean return {number(details['mean'])}"
-            return f"{details['submit']} {details['status']}{mean}; {details['budget_left']} episodes left"
+            return f"{details['submit']} {in_words(details['status'])}{mean}; {details['budget_left']} episodes left"
         if kind == "paused":
             return f"{details['provider']} is away, waits {details['seconds']} s ({details['why']})"
         if kind == "elsewhere":
@@ -209,8 +210,7 @@ def results_table(entries: list[Entry]) -> Table:
         tokens = tokens_in(entry.tokens)
         made.add_row(
             Text(entry.name),
-            entry.state.replace("_", " ")
-            + (f" on {entry.host}" if entry.host and not entry.directory else ""),
+            in_words(entry.state) + (f" on {entry.host}" if entry.host and not entry.directory else ""),
             number(entry.score),
             number(entry.random),
             str(entry.budget_used),
@@ -256,7 +256,7 @@ def _ended(row: SuiteRow) -> str:
 
 def _cells(row: SuiteRow) -> tuple[str, ...]:
     progress, tokens = row.progress, tokens_in(row.tokens)
-    state = row.state.replace("_", " ")
+    state = in_words(row.state)
     if row.state == "running" and row.phase is not None:
         state = f"{PHASES[row.phase.phase]} {row.phase.done}/{row.phase.total}"
     elif row.state == "running" and progress is not None and progress.submit_id is not None:

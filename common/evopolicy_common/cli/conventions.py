@@ -17,7 +17,7 @@ import typer
 from evopolicy_common.errors import ConfigError, DamagedStoreError, EvopolicyError, MachineError
 from evopolicy_common.installation import as_called
 from evopolicy_common.processes.preflight import explained
-from evopolicy_common.terminal import harmless, one_line, say_lines, shortened
+from evopolicy_common.terminal import event_text, harmless, one_line, say_lines, shortened
 
 T = TypeVar("T")
 
@@ -111,10 +111,7 @@ def setup_notices() -> None:
 
     def plain(_: Any, __: str, event: Any) -> str:
         text, error = str(event.pop("event")), event.pop("exc_info", None)
-        details = ", ".join(f"{name} {value}" for name, value in event.items())
-        return one_line(
-            as_called(text + (f" ({details})" if details else "") + (f": {error!r}" if error else ""))
-        )
+        return one_line(as_called(event_text(text, event) + (f": {error!r}" if error else "")))
 
     structlog.configure(
         processors=[plain],

@@ -58,7 +58,7 @@ class Requester(Generic[Reply]):
         `wait_s` is how long the message itself lets the coordinator wait. Raises RefusedError for a refusal,
         TransportError without a reply, ProtocolError for another reply.
         """
-        with notify_if_slow(f"the coordinator's answer to {verb!r}", wait_s + AFTER_S):
+        with notify_if_slow("the coordinator to answer", wait_s + AFTER_S):
             answer = await self._link.ask(self._key_of(verb), codec.encode(message), wait_s + ANSWER_S)
         return expect(codec.decode(self._replies, answer), wanted)
 
@@ -83,9 +83,7 @@ class Requester(Generic[Reply]):
                     raise
                 if waited > warn_after_s:
                     warn_after_s = 2.0 * waited
-                    log.warning(
-                        "still waiting for the coordinator", verb=verb, waited_s=round(waited), why=str(error)
-                    )
+                    log.warning("still waiting for the coordinator", waited_s=round(waited), why=str(error))
             await asyncio.sleep(pause * random.uniform(0.5, 1.5))
             pause = min(LONGEST_PAUSE_S, pause * 2)
 

@@ -196,9 +196,10 @@ class Link:
             async with asyncio.timeout(timeout_s + STUCK_S):
                 answer = await future
         except (zenoh.ZError, TimeoutError, RuntimeError) as error:
-            raise TransportError(f"no answer on {_verb(key)} within {timeout_s:g} s: {error}") from error
+            why = str(error) or self._doubt()  # a timeout has no text
+            raise TransportError(f"no answer to {_verb(key)!r} within {timeout_s:g} s; {why}") from error
         if answer is None:
-            raise TransportError(f"no answer on {_verb(key)}; {self._doubt()}")
+            raise TransportError(f"no answer to {_verb(key)!r}; {self._doubt()}")
         return answer
 
     def ask_blocking(self, key: str, payload: bytes, timeout_s: float) -> bytes:
@@ -211,8 +212,8 @@ class Link:
                 if reply.ok is not None:
                     return bytes(reply.ok.payload)
         except zenoh.ZError as error:
-            raise TransportError(f"no answer on {_verb(key)}: {error}") from error
-        raise TransportError(f"no answer on {_verb(key)}; {self._doubt()}")
+            raise TransportError(f"no answer to {_verb(key)!r}: {error}") from error
+        raise TransportError(f"no answer to {_verb(key)!r}; {self._doubt()}")
 
     def declare_alive(self, key: str) -> None:
         """Holds a liveliness token on `key` while this link is open."""

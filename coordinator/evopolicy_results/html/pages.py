@@ -11,6 +11,7 @@ import msgspec
 from jinja2 import DictLoader, Environment, StrictUndefined
 from markupsafe import Markup, escape
 
+from evopolicy_common.records.words import in_words
 from evopolicy_results.behaviour.trace import Trace, TraceRow, diff, sources
 from evopolicy_results.figures.plot import Plot, inline_svg
 from evopolicy_results.figures.timelines import Row, timeline_svg
@@ -318,7 +319,7 @@ def trace_page(
     phases = Row(transitions=transitions, budget=run.budget, submits=run.submits)
     label = f"Code phases of {len(run.submits)} submits over {run.budget} episodes"
     svg = inline_svg(timeline_svg([phases]), "phases", label) if transitions else ""
-    closed = outcome.closed_reason.replace("_", " ")
+    closed = in_words(outcome.closed_reason)
     return page(
         "trace",
         title=f"{run.entry} on {title_of(run.env)}, {run.record.exp_id}",
@@ -401,7 +402,7 @@ def _change(row: TraceRow) -> str:
 
 def _outcome(submit: Submit, row: TraceRow, trace: Trace) -> str:
     if submit.status != "ok":
-        return f"{submit.status}: no working policy"
+        return f"{in_words(submit.status)}: no working policy"
     parts: list[str] = []
     before = next((r.submit for r in trace.rows if r.transition and row.transition
                    and r.submit.index == row.transition.previous), None)  # fmt: skip

@@ -37,6 +37,7 @@ from evopolicy_common.records.rescores import (
 from evopolicy_common.records.run_files import RUN_JSON, read_record
 from evopolicy_common.records.run_record import RunRecord
 from evopolicy_common.records.splits import FILE_STEMS, cases_hash, folder_of, read_split_file
+from evopolicy_common.records.words import in_words
 from evopolicy_common.refusals import WRONG_SETTINGS, Refusal
 from evopolicy_common.wire.transport import Link
 from evopolicy_results.evaluations import Evaluations, Tell
@@ -103,7 +104,7 @@ def read_finished(folders: Sequence[Path]) -> tuple[list[Finished], list[str], l
             continue
         best = record.outcome.best_submit_index
         if record.outcome.status != "completed" or best is None:
-            without.append(f"{folder}: ended as {record.outcome.status}, without a selected checkpoint")
+            without.append(f"{folder}: {in_words(record.outcome.status)}, without a selected checkpoint")
         elif not record.run:
             without.append(f"{folder}: an earlier version wrote it without the coordinator's name of the run")
         else:

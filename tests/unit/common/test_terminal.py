@@ -11,8 +11,9 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from evopolicy_common.cli.conventions import fail, setup_logging
+from evopolicy_common.cli.conventions import fail, setup_logging, setup_notices
 from evopolicy_common.console import Terminal, filled_table, table
+from evopolicy_common.logs import structlog
 from evopolicy_common.terminal import harmless, one_line, say, say_json, say_lines
 
 STEERING = [
@@ -27,6 +28,20 @@ MARKUP = "[/x] [bold]b[/bold] [link=http://evil]l[/link] :smile:"
 
 def is_plain(text: str) -> bool:
     return all(letter.isprintable() or letter == "\n" for letter in text)
+
+
+def test_a_warning_reaches_people_as_a_sentence(capsys: pytest.CaptureFixture[str]) -> None:
+    try:
+        setup_notices()
+        log = structlog.get_logger()
+        log.warning("still waiting for the coordinator", waited_s=28, why="no answer to 'poll'", detail="")
+        log.warning("the event loop was blocked", first_seen=3)
+    finally:
+        structlog.reset_defaults()
+    assert capsys.readouterr().err.splitlines() == [
+        "still waiting for the coordinator (28 s): no answer to 'poll'",
+        "the event loop was blocked (first seen 3)",
+    ]
 
 
 def on_terminal() -> tuple[Terminal, io.StringIO]:

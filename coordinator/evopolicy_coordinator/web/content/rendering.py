@@ -10,6 +10,7 @@ from typing import Any
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
+from evopolicy_common.records.words import in_words
 from evopolicy_common.terminal import duration, number
 from evopolicy_coordinator.web.content.feeds import View
 from evopolicy_results.html import visible
@@ -25,7 +26,7 @@ STATES = {
     "random": ("▷", "random reference"),
     "finished": ("✓", "finished"),
     "completed": ("✓", "completed"),
-    "no_ok_submit": ("∅", "no ok submit"),
+    "no_ok_submit": ("∅", in_words("no_ok_submit")),
     "error": ("!", "failed"),
     "cancelled": ("×", "cancelled"),
     "unreadable": ("!", "unreadable"),
@@ -48,7 +49,13 @@ def _environment() -> Environment:
         lstrip_blocks=True,
         finalize=visible,
     )
-    environment.filters |= {"number": number, "duration": duration, "short": short, "state": state_words}
+    environment.filters |= {
+        "number": number,
+        "duration": duration,
+        "short": short,
+        "state": state_words,
+        "words": in_words,
+    }
     environment.filters["priority"] = lambda name: _PRIORITIES.get(name, name)
     environment.globals["title_of"] = title_of
     return environment
@@ -99,4 +106,4 @@ def short(value: float) -> str:
 
 def state_words(state: str) -> str:
     """A run's state as people read it."""
-    return STATES.get(state, ("?", state.replace("_", " ")))[1]
+    return STATES.get(state, ("?", in_words(state)))[1]

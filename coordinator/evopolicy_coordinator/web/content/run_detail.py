@@ -26,6 +26,8 @@ from evopolicy_common.records.json_lines import objects
 from evopolicy_common.records.open_run import Accepted, Requested
 from evopolicy_common.records.policies import bundles
 from evopolicy_common.records.policies.checkpoints import METADATA
+from evopolicy_common.records.words import in_words
+from evopolicy_common.terminal import event_text
 from evopolicy_coordinator.web.content.confined import Confined, NotThereError
 
 MAX_TEXT = 256 << 10
@@ -448,10 +450,10 @@ _NOT_SHOWN = frozenset({"event", "level", "timestamp", "exception", "exc_info", 
 
 
 _EVENTS = {
-    "submit accepted": "{submit} accepted: {n_episodes} episodes.",
-    "submit committed": "{submit} ended: {status}.",
-    "agent ended": "The agent ended: {reason}.",
-    "run closed": "The run was closed: {reason}.",
+    "submit accepted": "{submit} accepted: {n_episodes} episodes",
+    "submit committed": "{submit} ended: {status}",
+    "agent ended": "The agent ended after {turns} turns: {reason}",
+    "run closed": "The run was closed: {reason}",
 }
 """Frequent events in words, by their names in the log."""
 
@@ -467,10 +469,9 @@ def _event(entry: dict[str, Any]) -> Happened:
     if name in _EVENTS:
         used = {field for _, field, _, _ in Formatter().parse(_EVENTS[name]) if field}
         if used <= values.keys():
-            text = _EVENTS[name].format(**{each: values.pop(each).replace("_", " ") for each in used})
-    more = ", ".join(f"{each} {value}" for each, value in values.items())
+            text = _EVENTS[name].format(**{each: in_words(values.pop(each)) for each in used})
     return Happened(
         at=str(entry.get("timestamp", ""))[:19].replace("T", " "),
         level=str(entry.get("level", ""))[:20],
-        text=f"{text} ({more})" if more else text,
+        text=event_text(text, values),
     )

@@ -167,7 +167,7 @@ def test_without_an_ok_submit_the_exit_code_says_so(operator_file: Path, tmp_pat
     outcome = record_in(run_dir(tmp_path)).outcome
     assert (outcome.status, outcome.final_score, outcome.best_submit_index) == ("no_ok_submit", 0.0, None)
     assert outcome.budget_used == 2
-    assert "no_ok_submit" in out
+    assert "no working submit" in out
 
 
 def test_replay_submits_the_given_policies_in_order_with_even_shares(

@@ -39,6 +39,13 @@ def worker(name: str, **more: object) -> WorkerStatus:
 def test_lost_workers_and_retries_stand_among_a_runs_events(tmp_path: Path) -> None:
     folder = open_run(tmp_path)
     lines = [
+        {
+            "event": "agent ended",
+            "reason": "agent_failed",
+            "detail": "Error code: 401",
+            "turns": 0,
+            "timestamp": "2026-01-02T00:00:40Z",
+        },
         {"event": "agent paused for the provider", "timestamp": "2026-01-02T00:00:30Z", "level": "info"},
         {
             "event": "submit committed",
@@ -55,9 +62,10 @@ def test_lost_workers_and_retries_stand_among_a_runs_events(tmp_path: Path) -> N
         page = browser.get(f"/run/{key(folder)}").text
     expected = [
         "1 job failed on worker w-cellar, through no fault of the policy. It is played again, at no charge.",
+        "The agent ended after 0 turns: agent failed: Error code: 401</li>",
         "agent paused for the provider",
         "Worker w-attic was lost with 3 jobs of this run. They are played again, at no charge.",
-        "submit 0003 ended: import error.</li>",
+        "submit 0003 ended: import error</li>",
         "run opened",
     ]
     places = [page.index(text) for text in expected]
@@ -134,11 +142,16 @@ def test_every_end_has_a_counter_and_a_place_in_the_legend(tmp_path: Path) -> No
     with client(site_of(tmp_path)) as browser:
         page = browser.get("/").text
     facts = re.findall(r"<li><span>([a-z ]+)</span><b>([^<]*)</b>", page)
-    assert facts[:4] == [("completed", "1 of 5"), ("failed", "2"), ("no ok submit", "1"), ("cancelled", "1")]
+    assert facts[:4] == [
+        ("completed", "1 of 5"),
+        ("failed", "2"),
+        ("no working submit", "1"),
+        ("cancelled", "1"),
+    ]
     legend = page.partition('<ul class="legend"')[2].partition("</ul>")[0]
     assert re.findall(r"</span>([a-z ]+)</li>", legend) == [
         "completed",
-        "no ok submit",
+        "no working submit",
         "failed",
         "cancelled",
     ]

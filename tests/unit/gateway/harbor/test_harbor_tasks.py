@@ -156,5 +156,5 @@ def test_a_run_without_a_score_has_no_reward(tmp_path: Path) -> None:
     client = TestClient(make_app({"t": folder, "gone": RunFolder(tmp_path / "gone")}, "t"))
     answer = client.post("/t", headers=TOKEN)
     assert answer.status_code == 409
-    assert "has no score: no_ok_submit" in answer.text
+    assert "has no score: no working submit" in answer.text
     assert client.post("/gone", headers=TOKEN).status_code == 409

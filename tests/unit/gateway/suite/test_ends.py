@@ -205,15 +205,15 @@ def test_exit_codes_and_the_report_tell_how_runs_ended(
         printed = capsys.readouterr().err.splitlines()
         assert [line.partition(":")[0] for line in printed] == [one.name for one in plans[1:]]
     assert printed == [
-        f"b: no submit of it was ok; see {tmp_path}/evolve/b/t",
-        f"c: its agent stopped: agent_failed; see {tmp_path}/evolve/c/t",
+        f"b: no submit had a working policy; see {tmp_path}/evolve/b/t",
+        f"c: its agent failed; see {tmp_path}/evolve/c/t",
         f"d: it was cancelled; see {tmp_path}/evolve/d/t",
         f"e: worker lost; see {tmp_path}/evolve/e/t",
     ]
     out = io.StringIO()
     report(PlayedRuns(plans, index, {}, set()), Path("my runs"), Terminal(file=out, width=200))
     assert "evopolicy report 'my runs' --out report" in out.getvalue()
-    for needed in ("no_ok_submit", f"run directory: {tmp_path}/evolve/a/t", "agent failed", "cancelled"):
+    for needed in ("no working submit", f"run directory: {tmp_path}/evolve/a/t", "agent failed", "cancelled"):
         assert needed in out.getvalue()
     assert exit_code(plans[:1], Index(suite="")) == 1
     assert capsys.readouterr().err == "a: it was not begun\n"
