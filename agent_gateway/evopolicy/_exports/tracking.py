@@ -19,6 +19,7 @@ from collections.abc import Iterator
 from datetime import datetime
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
+from urllib.parse import urlsplit
 
 import msgspec
 
@@ -285,6 +286,11 @@ class MLflow:
     """Runs of an MLflow experiment named `evopolicy`, or by MLFLOW_EXPERIMENT_NAME."""
 
     def __init__(self, out: str) -> None:
+        if urlsplit(out).scheme in ("", "file") and out != "databricks":
+            raise ConfigError(
+                f"--out {out} is a folder, and MLflow keeps no runs in folders: name a database, such as"
+                " --out sqlite:///mlflow.db, or a server, such as --out http://HOST:5000"
+            )
         # Without it, a local database names a folder of this machine as the place of artifacts, of which there are none.
         os.environ.setdefault("_MLFLOW_SERVER_ARTIFACT_ROOT", "mlflow-artifacts:/")
         from mlflow import MlflowClient

@@ -388,6 +388,8 @@ def vars_of(entry: Entry) -> dict[str, Any]:
         (("nowhere", "--to", "tensorboard"), "no run directory here"),
         (("nowhere", "--to", "csv", "--follow"), "--follow: csv"),
         (("{runs}", "--to", "mlflow", "--out", "nosuch://x"), "--to mlflow"),
+        (("{runs}", "--to", "mlflow", "--out", "mlruns"), "sqlite:///mlflow.db"),
+        (("{runs}", "--to", "mlflow", "--out", "file:///tmp/x"), "--out file:///tmp/x is a folder"),
     ],
 )
 def test_wrong_calls_say_what_is_wrong(runs: Path, words: tuple[str, ...], expected: str) -> None:
