@@ -22,6 +22,7 @@ from typing import Any, NamedTuple
 import anyio.to_thread
 import inspect_ai
 from inspect_ai import Task, task
+from inspect_ai._util.error import PrerequisiteError
 from inspect_ai.dataset import Sample
 from inspect_ai.model import ChatMessageUser, get_model
 from inspect_ai.model._model import sample_model_usage
@@ -29,11 +30,13 @@ from inspect_ai.scorer import Score, Target, grouped, mean, scorer
 from inspect_ai.solver import Generate, Solver, TaskState, solver
 from inspect_ai.tool import Tool, ToolError, tool
 from inspect_ai.util import store
+from rich.text import Text
 
 from evopolicy._cluster import Cluster, plan_of
 from evopolicy._loop import awaited
 from evopolicy._runs import Run
 from evopolicy_common import catalogue
+from evopolicy_common.errors import ConfigError, EvopolicyError
 from evopolicy_common.processes import host
 from evopolicy_common.records.words import in_words
 from evopolicy_gateway.agents.client import Client, ProtocolError, Refusal
@@ -49,6 +52,7 @@ from evopolicy_gateway.workspace.prompts import Prompts
 
 _KEY = "evopolicy_run"
 """Name in a sample's store: the run's folder."""
+_TOKEN_TABLE = "o200k_base"
 _REMINDERS = 8
 _MAX_READ = 20_000
 _MAX_WRITTEN = 1 << 20
@@ -79,8 +83,8 @@ class _Live(NamedTuple):
 
 _live: dict[str, _Live] = {}
 """Runs of this process by their folders. A sample's store holds the folder only, because Inspect writes it to its log."""
-Where = tuple[str | None, str | None, int]
-"""Endpoint and credentials of a running cluster, or two None and the slots of a local one."""
+Where = tuple[str | None, str | None, int, str | None]
+"""Endpoint and credentials of a running cluster, or two None; slots and state folder of a local one."""
 _clusters: dict[Where, Cluster] = {}
 """Open clusters, each for all samples that name it; they close with the process."""
 _opening = threading.Lock()
@@ -92,6 +96,7 @@ def core16(
     connect: str | None = None,
     credentials: str | None = None,
     slots: int = 2,
+    state: str | None = None,
     validation: int | None = None,
     heldout: int | None = None,
     runs: str = "runs",
@@ -100,7 +105,7 @@ def core16(
 ) -> Task:
     """The sixteen environments of Core16; parameters as for `environments`."""
     options = {"budget": budget, "validation": validation, "heldout": heldout, "runs": runs}
-    return _task(["core16"], (connect, credentials, slots), options, exp_id, entry)
+    return _task(["core16"], (connect, credentials, slots, state), options, exp_id, entry)
 
 
 @task
@@ -110,6 +115,7 @@ def environments(
     connect: str | None = None,
     credentials: str | None = None,
     slots: int = 2,
+    state: str | None = None,
     validation: int | None = None,
     heldout: int | None = None,
     runs: str = "runs",
@@ -124,6 +130,7 @@ def environments(
         connect: Endpoint of a running cluster, such as `tls/host:7447`; by default a local one is started.
         credentials: Folder of the operator's credentials for `connect`.
         slots: Episodes that a local cluster plays at once, for each environment.
+        state: Folder of a local cluster's state; by default the one of all local commands.
         validation: Hidden validation cases; by default the suite's.
         heldout: Hidden held-out cases; by default the suite's.
         runs: Folder of the run directories.
@@ -132,19 +139,43 @@ def environments(
     """
     patterns = envs.split(",") if isinstance(envs, str) else envs
     options = {"budget": budget, "validation": validation, "heldout": heldout, "runs": runs}
-    return _task(patterns, (connect, credentials, slots), options, exp_id, entry)
+    return _task(patterns, (connect, credentials, slots, state), options, exp_id, entry)
 
 
 def _task(
     patterns: list[str], where: Where, options: dict[str, Any], exp_id: str | None, entry: str | None
 ) -> Task:
+    try:
+        dataset = [Sample(id=env, input=env, metadata={"env": env}) for env in catalogue.resolve(patterns)]
+        _check_token_table()
+        _cluster(where)
+    except EvopolicyError as error:
+        # Inspect ends with this line. An error in a sample has a traceback, and `inspect eval` exits with 0.
+        raise PrerequisiteError(Text(f"error: {error}".replace("--state", "-T state"))) from error
     return Task(
-        dataset=[Sample(id=env, input=env, metadata={"env": env}) for env in catalogue.resolve(patterns)],
+        dataset=dataset,
         setup=open_run(where, options, exp_id or default_exp_id(), entry),
         solver=improve(),
         scorer=heldout_return(),
         cleanup=_clean_up,
     )
+
+
+def _check_token_table() -> None:
+    """Raises ConfigError where Inspect's mock model cannot download the table with which it counts tokens."""
+    if get_model().api.__class__.__name__ != "MockLLM":
+        return
+    import tiktoken
+
+    try:
+        tiktoken.get_encoding(_TOKEN_TABLE)
+    except OSError as error:
+        raise ConfigError(
+            "Inspect's mock model counts tokens with a table that cannot be downloaded here."
+            " Where there is a network, run:"
+            f" TIKTOKEN_CACHE_DIR=tokens python -c \"import tiktoken; tiktoken.get_encoding('{_TOKEN_TABLE}')\";"
+            " copy the folder tokens to this machine, and set TIKTOKEN_CACHE_DIR to its path"
+        ) from error
 
 
 @solver
@@ -364,9 +395,9 @@ def _left() -> int:
 def _cluster(where: Where) -> Cluster:
     with _opening:
         if where not in _clusters:
-            connect, credentials, slots = where
+            connect, credentials, slots, state = where
             if connect is None and credentials is None:
-                cluster = Cluster.local(slots)
+                cluster = Cluster.local(slots, state=state)
             else:
                 cluster = Cluster.connect(*([] if connect is None else [connect]), credentials=credentials)
             _clusters[where] = cluster.open()

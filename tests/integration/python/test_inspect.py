@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import math
 import os
@@ -172,6 +173,34 @@ def test_the_pages_commands_play(inspect: Path, tmp_path: Path) -> None:
     assert math.isnan(score["value"])
     (folder,) = (tmp_path / "runs").glob("*/toy_line/*")
     assert json.loads((folder / "run.json").read_text())["outcome"]["budget_used"] == 0
+
+
+def test_what_forbids_every_sample_ends_inspect_with_one_line(inspect: Path, tmp_path: Path) -> None:
+    state = tmp_path / "state"
+    state.mkdir(mode=0o700)
+    command = [inspect, "eval", "evopolicy/environments", "-T", "envs=toy/line", "-T", f"state={state}"]
+    command += ["--model", "mockllm/model", "--display", "plain"]
+    away = {"HTTPS_PROXY": "http://127.0.0.1:1", "TIKTOKEN_CACHE_DIR": str(tmp_path / "none")}
+    with (state / "lock").open("w") as held:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        (tmp_path / "sitecustomize.py").write_text(OFFLINE)
+        for more, expected in (
+            (away, "set TIKTOKEN_CACHE_DIR to its path"),
+            ({"PYTHONPATH": str(tmp_path)}, "choose another folder with -T state"),
+        ):
+            done = subprocess.run(
+                [*map(str, command)],
+                cwd=tmp_path,
+                env=surroundings(tmp_path) | more,
+                capture_output=True,
+                text=True,
+                check=False,
+                timeout=200,
+            )
+            assert done.returncode == 1
+            assert expected in " ".join((done.stdout + done.stderr).split())
+            assert "Traceback" not in done.stdout + done.stderr
+    assert not (tmp_path / "runs").exists()
 
 
 def test_exported_logs_of_agents_are_listed_read_and_served_by_inspect(inspect: Path, tmp_path: Path) -> None:
