@@ -24,6 +24,7 @@ from typing import NamedTuple
 
 import pytest
 from commands import toy_cluster
+from ordinary_user import ordinary, own_all
 from packaging.requirements import Requirement
 from stages.cli_stage import FAKES
 from stages.model_api import ModelApi, Step
@@ -42,7 +43,6 @@ REPOSITORY_ONLY = (
     "examples/measure_policies.py",
 )
 """What pages show or tell developers, and no user needs as a file."""
-NOBODY = 65534
 
 
 class Built(NamedTuple):
@@ -120,10 +120,8 @@ class Place:
     def __init__(self, root: Path, wheel: Path) -> None:
         self.root = root
         self.bin = root / "venv" / "bin"
-        self.python, self.prefix = _ordinary()
-        root.chmod(0o755)
-        if self.prefix:
-            os.chown(root, NOBODY, NOBODY)
+        self.python, self.prefix = ordinary()
+        own_all(root, self.prefix)
         shutil.copy(wheel, root)
         (root / wheel.name).chmod(0o644)
         self.run([self.python, "-m", "venv", "--without-pip", str(root / "venv")])
@@ -145,22 +143,6 @@ class Place:
         )
         assert done.returncode == code, f"{words}\n{done.stdout[-2000:]}\n{done.stderr[-4000:]}"
         return done.stdout
-
-
-def _ordinary() -> tuple[str, list[str]]:
-    """A Python of this version, and what makes its user an ordinary one: as root, nobody, who needs one to read."""
-    own = os.path.realpath(sys.executable)
-    if os.geteuid() != 0:
-        return own, []
-    become = ["setpriv", f"--reuid={NOBODY}", f"--regid={NOBODY}", "--clear-groups"]
-    numbered = f"python{sys.version_info.major}.{sys.version_info.minor}"
-    for python in (own, f"/usr/bin/{numbered}", f"/usr/local/bin/{numbered}"):
-        # A second time from within: the first one may still be started with root's rights.
-        again = f"import os, sys; os.listdir({site.getsitepackages()[0]!r}); os.execv(sys.executable, ['python', '-c', ''])"
-        reads = [*become, python, "-c", again]
-        if Path(python).exists() and subprocess.run(reads, capture_output=True, check=False).returncode == 0:
-            return python, become
-    return own, []
 
 
 @pytest.fixture(scope="module")
