@@ -64,8 +64,10 @@ _REASONS = ("why", "error", "detail")
 
 
 def event_text(event: str, values: Mapping[str, Any]) -> str:
-    """An event of a log as people read it: `slot was stopped from outside (2 s): …`. Values named `why`, `error` or `detail` are
-    its reason, seconds (`…_s`) need no name, and empty ones are left out."""
+    """An event of a log as people read it: `slot was stopped from outside (2 s): …`.
+
+    Values named `why`, `error` or `detail` are its reason, seconds (`…_s`) need no name, and empty ones are left out.
+    """
     given = {name: value for name, value in values.items() if value not in ("", None)}
     details = ", ".join(
         f"{value} s" if name.endswith("_s") else f"{name.replace('_', ' ')} {value}"
