@@ -16,6 +16,7 @@
 # make bench-channels     what a policy can tell others on its machine, at once and afterwards; --gaps N: what time tells it of its split
 # make bench-report bench-coverage       a report over 1,024 runs
 # make bench-isolation    a sweep with hidden episodes kept from agents' machines, and without
+# make bench-costs        processor time, hours and disk of runs without a model's bill
 # make bench-web bench-web-live       the live view: 2,000 workers, 500 open runs, 200 browsers
 # make faults real processes killed, frozen and starved through whole runs; ARGS="--chaos 3600": several at once, at random
 # make sim    the coordinator's core under a simulated network with faults
@@ -30,7 +31,7 @@ FAMILIES := $(VENV)/.families
 STAMP := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help install families paper-worker demo test test-system test-families check check-envs docs release bench bench-start bench-peers bench-throughput bench-scale bench-channels bench-report bench-coverage bench-isolation bench-web bench-web-live faults sim clean
+.PHONY: help install families paper-worker demo test test-system test-families check check-envs docs release bench bench-start bench-peers bench-throughput bench-scale bench-channels bench-report bench-coverage bench-isolation bench-costs bench-web bench-web-live faults sim clean
 
 help:
 	@sed -n 's/^# make/make/p' Makefile
@@ -149,6 +150,10 @@ bench-coverage: install
 # What it costs that hidden episodes and agents never share a machine. Smaller: ARGS="--agents 2 --environments toy --parallel 2"
 bench-isolation: install
 	@$(BIN)/python tests/bench/isolation_bench.py $(ARGS)
+
+# What whole runs cost on this machine, as docs/explanation/costs.md has it. Quicker: ARGS="--budget 16 --only random llm"
+bench-costs: install
+	@PYTHONPATH=tests/support $(BIN)/python tests/bench/run_costs.py $(ARGS)
 
 # The live view at scale: what pages weigh, what browsers are sent, and what the coordinator spends on it.
 bench-web: install

@@ -116,8 +116,8 @@ def _document(run: Plan, entry: Entry, played: PlayedRuns) -> dict[str, Any]:
 
 
 def _above_random(outcome: Outcome) -> Estimate | None:
-    """Score minus the mean return of uniform random actions, paired by held-out case, with the 95 % interval over cases
-    that a report has of one run. None without a score, or if random actions were not played."""
+    """Score minus the mean return of uniform random actions, paired by held-out case, with the 95 % interval over
+    cases that a report has of one run. None without a score, or if random actions were not played."""
     returns, reference = outcome.heldout_returns, outcome.random_reference
     if outcome.score is None or not returns or reference is None or len(reference.returns) != len(returns):
         return None

@@ -154,7 +154,8 @@ class SuiteView(View[SuiteRow]):
             return in_words(details["state"]) + why
         if kind == "submit":
             mean = "" if details["mean"] is None else f", mean return {number(details['mean'])}"
-            return f"{details['submit']} {in_words(details['status'])}{mean}; {details['budget_left']} episodes left"
+            status = in_words(details["status"])
+            return f"{details['submit']} {status}{mean}; {details['budget_left']} episodes left"
         if kind == "paused":
             return f"{details['provider']} is away, waits {details['seconds']} s ({details['why']})"
         if kind == "elsewhere":

@@ -38,6 +38,12 @@ class Cgroup:
     def get(self, name: str) -> str:
         return (self._folder / name).read_text().strip()
 
+    def cpu_s(self) -> float:
+        """Processor time of all its processes so far, also of those that nobody waited for, seconds."""
+        if (self._folder / "cpuacct.usage").exists():
+            return int(self.get("cpuacct.usage")) / 1e9
+        return int(self.get("cpu.stat").split()[1]) / 1e6
+
     def release(self) -> None:
         """Its processes go on in the group above."""
         for pid in self.get("cgroup.procs").split():
@@ -76,6 +82,13 @@ class Freezer(Cgroup):
 def starved() -> Iterator[Cgroup]:
     """Yields a cgroup whose processes get next to nothing of a processor that others want."""
     with _group("cpu", {"cpu.shares": "5"}, {"cpu.weight": "1"}) as group:
+        yield group
+
+
+@contextlib.contextmanager
+def counted() -> Iterator[Cgroup]:
+    """Yields a cgroup that counts its processes' time (`cpu_s`)."""
+    with _group("cpuacct", {}, {}) as group:
         yield group
 
 
