@@ -23,6 +23,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import itertools
 import sys
 import time
 from collections import OrderedDict
@@ -327,11 +328,10 @@ class _Episode:
 
     def _steps(self, source: Source, course: _Course) -> None:
         """Plays from reset to the end."""
-        environment, progress, taken = self.environment, self.progress, self.begun.taken
+        progress, taken, step, add = self.progress, self.begun.taken, self.environment.step, course.add
         float_environment.reset()
-        obs = environment.reset(self.spec.case)
-        while True:
-            t = course.length
+        obs = self.environment.reset(self.spec.case)
+        for t in itertools.count():
             try:
                 returned, action, mark = source(t, obs)
             except PolicyFailedError as error:
@@ -341,9 +341,9 @@ class _Episode:
             if not self.acted and t < len(taken):
                 self.acted = True
                 self.tell(_ACTING)
-            result = environment.step(action)
+            result = step(action)
             progress.steps += 1
-            if course.add(obs, returned, action, mark, result):
+            if add(obs, returned, action, mark, result):
                 break
             if progress.cancelled:
                 raise CancelledJobError
@@ -367,7 +367,7 @@ class _Course:
         self.success: bool | None = None
         self._solves = description.success or environment.solved_by
         self._ever = description.success_at == "any"
-        self._last = (job.max_steps or sys.maxsize) - 1
+        self._truncated_at = job.max_steps or sys.maxsize
         self._n_recorded = len(recorded or ())
         self._last_mark = FAILED if job.failed_episodes == "end-submit" else None
         self.full: Recorder | None = None
@@ -383,11 +383,12 @@ class _Course:
     def add(self, obs: Any, returned: Any, action: Any, mark: str, step: Step) -> bool:
         """Adds the step that follows `obs`; whether the episode ends with it."""
         _, reward, terminated, truncated, info = step
-        truncated = truncated or self.length >= self._last
-        if self.sums:
+        length = self.length = self.length + 1
+        truncated = truncated or length >= self._truncated_at
+        if sums := self.sums:
             components = info.get("rewards", info)
-            for name in self.sums:
-                self.sums[name] += _number(components.get(name))
+            for name in sums:
+                sums[name] += _number(components.get(name))
         if self._solves and (reported := info.get(self._solves)) is not None:
             now = solved(reported)
             self.success = self.success if now is None else now or (self._ever and bool(self.success))
@@ -398,9 +399,8 @@ class _Course:
         if self.actions is not None:
             self.actions.append(None, action, reward, terminated, truncated, info)
         self.total += reward
-        self.length += 1
         self.terminated, self.truncated = terminated, truncated
-        return terminated or truncated or self.length == self._n_recorded or mark == self._last_mark
+        return terminated or truncated or length == self._n_recorded or mark == self._last_mark
 
 
 def _random(codec: ActionCodec, policy_seed: bytes, mark: str) -> Source:
@@ -487,7 +487,7 @@ def _unplayed(index: int, failure: PolicyFailure) -> EpisodeOutcome:
 
 
 def _number(value: Any) -> float:
-    return float(value) if isinstance(value, int | float) else 0.0
+    return float(value) if isinstance(value, (int, float)) else 0.0
 
 
 def _blob(data: bytes) -> BlobRef:
