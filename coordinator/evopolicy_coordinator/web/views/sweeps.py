@@ -67,13 +67,11 @@ def _order(run: RunFacts) -> tuple[int, str, str, int]:
 
 
 def _shown(run: RunFacts, may_show: bool) -> dict[str, Any]:
-    """The visible part of a run's hidden results, and its share of the budget."""
+    """The visible part of a run's hidden results."""
     return {
         "score": run.score if may_show else None,
         "random": run.random if may_show else None,
         "hidden": run.finished and not may_show and run.state == "completed",
-        "share": None if not run.budget else min(1.0, run.used / run.budget),
-        "left_s": run.left_s,
     }
 
 
