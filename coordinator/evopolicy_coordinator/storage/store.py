@@ -14,10 +14,11 @@ Rules that this module owns:
 from __future__ import annotations
 
 import contextlib
+import operator
 import sqlite3
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar, get_args
 
 import msgspec
 
@@ -102,23 +103,44 @@ SCHEMA_VERSION = len(_MIGRATIONS)
 
 _encode = msgspec.msgpack.Encoder().encode
 
-_PLACES: dict[type[Any], tuple[str, str, str]] = {
-    RunRow: ("runs", "run", "data"),
-    RunStateRow: ("run_states", "run", "data"),
-    SubmitRow: ("submits", "run, submit_index", "data"),
-    OutcomeRow: ("outcomes", "grp, idx", "data"),
-    OutcomeHead: ("outcomes", "grp, idx", "head"),
-    BegunRow: ("begun", "grp, first", "data"),
-    EvaluationRow: ("evaluations", "evaluation", "data"),
-    FinishedRow: ("finished", "run", "data"),
-    WorkerRow: ("workers", "worker", "data"),
-    AuditRow: ("audits", "audit", "data"),
-    PermitRow: ("permits", "run, boot_id", "data"),
-    KernelRow: ("kernels", "worker", "data"),
-    JournalRow: ("journal", "seq", "data"),
-    DocumentRow: ("documents", "run, kind", "data"),
+
+class _Place(NamedTuple):
+    """Where the rows of a kind are stored."""
+
+    table: str
+    key: tuple[str, ...]
+    lookup: tuple[str, ...] = ()
+    """Further columns of the table."""
+    column: str = "data"
+    """The column of the row's bytes."""
+    replaced: bool = True
+    """Whether a row replaces the one of the same key; otherwise a second one fails."""
+
+
+_PLACES: dict[type[Any], _Place] = {
+    RunRow: _Place("runs", ("run",), ("key",)),
+    RunStateRow: _Place("run_states", ("run",), ("phase",)),
+    SubmitRow: _Place("submits", ("run", "submit_index"), ("key",)),
+    OutcomeRow: _Place("outcomes", ("grp", "idx"), ("seq", "head")),
+    OutcomeHead: _Place("outcomes", ("grp", "idx"), column="head"),
+    BegunRow: _Place("begun", ("grp", "first")),
+    EvaluationRow: _Place("evaluations", ("evaluation",), ("key", "finished")),
+    FinishedRow: _Place("finished", ("run",)),
+    WorkerRow: _Place("workers", ("worker",)),
+    AuditRow: _Place("audits", ("audit",), ("run",)),
+    PermitRow: _Place("permits", ("run", "boot_id"), ("ended",)),
+    KernelRow: _Place("kernels", ("worker",)),
+    JournalRow: _Place("journal", ("seq",), ("reveals",), replaced=False),
+    DocumentRow: _Place("documents", ("run", "kind"), replaced=False),
 }
-"""Location of each kind of row: table, key columns, and the column of its bytes."""
+_VALUES: dict[str, Callable[[Any], object]] = {
+    "grp": lambda row: row.group,
+    "idx": lambda row: row.index,
+    "ended": lambda row: row.ended_at is not None,
+    "head": lambda row: _encode(records.head_of(row)),
+    "data": _encode,
+}
+"""The columns that do not hold the row's field of their name."""
 _DECODERS: dict[type[Any], msgspec.msgpack.Decoder[Any]] = {
     kind: msgspec.msgpack.Decoder(kind) for kind in _PLACES
 }
@@ -135,7 +157,8 @@ class Store:
         self._path = path
         self._db = _connect(path)
         try:
-            _guard(path, self._prepare)
+            with storage_errors(path):
+                self._prepare()
         except BaseException:
             self._db.close()
             raise
@@ -154,12 +177,9 @@ class Store:
 
     def write(self, changed: Iterable[Row]) -> None:
         """Writes all rows in one durable transaction. Raises StorageError when it fails; then no row is stored."""
-        _guard(self._path, lambda: self._write(changed))
-
-    def _write(self, changed: Iterable[Row]) -> None:
-        with self._transaction():
+        with storage_errors(self._path), self._transaction():
             for row in changed:
-                _WRITERS[type(row)](self._db, row)
+                _write_row(self._db, row)
 
     @contextlib.contextmanager
     def _transaction(self) -> Iterator[None]:
@@ -175,35 +195,32 @@ class Store:
 
     def forget_kernels(self, boot_id: str) -> None:
         """Durably deletes the records of which workers were on that kernel: those workers are known to have ended."""
-
-        def forget() -> None:
-            with self._transaction():
-                for row in list(rows(self._db, KernelRow)):
-                    if row.boot_id == boot_id:
-                        self._db.execute("DELETE FROM kernels WHERE worker = ?", (row.worker,))
-
-        _guard(self._path, forget)
+        with storage_errors(self._path), self._transaction():
+            for row in list(rows(self._db, KernelRow)):
+                if row.boot_id == boot_id:
+                    self._db.execute("DELETE FROM kernels WHERE worker = ?", (row.worker,))
 
     def write_claim(self, suite: str, name: str, data: bytes) -> None:
         """Stores a sweep's claim durably. Raises StorageError when it fails."""
-        _guard(self._path, lambda: self._db.execute(_CLAIM, (suite, name, data)))
+        replace = "ON CONFLICT (suite, name) DO UPDATE SET data = excluded.data"
+        with storage_errors(self._path):
+            self._db.execute(f"INSERT INTO claims VALUES (?, ?, ?) {replace}", (suite, name, data))
 
     def claims(self) -> list[tuple[str, str, bytes]]:
         """All claims of sweeps: suite, name and stored bytes."""
-        return _guard(self._path, lambda: self._db.execute("SELECT suite, name, data FROM claims").fetchall())
+        with storage_errors(self._path):
+            return self._db.execute("SELECT suite, name, data FROM claims").fetchall()
 
     def load(self) -> Snapshot:
         """Durably increments the incarnation, then reads the state that a core starts from."""
-        return _guard(self._path, self._load)
-
-    def _load(self) -> Snapshot:
-        with self._transaction():
-            self._db.execute("UPDATE meta SET value = value + 1 WHERE name = 'incarnation'")
-        self._db.execute("BEGIN")
-        try:
-            return self._snapshot()
-        finally:
-            self._db.execute("ROLLBACK")
+        with storage_errors(self._path):
+            with self._transaction():
+                self._db.execute("UPDATE meta SET value = value + 1 WHERE name = 'incarnation'")
+            self._db.execute("BEGIN")
+            try:
+                return self._snapshot()
+            finally:
+                self._db.execute("ROLLBACK")
 
     def _snapshot(self) -> Snapshot:
         db = self._db
@@ -269,19 +286,9 @@ class Reader:
 
     def outcomes(self, group: str, cursor: int, upto: int, max_bytes: int) -> OutcomePage:
         """Outcomes with cursor ≤ seq < upto in order of `seq`, up to `max_bytes` of rows but at least one."""
-
-        def read() -> OutcomePage:
-            page: list[OutcomeRow] = []
-            total = 0
-            where = "WHERE grp = ? AND seq >= ? AND seq < ? ORDER BY seq"
-            for row, n_bytes in _sized_rows(self._db, OutcomeRow, where, (group, cursor, upto)):
-                total += n_bytes
-                if page and total > max_bytes:
-                    break
-                page.append(row)
-            return OutcomePage(tuple(page), page[-1].seq + 1 if page else cursor)
-
-        return _guard(self._path, read)
+        where = "WHERE grp = ? AND seq >= ? AND seq < ? ORDER BY seq"
+        page = self._page(OutcomeRow, where, (group, cursor, upto), max_bytes)
+        return OutcomePage(page, page[-1].seq + 1 if page else cursor)
 
     def outcome(self, group: str, index: int) -> OutcomeRow | None:
         """The outcome at `index` of its group; None when it is missing."""
@@ -293,10 +300,8 @@ class Reader:
 
     def bundles(self, run: str) -> frozenset[str | None]:
         """The bundles that the run's submits name."""
-        return _guard(
-            self._path,
-            lambda: frozenset(row.bundle for row in rows(self._db, SubmitRow, "WHERE run = ?", (run,))),
-        )
+        with storage_errors(self._path):
+            return frozenset(row.bundle for row in rows(self._db, SubmitRow, "WHERE run = ?", (run,)))
 
     def finished(self, run: str) -> RunFinished | None:
         """The result of a run; None while it is not finished."""
@@ -309,22 +314,12 @@ class Reader:
 
     def journal(self, cursor: int, max_bytes: int) -> tuple[JournalRow, ...]:
         """Entries of the journal from `cursor` on, up to `max_bytes` but at least one; empty past the last entry."""
-
-        def read() -> tuple[JournalRow, ...]:
-            page: list[JournalRow] = []
-            total = 0
-            for row, n_bytes in _sized_rows(self._db, JournalRow, "WHERE seq >= ? ORDER BY seq", (cursor,)):
-                total += n_bytes
-                if page and total > max_bytes:
-                    break
-                page.append(row)
-            return tuple(page)
-
-        return _guard(self._path, read)
+        return self._page(JournalRow, "WHERE seq >= ? ORDER BY seq", (cursor,), max_bytes)
 
     def revealed(self) -> frozenset[str]:
         """Epochs whose secret is revealed."""
-        return _guard(self._path, lambda: frozenset(revealed(self._db)))
+        with storage_errors(self._path):
+            return frozenset(revealed(self._db))
 
     def document(self, run: str, kind: str) -> bytes | None:
         """The document whose hash an entry of the journal holds; None when it is missing."""
@@ -333,15 +328,25 @@ class Reader:
 
     def names_blob(self, run: str, digest: str) -> bool:
         """Whether the train feedback of `run` names the blob."""
-
-        def read() -> bool:
-            query = "SELECT 1 FROM train_blobs WHERE run = ? AND digest = ?"
+        query = "SELECT 1 FROM train_blobs WHERE run = ? AND digest = ?"
+        with storage_errors(self._path):
             return self._db.execute(query, (run, digest)).fetchone() is not None
 
-        return _guard(self._path, read)
-
     def _one(self, kind: type[T], where: str, args: tuple[Any, ...]) -> T | None:
-        return _guard(self._path, lambda: next(rows(self._db, kind, where, args), None))
+        with storage_errors(self._path):
+            return next(rows(self._db, kind, where, args), None)
+
+    def _page(self, kind: type[T], where: str, args: tuple[Any, ...], max_bytes: int) -> tuple[T, ...]:
+        """Rows of up to `max_bytes`, but at least one if there is any."""
+        page: list[T] = []
+        total = 0
+        with storage_errors(self._path):
+            for row, n_bytes in _sized_rows(self._db, kind, where, args):
+                total += n_bytes
+                if page and total > max_bytes:
+                    break
+                page.append(row)
+        return tuple(page)
 
     def close(self) -> None:
         """Closes the connection."""
@@ -384,11 +389,6 @@ def storage_errors(path: Path) -> Iterator[None]:
         raise DamagedStoreError(f"{path}: {error}") from error
 
 
-def _guard(path: Path, work: Callable[[], T]) -> T:
-    with storage_errors(path):
-        return work()
-
-
 def rows(db: sqlite3.Connection, kind: type[T], where: str = "", args: tuple[Any, ...] = ()) -> Iterator[T]:
     """Yields the rows of a kind. DamagedStoreError names the unreadable row; `storage_errors` adds the database's path."""
     for row, _ in _sized_rows(db, kind, where, args):
@@ -399,14 +399,15 @@ def _sized_rows(
     db: sqlite3.Connection, kind: type[T], where: str, args: tuple[Any, ...]
 ) -> Iterator[tuple[T, int]]:
     """Yields each row with its size in bytes."""
-    table, key, column = _PLACES[kind]
+    place = _PLACES[kind]
+    key = ", ".join(place.key)
     decode = _DECODERS[kind].decode
-    for *place, data in db.execute(f"SELECT {key}, {column} FROM {table} {where}", args):
+    for *values, data in db.execute(f"SELECT {key}, {place.column} FROM {place.table} {where}", args):
         try:
             row = decode(data)
         except DECODE_ERRORS as error:
             raise DamagedStoreError(
-                f"table {table}, row ({key}) = {tuple(place)}: {unreadable(error)}"
+                f"table {place.table}, row ({key}) = {tuple(values)}: {unreadable(error)}"
             ) from error
         yield row, len(data)
 
@@ -424,101 +425,25 @@ def unreadable(error: Exception) -> str:
     )
 
 
-def _upsert(table: str, columns: str, key: str) -> str:
-    """An insert that replaces the row of the same key, and fails when another unique column clashes."""
-    names = columns.split(", ")
-    changed = ", ".join(f"{name} = excluded.{name}" for name in names if name not in key.split(", "))
-    marks = ", ".join("?" for _ in names)
-    return f"INSERT INTO {table} ({columns}) VALUES ({marks}) ON CONFLICT ({key}) DO UPDATE SET {changed}"
+def _insert_of(place: _Place) -> tuple[str, tuple[Callable[[Any], object], ...]]:
+    """The statement that stores a row, and its parameters. It fails when another unique column clashes."""
+    columns = (*place.key, *place.lookup, place.column)
+    statement = f"INSERT INTO {place.table} ({', '.join(columns)}) VALUES ({', '.join('?' * len(columns))})"
+    if place.replaced:
+        changed = ", ".join(f"{name} = excluded.{name}" for name in (*place.lookup, place.column))
+        statement += f" ON CONFLICT ({', '.join(place.key)}) DO UPDATE SET {changed}"
+    return statement, tuple(_VALUES.get(name) or operator.attrgetter(name) for name in columns)
 
 
-_RUN = _upsert("runs", "run, key, data", "run")
-_RUN_STATE = _upsert("run_states", "run, phase, data", "run")
-_SUBMIT = _upsert("submits", "run, submit_index, key, data", "run, submit_index")
-_OUTCOME = _upsert("outcomes", "grp, idx, seq, head, data", "grp, idx")
-_BEGUN = _upsert("begun", "grp, first, data", "grp, first")
-_EVALUATION = _upsert("evaluations", "evaluation, key, finished, data", "evaluation")
-_FINISHED = _upsert("finished", "run, data", "run")
-_WORKER = _upsert("workers", "worker, data", "worker")
-_AUDIT = _upsert("audits", "audit, run, data", "audit")
-_PERMIT = _upsert("permits", "run, boot_id, ended, data", "run, boot_id")
-_KERNEL = _upsert("kernels", "worker, data", "worker")
-_JOURNAL = "INSERT INTO journal (seq, reveals, data) VALUES (?, ?, ?)"
-_DOCUMENT = "INSERT INTO documents (run, kind, data) VALUES (?, ?, ?)"
-_CLAIM = _upsert("claims", "suite, name, data", "suite, name")
+_INSERTS = {kind: _insert_of(_PLACES[kind]) for kind in get_args(Row)}
 
 
-def _write_run(db: sqlite3.Connection, row: RunRow) -> None:
-    db.execute(_RUN, (row.run, row.key, _encode(row)))
-
-
-def _write_run_state(db: sqlite3.Connection, row: RunStateRow) -> None:
-    db.execute(_RUN_STATE, (row.run, row.phase, _encode(row)))
-
-
-def _write_submit(db: sqlite3.Connection, row: SubmitRow) -> None:
-    db.execute(_SUBMIT, (row.run, row.submit_index, row.key, _encode(row)))
-
-
-def _write_outcome(db: sqlite3.Connection, row: OutcomeRow) -> None:
-    db.execute(_OUTCOME, (row.group, row.index, row.seq, _encode(records.head_of(row)), _encode(row)))
-    run = train_run(row.group)
-    if run is not None:
+def _write_row(db: sqlite3.Connection, row: Row) -> None:
+    statement, values = _INSERTS[type(row)]
+    db.execute(statement, [value(row) for value in values])
+    if isinstance(row, OutcomeRow) and (run := train_run(row.group)) is not None:
         for ref in stored_blobs(row.outcome):
             db.execute("INSERT OR IGNORE INTO train_blobs VALUES (?, ?)", (run, ref.digest))
-
-
-def _write_begun(db: sqlite3.Connection, row: BegunRow) -> None:
-    db.execute(_BEGUN, (row.group, row.first, _encode(row)))
-
-
-def _write_evaluation(db: sqlite3.Connection, row: EvaluationRow) -> None:
-    db.execute(_EVALUATION, (row.evaluation, row.key, int(row.finished), _encode(row)))
-
-
-def _write_finished(db: sqlite3.Connection, row: FinishedRow) -> None:
-    db.execute(_FINISHED, (row.run, _encode(row)))
-
-
-def _write_worker(db: sqlite3.Connection, row: WorkerRow) -> None:
-    db.execute(_WORKER, (row.worker, _encode(row)))
-
-
-def _write_audit(db: sqlite3.Connection, row: AuditRow) -> None:
-    db.execute(_AUDIT, (row.audit, row.run, _encode(row)))
-
-
-def _write_permit(db: sqlite3.Connection, row: PermitRow) -> None:
-    db.execute(_PERMIT, (row.run, row.boot_id, int(row.ended_at is not None), _encode(row)))
-
-
-def _write_kernel(db: sqlite3.Connection, row: KernelRow) -> None:
-    db.execute(_KERNEL, (row.worker, _encode(row)))
-
-
-def _write_journal(db: sqlite3.Connection, row: JournalRow) -> None:
-    db.execute(_JOURNAL, (row.seq, row.reveals, _encode(row)))
-
-
-def _write_document(db: sqlite3.Connection, row: DocumentRow) -> None:
-    db.execute(_DOCUMENT, (row.run, row.kind, _encode(row)))
-
-
-_WRITERS: dict[type[Row], Callable[[sqlite3.Connection, Any], None]] = {
-    RunRow: _write_run,
-    RunStateRow: _write_run_state,
-    SubmitRow: _write_submit,
-    OutcomeRow: _write_outcome,
-    BegunRow: _write_begun,
-    EvaluationRow: _write_evaluation,
-    FinishedRow: _write_finished,
-    WorkerRow: _write_worker,
-    AuditRow: _write_audit,
-    PermitRow: _write_permit,
-    KernelRow: _write_kernel,
-    JournalRow: _write_journal,
-    DocumentRow: _write_document,
-}
 
 
 def train_run(group: str) -> str | None:
