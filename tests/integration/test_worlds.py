@@ -18,7 +18,9 @@ CLUSTER = ("--state", "state")
 @pytest.mark.timeout(600)
 def test_the_key_of_a_world_is_in_no_file_of_a_run(tmp_path: Path) -> None:
     numbers = ("--budget", "3", "--validation", "2", "--heldout", "2")
-    with command(tmp_path, "local", "--env", WORLD, "--agent", "evolve", "--exp-id", "t", *numbers, *CLUSTER) as running:
+    with command(
+        tmp_path, "local", "--env", WORLD, "--agent", "evolve", "--exp-id", "t", *numbers, *CLUSTER
+    ) as running:
         code, out, err = running.finish(500)
     assert code == 0, err
     secret = (tmp_path / "state" / "secret").read_bytes()

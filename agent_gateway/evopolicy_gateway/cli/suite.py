@@ -116,8 +116,7 @@ def suite(
             limits = msgspec.structs.replace(wanted.parallel, machine=parallel)
             wanted = msgspec.structs.replace(wanted, parallel=limits)
         if profile is not None:
-            chosen = settings_of(profile)["profile"]
-            defaults = msgspec.structs.replace(wanted.defaults, profile=chosen)
+            defaults = msgspec.structs.replace(wanted.defaults, profile=settings_of(profile)["profile"])
             wanted = msgspec.structs.replace(wanted, defaults=defaults)
         root = (runs or Path("runs") / wanted.name).absolute()
         expanded = suite_file.expand(wanted, root, Path.cwd(), tuple(only or ()))
