@@ -16,8 +16,10 @@ from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
 from evopolicy_common.errors import ProtocolError
 from evopolicy_common.records import journal
 from evopolicy_common.records.aggregates import mean, std
+from evopolicy_common.records.run_record import decode_run_record
 from evopolicy_coordinator.pki import identity
-from evopolicy_results.publish import contents
+from evopolicy_results.publish import card as cards
+from evopolicy_results.publish import contents, descriptions
 from evopolicy_results.publish.archive import Archive, Writer
 
 ENV = "toy/line"
@@ -113,6 +115,7 @@ class Forger:
 
     def __init__(self, files: dict[str, bytes]) -> None:
         self.files = dict(files)
+        self.described = {name: files.get(name) for name in contents.DESCRIPTIONS}
 
     def json(self, name: str, change: Callable[[Any], Any]) -> None:
         """Changes a document in place, or into what `change` returns."""
@@ -189,20 +192,51 @@ class Forger:
             }
             self.files[f"{folder}/{contents.DIGESTS}"] = contents.document(own)
             manifest["files"][f"{folder}/{contents.DIGESTS}"] = contents.digest(contents.document(own))
-        for name in (contents.JOURNAL, contents.REMOVED):
+        self.describe(state)
+        for name in (contents.JOURNAL, contents.REMOVED, *contents.DESCRIPTIONS):
+            if name not in self.files:
+                continue
             manifest["files"][name] = contents.digest(self.files[name])
         lines = contents.journal_entries(self.files[contents.JOURNAL])
         manifest["journal_entries"], manifest["journal_head"] = len(lines), journal.heads(lines)[-1]
         self.files[contents.MANIFEST] = contents.document(msgspec.convert(manifest, contents.Manifest))
         self.sign_manifest(state)
 
+    def describe(self, state: Path | None = None) -> None:
+        """Makes the card and its descriptions anew, from the files as they are, unless the forger changed these.
+        Keeps them where a file cannot be read."""
+        now = {name: self.files.get(name) for name in contents.DESCRIPTIONS}
+        if now != self.described or contents.CARD not in self.files:
+            return
+        try:
+            sources = [
+                cards.Source(
+                    name[:9],
+                    decode_run_record(data),
+                    msgspec.json.decode(self.files[f"{name[:9]}/{contents.RESULT}"], type=journal.Result),
+                )
+                for name, data in sorted(self.files.items())
+                if name.endswith(f"/{contents.RUN}")
+            ]
+            card = cards.make(
+                sources,
+                contents.journal_entries(self.files[contents.JOURNAL]),
+                signer=key_of(state),
+                software=json.loads(self.files[contents.MANIFEST])["software"],
+            )
+        except (ProtocolError, msgspec.MsgspecError, KeyError, ValueError):
+            return
+        digests = {name: contents.digest(data) for name, data in self.files.items()}
+        self.files |= descriptions.files(card, digests)
+
     def sign_manifest(self, state: Path | None = None) -> None:
         """Makes the signature anew, of the manifest as it is."""
         digest = contents.digest(self.files[contents.MANIFEST])
         if state is None:
-            private = Ed25519PrivateKey.from_private_bytes(b"f" * 32)
-            key = private.public_key().public_bytes(Encoding.Raw, PublicFormat.Raw).hex()
-            signature = private.sign(b"evopolicy manifest 1\0" + bytes.fromhex(digest)).hex()
+            key, signature = (
+                key_of(state),
+                FORGER.sign(b"evopolicy manifest 1\0" + bytes.fromhex(digest)).hex(),
+            )
         else:
             key, signature = identity.sign(state, digest)
         self.put(contents.SIGNATURE, {"key": key, "signature": signature})
@@ -213,6 +247,16 @@ class Forger:
         for name, data in self.files.items():
             writer.add(name, data)
         writer.close()
+
+
+FORGER = Ed25519PrivateKey.from_private_bytes(b"f" * 32)
+
+
+def key_of(state: Path | None) -> str:
+    """The public key of the coordinator in `state`, or the forger's."""
+    if state is not None:
+        return identity.sign(state, "00" * 32)[0]
+    return FORGER.public_key().public_bytes(Encoding.Raw, PublicFormat.Raw).hex()
 
 
 def spelt(name: str, content: Any) -> bytes:

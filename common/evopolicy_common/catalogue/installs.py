@@ -53,9 +53,9 @@ class Install(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     python: tuple[str, str] = ("3.11", "3.14")
     """First Python version it was tested with, and the first that it was not."""
     assets: Mapping[str, tuple[str, ...]] = {}
-    """Files in its packages that may have another licence than the package: ROMs, sprites, meshes, maps. Each with
-    two texts, the words that state its licence and the installed file that has them, below `site-packages`; with
-    none where no file states one."""
+    """Files in its packages that may have another licence than the package: ROMs, sprites, meshes, maps. Each
+    with two texts, the words that state its licence and the installed file that has them, below
+    `site-packages`; with none where no file states one."""
 
 
 class Made(msgspec.Struct, frozen=True, kw_only=True):

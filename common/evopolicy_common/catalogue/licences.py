@@ -1,4 +1,4 @@
-"""Licences of the packages that evopolicy requires directly, as their metadata state them, and of their assets.
+"""Licences of the packages that evopolicy requires directly, and of their assets, as the packages state them.
 
 `docs/_site/licences.py` writes `licences.json` from installed metadata; `installs.toml` names the assets.
 """

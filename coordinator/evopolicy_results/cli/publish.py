@@ -76,6 +76,18 @@ def publish(
             show_default=False,
         ),
     ] = None,
+    licence: Annotated[
+        str,
+        typer.Option(help="Licence of the file, such as CC-BY-4.0, for its card.", show_default=False),
+    ] = "",
+    card: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FOLDER",
+            help="Also write the evaluation card and a Croissant description of the file into this folder.",
+            show_default=False,
+        ),
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print what was published as JSON.")] = False,
 ) -> None:
     """Write finished runs into one signed file that anyone can check, and make their cases public.
@@ -89,6 +101,8 @@ def publish(
         fail(f"--out {out} is there already; name a new file")
     if not out.absolute().parent.is_dir():
         fail(f"--out {out}: there is no folder {out.parent}")
+    if card is not None and not card.is_dir():
+        fail(f"--card {card}: there is no such folder; create it first")
 
     async def work() -> Published:
         end_on_sigterm()
@@ -103,7 +117,7 @@ def publish(
                 remove_findings=remove_findings,
                 accepted=accept_finding or (),
             )
-            return await publisher.publish(found, out, left)
+            return await publisher.publish(found, out, left, licence=licence, card=card)
 
     with fail_on_our_errors():
         done = asyncio.run(work())

@@ -10,6 +10,7 @@ Rules that this module owns:
 from __future__ import annotations
 
 import getpass
+import hashlib
 import os
 import socket
 from collections.abc import AsyncIterator, Callable, Sequence
@@ -31,12 +32,13 @@ from evopolicy_common.records.journal import Result, SubmitResult
 from evopolicy_common.records.policies.bundles import Bundle
 from evopolicy_common.records.policies.checkpoints import bundle_of
 from evopolicy_common.records.run_files import read_record, run_folders
-from evopolicy_common.records.run_record import RunRecord, encode_run_record
+from evopolicy_common.records.run_record import RunRecord, decode_run_record, encode_run_record
 from evopolicy_common.records.secrets import Passed, read_passed
 from evopolicy_common.regular_files import read_regular
 from evopolicy_common.wire.operator_client import TIMEOUT_S, OperatorClient
 from evopolicy_common.wire.transport import Link
-from evopolicy_results.publish import contents, scrub
+from evopolicy_results.publish import card as cards
+from evopolicy_results.publish import contents, descriptions, scrub
 from evopolicy_results.publish.archive import Writer
 from evopolicy_results.publish.contents import Episode, Group, Listed, Manifest, Removed
 
@@ -134,9 +136,16 @@ class Publisher:
         self._removed: list[Removed] = [_OTHER_LOGS if with_logs else _LOGS, *_NEVER]
 
     async def publish(
-        self, runs: Sequence[tuple[Path, RunRecord]], out: Path, left: Sequence[Removed] = ()
+        self,
+        runs: Sequence[tuple[Path, RunRecord]],
+        out: Path,
+        left: Sequence[Removed] = (),
+        *,
+        licence: str = "",
+        card: Path | None = None,
     ) -> Published:
-        """Writes `out` atomically. Raises ConfigError when the coordinator refuses. `left`: folders that are left out."""
+        """Writes `out` atomically. Raises ConfigError when the coordinator refuses. `left`: folders that are
+        left out. `licence`: of the file, for its card. `card`: a folder for copies of card and descriptions."""
         left = list(left)
         ids: list[str] = []
         passed = [read_passed(folder) for folder, _ in runs]
@@ -156,6 +165,8 @@ class Publisher:
             raise ConfigError(f"{error}{where}") from error
         entries = await self._ask.journal()
         files: dict[str, str] = {}
+        described: dict[str, str] = {}
+        sources: list[cards.Source] = []
         partial = out.with_name(f".{out.name}.partial")
         writer = Writer(partial)
         try:
@@ -163,11 +174,14 @@ class Publisher:
                 self._tell(f"{number + 1} of {len(runs)}: {record.agent.entry} on {record.env}")
                 place = contents.run_folder(len(ids))
                 inner: dict[str, str] = {}
+                documents: dict[str, bytes] = {}
                 before = len(self._removed)
                 try:
                     async for name, data in self._run_files(folder, record, place, passed[number]):
                         writer.add(f"{place}/{name}", data)
                         inner[name] = contents.digest(data)
+                        if name in (contents.RUN, contents.RESULT):
+                            documents[name] = data
                 except _GoneError as error:  # before the first file
                     del self._removed[before:]
                     left.append(Removed(what=str(folder), why=str(error)))
@@ -175,6 +189,9 @@ class Publisher:
                 digests = contents.document(inner)
                 writer.add(f"{place}/{contents.DIGESTS}", digests)
                 files[f"{place}/{contents.DIGESTS}"] = contents.digest(digests)
+                described |= {f"{place}/{name}": each for name, each in inner.items()}
+                result = msgspec.json.decode(documents[contents.RESULT], type=Result)
+                sources.append(cards.Source(place, decode_run_record(documents[contents.RUN]), result))
                 ids.append(record.run)
             if not ids:
                 raise ConfigError(f"no run to publish: {left[-1].what}: {left[-1].why}")
@@ -187,6 +204,19 @@ class Publisher:
                 writer.add(name, data)
                 files[name] = contents.digest(data)
             heads = journal.heads(entries)
+            made = cards.make(
+                sources,
+                entries,
+                # The card names the key, so it is asked for before the manifest can be signed.
+                signer=(await self._ask.sign(heads[-1])).key,
+                software=version("evopolicy"),
+                licence=licence,
+            )
+            described |= files
+            for name, data in descriptions.files(made, described).items():
+                self._must_be_clean(name, data)
+                writer.add(name, data)
+                files[name] = contents.digest(data)
             manifest = contents.document(
                 Manifest(
                     format=contents.FORMAT,
@@ -204,6 +234,12 @@ class Publisher:
             writer.add(contents.SIGNATURE, contents.document(signature))
             writer.close()
             partial.replace(out)
+            if card is not None:
+                with out.open("rb") as stream:
+                    sha256 = hashlib.file_digest(stream, "sha256").hexdigest()
+                file = descriptions.File(out.name, sha256, out.stat().st_size)
+                for name, data in descriptions.files(made, described, file).items():
+                    (card / name).write_bytes(data)
         finally:
             partial.unlink(missing_ok=True)
         listed = contents.listing(map(journal.read_entry, entries), ids)

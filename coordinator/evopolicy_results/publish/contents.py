@@ -4,6 +4,8 @@
     signature.json             key and signature of the manifest's SHA-256
     journal.jsonl              all entries of the coordinator's journal, a line each, as they were hashed
     removed.json               what was taken out before publication
+    card.json, card.md         the evaluation card; files of earlier versions have neither these nor the next
+    croissant.json             what the files hold, for catalogues of data sets
     runs/0000/digests.json     digests of the files beside it: one run can be checked without the others
     runs/0000/run.json         the run's record
     runs/0000/opening.json, salt, result.json      what the journal's entries hold the hashes of
@@ -31,6 +33,9 @@ from evopolicy_common.records.journal import Result
 FORMAT = "evopolicy results"
 VERSION = 1
 MANIFEST, SIGNATURE, JOURNAL, REMOVED = "manifest.json", "signature.json", "journal.jsonl", "removed.json"
+CARD, CARD_TEXT, CROISSANT = "card.json", "card.md", "croissant.json"
+DESCRIPTIONS = (CARD, CARD_TEXT, CROISSANT)
+"""Files that follow from the others."""
 DIGESTS, RUN, OPENING, SALT, RESULT, EPISODES = (
     "digests.json",
     "run.json",

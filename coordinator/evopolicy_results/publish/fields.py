@@ -14,6 +14,7 @@ from typing import Any, Literal
 
 import msgspec
 
+from evopolicy_common.catalogue.licences import Licence
 from evopolicy_common.errors import DECODE_ERRORS, ProtocolError
 from evopolicy_common.messages.episode import ResourceLimits
 from evopolicy_common.messages.journal import Committed
@@ -79,6 +80,9 @@ FIELDS: dict[str, dict[Cover, str]] = {
     contents.SIGNATURE: {"derived": "key signature"},
     contents.REMOVED: {"claim": "*.what *.why"},
     contents.JOURNAL: {"derived": "**"},
+    contents.CARD: {"derived": "**", "claim": f"licence {_all('licences.*', Licence)} licences.*.used_by.*"},
+    contents.CARD_TEXT: {"derived": ""},
+    contents.CROISSANT: {"derived": "**"},
     f"runs/*/{contents.DIGESTS}": {"derived": "*"},
     f"runs/*/{contents.OPENING}": {"committed": "**"},
     f"runs/*/{contents.SALT}": {"committed": ""},

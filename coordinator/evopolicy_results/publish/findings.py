@@ -36,6 +36,7 @@ KINDS = {
     "checkpoints": "the policies are those that were submitted",
     "signals": "nothing in checkpoints and logs asks for a look (no verdict)",
     "logs": "agents' logs are what the agents wrote",
+    "card": "the evaluation card and its descriptions follow from the runs",
     "completeness": "every run that was opened for the entries is here",
     "order": "the journal could not be begun anew",
     "policies": "the actions came from the policies",

@@ -10,16 +10,17 @@ Rules that this module owns:
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from evopolicy_common.errors import ProtocolError
 from evopolicy_common.records import journal
 from evopolicy_common.records.canary import CANARY
 from evopolicy_common.records.journal import Ended, Opened
 from evopolicy_common.records.summary import utc_text
-from evopolicy_results.publish import contents, fields
+from evopolicy_results.publish import card as cards
+from evopolicy_results.publish import contents, descriptions, fields
 from evopolicy_results.publish.contents import Countersignature, Manifest, Removed, Signature
-from evopolicy_results.publish.findings import Checked, Files, History, decoded
+from evopolicy_results.publish.findings import KINDS, Checked, Files, History, decoded
 from evopolicy_results.publish.run_rules import UPDATE, check_run, read_run, refuse_unknown
 from evopolicy_results.publish.signatures import HEAD, signed_by
 
@@ -34,7 +35,7 @@ def check(files: Files, identity: str = "", heads: Sequence[str | Countersignatu
     if manifest is None:
         return checked
     _names(files, manifest, checked)
-    damaged = _digests(files, manifest, checked)
+    damaged, digests = _digests(files, manifest, checked)
     entries = _journal(files, manifest, checked)
     _order(entries, heads, checked)
     _removed(files, checked)
@@ -59,6 +60,7 @@ def check(files: Files, identity: str = "", heads: Sequence[str | Countersignatu
         checked.add("claims", "open", text)
     checked.listing = contents.listing(entries.entries, seen)
     _completeness(checked)
+    _descriptions(files, manifest, digests, checked)
     _claims(checked)
     return checked
 
@@ -109,14 +111,14 @@ def _manifest(files: Files, identity: str, checked: Checked) -> Manifest | None:
 def _names(files: Files, manifest: Manifest, checked: Checked) -> None:
     """Files that publication does not write, and those of the manifest that it leaves to a run's digests."""
     odd = sorted(name for name in files.names if fields.file_kind(name) is None)
-    top = (contents.JOURNAL, contents.REMOVED)
+    top = (contents.JOURNAL, contents.REMOVED, *contents.DESCRIPTIONS)
     odd += [name for name in manifest.files if name not in top and not name.endswith(f"/{contents.DIGESTS}")]
     for name in odd:
         checked.add("format", "failed", f"{name[:120]} is no file of published results: {UPDATE}")
 
 
-def _digests(files: Files, manifest: Manifest, checked: Checked) -> set[str]:
-    """The names of files that are not what was signed."""
+def _digests(files: Files, manifest: Manifest, checked: Checked) -> tuple[set[str], dict[str, str]]:
+    """The names of files that are not what was signed, and the signed digests of all."""
     wanted = dict(manifest.files)
     bad: list[str] = []
     for name in [name for name in manifest.files if name.endswith(f"/{contents.DIGESTS}")]:
@@ -147,7 +149,7 @@ def _digests(files: Files, manifest: Manifest, checked: Checked) -> set[str]:
         checked.add("digests", "failed", text)
     if not bad:
         checked.add("digests", "ok", f"{len(wanted):,} files")
-    return damaged
+    return damaged, wanted
 
 
 def _journal(files: Files, manifest: Manifest, checked: Checked) -> History:
@@ -238,6 +240,42 @@ def _removed(files: Files, checked: Checked) -> None:
         refuse_unknown(contents.REMOVED, fields.parsed(contents.REMOVED, data), {}, checked)
     except ProtocolError as error:
         checked.add("format", "failed", str(error))
+
+
+def _descriptions(files: Files, manifest: Manifest, digests: Mapping[str, str], checked: Checked) -> None:
+    """Makes the card and its descriptions again, and compares. Files of earlier versions have none."""
+    if checked.failed or not files.names.intersection(contents.DESCRIPTIONS):
+        return
+    try:
+        data = {name: files.read(name, contents.MAX_DOCUMENT_BYTES) for name in contents.DESCRIPTIONS}
+        found = decoded(contents.CARD, data[contents.CARD], cards.Card)
+        refuse_unknown(contents.CARD, fields.parsed(contents.CARD, data[contents.CARD]), {}, checked)
+    except ProtocolError as error:
+        checked.add("card", "failed", str(error))
+        return
+    if found.version != cards.VERSION:
+        text = f"it has version {found.version}, this program makes version {cards.VERSION}: not compared"
+        checked.add("card", "open", text)
+        for name in contents.DESCRIPTIONS:
+            checked.claim(name, ["**"])
+        return
+    own = cards.make(
+        [cards.Source(run.folder, run.record, run.result) for run in checked.runs],
+        contents.journal_entries(files.read(contents.JOURNAL, contents.MAX_RECORDING_BYTES)),
+        signer=checked.signer,
+        software=manifest.software,
+        licence=found.licence,
+        claimed=found.licences,
+    )
+    wrong = [
+        name
+        for name, made in descriptions.files(cards.matching(own, found), digests).items()
+        if made != data[name]
+    ]
+    for name in wrong:
+        checked.add("card", "failed", f"{name} is not what follows from the runs")
+    if not wrong:
+        checked.add("card", "ok", KINDS["card"])
 
 
 def _claims(checked: Checked) -> None:

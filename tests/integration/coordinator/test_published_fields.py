@@ -23,6 +23,8 @@ FILES = {
     "manifest.json": contents.MANIFEST,
     "signature.json": contents.SIGNATURE,
     "removed.json": contents.REMOVED,
+    contents.CARD: contents.CARD,
+    contents.CROISSANT: contents.CROISSANT,
     **{
         name: f"runs/0000/{name}"
         for name in (contents.RUN, contents.OPENING, contents.RESULT, contents.EPISODES, contents.DIGESTS)
@@ -99,6 +101,8 @@ def test_each_changed_field_is_refused_contradicted_or_listed_as_a_claim(results
     for path, _ in fields.leaves(content):
         if kind == contents.OPENING and path[0] == "train" and int(path[1]) > 2:
             continue  # hundreds of cases that are alike
+        if path[0] == "@context":
+            continue  # names of a vocabulary
         forger = Forger(results.files)
         forger.put(file, with_leaf(content, path))
         found = signed(results, forger, file)
@@ -245,6 +249,8 @@ def test_the_table_of_fields_names_every_field_of_a_run_record() -> None:
 def older(results: Results) -> Forger:
     """The same file as an earlier version would have written it: its result holds no fields of `run.json`."""
     forger = Forger(results.files)
+    for name in contents.DESCRIPTIONS:
+        del forger.files[name]
     for run in ("runs/0000", "runs/0001"):
         forger.begin_anew(lambda result: result.pop("record") and None, run)
     forger.place()

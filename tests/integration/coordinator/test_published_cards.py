@@ -1,0 +1,171 @@
+"""Evaluation cards of published results: made from the runs, made again by the check, and valid for others' tools."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import msgspec
+import pytest
+from commands import evopolicy
+from publications import Forger, Held, Results
+
+from evopolicy_common.catalogue.licences import licences
+from evopolicy_results.publish import card as cards
+from evopolicy_results.publish import contents, descriptions, rules
+from evopolicy_results.publish.findings import Checked
+
+pytestmark = pytest.mark.system
+
+VALIDATE = """
+import json, socket, sys
+def refuse(*_): raise OSError("no network")
+socket.socket.connect = socket.getaddrinfo = refuse
+import mlcroissant
+found = mlcroissant.Dataset(sys.argv[1])
+issues = found.metadata.ctx.issues
+records = [
+    {name: value.decode() if isinstance(value, bytes) else value for name, value in each.items()}
+    for each in found.records("runs")
+]
+limits = found.metadata.data_limitations
+print(json.dumps([sorted(issues.errors), sorted(issues.warnings), records, limits], default=float))
+"""
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> Results:
+    return Results(tmp_path_factory.mktemp("cards"))
+
+
+def card_of(results: Results) -> cards.Card:
+    return msgspec.json.decode(results.files[contents.CARD], type=cards.Card)
+
+
+def checked(results: Results, forger: Forger) -> Checked:
+    """Signed by the publisher itself."""
+    forger.sign(results.root / "st")
+    return rules.check(Held(forger.files), results.summary["signer"])
+
+
+def states(found: Checked, kind: str = "card") -> list[str]:
+    return [each.state for each in found.findings if each.kind == kind]
+
+
+def validated(
+    description: Path, home: Path
+) -> tuple[list[str], list[str], list[dict[str, object]], list[str]]:
+    """Errors, warnings, records of the runs, and limits, as `mlcroissant` reads them without a network."""
+    done = subprocess.run(
+        [sys.executable, "-c", VALIDATE, str(description)],
+        env={**os.environ, "HOME": str(home)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    errors, warnings, records, limits = json.loads(done.stdout.splitlines()[-1])
+    return errors, warnings, records, limits
+
+
+def test_a_card_tells_what_the_runs_tell(results: Results) -> None:
+    card, run = card_of(results), json.loads(results.files["runs/0000/run.json"])
+    assert card.runs[0].score == run["outcome"]["final_score"]
+    assert card.results[0].mean == sum(each.score or 0.0 for each in card.runs) / 2
+    assert [(each.entry, each.runs, each.episodes) for each in card.agents] == [("mine", 2, 10)]
+    assert card.conditions["isolation"]["agents' jail"] == {"bwrap": 2}
+    assert card.signer == results.summary["signer"]
+    text = results.files[contents.CARD_TEXT].decode()
+    assert all(limit in text for limit in card.limits)
+    assert f"`{card.signer}`" in text
+
+
+def test_a_changed_card_is_refused_and_a_narrower_interval_too(results: Results) -> None:
+    assert states(checked(results, Forger(results.files))) == ["ok"]
+    card = card_of(results)
+    cell = card.results[0]
+    assert cell.low is not None
+    assert cell.high is not None
+    width = cell.high - cell.low
+    for low, state in ((cell.low + 0.01 * width, "ok"), (cell.low + 0.1 * width, "failed")):
+        forger = Forger(results.files)
+        changed = msgspec.structs.replace(
+            card, results=(msgspec.structs.replace(cell, low=low), *card.results[1:])
+        )
+        digests = {name: contents.digest(data) for name, data in forger.files.items()}
+        forger.files |= descriptions.files(changed, digests)
+        assert set(states(checked(results, forger))) == {state}
+    for name in (contents.CARD_TEXT, contents.CROISSANT):
+        forger = Forger(results.files)
+        forger.files[name] = forger.files[name].replace(b"runs", b"ruins", 1)
+        assert states(checked(results, forger)) == ["failed"]
+
+
+def test_a_card_without_its_text_is_refused(results: Results) -> None:
+    forger = Forger(results.files)
+    del forger.files[contents.CARD_TEXT]
+    assert states(checked(results, forger)) == ["failed"]
+
+
+def test_a_card_of_another_version_is_a_claim(results: Results) -> None:
+    forger = Forger(results.files)
+    forger.json(contents.CARD, lambda card: card.update(version=cards.VERSION + 1))
+    found = checked(results, forger)
+    assert not found.failed
+    assert states(found) == ["open"]
+    assert found.claims[contents.CARD_TEXT] == ["**"]
+
+
+def test_files_without_a_card_are_read_as_before(results: Results) -> None:
+    forger = Forger(results.files)
+    for name in contents.DESCRIPTIONS:
+        del forger.files[name]
+    found = checked(results, forger)
+    assert not found.failed
+    assert states(found) == []
+
+
+def test_licences_of_other_versions_are_claims(results: Results) -> None:
+    card = msgspec.structs.replace(card_of(results), licences=licences(["atari"]))
+    forger = Forger(results.files)
+    digests = {name: contents.digest(data) for name, data in forger.files.items()}
+    forger.files |= descriptions.files(card, digests)
+    found = checked(results, forger)
+    assert states(found) == ["ok"]
+    assert "licences.*.licence" in found.claims[contents.CARD]
+    assert b"| game ROMs |  | unknown | atari |" in forger.files[contents.CARD_TEXT]
+
+
+def test_descriptions_are_valid_for_mlcroissant_without_a_network(results: Results, tmp_path: Path) -> None:
+    folder = tmp_path / "beside"
+    folder.mkdir()
+    done = evopolicy(
+        results.root,
+        *("publish", "runs", "--out", str(folder / "licensed.evp"), "--local", "--state", "st"),
+        *("--licence", "CC-BY-4.0", "--card", str(folder)),
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    unpacked = tmp_path / "unpacked"
+    for name, data in results.read(str(folder / "licensed.evp")).items():
+        (unpacked / name).parent.mkdir(parents=True, exist_ok=True)
+        (unpacked / name).write_bytes(data)
+    assert (folder / contents.CARD).read_bytes() == (unpacked / contents.CARD).read_bytes()
+    card = msgspec.json.decode((folder / contents.CARD).read_bytes(), type=cards.Card)
+    for place in (folder, unpacked):
+        errors, warnings, records, limits = validated(place / contents.CROISSANT, tmp_path)
+        assert (errors, warnings) == ([], [])
+        assert [each["runs/score"] for each in records] == [each.score for each in card.runs]
+        assert tuple(limits) == card.limits
+    (unpacked / contents.CARD).write_bytes(b"{}")
+    (folder / contents.CROISSANT).write_text('{"@type": "sc:Dataset"}')
+    with pytest.raises(AssertionError):
+        validated(folder / contents.CROISSANT, tmp_path)
+
+
+def test_the_same_runs_give_the_same_card(results: Results) -> None:
+    for name in ("again.evp", "once-more.evp"):
+        results.publish(name, "runs")
+    assert (results.root / "again.evp").read_bytes() == (results.root / "once-more.evp").read_bytes()
