@@ -203,8 +203,8 @@ class Forger:
         self.sign_manifest(state)
 
     def describe(self, state: Path | None = None) -> None:
-        """Makes the card and its descriptions anew, from the files as they are, unless the forger changed these.
-        Keeps them where a file cannot be read."""
+        """Makes the card and its descriptions anew from the files, unless the forger changed these. Keeps them
+        where a file cannot be read."""
         now = {name: self.files.get(name) for name in contents.DESCRIPTIONS}
         if now != self.described or contents.CARD not in self.files:
             return

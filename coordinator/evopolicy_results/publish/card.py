@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 
 import msgspec
 
+from evopolicy_common import catalogue
 from evopolicy_common.catalogue.installs import family_of
 from evopolicy_common.catalogue.licences import Licence, licences
 from evopolicy_common.records import journal
@@ -37,11 +38,11 @@ _LIMITS = {
     "agents' jail": ("bwrap", "Some agents ran outside the jail, or with a network."),
     "agents beside hidden episodes": ("exclusive", "Some agents and hidden episodes could share a kernel."),
     "hidden cases": ("secret", "Some hidden cases are public: an agent's model may have seen them."),
+    "rules": ("renewed", "Rules of some environments cannot be renewed: their scores may contain recall."),
     "episodes repeat": ("true", "Some environments do not repeat an episode from seed and actions."),
 }
 """By condition: the value that limits nothing, and the limit that other values mean."""
 _ALWAYS = (
-    "Dynamics of environments are public and cannot be renewed: a score may contain recall.",
     "No human played these cases: there is no human reference.",
     "A recording shows the actions that were played, not that the policy chose them.",
     "Returns of different environments have different scales, so there is no mean over environments.",
@@ -103,6 +104,8 @@ class AgentCost(msgspec.Struct, frozen=True, kw_only=True):
     episodes: int
     wall_s: float
     turns: int
+    cpu_s: float | None
+    """Processor time of its programs."""
     tokens: int | None
     """Of all kinds."""
     cost: float | None
@@ -218,6 +221,7 @@ def _cell(env: str, entry: str, sources: Sequence[Source]) -> Cell:
 
 def _agent(entry: str, sources: Sequence[Source]) -> AgentCost:
     agents = [each.record.agent for each in sources]
+    used = [agent.resources.cpu_s for agent in agents if agent.resources is not None]
     tokens = [agent.tokens for agent in agents if agent.tokens is not None]
     costs = [each.cost for each in tokens if each.cost is not None]
     named = [(agent.harness, agent.cli_version, agent.model_string) for agent in agents]
@@ -229,6 +233,7 @@ def _agent(entry: str, sources: Sequence[Source]) -> AgentCost:
         episodes=sum(each.result.budget_used for each in sources),
         wall_s=round(sum(each.record.timing.wall_time_seconds for each in sources), 3),
         turns=sum(agent.turns for agent in agents),
+        cpu_s=round(sum(used), 3) if len(used) == len(sources) else None,
         tokens=sum(each.total for each in tokens) if len(tokens) == len(sources) else None,
         cost=sum(costs) if len(costs) == len(sources) else None,
     )
@@ -240,12 +245,16 @@ def _conditions(records: Sequence[RunRecord]) -> dict[str, dict[str, dict[str, i
         use, audit, versions = record.agent.model_use, record.audit, record.versions
         settings: dict[str, Any] = msgspec.to_builtins(record.experiment_dimensions)
         limits = settings.pop("limits") or {}
+        resources = record.agent.resources
+        own = {} if resources is None else msgspec.to_builtins(resources.limits)
+        entry = catalogue.known(record.env)
         topics: dict[str, dict[str, Any]] = {
             "isolation": {
                 "policies' sandbox": record.sandbox_tier,
                 "agents' jail": record.jail,
                 "agents beside hidden episodes": record.hidden_isolation,
                 "hidden cases": "secret" if versions.data_secret else "public",
+                "rules": "renewed" if entry is not None and entry.world else "fixed",
             },
             "metering": {
                 "tokens counted by": use.metering
@@ -256,6 +265,7 @@ def _conditions(records: Sequence[RunRecord]) -> dict[str, dict[str, dict[str, i
                 "audits": f"{audit.agreed} of {audit.sampled} confirmed" if audit else "none",
             },
             "hardware": {"processor": versions.fingerprint.get("cpu")},
+            "agents' limits": own,
             "software": {**versions.fingerprint, "cpu": None, "episodes repeat": versions.env_deterministic},
             "settings": {**settings, **limits, "protocol": record.protocol_version},
         }

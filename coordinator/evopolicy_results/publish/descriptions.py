@@ -72,14 +72,25 @@ random actions on the same cases.
                 for each in card.results
             ),
         ),
-        "\n## Agents and costs\n\n*Hours*: sum of the runs' wall times; runs may have shared a machine.\n",
+        "\n## Agents and costs\n\n*Hours*: the runs' wall times. *CPU s*: the agents' own.\n",
         *_table(
-            ("entry", "agent", "runs", "submits", "train episodes", "hours", "turns", "tokens", "US dollars"),
+            (
+                "entry",
+                "agent",
+                "runs",
+                "submits",
+                "episodes",
+                "hours",
+                "CPU s",
+                "turns",
+                "tokens",
+                "US dollars",
+            ),
             (
                 (
                     *(each.entry, "; ".join(each.agents), each.runs, each.submits, each.episodes),
-                    *(f"{each.wall_s / 3600:.2f}", each.turns, _number(each.tokens, "not counted")),
-                    _number(each.cost, "not known"),
+                    *(f"{each.wall_s / 3600:.2f}", _number(each.cpu_s, "not counted"), each.turns),
+                    *(_number(each.tokens, "not counted"), _number(each.cost, "not known")),
                 )
                 for each in card.agents
             ),

@@ -1,4 +1,4 @@
-"""Evaluation cards of published results: made from the runs, made again by the check, and valid for others' tools."""
+"""Evaluation cards: made from the runs, made again by the check, and valid for others' tools."""
 
 from __future__ import annotations
 
