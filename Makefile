@@ -3,6 +3,7 @@
 # make test   installs, then runs the tests of every layer, but for:
 # make test-system  those that play many whole runs on clusters of their own
 # make test-families  those that play every family of environments
+# make test-long  both at once, which takes less time than one after the other
 # make paper-worker  installs a worker with the paper's library versions into .venv-paper
 # make check  ruff and mypy
 # make release  builds wheel and sdist in dist/, checks them, and installs them in clean environments
@@ -31,7 +32,7 @@ FAMILIES := $(VENV)/.families
 STAMP := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help install families paper-worker demo test test-system test-families check check-envs docs release bench bench-start bench-peers bench-throughput bench-scale bench-channels bench-report bench-coverage bench-isolation bench-costs bench-web bench-web-live faults sim clean
+.PHONY: help install families paper-worker demo test test-system test-families test-long check check-envs docs release bench bench-start bench-peers bench-throughput bench-scale bench-channels bench-report bench-coverage bench-isolation bench-costs bench-web bench-web-live faults sim clean
 
 help:
 	@sed -n 's/^# make/make/p' Makefile
@@ -78,15 +79,16 @@ PROCESSES := $$(( $$(nproc) + 9 ))
 test: LAYERS = not system and not families
 test-system: LAYERS = system
 test-families: LAYERS = families
+test-long: LAYERS = system or families
 # Here every test starts clusters of its own.
-test-system: PROCESSES = $$(( $$(nproc) + 4 ))
-# These compute without pause, and have limits on time.
-test-families: PROCESSES = $$(nproc)
+test-system test-long: PROCESSES = $$(( $$(nproc) + 4 ))
+# These compute most of the time, and have limits on time; browsers and clusters wait.
+test-families: PROCESSES = $$(( $$(nproc) + 2 ))
 test: HOST = --tests
-test-system test-families: HOST = --all-tests
+test-system test-families test-long: HOST = --all-tests
 # The tests start hundreds of processes: none of them shall compile our modules anew, whatever the shell asks of Python.
-test test-system test-families: export PYTHONDONTWRITEBYTECODE :=
-test test-system test-families: install
+test test-system test-families test-long: export PYTHONDONTWRITEBYTECODE :=
+test test-system test-families test-long: install
 	@bash deploy/setup-host.sh $(HOST)
 # In a fresh checkout one process compiles the tests, not each of them at the same time.
 	@test -e tests/unit/__pycache__ || $(BIN)/python -m pytest -q --collect-only -m "$(LAYERS)" >/dev/null 2>&1 || true

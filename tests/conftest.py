@@ -9,7 +9,7 @@ import re
 import shutil
 import signal
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,11 +20,21 @@ if TYPE_CHECKING:
     from forked import Forks
     from slots import Slots
 
-_LAYER = re.compile(rb"^pytestmark = \[?\s*pytest\.mark\.(system|families)\b", re.MULTILINE)
-"""A file of another layer than `make test` says so in its first mark."""
+_LEFT_OUT: dict[str, Callable[[bytes], object]] = {
+    "not system and not families": re.compile(
+        rb"^pytestmark = \[?\s*pytest\.mark\.(system|families)\b", re.MULTILINE
+    ).search,
+    "system or families": lambda text: (
+        b"pytest.mark.system" not in text and b"pytest.mark.families" not in text
+    ),
+    "system": lambda text: b"pytest.mark.system" not in text,
+    "families": lambda text: b"pytest.mark.families" not in text,
+}
+"""By `-m`: whether a file has no test of the layer. A file of another layer than `make test` says so in its first mark."""
 
-
-_ONE_BY_ONE = ("tests/families/test_proof_of_life.py::",)
+_ONE_BY_ONE = tuple(
+    f"tests/families/test_{name}.py::" for name in ("proof_of_life", "parity", "cited_policies")
+)
 """Their tests share nothing and take minutes together: each is played where there is room."""
 
 
@@ -57,10 +67,10 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
-    """`make test` does not import the files that it leaves out: each of its processes would."""
-    left_out = config.getoption("markexpr") == "not system and not families"
+    """Files that a layer leaves out are not imported: each of its processes would."""
+    left_out = _LEFT_OUT.get(config.getoption("markexpr"))
     is_test = left_out and collection_path.name.startswith("test_") and collection_path.suffix == ".py"
-    return True if is_test and _LAYER.search(collection_path.read_bytes()) else None
+    return True if is_test and left_out(collection_path.read_bytes()) else None
 
 
 def _beside_others(config: pytest.Config) -> bool:

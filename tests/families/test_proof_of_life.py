@@ -37,8 +37,8 @@ def test_every_family_has_a_row_and_cases_that_nobody_chose() -> None:
     for proof in TABLE:
         suite = catalogue.suites()[proof.family]
         assert {proof.env, *proof.check} <= set(suite.environments)
-        assert proof.seeds == proofs.drawn(proof.family)
-        assert len(set(proof.seeds)) == proofs.N_CASES
+        assert proof.seeds == proofs.drawn(proof.family)[: proof.cases]
+        assert len(set(proof.seeds)) == proof.cases >= 6
 
 
 @pytest.mark.slow

@@ -26,6 +26,8 @@ class Proof(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     """The environments that `check-env` plays."""
     check_steps: int = 100
     """Steps of each of these."""
+    cases: int = N_CASES
+    """How many of the drawn cases are played; fewer where an episode takes seconds."""
 
     @property
     def policy(self) -> Path:
@@ -35,7 +37,7 @@ class Proof(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     @property
     def seeds(self) -> list[int]:
         """The cases that the policy is measured on."""
-        return list(json.loads((FOLDER / "cases.json").read_text())[self.family])
+        return list(json.loads((FOLDER / "cases.json").read_text())[self.family])[: self.cases]
 
 
 def table() -> list[Proof]:
