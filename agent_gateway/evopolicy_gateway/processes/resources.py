@@ -27,7 +27,7 @@ _LOOK_SHARE = 10
 """A look at the files is followed by a pause of at least this many times its length."""
 _QUOTA_US = 100_000
 _COUNTED_BY_NAMESPACE = (5, 14)
-_WORDS = {"cpus": "{:g} cores", "memory_bytes": "{:,} bytes of memory", "pids": "{:,} processes"}
+_WORDS = {"cpus": "cores {:g}", "memory_bytes": "memory {:,} bytes", "pids": "processes {:,}"}
 _CONTROLLERS = {"cpus": "cpu", "memory_bytes": "memory", "pids": "pids"}
 
 
@@ -49,7 +49,7 @@ class Resources:
         """Files into which a program of the agent writes its id before it starts."""
         held = self._group.held
         by = {
-            name: f"cgroup {held[controller]}"
+            name: f"cgroup v{held[controller]}"
             for name, controller in _CONTROLLERS.items()
             if controller in held and getattr(asked, name) is not None
         }

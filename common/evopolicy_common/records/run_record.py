@@ -123,7 +123,7 @@ class AgentResources(msgspec.Struct, frozen=True, kw_only=True):
     limits: AgentLimits
     """Those that something kept; a limit that this machine could not keep is None."""
     kept_by: dict[str, str] = {}
-    """`cgroup 1`, `cgroup 2`, `affinity` or `rlimit`, by name of the limit."""
+    """`cgroup v1`, `cgroup v2`, `affinity` or `rlimit`, by name of the limit."""
     cpu_s: float = 0.0
     """Processor time of all its programs, seconds."""
     memory_peak_bytes: int = 0

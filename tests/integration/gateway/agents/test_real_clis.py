@@ -190,7 +190,7 @@ def test_the_relay_counts_for_a_real_cli_which_never_has_the_key(
         (tmp_path / "agent.toml").write_text("".join(lines))
         arguments = ("--env", "toy/line", "--agent", "file:agent.toml", "--exp-id", "t", "--budget", "4")
         with command(tmp_path, "local", *arguments, *SMALL_HIDDEN) as running:
-            assert running.wait() == 0, running.text
+            assert running.wait(400) == 0, running.text
     record = record_in(run_dir(tmp_path))
     use, tokens = record.agent.model_use, record.agent.tokens
     assert record.outcome.budget_used == 4

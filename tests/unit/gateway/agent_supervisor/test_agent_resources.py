@@ -195,7 +195,7 @@ def test_without_cgroups_cores_and_processes_are_limited_in_the_jail(
     assert held.used().limits == AgentLimits(cpus=1.0, pids=64)
     assert held.used().kept_by == {"cpus": "affinity", "pids": "rlimit"}
     assert (held.fixed_cores, held.own_pids, held.joins) == (True, 64, ())
-    assert "1,000,000,000 bytes of memory (no cgroup can be made here: unlimited)" in held.words()
+    assert "memory 1,000,000,000 bytes (no cgroup can be made here: unlimited)" in held.words()
     assert loose.used().limits == AgentLimits()
 
 
