@@ -23,7 +23,7 @@ from evopolicy_gateway.processes import trees
 from evopolicy_gateway.processes.disk_use import MAX_DEPTH, TooDeepError, used_bytes
 
 _LOOK_S = 1.0
-_LOOK_SHARE = 10
+_LOOK_SHARE = 50
 """A look at the files is followed by a pause of at least this many times its length."""
 _QUOTA_US = 100_000
 _COUNTED_BY_NAMESPACE = (5, 14)
