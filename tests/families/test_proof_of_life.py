@@ -53,6 +53,7 @@ def test_a_policy_beats_random_on_the_cases_that_were_fixed_beforehand(slots: Sl
                 seed=seed,
                 bundle=None if folder is None else "digest",
                 limits=ResourceLimits(),
+                max_steps=proof.steps,
                 record="actions",
             )
             (outcome,) = slots.run(slots.slot().play(job, folder, lambda episodes, steps: None))

@@ -28,6 +28,8 @@ class Proof(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     """Steps of each of these."""
     cases: int = N_CASES
     """How many of the drawn cases are played; fewer where an episode takes seconds."""
+    steps: int = 0
+    """The most steps of an episode, of the policy's and of random actions; 0: as many as the environment gives."""
 
     @property
     def policy(self) -> Path:
