@@ -25,9 +25,8 @@ from evopolicy_common.records.open_run import Accepted, AnyEntry, Died, Requeste
 from evopolicy_common.refusals import Refusal
 from evopolicy_gateway.run_folder.journal import Journal
 from evopolicy_gateway.submits import snapshots
-from evopolicy_gateway.submits.collecting import Collector
 from evopolicy_gateway.submits.coordinator_client import CoordinatorClient
-from evopolicy_gateway.submits.feedback import SubmitTree
+from evopolicy_gateway.submits.feedback import Collector, SubmitTree
 from evopolicy_gateway.submits.tickets import Do, Effect, Ticket, TicketMachine
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger()

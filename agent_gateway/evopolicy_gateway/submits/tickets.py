@@ -165,7 +165,7 @@ class TicketMachine:
     # Requests.
 
     def repeated(self, body: bytes, client_key: str | None) -> Ticket | None:
-        """Returns the ticket that a request repeats. Raises ConflictError: its key belongs to another body."""
+        """The ticket that a request repeats. Raises ConflictError when its key belongs to another body."""
         keyed = (each for each in self.tickets if each.request.client_key == client_key is not None)
         ticket = next(keyed, None)
         if ticket is not None and ticket.request.body_digest != digest_of(body):

@@ -75,7 +75,7 @@ def test_an_episode_whose_recording_is_gone_is_put_aside(tmp_path: Path) -> None
 KILLED = """
 import asyncio, os, signal, sys
 from pathlib import Path
-from evopolicy_gateway.submits import collecting as submits
+from evopolicy_gateway.submits import feedback as submits
 from evopolicy_gateway.run.gateway import Gateway
 from evopolicy_common.records.episodes import rendered
 from evopolicy_gateway.run_folder.layout import RunFolder

@@ -27,7 +27,7 @@ from evopolicy_common.records.blobs import digest_of
 from evopolicy_common.records.episodes import npz, rendered, trajectory
 from evopolicy_common.records.episodes.trajectory import Recorder
 from evopolicy_common.wire import codec
-from evopolicy_gateway.submits import collecting
+from evopolicy_gateway.submits import feedback
 from evopolicy_gateway.submits.coordinator_client import LARGE_BYTES, CoordinatorClient
 from evopolicy_gateway.submits.episode_files import episode_files, episode_share
 
@@ -128,7 +128,7 @@ def test_large_episodes_are_written_one_after_another(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     at_work, most, lock = 0, 0, threading.Lock()
-    real = collecting.episode_files
+    real = feedback.episode_files
 
     def slow(*args: Any, **more: Any) -> dict[str, bytes]:
         nonlocal at_work, most
@@ -140,7 +140,7 @@ def test_large_episodes_are_written_one_after_another(
             at_work -= 1
         return real(*args, **more)
 
-    monkeypatch.setattr(collecting, "episode_files", slow)
+    monkeypatch.setattr(feedback, "episode_files", slow)
 
     async def main() -> None:
         async with served(tmp_path) as s:

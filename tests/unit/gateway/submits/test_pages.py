@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from evopolicy_gateway.submits.collecting import LONGEST_LINGER_S, Linger
+from evopolicy_gateway.submits.feedback import LONGEST_LINGER_S, Linger
 
 
 def play(n: int, episode_s: float, round_trip_s: float = 0.002) -> tuple[int, float]:

@@ -1,4 +1,4 @@
-"""The ticket machine under any order of requests, refusals, errors and crashes, and with bugs planted in it."""
+"""The ticket machine under any order of requests, refusals, errors and crashes, with and without bugs."""
 
 from __future__ import annotations
 
