@@ -1,13 +1,22 @@
-"""One run from its opening to `run.json`, in the operator's process.
+"""One run from its opening to `run.json`, in the operator's process: the phases of `PHASES` in order.
 
-The order matters:
+| phase   | does                                        | ends by                  | durable before the next |
+|---------|---------------------------------------------|--------------------------|-------------------------|
+| `claim` | empties the folder; opens the run first     | a refusal: the earlier   | `intended.json`: the    |
+|         | where an earlier one would be lost          | run stays                | request and its key     |
+| `open`  | opens the run, or finds it again by its key | a refusal: a new folder  | `run.json`: the run;    |
+|         |                                             | is removed               | its capability          |
+| `agent` | keeps gateway, relay and agent alive until  | the agent, its budget,   | the closed run, at the  |
+|         | the gateway has closed the run              | its limits, cancellation | coordinator             |
+| `score` | waits for the scores of the hidden cases,   | the run's result         | the result, at the      |
+|         | which only this process receives            |                          | coordinator             |
+| `write` | writes the finished run's files             | a disk or folder that    | `run.json`, in place of |
+|         |                                             | refuses                  | the gateway's folder    |
 
-1. The run is opened, the coordinator permits the agent to be alive here, the gateway serves, the agent starts.
-2. The agent and all that it started end before the run is closed or cancelled, which ends the permit.
-3. Only then are its hidden cases scored on this machine; only this process receives the scores.
-
-A gateway that dies is restarted on the same port while the agent continues. An agent supervisor that dies is restarted
-with its agent. When this process is killed, its children end, and the folder holds everything needed to resume the run.
+A command that resumes a run begins at the first phase whose result is not durable. The permit begins before
+the agent, and ends with the closing of the run, after the agent and all that it started. A gateway that dies
+is restarted on the same port while the agent continues; an agent supervisor that dies, with its agent. When
+this process is killed, its children end.
 """
 
 from __future__ import annotations
@@ -18,10 +27,10 @@ import os
 import sys
 import time
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Coroutine
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 
@@ -41,21 +50,7 @@ from evopolicy_common.wire import credentials
 from evopolicy_common.wire.credentials import Credentials
 from evopolicy_gateway.jail.jail import JailOrder
 from evopolicy_gateway.processes import child_messages, child_rpc
-from evopolicy_gateway.processes.child_messages import (
-    AgentDoing,
-    AgentEnded,
-    AgentSurvives,
-    AgentTime,
-    AgentTurn,
-    AgentUsed,
-    CloseRun,
-    HeldTime,
-    Progress,
-    Ready,
-    RunClosed,
-    StartAgent,
-    Waits,
-)
+from evopolicy_gateway.processes.child_messages import AgentEnded, Ready, StartAgent
 from evopolicy_gateway.processes.child_rpc import Child
 from evopolicy_gateway.relay.service import Order
 from evopolicy_gateway.run import record
@@ -70,6 +65,7 @@ from evopolicy_gateway.run_folder.locks import alone
 from evopolicy_gateway.workspace import staging as workspace
 from evopolicy_gateway.workspace.agents_md import LAST_WORDS_S
 
+T = TypeVar("T")
 END_GRACE_S = 15.0
 GIVE_UP_TIMEOUT_S = 10.0
 """Limit for reporting a given-up run to the coordinator, whose failure may be the reason for giving up."""
@@ -101,8 +97,8 @@ class RunLifecycle:
     ) -> None:
         """`gateway`: credentials of the gateway role, without a run's capability.
 
-        `stays_open`: cancelling this leaves the run open, to be resumed. `on_agent_gone` is called once the agent's
-        side is over; the rest of the run needs no slot for an agent.
+        `stays_open`: cancelling this leaves the run open, to be resumed. `on_agent_gone` is called once the
+        agent's side is over; the rest of the run needs no slot for an agent.
         """
         self._plan = plan
         self._folder = plan.folder
@@ -113,7 +109,8 @@ class RunLifecycle:
         self._stays_open = stays_open
         self.run = ""
         """The cluster's id of the run, once it is open."""
-        self._ready: asyncio.Future[Ready] = asyncio.get_running_loop().create_future()
+        self.served: asyncio.Future[Ready] = asyncio.get_running_loop().create_future()
+        """Done when the gateway serves the agent for the first time."""
         self._spent = asyncio.Event()
         self._closed = asyncio.Event()
         self._cancelled = False
@@ -125,19 +122,19 @@ class RunLifecycle:
         """As last reported by the gateway."""
         self._held_before = 0.0
         """`held_s` of the run when the agent supervisor was started."""
-        self._order: CloseRun | None = None
+        self._order: child_messages.CloseRun | None = None
         self._relay: ModelRelay | None = None
         self._model_spent = asyncio.Event()
         """A request beyond the limits of the run's model was refused."""
         self._gateway: Child | None = None
         self._supervisor: Child | None = None
         self._stopwatch: Stopwatch
-        """Set when the run is played: the folder is new then, or holds the times of earlier commands."""
-
-    @property
-    def served(self) -> asyncio.Future[Ready]:
-        """Done when the gateway serves the agent for the first time."""
-        return self._ready
+        """Set when the run is open: the folder is new then, or holds the times of earlier commands."""
+        self._new = False
+        """Whether this command claims the folder."""
+        self._put_aside: Callable[[], None] | None = None
+        self._finished: RunFinished | None = None
+        self._record: RunRecord
 
     @property
     def agent_at_work(self) -> bool:
@@ -145,52 +142,67 @@ class RunLifecycle:
         return self._supervisor is not None and self._order is None and not self._closed.is_set()
 
     async def play(self, put_aside: Callable[[], None] | None = None) -> RunRecord:
-        """Plays the run to `run.json`. Raises EvopolicyError. Cancellation cancels the run; `run.json` records it.
+        """Plays the run to `run.json`, also when this is cancelled, which cancels it. Raises EvopolicyError.
 
-        `put_aside` moves the folder's earlier run away, which is deleted without it. A refused run leaves it as it is.
+        `put_aside` moves the folder's earlier run away, which is deleted without it; a refused run leaves it.
         """
+        self._new, self._put_aside = True, put_aside
         with alone(self._folder.lock, self._folder.root):
-            return await self._play(put_aside)
+            return await self._run_phases()
 
     async def go_on(self) -> RunRecord:
-        """Plays a new run, resumes an open one, or returns the record of a finished one, as the folder requires."""
+        """Plays a new run, resumes an open one, or returns a finished one's record: as the folder has it."""
         with alone(self._folder.lock, self._folder.root):
-            return await self._go_on()
+            if not self._folder.run_json.exists():
+                return await self._run_phases()
+            # The command may have been killed before it removed the gateway's folder.
+            remove_tree(self._folder.state)
+            done, how = read_record(self._folder.root), "it is finished, and this is its result"
+            if await self._operations.phase(done.run) is None:
+                how += (
+                    f"; the cluster has no run {done.run}, so that nothing of it can be verified or re-scored"
+                    " there (another cluster played it, or the state is of an earlier backup); --overwrite"
+                    " plays it anew"
+                )
+            self._note(how)
+            return done
 
-    async def _play(self, put_aside: Callable[[], None] | None = None) -> RunRecord:
+    async def _run_phases(self) -> RunRecord:
+        for phase, leave in PHASES:
+            try:
+                await phase(self)
+            except BaseException as error:
+                await leave(self, error)
+                raise
+        return self._record
+
+    # The phases.
+
+    async def _claim(self) -> None:
         plan, folder = self._plan, self._folder
-        # Checking starts programs that try the jail; the orphan search of another run would take them for orphans.
+        if not self._new and (folder.intended.exists() or folder.opened.exists()):
+            return
+        self._new = True
+        # Checking starts programs that try the jail, which another run's search would take for orphans.
         async with child_process.starting():
             plan.check_held()
         key = await self._ask() if folder.root.exists() or folder.asked.exists() else uuid.uuid4().hex
-        try:
-            await self._operations.drop(folder)
-            if put_aside is not None:
-                put_aside()
-            async with child_process.starting():
-                plan.claim()
-        except BaseException:
-            if self.run:
-                with contextlib.suppress(EvopolicyError):
-                    await self._operations.cancel(self.run)
-                folder.asked.unlink(missing_ok=True)
-                self.run = ""
-            raise
+        await self._operations.drop(folder)
+        if self._put_aside is not None:
+            self._put_aside()
+        async with child_process.starting():
+            plan.claim()
         folder.state.mkdir(mode=0o700)
         save(folder.intended, IntendedRun(key=key, settings=plan.settings))
         folder.asked.unlink(missing_ok=True)
         if plan.listener is not None:
             save(folder.listener, plan.listener)
-        try:
-            run = await self._open(key)
-        except BaseException:
-            remove_tree(folder.root)
-            raise
-        return await self._played(run, agents_side=True)
 
     async def _ask(self) -> str:
-        """Opens the run, and returns its key, before the folder's earlier run is gone: a refusal shall not cost that one. The request
-        is kept beside the folder, so that a command that is killed meanwhile finds the run again."""
+        """Opens the run and returns its key while the folder has its earlier run, which a refusal keeps.
+
+        The request is kept beside the folder, so that a command that is killed meanwhile finds the run again.
+        """
         folder, settings, key = self._folder, self._plan.settings, uuid.uuid4().hex
         if folder.asked.exists():
             before = saved(folder.asked, IntendedRun)
@@ -198,9 +210,8 @@ class RunLifecycle:
                 key = before.key
             else:
                 with contextlib.suppress(EvopolicyError):
-                    await self._operations.cancel(
-                        (await self._operations.create(before.settings, before.key)).run
-                    )
+                    other = await self._operations.create(before.settings, before.key)
+                    await self._operations.cancel(other.run)
         save(folder.asked, IntendedRun(key=key, settings=settings))
         try:
             self.run = (await self._operations.create(settings, key)).run
@@ -209,129 +220,144 @@ class RunLifecycle:
             raise
         return key
 
-    async def _open(self, key: str) -> str:
-        created = await self._operations.create(self._plan.settings, key)
-        found = msgspec.structs.replace(self._credentials, token=created.capability)
-        credentials.write(found, self._folder.credentials)
-        save(self._folder.opened, OpenedRun(run=created.run, agents_md=self._plan.texts.agents_md))
-        self._watch.note(self._name, f"run {created.run} in {self._folder.root}")
-        return created.run
+    async def _withdraw(self, error: BaseException) -> None:
+        """Cancels the run that was asked for, as its folder cannot be had."""
+        if self.run:
+            with contextlib.suppress(EvopolicyError):
+                await self._operations.cancel(self.run)
+            self._folder.asked.unlink(missing_ok=True)
+            self.run = ""
 
-    async def _go_on(self) -> RunRecord:
+    async def _open(self) -> None:
         folder = self._folder
-        if folder.run_json.exists():
-            # The command was killed after it wrote `run.json` and before it removed the gateway's folder.
-            remove_tree(folder.state)
-            done = read_record(folder.root)
-            how = "it is finished, and this is its result"
-            if await self._operations.phase(done.run) is None:
-                how += (
-                    f"; the cluster has no run {done.run}, so that nothing of it can be verified or re-scored there (another"
-                    " cluster played it, or the state is of an earlier backup); --overwrite plays it anew"
-                )
-            self._watch.note(self._name, how)
-            return done
-        if folder.opened.exists():
-            return await self._resume()
-        intended = self._plan.intended()
-        if intended is None:
-            return await self._play()
-        return await self._played(await self._open(intended.key), agents_side=True)
+        if resumed := folder.opened.exists():
+            self.run, token = saved(folder.opened, OpenedRun).run, credentials.read(folder.credentials).token
+        else:
+            key = saved(folder.intended, IntendedRun).key
+            created = await self._operations.create(self._plan.settings, key)
+            self.run, token = created.run, created.capability
+        credentials.write(msgspec.structs.replace(self._credentials, token=token), folder.credentials)
+        if resumed:
+            phase = await self._operations.phase(self.run)
+            if phase is None:
+                raise ConfigError(f"the cluster no longer knows run {self.run} of {folder.root}")
+            if phase != "open":
+                self._closed.set()
+            self._note(f"goes on with run {self.run} in {folder.root}")
+        else:
+            save(folder.opened, OpenedRun(run=self.run, agents_md=self._plan.texts.agents_md))
+            self._note(f"run {self.run} in {folder.root}")
+        self._operations.watched_by(self.run, (folder.lock, folder.supervisor_lock))
+        self._stopwatch = Stopwatch(folder.times)
 
-    async def _resume(self) -> RunRecord:
-        run = saved(self._folder.opened, OpenedRun).run
-        capability = credentials.read(self._folder.credentials).token
-        found = msgspec.structs.replace(self._credentials, token=capability)
-        credentials.write(found, self._folder.credentials)
-        phase = await self._operations.phase(run)
-        if phase is None:
-            raise ConfigError(f"the cluster no longer knows run {run} of {self._folder.root}")
-        self._watch.note(self._name, f"goes on with run {run} in {self._folder.root}")
-        return await self._played(run, agents_side=phase == "open")
+    async def _remove_new(self, error: BaseException) -> None:
+        if self._new:
+            remove_tree(self._folder.root)
 
-    async def _played(self, run: str, *, agents_side: bool) -> RunRecord:
-        self.run = run
-        self._operations.watched_by(run, (self._folder.lock, self._folder.supervisor_lock))
-        self._stopwatch = Stopwatch(self._folder.times)
-        if not agents_side:
-            self._closed.set()
-        finished: RunFinished | None = None
+    async def _score(self) -> None:
+        if self._cancelled:
+            await self._tell_gone()
+        self._on_agent_gone()
+        self._finished = await self._result()
+
+    async def _result(self) -> RunFinished:
+        async for progress in self._operations.wait(self.run):
+            self._watch.phase(self._name, progress)
+            if progress.finished is not None:
+                return progress.finished
+        raise AssertionError("waiting ends with the finished run")
+
+    async def _write(self, why: str | None = None) -> None:
+        assert self._finished is not None
+        root, times = self._folder.root, self._stopwatch.times
+        if refused := await asyncio.to_thread(keep_to_owner, root):
+            how = f"as root: chown -R {os.getuid()} {root}; chmod -R a-s,o-w {root}"
+            left = "files and folders that the agent left belong to other users and keep their modes"
+            self._note(f"{refused} {left}; {how}")
+        given = (self._folder, self._plan, self._finished, self._operations, times, self._note, why)
+        self._record = await record.write(*given)
+
+    async def _leave(self, error: BaseException) -> None:
+        """Tells how the open run goes on, or gives it up."""
+        if self._survivors:
+            self._tell_survivors()
+            self._note(
+                f"when they are gone, go on with --resume, or say: evopolicy runs agent-gone {self.run}"
+            )
+        elif self._finished is not None or (self._closed.is_set() and isinstance(error, Exception)):
+            how = f"--resume --exp-id {self._plan.settings.exp_id}, or the suite's command again,"
+            self._note(f"its agent has ended: {how} completes the run without starting it")
+        elif self._stays_open and isinstance(error, asyncio.CancelledError):
+            await self._tell_gone()
+        else:
+            await self._give_up(str(error) if isinstance(error, EvopolicyError) else None)
+
+    async def _give_up(self, why: str | None) -> None:
+        """Cancels the run at the coordinator, so that no more is played, and records it in `run.json`."""
+        with contextlib.suppress(EvopolicyError, OSError, TimeoutError):
+            async with asyncio.timeout(GIVE_UP_TIMEOUT_S):
+                await self._operations.cancel(self.run)
+                await self._tell_gone()
+                self._finished = await self._result()
+                await self._write(why)
+
+    async def _tell_gone(self) -> None:
+        """Tells the coordinator that an open run's agent is gone; resuming the run needs a new permit."""
+        if self._plan.listener is not None:
+            return  # this machine does not know about a remote agent
+        with contextlib.suppress(EvopolicyError, TimeoutError):
+            async with asyncio.timeout(GIVE_UP_TIMEOUT_S):
+                # Only for this machine: the run may have been resumed elsewhere before this arrives.
+                await self._operations.agent_gone(self.run, agent_place(self._folder).boot_id)
+
+    def _note(self, text: str) -> None:
+        self._watch.note(self._name, text)
+
+    # The phase of the agent.
+
+    async def _agent(self) -> None:
+        if self._closed.is_set():
+            return
+        tasks: list[asyncio.Task[Any]] = []
+
+        def begin(work: Coroutine[Any, Any, T]) -> asyncio.Task[T]:
+            task = asyncio.create_task(work)
+            tasks.append(task)
+            return task
+
+        serving = begin(self._keep_gateway())
+        begin(self._follow())
+        ends = [begin(self._model_spent.wait()), begin(self._spent.wait())]
         try:
-            if agents_side:
-                await self._agents_side()
-            if self._cancelled:
-                await self._tell_gone(run)
-            self._on_agent_gone()
-            finished = await self._finish(run)
-            return await self._write(finished)
-        except BaseException as error:
-            if self._survivors:
-                self._tell_survivors()
-                how = f"when they are gone, go on with --resume, or say: evopolicy runs agent-gone {run}"
-                self._watch.note(self._name, how)
-            elif finished is not None or (self._closed.is_set() and isinstance(error, Exception)):
-                how = f"--resume --exp-id {self._plan.settings.exp_id}, or the suite's command again,"
-                self._watch.note(
-                    self._name, f"its agent has ended: {how} completes the run without starting it"
-                )
-            elif self._stays_open and isinstance(error, asyncio.CancelledError):
-                await self._tell_gone(run)
-            else:
-                await self._give_up(run, str(error) if isinstance(error, EvopolicyError) else None)
-            raise
-
-    async def _write(self, finished: RunFinished, why: str | None = None) -> RunRecord:
-        refused = await asyncio.to_thread(keep_to_owner, self._folder.root)
-        if refused:
-            how = f"as root: chown -R {os.getuid()} {self._folder.root}; chmod -R a-s,o-w {self._folder.root}"
-            text = f"{refused} files and folders that the agent left belong to other users and keep their modes; {how}"
-            self._watch.note(self._name, text)
-        times, note = self._stopwatch.times, partial(self._watch.note, self._name)
-        return await record.write(self._folder, self._plan, finished, self._operations, times, note, why)
-
-    async def _agents_side(self) -> None:
-        """Runs gateway and agent until the run is closed."""
-        serving = asyncio.create_task(self._keep_gateway())
-        following = asyncio.create_task(self._follow())
-        keeping: asyncio.Task[AgentEnded] | None = None
-        relaying: asyncio.Task[None] | None = None
-        model_spent = asyncio.create_task(self._model_spent.wait())
-        spent = asyncio.create_task(self._spent.wait())
-        try:
-            up: list[asyncio.Future[Any]] = [serving, self._ready]
+            up: list[asyncio.Future[Any]] = [serving, self.served]
             await asyncio.wait(up, return_when=asyncio.FIRST_COMPLETED)
             if serving.done():
                 serving.result()
-            if not self._ready.done():
+            if not self.served.done():
                 return  # cancelled before it was served
             self._stopwatch.opened()
             self._relay = self._new_relay()
-            if self._relay is not None:
-                relaying = asyncio.create_task(self._relay.serve())
-            keeping = asyncio.create_task(self._keep_agent(self._ready.result()))
-            going: list[asyncio.Future[Any]] = [serving, keeping, spent, model_spent]
-            going += [] if relaying is None else [relaying]
+            relaying = [] if self._relay is None else [begin(self._relay.serve())]
+            keeping = begin(self._keep_agent(self.served.result()))
+            going: list[asyncio.Future[Any]] = [serving, keeping, *ends, *relaying]
             await asyncio.wait(going, return_when=asyncio.FIRST_COMPLETED)
-            if relaying is not None and relaying.done():
-                relaying.result()
+            for task in relaying:
+                if task.done():
+                    task.result()
             if not serving.done() and not keeping.done():
-                await asyncio.wait(
-                    [serving, keeping], timeout=LAST_WORDS_S, return_when=asyncio.FIRST_COMPLETED
-                )
+                either: list[asyncio.Future[Any]] = [serving, keeping]
+                await asyncio.wait(either, timeout=LAST_WORDS_S, return_when=asyncio.FIRST_COMPLETED)
             if serving.done() and not self._closed.is_set():
                 serving.result()
-            if self._supervisor is not None and not keeping.done():
-                await self._supervisor.tell(child_messages.StopAgent())
-            ended = await keeping
-            await self._close(ended)
+            if not keeping.done():
+                await self._tell_agent(child_messages.StopAgent())
+            await self._close(await keeping)
             await serving
         finally:
-            every = (serving, following, keeping, spent, relaying, model_spent)
-            tasks = [task for task in every if task is not None]
-            for task in tasks:
-                # At the loop's end they are being cancelled too. A second time would interrupt their clean-up.
-                if not task.cancelling():
-                    task.cancel()
+            for each in tasks:
+                # At the loop's end they are being cancelled too. A second time would interrupt the clean-up.
+                if not each.cancelling():
+                    each.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
             for child in (self._supervisor, self._relay, self._gateway):
                 if child is not None:
@@ -339,61 +365,62 @@ class RunLifecycle:
             self._survivors = await child_rpc.end_orphans()
             self._stopwatch.closed()
 
+    async def _tell_agent(self, message: Any) -> None:
+        if self._supervisor is not None:
+            await self._supervisor.tell(message)
+
     async def _close(self, ended: AgentEnded) -> None:
         reason = "budget_spent" if self._spent.is_set() else ended.reason
         if self._model_spent.is_set() and reason in ("agent_stopped", "agent_failed", "told"):
             reason = "model_budget_spent"
         reason = CANCELLED if self._cancelled else reason
         how = f"agent ended: {in_words(reason)}"
-        self._watch.note(self._name, f"{how}, {ended.detail}" if ended.detail else how)
+        self._note(f"{how}, {ended.detail}" if ended.detail else how)
         if reason == "agent_failed":
             for line in ended.stderr_tail:
-                self._watch.note(self._name, f"stderr: {line}")
+                self._note(f"stderr: {line}")
             without = "" if ended.stderr_tail else "the agent printed no errors; "
-            self._watch.note(self._name, f"{without}full log: {self._folder.agent_log}")
+            self._note(f"{without}full log: {self._folder.agent_log}")
         facts = without_keys(ended.facts)
         about = {"turns": ended.turns, "retries": ended.retries, "detail": ended.detail, **facts}
         try:
             about["record"] = record.told_at_close(self._folder, self._plan, about, self._stopwatch.times)
         except Exception as error:  # the agent has ended: no bug in this costs the run
             why = record.why_failed(error, self._folder.harness_log)
-            self._watch.note(self._name, f"the coordinator does not commit to this side of run.json: {why}")
-        self._order = CloseRun(reason=reason, agent=about)
+            self._note(f"the coordinator does not commit to this side of run.json: {why}")
+        self._order = child_messages.CloseRun(reason=reason, agent=about)
         if self._gateway is not None:
             await self._gateway.tell(self._order)
 
     async def _follow(self) -> None:
-        """Prints why the run is not served yet, and ends the agent when the run is cancelled at the coordinator.
-
-        The gateway may not learn of such a cancellation.
-        """
+        """Prints why the run is not served yet. Ends the agent when the run is cancelled at the coordinator,
+        which the gateway may not learn."""
         waiting = Waiting()
         async for progress in self._operations.wait(self.run):
-            if not self._ready.done() and progress.env_failure and self._operations.own:
-                self._ready.set_exception(BrokenEnvironmentError(progress.env_failure))
-            if not self._ready.done() and waiting.worth_saying(progress.waits_for):
-                self._watch.note(self._name, f"waiting for {progress.waits_for}")
+            if not self.served.done() and progress.env_failure and self._operations.own:
+                self.served.set_exception(BrokenEnvironmentError(progress.env_failure))
+            if not self.served.done() and waiting.worth_saying(progress.waits_for):
+                self._note(f"waiting for {progress.waits_for}")
             finished = progress.finished
             if finished is not None and finished.status == CANCELLED:
                 self._cancelled = True
                 self._spent.set()
 
     def _new_relay(self) -> ModelRelay | None:
-        """The relay for the agent's model; None for an agent without one, or one that cannot use it. Tells the operator the limits."""
-        plan, name = self._plan, self._name
-        terms = plan.harness().model
+        """The relay for the agent's model, or None where it has none or cannot use one. Prints the limits."""
+        terms = self._plan.harness().model
         if terms is None:
             return None
         if terms.upstream is None:
             how = "counted by the agent itself, so that only its tokens are limited"
-            self._watch.note(name, f"model limits: {terms.limits}; metering: agent ({how})")
+            self._note(f"model limits: {terms.limits}; metering: agent ({how})")
             return None
-        self._watch.note(name, f"model limits: {terms.limits}; metering: relay")
+        self._note(f"model limits: {terms.limits}; metering: relay")
         upstream = terms.upstream
 
         def spent(what: str) -> None:
             if not self._model_spent.is_set():
-                self._watch.note(name, f"the model budget is spent: {what}")
+                self._note(f"the model budget is spent: {what}")
             self._model_spent.set()
 
         return ModelRelay(
@@ -408,21 +435,15 @@ class RunLifecycle:
             ),
             self._folder.model_requests,
             self._folder.harness_log,
-            jailed=plan.jail.mode != "none",
-            doing=partial(self._watch.doing, name),
+            jailed=self._plan.jail.mode != "none",
+            doing=partial(self._watch.doing, self._name),
             spent=spent,
         )
 
     async def _keep_gateway(self) -> None:
         """Runs the gateway, with restarts, until it has closed the run."""
-        program = [
-            sys.executable,
-            "-P",
-            "-m",
-            "evopolicy_gateway.cli.serve",
-            str(self._folder.root),
-            "--controlled",
-        ]
+        serve = [sys.executable, "-P", "-m", "evopolicy_gateway.cli.serve"]
+        program = [*serve, str(self._folder.root), "--controlled"]
         quick_deaths = 0
         while not self._closed.is_set():
             started = time.monotonic()
@@ -435,55 +456,47 @@ class RunLifecycle:
                 return
             quick_deaths = quick_deaths + 1 if time.monotonic() - started < _QUICK_DEATH_S else 0
             if code == _USAGE_ERROR or quick_deaths > _MAX_QUICK_DEATHS:
-                raise RunError(
-                    f"the gateway cannot serve (exit status {code}): {child_process.last_words(self._gateway.log)};"
-                    f" see {self._folder.harness_log}"
-                )
-            self._watch.note(self._name, f"the gateway ended with status {code}; starting it again")
+                words = child_process.last_words(self._gateway.log)
+                log = self._folder.harness_log
+                raise RunError(f"the gateway cannot serve (exit status {code}): {words}; see {log}")
+            self._note(f"the gateway ended with status {code}; starting it again")
             await asyncio.sleep(0.1 * 2**quick_deaths)
 
     async def _on_gateway_event(self, event: object) -> None:
-        if isinstance(event, Waits):
+        if isinstance(event, child_messages.Waits):
             self._watch.held(self._name, event.waits_for)
         elif isinstance(event, Ready):
             self._stopwatch.permit_reported(event.permit_s)
             self._stopwatch.held_reported(event.held_s)
-            if not self._ready.done():
+            if not self.served.done():
                 for text in event.notes:
-                    self._watch.note(self._name, text)
+                    self._note(text)
                 self._tell_where(event)
-                self._ready.set_result(event)
+                self.served.set_result(event)
             if self._order is not None and self._gateway is not None:
                 await self._gateway.tell(self._order)
-        elif isinstance(event, Progress):
+        elif isinstance(event, child_messages.Progress):
             self._stopwatch.gateway_reported(event.in_flight_s, event.feedback_s)
             self._watch.progress(self._name, event)
-            await self._give_back(event.held_s)
-            await self._tell_submits(event)
+            before, held = self._stopwatch.times.held_s, self._stopwatch.held_reported(event.held_s)
+            if held > before:
+                # Time for which submits waited for hidden episodes is given back to the agent's clock.
+                await self._tell_agent(child_messages.HeldTime(seconds=held - self._held_before))
+            asked, running = event.n_submits + event.n_rejected, event.submit_id is not None
+            self._submits = child_messages.SubmitsSeen(asked=asked, running=running)
+            await self._tell_agent(self._submits)
             self._cancelled = self._cancelled or event.cancelled
             if event.spent:
                 self._spent.set()
-        elif isinstance(event, RunClosed):
+        elif isinstance(event, child_messages.RunClosed):
             self._closed.set()
-
-    async def _give_back(self, held_s: float) -> None:
-        """Gives the time for which submits waited for hidden episodes back to the agent's clock."""
-        before, held = self._stopwatch.times.held_s, self._stopwatch.held_reported(held_s)
-        if held > before and self._supervisor is not None:
-            await self._supervisor.tell(HeldTime(seconds=held - self._held_before))
-
-    async def _tell_submits(self, progress: Progress) -> None:
-        asked, running = progress.n_submits + progress.n_rejected, progress.submit_id is not None
-        self._submits = child_messages.SubmitsSeen(asked=asked, running=running)
-        if self._supervisor is not None:
-            await self._supervisor.tell(self._submits)
 
     def _tell_where(self, ready: Ready) -> None:
         """Prints the facts that the operator passes on to a remote agent."""
         if self._plan.listener is None:
             if not host.boot_id():
-                why = f"{host.NO_BOOT_ID}; until then no hidden case that this run shares is played while its agent lives"
-                self._watch.note(self._name, why)
+                until = "until then no hidden case that this run shares is played while its agent lives"
+                self._note(f"{host.NO_BOOT_ID}; {until}")
             return
         for text in (
             place_notice(self._plan.settings.agent_host, self._folder.root),
@@ -492,7 +505,7 @@ class RunLifecycle:
             f"its workspace is {self._folder.workspace}; the rules are in AGENTS.md there",
             f"when it is done before its budget is spent: evopolicy finish {self._folder.root}",
         ):
-            self._watch.note(self._name, text)
+            self._note(text)
 
     def _jail(self) -> JailOrder | None:
         if self._plan.jail.mode == "none":
@@ -505,19 +518,15 @@ class RunLifecycle:
         return JailOrder(settings=self._plan.jail, private=str(self._folder.agent), hidden=tuple(hidden))
 
     async def _keep_agent(self, ready: Ready) -> AgentEnded:
-        """Runs the agent to its end. Restarts it when its supervisor dies, which is our failure and not the agent's.
-
-        An agent with a session continues in it; any other program starts anew in its workspace.
-        """
+        """Runs the agent to its end. Restarts it when its supervisor dies, our failure: in its session if it
+        has one, else anew in its workspace."""
         for _ in range(_MAX_SUPERVISOR_DEATHS):
             ended = await self._keep_agent_once(ready)
             if ended is not None:
                 return ended
             if self._spent.is_set():
                 break
-            self._watch.note(
-                self._name, "the agent's supervisor died; starting it again, and the agent with it"
-            )
+            self._note("the agent's supervisor died; starting it again, and the agent with it")
         known = self._plan.harness().known()
         return AgentEnded(reason="agent_failed", detail="its agent supervisor died", facts=known)
 
@@ -554,17 +563,17 @@ class RunLifecycle:
         await self._supervisor.tell(self._submits)
         ended: AgentEnded | None = None
         async for event in self._supervisor.events():
-            if isinstance(event, AgentTurn):
+            if isinstance(event, child_messages.AgentTurn):
                 self._watch.turn(self._name, event.turn, event.text)
-            elif isinstance(event, AgentDoing):
+            elif isinstance(event, child_messages.AgentDoing):
                 if self._relay is not None:
                     event = msgspec.structs.replace(event, tokens=None)  # the relay's count is the run's
                 self._watch.doing(self._name, event)
-            elif isinstance(event, AgentTime):
+            elif isinstance(event, child_messages.AgentTime):
                 self._stopwatch.agent_reported(event.used_s)
-            elif isinstance(event, AgentUsed) and here:
+            elif isinstance(event, child_messages.AgentUsed) and here:
                 self._stopwatch.agent_used(event.resources)
-            elif isinstance(event, AgentSurvives):
+            elif isinstance(event, child_messages.AgentSurvives):
                 self._survivors = list(event.pids)
                 self._tell_survivors()
             elif isinstance(event, AgentEnded):
@@ -581,33 +590,17 @@ class RunLifecycle:
 
     def _tell_survivors(self) -> None:
         pids = ", ".join(map(str, self._survivors))
-        self._watch.note(
-            self._name,
-            f"processes of the agent survive being killed ({pids}): the run stays open, and no hidden case that it shares is"
-            " played on this machine, before they are gone",
+        self._note(
+            f"processes of the agent survive being killed ({pids}): the run stays open, and no hidden case"
+            " that it shares is played on this machine, before they are gone"
         )
 
-    async def _finish(self, run: str) -> RunFinished:
-        async for progress in self._operations.wait(run):
-            self._watch.phase(self._name, progress)
-            if progress.finished is not None:
-                return progress.finished
-        raise AssertionError("waiting ends with the finished run")
 
-    async def _tell_gone(self, run: str) -> None:
-        """Reports to the coordinator that the agent of an open run is gone; resuming the run needs a new permit."""
-        if self._plan.listener is not None:
-            return  # this machine does not know about a remote agent
-        with contextlib.suppress(EvopolicyError, TimeoutError):
-            async with asyncio.timeout(GIVE_UP_TIMEOUT_S):
-                # Only for this machine: the run may have been resumed elsewhere before this arrives.
-                await self._operations.agent_gone(run, agent_place(self._folder).boot_id)
-
-    async def _give_up(self, run: str, why: str | None) -> None:
-        """Cancels the run at the coordinator, so that it plays no more episodes, and records that in `run.json`."""
-        with contextlib.suppress(EvopolicyError, OSError, TimeoutError):
-            async with asyncio.timeout(GIVE_UP_TIMEOUT_S):
-                await self._operations.cancel(run)
-                await self._tell_gone(run)
-                finished = await self._finish(run)
-                await self._write(finished, why)
+PHASES = (
+    (RunLifecycle._claim, RunLifecycle._withdraw),
+    (RunLifecycle._open, RunLifecycle._remove_new),
+    (RunLifecycle._agent, RunLifecycle._leave),
+    (RunLifecycle._score, RunLifecycle._leave),
+    (RunLifecycle._write, RunLifecycle._leave),
+)
+"""Each phase, which returns at once if its result is durable; and what is called with the error of one."""

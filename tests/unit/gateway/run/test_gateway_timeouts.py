@@ -318,7 +318,7 @@ def test_giving_up_a_run_ends_although_nobody_hears_of_it(
         plan: Any = SimpleNamespace(folder=None, name="", settings=SimpleNamespace(env="toy/line"))
         running = RunLifecycle(plan, Deaf(), None, None)  # type: ignore[arg-type]
         async with asyncio.timeout(60):
-            await running._give_up("r", None)
+            await running._give_up(None)
 
     asyncio.run(main())
 
