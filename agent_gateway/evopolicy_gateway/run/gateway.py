@@ -97,45 +97,41 @@ class Gateway:
         """Serves until `tell`; returns whether the run was closed. Raises errors that make serving impossible."""
         found, known = _load(self._folder, self._connect, self._credentials_file)
         run = known.run
-        sock, address = await bind(self._folder)
-        journal = Journal(self._folder.journal)
-        try:
-            async with contextlib.AsyncExitStack() as stack:
-                link = await self._unless_stopped(
-                    stack.enter_async_context(transport.connect(found, timeout_s=None))
-                )
-                if link is None:
+        async with contextlib.AsyncExitStack() as stack:
+            sock, address = await bind(self._folder)
+            stack.callback(sock.close)
+            journal = stack.enter_context(contextlib.closing(Journal(self._folder.journal)))
+            linked = stack.enter_async_context(transport.connect(found, timeout_s=None))
+            link = await self._unless(self._stopped.wait(), linked)
+            if link is None:
+                return False
+            session = CoordinatorClient(link, run, self._folder.state)
+            try:
+                opened = await self._unless(self._stopped.wait(), session.open())
+                if opened is None or not await self._permitted(session):
                     return False
-                session = CoordinatorClient(link, run, self._folder.state)
-                try:
-                    opened = await self._unless_stopped(session.open())
-                    if opened is None or not await self._permitted(session):
-                        return False
-                except RefusedError as error:
-                    if error.status not in RUN_OVER:
-                        raise
-                    log.warning("the run takes no more", status=error.status, why=error.message)
-                    return True
-                workspace.stage(self._folder, opened, address.urls(), known.agents_md)
-                blobs = BlobStore(self._folder.blobs)
-                pipeline = SubmitPipeline(
-                    session, opened, self._folder.workspace, journal, blobs, self._changed.set
-                )
-                http = await stack.enter_async_context(
-                    serving(make_app(pipeline, address.token, address.bearer), sock)
-                )
-                log.info("serving", run=run, env=opened.env.env, port=address.port)
-                self._on_ready(address.urls(), pipeline)
-                if not self._orders.done():
-                    stack.callback(asyncio.ensure_future(session.keep_permit(self._agent_place)).cancel)
-                try:
-                    close = await self._watch(pipeline, http)
-                    return close is not None and await self._close(session, journal, pipeline, close)
-                finally:
-                    await pipeline.stop()
-        finally:
-            sock.close()
-            journal.close()
+            except RefusedError as error:
+                if error.status not in RUN_OVER:
+                    raise
+                log.warning("the run takes no more", status=error.status, why=error.message)
+                return True
+            workspace.stage(self._folder, opened, address.urls(), known.agents_md)
+            blobs = BlobStore(self._folder.blobs)
+            pipeline = SubmitPipeline(
+                session, opened, self._folder.workspace, journal, blobs, self._changed.set
+            )
+            http = await stack.enter_async_context(
+                serving(make_app(pipeline, address.token, address.bearer), sock)
+            )
+            log.info("serving", run=run, env=opened.env.env, port=address.port)
+            self._on_ready(address.urls(), pipeline)
+            if not self._orders.done():
+                stack.callback(asyncio.ensure_future(session.keep_permit(self._agent_place)).cancel)
+            try:
+                close = await self._watch(pipeline, http)
+                return close is not None and await self._close(session, journal, pipeline, close)
+            finally:
+                await pipeline.stop()
 
     @property
     def _agent_place(self) -> AgentPlace:
@@ -146,16 +142,11 @@ class Gateway:
         if self._alone:
             self._folder.unwatched.touch(mode=0o600)
         requested_at = time.monotonic()
-        permit = asyncio.ensure_future(session.permit(self._agent_place, self._on_wait))
-        waited: list[asyncio.Future[Any]] = [permit, self._orders]
-        await asyncio.wait(waited, return_when=asyncio.FIRST_COMPLETED)
+        permit = session.permit(self._agent_place, self._on_wait)
+        granted = await self._unless(asyncio.shield(self._orders), permit)
         self.permit_s = time.monotonic() - requested_at
         self._on_wait("")
-        if permit.done():
-            return permit.result()
-        permit.cancel()
-        await asyncio.gather(permit, return_exceptions=True)
-        return not self._stopped.is_set()
+        return not self._stopped.is_set() if granted is None else granted
 
     async def _watch(self, pipeline: SubmitPipeline, http: asyncio.Task[None]) -> Close | None:
         """Reports changes until `tell`; returns its argument, or a `Close` when the gateway itself decides to end."""
@@ -203,11 +194,11 @@ class Gateway:
         self._on_wait("")
         return not self._stopped.is_set()
 
-    async def _unless_stopped(self, wanted: Any) -> Any:
-        """Returns the result, or None when first ordered to leave the run open."""
-        task, stopped = asyncio.ensure_future(wanted), asyncio.ensure_future(self._stopped.wait())
-        await asyncio.wait([task, stopped], return_when=asyncio.FIRST_COMPLETED)
-        stopped.cancel()
+    async def _unless(self, order: Any, wanted: Any) -> Any:
+        """Returns what is wanted, or None when the order comes first."""
+        task, ordered = asyncio.ensure_future(wanted), asyncio.ensure_future(order)
+        await asyncio.wait([task, ordered], return_when=asyncio.FIRST_COMPLETED)
+        ordered.cancel()
         if task.done():
             return task.result()
         task.cancel()

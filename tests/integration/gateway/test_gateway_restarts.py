@@ -8,6 +8,7 @@ import re
 import shutil
 import socket
 import tracemalloc
+import warnings
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -15,7 +16,7 @@ from urllib.parse import urlsplit
 import pytest
 from gateway_double import Double, answering, gateway_on, opened, prepare, served
 
-from evopolicy_common.errors import ConfigError
+from evopolicy_common.errors import ConfigError, StorageError
 from evopolicy_common.messages.gateway import CloseRun, Submit
 from evopolicy_gateway.http import server
 from evopolicy_gateway.submits import pipeline as submits
@@ -310,3 +311,20 @@ def test_a_gateway_keeps_nothing_of_the_episodes_that_it_has_answered(tmp_path: 
         assert (after - before) / (12 * n) < 20.0, "bytes for each episode"
 
     asyncio.run(main())
+
+
+def test_a_damaged_journal_is_refused_and_leaves_no_socket_open(tmp_path: Path) -> None:
+    async def main() -> None:
+        double = Double(opened())
+        async with answering(tmp_path, double) as found:
+            folder = prepare(tmp_path / "run", found, double)
+            folder.journal.write_bytes(b"damaged\n")
+            with pytest.raises(StorageError, match="line 1"):
+                async with gateway_on(folder, double):
+                    pass
+
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        asyncio.run(main())
+        gc.collect()
+    assert not [each for each in caught if str(each.message).startswith("unclosed <socket")]
