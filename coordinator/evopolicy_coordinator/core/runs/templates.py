@@ -83,18 +83,6 @@ class _Parts(NamedTuple):
     numerics: str | None = None
 
 
-class _Common(NamedTuple):
-    """The fields that all groups of a run or an evaluation share."""
-
-    env: str
-    secret: bytes
-    observations: ObservationForm
-    tier: Tier
-    limits: ResourceLimits
-    max_steps: int
-    failed_episodes: FailedEpisodes
-
-
 def env_meta(run: Run, row: SubmitRow) -> dict[str, object]:
     """Metadata that a submit's policies receive; the worker adds the spaces."""
     return {
@@ -256,29 +244,30 @@ def build(
     stimulus_id: str,
 ) -> JobGroup:
     """The group of that kind for `row` (None for the random reference), without jobs yet."""
-    parts, common = KINDS[kind](owner, row, stimulus_id), _common(owner)
+    parts = KINDS[kind](owner, row, stimulus_id)
+    observations, tier, limits, failed_episodes = _conditions(owner)
     n = len(parts.cases)
     modulo = n if parts.modulo is None else parts.modulo
     template = Template(
-        env=common.env,
+        env=owner.flow.env,
         bundle=parts.bundle,
         cases=parts.cases,
         case_ids=tuple(range(n)) if parts.case_ids is None else parts.case_ids,
         occurrences=(0,) * n if parts.occurrences is None else parts.occurrences,
-        secret=common.secret if parts.keyed else None,
+        secret=owner.row.secret if parts.keyed else None,
         split=parts.split or kind,
         submit_index=parts.submit_index,
         modulo=modulo,
         per_job=modulo if parts.scope == "submit" else 1,
         scope=parts.scope,
         env_meta=parts.env_meta,
-        observations=common.observations,
+        observations=observations,
         record=parts.record,
         video=parts.video,
-        tier=common.tier,
-        limits=common.limits,
-        max_steps=common.max_steps,
-        failed_episodes=common.failed_episodes,
+        tier=tier,
+        limits=limits,
+        max_steps=owner.row.max_steps,
+        failed_episodes=failed_episodes,
         replays=parts.replays,
         indexes=parts.indexes,
     )
@@ -298,26 +287,13 @@ def build(
     )
 
 
-def _common(owner: Run | Evaluation) -> _Common:
+def _conditions(
+    owner: Run | Evaluation,
+) -> tuple[ObservationForm, Tier, ResourceLimits, FailedEpisodes]:
+    """How all episodes of a run or an evaluation are played."""
     if isinstance(owner, Run):
-        run, settings = owner.row, owner.row.settings
-        return _Common(
-            env=settings.env,
-            secret=run.secret,
-            observations=settings.observations,
-            tier=settings.sandbox_tier,
-            limits=settings.limits,
-            max_steps=run.max_steps,
-            failed_episodes=settings.failed_episodes,
-        )
+        settings = owner.row.settings
+        return settings.observations, settings.sandbox_tier, settings.limits, settings.failed_episodes
     row = owner.row
     place = row.as_in or _alone(row)
-    return _Common(
-        env=row.env,
-        secret=row.secret,
-        observations=place.observations,
-        tier=row.tier,
-        limits=row.limits,
-        max_steps=row.max_steps,
-        failed_episodes=place.failed_episodes,
-    )
+    return place.observations, row.tier, row.limits, place.failed_episodes
