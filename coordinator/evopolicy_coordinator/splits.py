@@ -194,11 +194,10 @@ def load(folder: Path) -> tuple[EnvironmentSplits | None, list[str]]:
     findings.extend(overlaps({split: content.cases for split, content in contents.items()}))
     splits = EnvironmentSplits(
         env=contents["train"].env,
-        train=contents["train"].cases,
-        validation=contents["validation"].cases,
-        heldout=contents["heldout"].cases,
         secret=all(content.secret is True for content in contents.values()),
+        epoch="",
         files=hashes,
+        **{split: content.cases for split, content in contents.items()},
     )
     return splits, findings
 
@@ -250,7 +249,7 @@ class SplitSource:
                 shared = {case.seed for members in cases.values() for case in members}
                 cases = {**derive(key, suite, env, counts, shared), "train": cases["train"]}
             cases = in_world(self._secret, env, cases)
-            return _splits(env, cases, secret=True, epoch=epoch_of(self._secret))
+            return EnvironmentSplits(env=env, secret=True, epoch=epoch_of(self._secret), files={}, **cases)
         if own:
             raise ConfigError(
                 "--hidden-cases per-run needs cases that are derived from the coordinator's secret; this one takes them from"
@@ -274,7 +273,7 @@ class SplitSource:
         cut = {split: _cut(folder, split, splits.cases(split), counts.get(split)) for split in SPLITS}
         hidden = cases_hash((*splits.validation, *splits.heldout))
         epoch = f"files-{hidden[:16]}"
-        return _splits(env, cut, secret=splits.secret, epoch=epoch, files=splits.files)
+        return EnvironmentSplits(env=env, secret=splits.secret, epoch=epoch, files=splits.files, **cut)
 
     def further(self, suite: str, env: str, name: str, n: int, taken: Sequence[Case]) -> FurtherSplit:
         """Derives `n` further hidden cases, equal for equal `name`, none with a seed of `taken`.
@@ -289,25 +288,6 @@ class SplitSource:
         cases = derive(key, suite, env, {"heldout": n}, (case.seed for case in taken))
         cases = in_world(self._secret, env, cases)
         return FurtherSplit(cases=cases["heldout"], epoch=epoch_of(self._secret))
-
-
-def _splits(
-    env: str,
-    cases: dict[Split, tuple[Case, ...]],
-    *,
-    secret: bool,
-    epoch: str,
-    files: dict[str, str] | None = None,
-) -> EnvironmentSplits:
-    return EnvironmentSplits(
-        env=env,
-        train=cases["train"],
-        validation=cases["validation"],
-        heldout=cases["heldout"],
-        secret=secret,
-        epoch=epoch,
-        files=files or {},
-    )
 
 
 def _cut(folder: Path, split: Split, cases: Sequence[Case], count: int | None) -> tuple[Case, ...]:
