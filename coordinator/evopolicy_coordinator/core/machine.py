@@ -136,7 +136,7 @@ def drain(state: State, this: Step) -> None:
     while pending:
         piece = pending.popleft()
         this.news = deque()
-        for rule in NEWS[type(piece), piece.kind]:
+        for rule in NEWS[type(piece), getattr(piece, "kind", "")]:
             rule(state, piece, this)
         if this.news:
             pending.extendleft(reversed(this.news))
@@ -198,7 +198,7 @@ NEWS: dict[tuple[type, str], tuple[Rule, ...]] = {
     (step.JobRetried, ""): (runs.retried,),
     (step.ResultsDiffered, ""): (runs.differed,),
 }
-"""The rules for each piece of news: by its type and the kind of its group or flow (`kind`)."""
+"""The rules for each piece of news: by its type and, where it has one, its `kind`."""
 
 
 # ---- timers ----

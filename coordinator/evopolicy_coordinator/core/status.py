@@ -24,7 +24,6 @@ from evopolicy_coordinator.core.tables.model import (
     JobGroup,
     JobState,
     Lane,
-    Lease,
     Run,
     Worker,
 )
@@ -71,9 +70,6 @@ def status(state: State, now: float, words: Words) -> CoreStatus:
             waits[group] = reason
     workers = tuple(_worker(state, worker, now, refused[worker.profile]) for worker in state.workers.values())
     runs = tuple(_run(state, run, groups.get(run.id, []), waits, words) for run in state.runs.values())
-    states: dict[str, int] = {}
-    for row in [row for run in state.runs.values() for row in run.audits.values()]:
-        states[row.state] = states.get(row.state, 0) + 1
     return CoreStatus(
         episodes_done=state.rate.total,
         episodes_per_s=state.rate.per_s(now),
@@ -81,7 +77,7 @@ def status(state: State, now: float, words: Words) -> CoreStatus:
         runs=runs,
         stalls=_stalls(state, now, words),
         audit_share=state.settings.audit_share,
-        audits=states,
+        audits=dict(Counter(row.state for run in state.runs.values() for row in run.audits.values())),
         disputes=(*state.disputes, *audits.undecided(state)),
         quarantined=dict(state.quarantined),
         queue=_queue(state, waits, words),
@@ -132,21 +128,11 @@ def _worker(state: State, worker: Worker, now: float, refused: dict[str, str]) -
         refused=refused,
         boot_id=worker.kernel.boot_id,
         hidden_bar=conflicts.conflict_of_worker(state, worker),
-        playing=_playing(live),
+        playing=dict(Counter(lease.job.group.run for lease in live if lease.running)),
         installation=worker.installation,
         missing_tiers=worker.missing_tiers,
         failed_environments=worker.failed_environments,
     )
-
-
-def _playing(live: list[Lease]) -> dict[str, int]:
-    """Returns run or evaluation to its number of jobs that are played now."""
-    found: dict[str, int] = {}
-    for lease in live:
-        if lease.running:
-            run = lease.job.group.run
-            found[run] = found.get(run, 0) + 1
-    return found
 
 
 def _run(

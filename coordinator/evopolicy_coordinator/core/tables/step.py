@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 import msgspec
 
@@ -29,7 +29,7 @@ from evopolicy_coordinator.core.tables.model import Flow, JobGroup, JobState, La
 
 # ---- news ----
 #
-# The table in `machine` distinguishes news by type and `kind`; `kind` is empty where a type has only one.
+# The table in `machine` distinguishes news by type, and by `kind` where a type has several.
 
 
 @dataclass(slots=True, eq=False)
@@ -38,8 +38,6 @@ class ResultsPersisted:
 
     worker: Worker
     result: JobResult
-
-    kind: ClassVar[str] = ""
 
 
 @dataclass(slots=True, eq=False)
@@ -66,8 +64,6 @@ class JobRetried:
     failure: str
     """As `leasing.retry.JobFailure`."""
 
-    kind: ClassVar[str] = ""
-
 
 @dataclass(slots=True, eq=False)
 class EnvironmentFailed:
@@ -87,8 +83,6 @@ class ResultsDiffered:
     """Two results of one episode differed."""
 
     group: JobGroup
-
-    kind: ClassVar[str] = ""
 
 
 @dataclass(slots=True, eq=False)
@@ -111,8 +105,6 @@ class SubmitEnded:
     run: Run
     row: SubmitRow
 
-    kind: ClassVar[str] = ""
-
 
 @dataclass(slots=True, eq=False)
 class AuditsMoved:
@@ -120,16 +112,12 @@ class AuditsMoved:
 
     run: Run
 
-    kind: ClassVar[str] = ""
-
 
 @dataclass(slots=True, eq=False)
 class AgentOverdue:
     """A run's agent has kept hidden jobs of closed runs from their kernels for too long."""
 
     run: Run
-
-    kind: ClassVar[str] = ""
 
 
 News = (
