@@ -66,10 +66,8 @@ class StateFolder:
         `cluster` None: the folder's own name, `local` for a new folder. Raises ConfigError when another coordinator
         holds the lock, others may enter the folder, or it belongs to another cluster.
         """
-        if cluster is not None and not keys.valid_name(cluster):
-            raise ConfigError(f"--cluster {cluster!r}: use letters, digits, dots, dashes, at most 63")
         root = Path(os.path.abspath(root))
-        _make_private(root)
+        _make_private(root, cluster)
         lock_fd = _lock(root)
         try:
             return cls(root, lock_fd, _identity(root, cluster))
@@ -147,13 +145,13 @@ def cluster_of(root: Path, cluster: str | None) -> str:
     Creates a missing folder, with the name `cluster`. Raises ConfigError in the same cases as `StateFolder.open`,
     except for the lock.
     """
-    if cluster is not None and not keys.valid_name(cluster):
-        raise ConfigError(f"--cluster {cluster!r}: use letters, digits, dots, dashes, at most 63")
-    _make_private(root)
+    _make_private(root, cluster)
     return _identity(root, cluster).cluster
 
 
-def _make_private(root: Path) -> None:
+def _make_private(root: Path, cluster: str | None) -> None:
+    if cluster is not None and not keys.valid_name(cluster):
+        raise ConfigError(f"--cluster {cluster!r}: use letters, digits, dots, dashes, at most 63")
     # A coordinator that restarts on a full disk waits for space.
     check_writable(root, "--state", may_be_full=(root / "identity.json").exists())
     try:
