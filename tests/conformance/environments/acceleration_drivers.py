@@ -40,8 +40,10 @@ def competent_driver(environment: Environment, seed: int) -> Driver:
         return lambda obs: _race(simulator, rng)
     if "parking" in env_id:
         return _park
-    if "roundabout" in env_id:
+    if env_id == "gymnasium/roundabout-v0":
         return lambda obs: _give_way(obs, rng)
+    if hasattr(simulator, "road"):
+        return lambda obs: _cruise(environment.action_codec.sample(rng), rng)
     if "MiniGrid" in env_id:
         return lambda obs: _explore(simulator, rng)
     if env_id == "gym/acrobot":
@@ -107,6 +109,15 @@ def _give_way(obs: Any, rng: np.random.Generator) -> int:
         if present and math.hypot(dx, dy) < 20 and dx * vx + dy * vy > 0:
             return 4
     return 3
+
+
+def _cruise(drawn: Any, rng: np.random.Generator) -> Any:
+    """Straight on, mostly; continuous actions are small, so that the car stays on the road."""
+    if isinstance(drawn, tuple):
+        return tuple(_cruise(each, rng) for each in drawn)
+    if isinstance(drawn, int | np.integer):
+        return drawn if rng.random() < 0.3 else 1
+    return (0.2 * drawn).astype(drawn.dtype)
 
 
 def _explore(simulator: Any, rng: np.random.Generator) -> int:

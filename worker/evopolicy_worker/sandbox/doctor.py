@@ -15,7 +15,10 @@ import msgspec
 
 from evopolicy_common.messages.episode import Tier
 from evopolicy_common.processes import distribution, host
+from evopolicy_worker.environments import accelerations
+from evopolicy_worker.environments.interface import settings
 from evopolicy_worker.environments.interface.fingerprint import fingerprint
+from evopolicy_worker.environments.interface.gymnasium_adapter import quiet
 from evopolicy_worker.sandbox import jail, seccomp, why_not
 
 Verdict = Literal["ok", "missing", "note"]
@@ -63,6 +66,7 @@ def examine(allowed_packages: tuple[str, ...] = ("numpy",)) -> tuple[Check, ...]
         _shared_memory(),
         _clock(),
         *_fingerprint(),
+        _accelerations(),
         *_tiers(allowed_packages),
     )
 
@@ -219,6 +223,20 @@ def _fingerprint() -> list[Check]:
         Check(name="packages", verdict="note", found=packages),
         Check(name="CPU", verdict="note", found=found.cpu),
     ]
+
+
+def _accelerations() -> Check:
+    if not settings.accelerations_on():
+        return Check(name="accelerations", verdict="note", found="all off: EVOPOLICY_ACCELERATIONS is set")
+    with quiet():
+        off = accelerations.off()
+    texts = [f"{name} off ({why})" for name, why in off.items()]
+    return Check(
+        name="accelerations",
+        verdict="note" if off else "ok",
+        found="; ".join(texts) or "all that the installed environments have are on",
+        advice="install the proved versions: -c constraints.txt" if off else "",
+    )
 
 
 def _tiers(allowed_packages: tuple[str, ...]) -> list[Check]:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
 
 from evopolicy_common.processes import distribution, host
+from evopolicy_worker.environments.accelerations import acrobot_scalars, table
 from evopolicy_worker.environments.browser import chromium
 from evopolicy_worker.environments.interface.settings import BROWSER
 from evopolicy_worker.sandbox import doctor, jail, machine, why_not
@@ -43,6 +45,17 @@ def test_what_is_missing_comes_with_what_to_do(monkeypatch: pytest.MonkeyPatch, 
     assert "lsm=landlock" in checks["Landlock"].advice
     assert checks["tier bwrap"].verdict == checks["tier landlock"].verdict == "missing"
     assert doctor.best_tier(tuple(checks.values())) is None
+
+
+def test_accelerations_that_are_off_are_named_with_the_reason(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert doctor._accelerations().verdict == "ok"
+    with monkeypatch.context() as patched:
+        patched.setattr(table, "version", lambda name: "99.0" if name == "mujoco" else version(name))
+        assert doctor._accelerations().found == "mujoco_state off (mujoco 99.0, proved: 3.10.0)"
+        patched.setattr(acrobot_scalars, "holds", lambda: False)
+        assert "acrobot_scalars off (not exact on this machine)" in doctor._accelerations().found
+    monkeypatch.setenv("EVOPOLICY_ACCELERATIONS", "off")
+    assert doctor._accelerations().found.startswith("all off")
 
 
 def test_a_namespace_that_cannot_be_made_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:

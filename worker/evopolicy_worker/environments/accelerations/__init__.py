@@ -21,7 +21,8 @@ from evopolicy_worker.environments.accelerations.table import (
     PROVED,
     Acceleration,
     accelerate,
+    off,
     usable,
 )
 
-__all__ = ["ACCELERATIONS", "PROVED", "Acceleration", "accelerate", "usable"]
+__all__ = ["ACCELERATIONS", "PROVED", "Acceleration", "accelerate", "off", "usable"]

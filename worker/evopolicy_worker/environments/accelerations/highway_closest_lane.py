@@ -28,6 +28,8 @@ DOUBT = 1e-6
 """Metres; far more than the error of an estimate."""
 _MAX_CELLS = 4_000
 """Some 3 KiB each; more than the cells along the roads of roundabout, or in the car park."""
+_FEW = 6
+"""So many lanes are all estimated sooner than sorted."""
 _REACH = 1e5
 """Metres from the origin within which the error of estimates is known."""
 
@@ -121,14 +123,13 @@ class _Map:
         self._lanes = [
             _Circular(*shape[1:]) if shape[0] == "circular" else _Straight(*shape[1:]) for shape in shapes
         ]
+        self._all = [(-math.inf, index) for index in range(len(shapes))] if len(shapes) <= _FEW else None
         self._cells: dict[tuple[float, float], list[tuple[float, int]]] = {}
 
     def closest(self, x: float, y: float, heading: float) -> int | None:
         """Position of the closest lane in the list; None where it is too close a thing."""
         key = (x // CELL, y // CELL)
-        cell = self._cells.get(key)
-        if cell is None:
-            cell = self._cell(key)
+        cell = self._all or self._cells.get(key) or self._cell(key)
         best = second = math.inf
         closest = None
         lanes = self._lanes

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from highway_env.road.regulation import RegulatedRoad
 from highway_env.road.road import Road
 
 from evopolicy_worker.environments.accelerations.highway_scene import Scene, take_over
@@ -28,6 +29,10 @@ class SiftedRoad(Road):  # type: ignore[misc]
     """A road on which most pairs are dismissed early."""
 
     def step(self, dt: float) -> None:
+        if isinstance(self, RegulatedRoad):
+            self.steps += 1
+            if self.steps % int(1 / dt / self.REGULATION_FREQUENCY) == 0:
+                self.enforce_road_rules()
         vehicles = self.vehicles
         for vehicle in vehicles:
             vehicle.step(dt)
@@ -36,8 +41,13 @@ class SiftedRoad(Road):  # type: ignore[misc]
         others = [_body(thing, dt) for thing in self.objects]
         for i, vehicle in enumerate(vehicles):
             body = bodies[i]
+            x, y, _, _, _, _, diagonal, way = body
             for j in range(i + 1, len(vehicles)):
-                if not _apart(body, bodies[j]):
+                other = bodies[j]
+                # As in `_apart`, which is called for few.
+                reach = (diagonal + other[6]) / 2 + way + DOUBT
+                near = reach >= 0 and not (x - other[0]) ** 2 + (y - other[1]) ** 2 > reach * reach
+                if near and not _apart(body, other):
                     vehicle.handle_collisions(vehicles[j], dt)
             for thing, other in zip(self.objects, others, strict=True):
                 if not _apart(body, other) and not _settled(vehicle, thing):

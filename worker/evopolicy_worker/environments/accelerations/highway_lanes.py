@@ -1,62 +1,74 @@
 """highway-env: coordinates along a lane, in scalars, and remembered while the same position is asked for.
 
-Replaces `local_coordinates`, `heading_at` and `on_lane` of straight, sine and circular lanes. A lane is asked by every
-vehicle about every other, so the same few positions come again and again: the last ones are remembered, by value. The
-arithmetic is the library's in its order, one number at a time (see `highway_arithmetic`); of a straight lane only
-where it runs along an axis, so that each product of its dot products is exact and fusing changes nothing. Other lanes
-keep the library's methods.
+Replaces `local_coordinates`, `heading_at` and `on_lane` of straight, sine and circular lanes. A lane is asked
+by every vehicle about every other, so the same few positions come again and again: the last ones are
+remembered, by value. The arithmetic is the library's in its order, one number at a time (see
+`highway_arithmetic`); of a straight lane only where it runs along an axis, so that each product of its dot
+products is exact and fusing changes nothing. Other straight lanes remember what the library's method gives.
 """
 
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
+from highway_env.envs.racetrack_env import RacetrackEnv
 from highway_env.road.lane import AbstractLane, CircularLane, SineLane, StraightLane
 
 from evopolicy_worker.environments.accelerations.highway_arithmetic import PI, wrap
 from evopolicy_worker.environments.accelerations.highway_scene import Scene, take_over
 from evopolicy_worker.environments.accelerations.specialise import specialise
 
-_REMEMBERED = 64
+_REMEMBERED = 256
 Coordinates = tuple[float, float]
 
 
-class _Remembering(AbstractLane, ABC):  # type: ignore[misc]
+class Remembering(AbstractLane):  # type: ignore[misc]
     """Looks a position up before it is computed."""
 
     _known: dict[tuple[float, float], Coordinates]
 
     def local_coordinates(self, position: Any) -> Coordinates:
-        key = (float(position[0]), float(position[1]))
-        known = self._known.get(key)
+        return self.at(position, *position.tolist())
+
+    def at(self, position: Any, x: float, y: float) -> Coordinates:
+        """The same, of a position whose numbers are known."""
+        known = self._known.get((x, y))
         if known is None:
-            known = self._compute(position, key[0], key[1])
+            known = self._compute(position, x, y)
             if len(self._known) >= _REMEMBERED:
                 self._known.clear()
             # Zeros of both signs are one key, but need not be one result.
-            if key[0] and key[1]:
-                self._known[key] = known
+            if x and y:
+                self._known[x, y] = known
         return known
 
-    @abstractmethod
     def _compute(self, position: Any, x: float, y: float) -> Coordinates:
         """The coordinates along the lane of `position`, which is (x, y)."""
+        raise NotImplementedError
 
     def on_lane(
         self, position: Any, longitudinal: Any = None, lateral: Any = None, margin: float = 0
     ) -> bool:
         if longitudinal is None or lateral is None:
             longitudinal, lateral = self.local_coordinates(position)
-        return bool(
-            abs(lateral) <= self.width_at(longitudinal) / 2 + margin
-            and -self.VEHICLE_LENGTH <= longitudinal < self.length + self.VEHICLE_LENGTH
-        )
+        if not abs(lateral) <= self.width_at(longitudinal) / 2 + margin:
+            # Rewards add it up: numpy's truth values and Python's make other numbers of a float32.
+            return cast(bool, np.False_)
+        within: bool = -self.VEHICLE_LENGTH <= longitudinal < self.length + self.VEHICLE_LENGTH
+        return within
 
 
-class AxisLane(_Remembering, StraightLane):  # type: ignore[misc]
+class AskewLane(Remembering, StraightLane):  # type: ignore[misc]
+    """A straight lane in any direction."""
+
+    def _compute(self, position: Any, x: float, y: float) -> Coordinates:
+        found: Coordinates = StraightLane.local_coordinates(self, position)
+        return found
+
+
+class AxisLane(Remembering, StraightLane):  # type: ignore[misc]
     """A straight lane along an axis: its direction has a one and a zero."""
 
     _origin: tuple[float, float, float, float, float, float]
@@ -81,7 +93,7 @@ class AxisSineLane(AxisLane, SineLane):  # type: ignore[misc]
         return float(self.heading + np.arctan(slope))
 
 
-class ScalarCircularLane(_Remembering, CircularLane):  # type: ignore[misc]
+class ScalarCircularLane(Remembering, CircularLane):  # type: ignore[misc]
     """A circular lane."""
 
     _start: float
@@ -98,26 +110,38 @@ class ScalarCircularLane(_Remembering, CircularLane):  # type: ignore[misc]
         return float(phi + PI / 2 * self.direction)
 
 
+class RacingCircularLane(ScalarCircularLane):
+    """The same in numpy's numbers: races square them, and the square of a Python number can differ."""
+
+    def local_coordinates(self, position: Any) -> Coordinates:
+        longitudinal, lateral = super().local_coordinates(position)
+        return np.float64(longitudinal), np.float64(lateral)
+
+
 class ScalarLanes(Scene):
     """An environment of which the lanes remember."""
 
     def _road_made(self) -> None:
         for lane in self.road.network.lanes_list():
-            quicken(lane)
+            quicken(lane, races=isinstance(self, RacetrackEnv))
         super()._road_made()
 
 
-def quicken(lane: Any) -> None:
+def quicken(lane: Any, *, races: bool = False) -> None:
     """Give a lane the methods above, if it is of a kind that has them."""
     kind = type(lane)
     if kind in (StraightLane, SineLane):
         if not (_on_axis(lane.direction) and _on_axis(lane.direction_lateral)):
+            if kind is SineLane:
+                return
+            specialise(lane, AskewLane)
+            lane._known = {}
             return
         specialise(lane, AxisSineLane if kind is SineLane else AxisLane)
         origin = (*lane.start, *lane.direction, *lane.direction_lateral)
         lane._origin = tuple(float(value) for value in origin)
     elif kind is CircularLane:
-        specialise(lane, ScalarCircularLane)
+        specialise(lane, RacingCircularLane if races else ScalarCircularLane)
         lane._start = float(lane.start_phase)
     else:
         return

@@ -25,8 +25,8 @@ class Scene(AbstractEnv):  # type: ignore[misc]
         super()._create_road(*args)
         self._road_made()
 
-    def _make_vehicles(self) -> None:
-        super()._make_vehicles()
+    def _make_vehicles(self, *args: Any) -> None:
+        super()._make_vehicles(*args)
         self._vehicles_made()
 
     def _create_vehicles(self) -> None:

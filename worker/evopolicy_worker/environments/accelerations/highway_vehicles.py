@@ -1,27 +1,42 @@
-"""highway-env: the vehicles' controllers and kinematics in scalars.
+"""highway-env: the vehicles' controllers and kinematics in scalars, and their neighbours in order.
 
-Replaces `Vehicle.step`; of controlled vehicles also `steering_control` and what `act` does around it; of IDM vehicles
-also `act`, `acceleration` and `desired_gap`; and `Road.neighbour_vehicles` where connected lanes are not searched. The
-library makes small arrays and calls numpy's `clip` for single numbers. Here the same operations are made in
-the same order on Python floats; trigonometric functions, powers and dot products stay numpy's (see
-`highway_arithmetic`).
+Replaces `Vehicle.step`; of controlled vehicles also `steering_control` and what `act` does around it; of IDM
+vehicles also `act`, `acceleration` and `desired_gap`. The library makes small arrays and calls numpy's `clip`
+for single numbers. Here the same operations are made in the same order on Python floats; trigonometric
+functions, powers and dot products stay numpy's (see `highway_arithmetic`). Vehicles that appear later are
+replaced before they act.
+
+Replaces `Road.neighbour_vehicles`, which asks every vehicle for its place on the lane. No vehicle moves while
+all decide, so the places on a lane are computed and sorted once. Of rules of priority, `is_conflict_possible`
+predicts the ways of two vehicles for each pair: here each way once.
 """
 
 from __future__ import annotations
 
-from types import MethodType
+import copy
+from bisect import bisect_left
+from operator import itemgetter
+from types import FunctionType, MethodType, SimpleNamespace
 from typing import Any
 
 import numpy as np
+from highway_env import utils
+from highway_env.road.regulation import RegulatedRoad
 from highway_env.road.road import Road
+from highway_env.vehicle import kinematics
 from highway_env.vehicle.behavior import IDMVehicle
 from highway_env.vehicle.controller import ControlledVehicle, MDPVehicle
+from highway_env.vehicle.dynamics import BicycleVehicle
 from highway_env.vehicle.kinematics import Vehicle
 from highway_env.vehicle.objects import Landmark
 
 from evopolicy_worker.environments.accelerations.highway_arithmetic import PI, clip, not_zero, wrap
+from evopolicy_worker.environments.accelerations.highway_lanes import Remembering
 from evopolicy_worker.environments.accelerations.highway_scene import Scene, take_over
 from evopolicy_worker.environments.accelerations.specialise import specialise
+
+DOUBT = 1e-6
+"""Metres."""
 
 
 def _advance(vehicle: Any, dt: float) -> None:
@@ -105,7 +120,8 @@ class ScalarIDM(ScalarControlled, IDMVehicle):  # type: ignore[misc]
         )
 
     def acceleration(self, ego_vehicle: Any, front_vehicle: Any = None, rear_vehicle: Any = None) -> float:
-        if not ego_vehicle or not isinstance(ego_vehicle, Vehicle):
+        # As vehicles alone have; to ask for the class takes longer.
+        if not hasattr(ego_vehicle, "action"):
             return 0
         target_speed = float(getattr(ego_vehicle, "target_speed", 0))
         lane = ego_vehicle.lane
@@ -140,34 +156,113 @@ class ScalarIDM(ScalarControlled, IDMVehicle):  # type: ignore[misc]
 
 
 class ScalarRoad(Road):  # type: ignore[misc]
-    """A road that is searched for neighbours."""
+    """A road that is searched for neighbours. While its vehicles decide, what is on a lane is sorted once."""
+
+    _sorted: dict[Any, tuple[list[float], list[Any]]] | None = None
+    _things: list[tuple[Any, Any, float, float]]
+
+    def act(self) -> None:
+        for vehicle in self.vehicles:
+            quicken(vehicle)
+        self._look()
+        self._sorted = {}
+        super().act()
+        self._sorted = None
+
+    def _look(self) -> None:
+        things = self.vehicles + [each for each in self.objects if not isinstance(each, Landmark)]
+        self._things = [(each, each.position, *each.position.tolist()) for each in things]
 
     def neighbour_vehicles(self, vehicle: Any, lane_index: Any = None) -> tuple[Any, Any]:
-        if self.neighbour_vehicles_connected_lanes:
-            found: tuple[Any, Any] = super().neighbour_vehicles(vehicle, lane_index)
-            return found
         lane_index = lane_index or vehicle.lane_index
         if not lane_index:
             return None, None
-        lane = self.network.get_lane(lane_index)
-        coordinates, length = lane.local_coordinates, lane.VEHICLE_LENGTH
-        s = coordinates(vehicle.position)[0]
-        s_front = s_rear = front = rear = None
-        for other in self.vehicles + self.objects:
-            if other is vehicle:
-                continue
-            s_other, lateral = coordinates(other.position)
-            if not -length <= s_other < lane.length + length:
-                continue
-            if not abs(lateral) <= lane.width_at(s_other) / 2 + 1 or isinstance(other, Landmark):
-                continue
-            if s <= s_other and (s_front is None or s_other <= s_front):
-                s_front, front = s_other, other
-            if s_other < s and (s_rear is None or s_other > s_rear):
-                s_rear, rear = s_other, other
+        s = self.network.get_lane(lane_index).local_coordinates(vehicle.position)[0]
+        known = self._sorted
+        if known is None:
+            self._look()
+            known = {}
+        if lane_index not in known:
+            known[lane_index] = self._along(lane_index)
+        places, things = known[lane_index]
+        # In front the nearest, of several at one place the last; behind the nearest, of several the first.
+        front = rear = None
+        s_front = s_rear = s
+        at = begin = bisect_left(places, s)
+        while at < len(places) and (front is None or places[at] == s_front):
+            if things[at] is not vehicle:
+                front, s_front = things[at], places[at]
+            at += 1
+        at = begin - 1
+        while at >= 0 and (rear is None or places[at] == s_rear):
+            if things[at] is not vehicle:
+                rear, s_rear = things[at], places[at]
+            at -= 1
         return front, rear
 
+    def _along(self, lane_index: Any) -> tuple[list[float], list[Any]]:
+        """Places along the lane, and along those that join it if asked for, with what is there, in order."""
+        lane, graph = self.network.get_lane(lane_index), self.network.graph
+        lanes = [(lane, 0.0)]
+        if self.neighbour_vehicles_connected_lanes:
+            begin, end, k = lane_index
+            after = [lanes for lanes in graph.get(end, {}).values() if lanes]
+            before = [ends[begin] for ends in graph.values() if ends.get(begin)]
+            lanes += [(each[k] if k < len(each) else each[0], lane.length) for each in after]
+            joining = [each[k] if k < len(each) else each[0] for each in before]
+            lanes += [(each, -each.length) for each in joining]
+        found = []
+        for thing, position, x, y in self._things:
+            for each, offset in lanes:
+                remembers = isinstance(each, Remembering)
+                s, lateral = each.at(position, x, y) if remembers else each.local_coordinates(position)
+                if -each.VEHICLE_LENGTH <= s < each.length + each.VEHICLE_LENGTH and (
+                    abs(lateral) <= each.width_at(s) / 2 + 1
+                ):
+                    found.append((s + offset, thing))
+                    break
+        found.sort(key=itemgetter(0))
+        return [s for s, _ in found], [thing for _, thing in found]
 
+
+class ScalarCrossing(ScalarRoad, RegulatedRoad):  # type: ignore[misc]
+    """A road with rules of priority: the way of each vehicle is predicted once for all others."""
+
+    _ways: dict[int, list[tuple[Any, float]]]
+
+    def enforce_road_rules(self) -> None:
+        self._ways = {}
+        super().enforce_road_rules()
+
+    def is_conflict_possible(self, v1: Any, v2: Any, horizon: int = 3, step: float = 0.25) -> bool:
+        for (place_1, heading_1), (place_2, heading_2) in zip(
+            self._way(v1, horizon, step), self._way(v2, horizon, step), strict=False
+        ):
+            dx, dy = float(place_2[0] - place_1[0]), float(place_2[1] - place_1[1])
+            if dx * dx + dy * dy > (v1.LENGTH + DOUBT) ** 2 or np.linalg.norm(place_2 - place_1) > v1.LENGTH:
+                continue
+            if utils.rotated_rectangles_intersect(
+                (place_1, 1.5 * v1.LENGTH, 0.9 * v1.WIDTH, heading_1),
+                (place_2, 1.5 * v2.LENGTH, 0.9 * v2.WIDTH, heading_2),
+            ):
+                return True
+        return False
+
+    def _way(self, vehicle: Any, horizon: int, step: float) -> list[tuple[Any, float]]:
+        way = self._ways.get(id(vehicle))
+        if way is None:
+            alone = type(vehicle) is BicycleVehicle
+            predict = _ALONE if alone else type(vehicle).predict_trajectory_constant_speed
+            way = list(zip(*predict(vehicle, np.arange(step, horizon, step)), strict=False))
+            self._ways[id(vehicle)] = way
+        return way
+
+
+# The library copies the vehicle with its whole world. A `BicycleVehicle` changes nothing in place.
+_ALONE = FunctionType(
+    Vehicle.predict_trajectory_constant_speed.__code__,
+    {**vars(kinematics), "copy": SimpleNamespace(deepcopy=copy.copy)},
+)
 _KINDS: dict[type[Any], type[Any]] = {
     MDPVehicle: ScalarMDP,
     IDMVehicle: ScalarIDM,
@@ -179,17 +274,22 @@ class ScalarTraffic(Scene):
 
     def _road_made(self) -> None:
         super()._road_made()
-        specialise(self.road, ScalarRoad)
+        specialise(self.road, ScalarCrossing if isinstance(self.road, RegulatedRoad) else ScalarRoad)
 
     def _vehicles_made(self) -> None:
         super()._vehicles_made()
         for vehicle in self.road.vehicles:
-            mixin = _KINDS.get(type(vehicle))
-            if mixin is not None:
-                specialise(vehicle, mixin)
-            elif type(vehicle) is Vehicle:
-                # Its class stays as it is: the library draws wheels for this very class only.
-                vehicle.step = MethodType(_advance, vehicle)
+            quicken(vehicle)
+
+
+def quicken(vehicle: Any) -> None:
+    """Give a vehicle the methods above, if it is of a kind that has them."""
+    mixin = _KINDS.get(type(vehicle))
+    if mixin is not None:
+        specialise(vehicle, mixin)
+    elif type(vehicle) is Vehicle and "step" not in vars(vehicle):
+        # Its class stays as it is: the library draws wheels for this very class only.
+        vehicle.step = MethodType(_advance, vehicle)
 
 
 def accelerate(env: Any) -> None:

@@ -17,6 +17,14 @@ def specialise(target: Any, mixin: Any) -> None:
 @cache
 def specialised(cls: Any, mixin: Any) -> Any:
     """`mixin` in front of `cls`, under the name of `cls`. The same pair gives the same class."""
-    return type(
-        cls.__name__, (mixin, cls), {"__module__": mixin.__module__, "__qualname__": cls.__qualname__}
-    )
+    names = {"__module__": mixin.__module__, "__qualname__": cls.__qualname__}
+    if _root(cls) is _root(mixin):
+        return type(cls.__name__, (mixin, cls), names)
+    # An object's class is exchanged for one of the same memory layout, which the first base determines.
+    order = [each for each in mixin.__mro__ if each not in cls.__mro__] + list(cls.__mro__)
+    kind = type("Ordered", (type(cls),), {"mro": lambda found: [found, *order]})
+    return kind(cls.__name__, (cls,), names)
+
+
+def _root(cls: Any) -> Any:
+    return cls if cls.__base__ is object else _root(cls.__base__)

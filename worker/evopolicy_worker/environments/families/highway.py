@@ -14,6 +14,10 @@ if TYPE_CHECKING:
     import gymnasium
 
 
+_TRAFFIC = {"DISTANCE_WANTED": 10.0, "COMFORT_ACC_MAX": 3.0, "COMFORT_ACC_MIN": -5.0}
+"""The library's own values of what an intersection sets for all."""
+
+
 class HighwayFamily(GymnasiumFamily):
     """Traffic, and a car to be parked."""
 
@@ -32,8 +36,15 @@ class HighwayFamily(GymnasiumFamily):
     solved_by = {"parking-v0": "is_success"}
 
     def rebuilds(self, entry: Entry) -> bool:
-        # These two have been seen to repeat; a scene is built in milliseconds.
-        return entry.gymnasium_id not in ("parking-v0", "roundabout-v0")
+        # All have been seen to repeat; this one keeps every state that it was in.
+        return entry.gymnasium_id == "lane-keeping-v0"
+
+    def begin(self) -> None:
+        """An intersection changes how the traffic of all later environments of the process drives."""
+        from highway_env.vehicle.behavior import IDMVehicle
+
+        for name, value in _TRAFFIC.items():
+            setattr(IDMVehicle, name, value)
 
     def info(self, info: Mapping[str, Any]) -> dict[str, Any]:
         """The nested `rewards` (unweighted, some of them bools) become numbers."""

@@ -102,6 +102,9 @@ class GymnasiumFamily:
         env.unwrapped.render_mode = "rgb_array"
         return env
 
+    def begin(self) -> None:
+        """Called before each reset: undoes what earlier episodes have changed in the library itself."""
+
     def encoding(self, space: gymnasium.Space[Any]) -> Opaque | None:
         """How values of a space are encoded that the protocol has no form for; None for a space of a known kind."""
         return declared(space)
@@ -232,6 +235,7 @@ class GymnasiumEnvironment(Environment):
             self._env.close()
             call.begin(env_id, "make")
             self._build()
+        self._family.begin()
         self._used = True
         self._options_used = case.options is not None
         self._steps = 0
