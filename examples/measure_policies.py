@@ -1,9 +1,9 @@
 """Plays the hand-written policies of `examples/policies/` in this process and prints how well each does.
 
-Made for developers with the extras `worker` and `coordinator`: one episode after another, no sandbox, no budget. A fresh
-Policy plays each episode, as under the policy scope `episode`; actions are repaired as a worker repairs them, and any
-that needed it are counted. The last columns put the mean beside the paper's Table 1: 0 is its random policy, 1 the best
-of its agents (not clipped, so a value above 1 beats them all).
+Made for developers with the extras `worker` and `coordinator`: one episode after another, no sandbox, no budget. A
+fresh Policy plays each episode, as under the policy scope `episode`; actions are repaired as a worker repairs them, and
+any that needed it are counted. The last columns put the mean beside the paper's Table 1: 0 is its random policy, 1 the
+best of its agents (not clipped, so a value above 1 beats them all).
 
     python examples/measure_policies.py                          # everything, 32 seeds each: some ten minutes
     python examples/measure_policies.py gym/acrobot --seeds 8    # one environment

@@ -30,7 +30,8 @@ _LEFT_OUT: dict[str, Callable[[bytes], object]] = {
     "system": lambda text: b"pytest.mark.system" not in text,
     "families": lambda text: b"pytest.mark.families" not in text,
 }
-"""By `-m`: whether a file has no test of the layer. A file of another layer than `make test` says so in its first mark."""
+"""By `-m`: whether a file has no test of the layer. A file of another layer than `make test` says so in its first
+mark."""
 
 _ONE_BY_ONE = tuple(
     f"tests/families/test_{name}.py::" for name in ("proof_of_life", "parity", "cited_policies")
@@ -80,7 +81,8 @@ def _beside_others(config: pytest.Config) -> bool:
 
 @functools.cache
 def _in(path: Path, names: tuple[str, ...]) -> bool:
-    """Whether it is one of these files, or in one of these folders. Every process asks for each file of thousands of tests."""
+    """Whether it is one of these files, or in one of these folders. Every process asks for each file of thousands of
+    tests."""
     return f"{path}/".startswith(tuple(f"{Path(__file__).parent}/{name}/" for name in names))
 
 

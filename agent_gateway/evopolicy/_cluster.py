@@ -331,7 +331,8 @@ def trial_of(
 def plan_of(
     env: str, agent: str, *, listener: Listener | None = None, agent_host: str = "", **options: Any
 ) -> Plan:
-    """The plan of a run; arguments as for `run`, and for an agent that is started elsewhere as in `Plan`. Raises ConfigError."""
+    """The plan of a run; arguments as for `run`, and for an agent that is started elsewhere as in `Plan`. Raises
+    ConfigError."""
     check_names(options, OPTIONS.keys() - {"agent"})
     env = one_environment(take("env", env))
     given = run_options.RunOptions(

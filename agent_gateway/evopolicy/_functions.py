@@ -1,6 +1,7 @@
 """Python functions as agents and as policies: sent by value to the process that calls them, by cloudpickle.
 
-Only the jail and the sandbox unpickle them. Pickled code is of one Python version; a policy says so where another one runs.
+Only the jail and the sandbox unpickle them. Pickled code is of one Python version; a policy says so where another one
+runs.
 """
 
 from __future__ import annotations

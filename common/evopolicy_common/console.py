@@ -102,7 +102,8 @@ def filled_table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> Tabl
 def table(*headings: str, right: Collection[str] = (), whole: Collection[str] = ()) -> Table:
     """A table without truncation: on narrow terminals cells fold, because other commands need their full content.
 
-    `right`: headings of right-aligned columns. `whole`: headings of columns whose cells never fold, as people copy them.
+    `right`: headings of right-aligned columns. `whole`: headings of columns whose cells never fold, as people copy
+    them.
     """
     made = NarrowTable()
     for heading in headings:

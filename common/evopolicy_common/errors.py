@@ -81,7 +81,8 @@ class WorkerError(EvopolicyError):
 
 
 class BrokenEnvironmentError(WorkerError):
-    """An environment breaks its word: it raises, hangs, or leaves its spaces. Neither the policy nor the worker is to blame."""
+    """An environment breaks its word: it raises, hangs, or leaves its spaces. Neither the policy nor the worker is to
+    blame."""
 
 
 class SlotDiedError(WorkerError):

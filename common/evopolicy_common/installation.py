@@ -1,4 +1,5 @@
-"""This installation in hints that can be pasted: its programs as they were called, and the command that adds an extra."""
+"""This installation in hints that can be pasted: its programs as they were called, and the command that adds an
+extra."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""structlog as all modules import it: without rich, whose import would take a fifth of the time in which a process of ours starts.
+"""structlog as all modules import it: without rich, whose import would take a fifth of the time in which a process of
+ours starts.
 
 structlog takes rich, where it is installed, to draw tracebacks; ours are text before its renderers see them.
 """

@@ -1,7 +1,7 @@
 """Reads files that others wrote or named.
 
-Rule that this module owns: such a file is a regular one of a bearable size. To open a pipe would wait for its writer forever, and a
-device may have no end.
+Rule that this module owns: such a file is a regular one of a bearable size. To open a pipe would wait for its writer
+forever, and a device may have no end.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ MAX_BYTES = 64 << 20
 
 
 def open_regular(path: Path | str, dir_fd: int | None = None, *, links: bool = False) -> BinaryIO:
-    """Opens a file. Raises OSError for anything but a regular file, and without `links` for a link, which may lead anywhere. Links
-    among the folders on the way are the caller's."""
+    """Opens a file. Raises OSError for anything but a regular file, and without `links` for a link, which may lead
+    anywhere. Links among the folders on the way are the caller's."""
     flags = os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | (0 if links else os.O_NOFOLLOW)
     try:
         fd = os.open(path, flags, dir_fd=dir_fd)

@@ -49,8 +49,8 @@ _NUMBERS = re.compile(r"[-+]?[0-9][0-9.]*(?:e[-+]?[0-9]+)?(?: to [-+]?[0-9][0-9.
 
 
 def csv_cell(value: Any) -> Any:
-    """The value for a CSV file: a text is `harmless`, with an apostrophe in front where a spreadsheet would take it for a
-    formula; empty for None."""
+    """The value for a CSV file: a text is `harmless`, with an apostrophe in front where a spreadsheet would take it for
+    a formula; empty for None."""
     if value is None:
         return ""
     if not isinstance(value, str):

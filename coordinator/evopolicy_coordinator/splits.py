@@ -88,8 +88,8 @@ def derive(
 
 
 def in_world(secret: bytes, env: str, cases: dict[Split, tuple[Case, ...]]) -> dict[Split, tuple[Case, ...]]:
-    """The cases with the key of their world, HMAC-SHA256(secret, world | environment) cut to 128 bits; of an environment
-    that is no world, as they are."""
+    """The cases with the key of their world, HMAC-SHA256(secret, world | environment) cut to 128 bits; of an
+    environment that is no world, as they are."""
     if unchanged(env) == env:
         return cases
     options = {OPTION: hmac.digest(secret, f"world|{env}".encode(), "sha256").hex()[:32]}

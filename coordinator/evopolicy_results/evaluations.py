@@ -1,4 +1,5 @@
-"""Evaluations on a cluster for the commands on finished runs: requests, outcomes with progress, and the workers' versions."""
+"""Evaluations on a cluster for the commands on finished runs: requests, outcomes with progress, and the workers'
+versions."""
 
 from __future__ import annotations
 
@@ -53,7 +54,8 @@ class Evaluations:
     async def versions(self, message: DescribeEnvironment, *, wait: bool) -> EnvironmentState:
         """The environment's state, with the versions of the workers that offer it.
 
-        With `wait` until there is a worker, as the first may still be starting, but not for a run that the coordinator does not know.
+        With `wait` until there is a worker, as the first may still be starting, but not for a run that the coordinator
+        does not know.
         """
         until = time.monotonic() + DESCRIPTION_S
         while True:

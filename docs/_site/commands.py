@@ -1,4 +1,5 @@
-"""Writes `docs/reference/cli.md` from the commands themselves: `python docs/_site/commands.py > docs/reference/cli.md`."""
+"""Writes `docs/reference/cli.md` from the commands themselves: `python docs/_site/commands.py >
+docs/reference/cli.md`."""
 
 from __future__ import annotations
 

@@ -1,7 +1,8 @@
-"""Measures the processor time of a step of every environment, and writes it into its row: `python docs/_site/costs.py [ID…]`.
+"""Measures the processor time of a step of every environment, and writes it into its row: `python docs/_site/costs.py
+[ID…]`.
 
-For machines without other work: a row that was measured with more work than cores is marked with `*`. Without ids it measures
-those that have no times. `python docs/_site/families.py` then writes the families' medians.
+For machines without other work: a row that was measured with more work than cores is marked with `*`. Without ids it
+measures those that have no times. `python docs/_site/families.py` then writes the families' medians.
 """
 
 from __future__ import annotations

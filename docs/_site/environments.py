@@ -1,7 +1,7 @@
 """Writes the tables of played environments, a page for each family: `python docs/_site/environments.py RESULTS`.
 
-RESULTS is what `evopolicy-worker check-env --results` keeps. Rows of environments that it lacks stay as they are, and so does
-the text above the table, which is written by hand. A family without a page gets one.
+RESULTS is what `evopolicy-worker check-env --results` keeps. Rows of environments that it lacks stay as they are, and
+so does the text above the table, which is written by hand. A family without a page gets one.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
 """Writes the table of families into README.md and docs/reference/environments.md: `python docs/_site/families.py`.
 
-Rows come from the catalogue, times from the table of played environments, and the original's coverage from original.toml.
+Rows come from the catalogue, times from the table of played environments, and the original's coverage from
+original.toml.
 """
 
 from __future__ import annotations
@@ -123,7 +124,8 @@ def _cost(suite: catalogue.Suite, costs: dict[str, tuple[str, ...]]) -> str:
 
 
 def _costs() -> dict[str, tuple[str, ...]]:
-    """By id, processor time of a step, bare and in a slot, µs, from the tables of played environments; "" is unknown."""
+    """By id, processor time of a step, bare and in a slot, µs, from the tables of played environments; "" is
+    unknown."""
     found: dict[str, tuple[str, ...]] = {}
     column = 0
     pages = sorted(LIST.with_suffix("").glob("*.md"))

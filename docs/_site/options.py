@@ -1,4 +1,5 @@
-"""Writes `docs/reference/options.md` from the declarations: `python docs/_site/options.py > docs/reference/options.md`."""
+"""Writes `docs/reference/options.md` from the declarations: `python docs/_site/options.py >
+docs/reference/options.md`."""
 
 from __future__ import annotations
 

@@ -14,7 +14,8 @@ from evopolicy_common.statistics import intervals
 
 
 def draw(run: Path, out: Path) -> None:
-    """Left: the mean of each submit on validation cases. Right: the held-out returns of the selected one, and of random actions."""
+    """Left: the mean of each submit on validation cases. Right: the held-out returns of the selected one, and of random
+    actions."""
     outcome = decode_run_record((run / "run.json").read_bytes()).outcome
     assert outcome.random_reference is not None
     assert outcome.heldout_returns is not None

@@ -1,9 +1,11 @@
-"""Writes, for each Core16 environment, six versions of a policy whose edits are one of each type: `replay` submits them.
+"""Writes, for each Core16 environment, six versions of a policy whose edits are one of each type: `replay` submits
+them.
 
     python examples/smoke-report/labelled_edits.py OUT
 
 OUT/<environment>/<NN-label>/ is a bundle; the label is the edit type that `evopolicy report` must find for it
-(docs/how-to/reports.md). Each version plays the environment's example policy, of which the earlier ones spoil some actions:
+(docs/how-to/reports.md). Each version plays the environment's example policy, of which the earlier ones spoil some
+actions:
 
     00-first       uniform random actions only
     01-synthesis   the example, but half of the actions are random

@@ -1,12 +1,13 @@
 """`make bench-channels`: what a policy can tell others on its machine, at once and after it has ended.
 
-Prints bits a second that arrive in an agent's jail, and in another policy, by each way that is known; then, of episodes some
-of which did all that lasts, which share a jailed agent tells apart by each number it can read, `--wait` seconds after they
-ended (0.5 is guessing). On a machine that does other things less arrives.
+Prints bits a second that arrive in an agent's jail, and in another policy, by each way that is known; then, of episodes
+some of which did all that lasts, which share a jailed agent tells apart by each number it can read, `--wait` seconds
+after they ended (0.5 is guessing). On a machine that does other things less arrives.
 
-With `--gaps N` instead: whether a policy tells hidden from train episodes by the time between its calls, from N episodes of each
-kind. The last table has a verdict for each environment, policy scope, with and without video: told apart if more guesses are right
-than in all but a few random assignments of the kinds (p of at most 0.05 over the number of rows). Another size:
+With `--gaps N` instead: whether a policy tells hidden from train episodes by the time between its calls, from N
+episodes of each kind. The last table has a verdict for each environment, policy scope, with and without video: told
+apart if more guesses are right than in all but a few random assignments of the kinds (p of at most 0.05 over the number
+of rows). Another size:
 `--gaps 40 --gap-steps 50 --gap-envs gym/acrobot`.
 """
 

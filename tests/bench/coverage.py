@@ -1,6 +1,7 @@
 """How often the intervals of a report cover, and its verdicts are wrong: `coverage.py [TRIALS [CLAIM…]]`.
 
-Measures each claim (or those named) of docs/explanation/statistics.md, writes the tables into that page, and asserts nothing. `test_statistics_claims.py` fails when the page has a claim without a row.
+Measures each claim (or those named) of docs/explanation/statistics.md, writes the tables into that page, and asserts
+nothing. `test_statistics_claims.py` fails when the page has a claim without a row.
 """
 
 from __future__ import annotations

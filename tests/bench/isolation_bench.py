@@ -1,9 +1,11 @@
-"""What it costs that hidden episodes and agents never share a machine: the same sweep with the rule and without, on one machine.
+"""What it costs that hidden episodes and agents never share a machine: the same sweep with the rule and without, on one
+machine.
 
     make bench-isolation
     make bench-isolation ARGS="--agents 2 --environments toy --parallel 2"
 
-Agents are uniform random ones with tiny budgets, so nearly all of a run is starting, waiting and scoring: the rule's worst case.
+Agents are uniform random ones with tiny budgets, so nearly all of a run is starting, waiting and scoring: the rule's
+worst case.
 """
 
 from __future__ import annotations

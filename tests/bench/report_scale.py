@@ -1,7 +1,7 @@
 """What a report over many runs takes: `python tests/bench/report_scale.py [REPEATS]`. Prints it, asserts nothing.
 
-Writes four agents × Core16 × REPEATS made-up runs of nine submits each (16 repeats: 1,024 runs), and has `evopolicy report`
-read them in a process of its own.
+Writes four agents × Core16 × REPEATS made-up runs of nine submits each (16 repeats: 1,024 runs), and has `evopolicy
+report` read them in a process of its own.
 """
 
 from __future__ import annotations

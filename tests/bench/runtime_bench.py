@@ -1,10 +1,10 @@
 """`make bench`: what an episode costs through a sandboxed slot, and through the whole cluster, beside a bare loop.
 
-Prints, per environment of Core16 and for one of each family: the bare loop's time per step; the slot's time over the bare loop's
-with accelerations off and on, for Core16 also over the limit of `step_profile.py`; and a whole submit on two slots, from POST to committed feedback, over (bare time / 2). Then the geometric means,
-a pipe's round trip on one core, the slot's overhead per step in such round trips, its overhead per episode, its memory,
-and what a one-episode submit takes beside its episode. At last a second small submit on two slots, over the bare loop on
-one core.
+Prints, per environment of Core16 and for one of each family: the bare loop's time per step; the slot's time over the
+bare loop's with accelerations off and on, for Core16 also over the limit of `step_profile.py`; and a whole submit on
+two slots, from POST to committed feedback, over (bare time / 2). Then the geometric means, a pipe's round trip on one
+core, the slot's overhead per step in such round trips, its overhead per episode, its memory, and what a one-episode
+submit takes beside its episode. At last a second small submit on two slots, over the bare loop on one core.
 """
 
 from __future__ import annotations
@@ -263,7 +263,8 @@ def report(rows: list[dict[str, Any]], round_trip_s: float, console: Console) ->
         "submit, acc.",
     ):
         table.add_column(heading, justify="left" if heading == "environment" else "right")
-    # The means are those of Core16, so that they compare with earlier ones; of other environments where it is not there.
+    # The means are those of Core16, so that they compare with earlier ones; of other environments where it is not
+    # there.
     measured = CORE16.intersection(row["env"] for row in rows)
     ratios: dict[str, list[float]] = {}
     overheads: list[float] = []

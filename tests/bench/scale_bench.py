@@ -1,10 +1,10 @@
 """What the path of a result costs: `python tests/bench/scale_bench.py [--envs core16] [--runs 1,8,32] [--json FILE]`.
 
-For each environment a real worker first plays real episodes through a coordinator and a gateway to feedback on disk. Then
-workers without a simulator report the same outcomes: the real supervisor with its leases, heartbeats and result reports over
-Zenoh connections of its own, whose slots answer at once (with `--paced`: after the bare time of an episode). Coordinator
-and gateways are the real programs, a process a run. The feedback of the first and the last submit of every run is hashed
-and has to equal the real one. Prints tables; the only thing that it asserts is that hash.
+For each environment a real worker first plays real episodes through a coordinator and a gateway to feedback on disk.
+Then workers without a simulator report the same outcomes: the real supervisor with its leases, heartbeats and result
+reports over Zenoh connections of its own, whose slots answer at once (with `--paced`: after the bare time of an
+episode). Coordinator and gateways are the real programs, a process a run. The feedback of the first and the last submit
+of every run is hashed and has to equal the real one. Prints tables; the only thing that it asserts is that hash.
 
 CPU is the system's count for whole processes and their threads, while submits were in flight. "By CPU": slots whose
 episodes cost, without a slot, as much CPU as their results cost the process. "Busy": slots that the measured rate of

@@ -1,12 +1,15 @@
-"""`make bench-start`: what a person waits for before anything is played, each beside a bare Python with the same imports.
+"""`make bench-start`: what a person waits for before anything is played, each beside a bare Python with the same
+imports.
 
-Rows: the help; `evopolicy local` from its call to the answer of a first one-episode submit, then that submit and the next
-one; `evopolicy try` on one case; a report of 48 runs; a worker that offers all environments installed here, from its call to
-its registration, for which the floor is one that offers Core16 (`--workers-only`: this row alone); a thousand requests to a model API
-on loopback through the relay, for which the floor is the same without it (`--relay-only`): the wall time of
-`N_REQUESTS`, so that seconds read as milliseconds a request. Wall time and processor time (of all processes), the best of
-`--times`; the floor is the same of bare Pythons, one for each process that the command starts, which import what it imports.
-Prints a table, asserts nothing.
+Rows: the help; `evopolicy local` from its call to the answer of a first one-episode submit, then that submit and the
+next one; `evopolicy try` on one case; a report of 48 runs; a worker that offers all environments installed here, from
+its call to its registration, for which the floor is one that offers Core16 (`--workers-only`: this row alone); a
+thousand requests to a model API on loopback through the relay, for which the floor is the same without it
+(`--relay-only`): the wall time of
+`N_REQUESTS`, so that seconds read as milliseconds a request. Wall time and processor time (of all processes), the best
+of
+`--times`; the floor is the same of bare Pythons, one for each process that the command starts, which import what it
+imports. Prints a table, asserts nothing.
 """
 
 from __future__ import annotations

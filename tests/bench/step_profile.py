@@ -1,8 +1,8 @@
 """Where a step's time goes: `python tests/bench/step_profile.py [ENV…]`. Prints µs per step, asserts nothing.
 
-`--limit ENV N` prints JSON, `{"limit_s": …}`: the time of N episodes of the bench with accelerations, adapter, the slot's recording, a
-byte to another process and back at each step, and one fork and exit of a Python with numpy for each episode. No slot that starts
-a process for each policy, and leaves the core to it at each step, takes less.
+`--limit ENV N` prints JSON, `{"limit_s": …}`: the time of N episodes of the bench with accelerations, adapter, the
+slot's recording, a byte to another process and back at each step, and one fork and exit of a Python with numpy for each
+episode. No slot that starts a process for each policy, and leaves the core to it at each step, takes less.
 
 One episode of zero actions each way, accelerations off, pinned to one core, the best of three:
 - bare: `env.step` alone.

@@ -2,8 +2,8 @@
 
 Rows, each with a coordinator process of its own on a state folder of its own, over Zenoh on a unix socket:
 - `slots`: one real worker with two slots and sandboxes on `toy/line`; short episodes, train splits.
-- `one by one`, `batches`: workers that answer at once, taking one lease at a time or sixteen. Every episode is committed
-  for itself, durably, and read back by the gateway that submitted it.
+- `one by one`, `batches`: workers that answer at once, taking one lease at a time or sixteen. Every episode is
+  committed for itself, durably, and read back by the gateway that submitted it.
 - `dask`: as many tasks that do nothing through `dask.distributed`, in a virtual environment of its own.
 And the time from a submit's acceptance to its first lease, seen by the clients.
 """
@@ -78,7 +78,8 @@ def cpu_s(pid: int) -> float:
 
 
 def playing(wall_s: float) -> Callable[[Job, EpisodeSpec], EpisodeOutcome]:
-    """`play` whose episodes claim to have taken so long: by that the coordinator decides how many it hands out at once."""
+    """`play` whose episodes claim to have taken so long: by that the coordinator decides how many it hands out at
+    once."""
     return lambda job, spec: msgspec.structs.replace(play(job, spec), wall_s=wall_s)
 
 

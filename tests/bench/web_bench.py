@@ -1,8 +1,8 @@
 """The live view at scale: what pages weigh, what browsers are sent, and what the coordinator spends on it.
 
-The cluster's state is the real core's, under the simulated load of `tests/simulation/scale.py`: 2,000 workers that poll, beat
-and hand in, 500 open runs. Its status is encoded as on the wire and decoded by the view. Browsers are the view's own event
-streams, read in one process; a slow one is never read to its end.
+The cluster's state is the real core's, under the simulated load of `tests/simulation/scale.py`: 2,000 workers that
+poll, beat and hand in, 500 open runs. Its status is encoded as on the wire and decoded by the view. Browsers are the
+view's own event streams, read in one process; a slow one is never read to its end.
 
     python tests/bench/web_bench.py [--workers 2000] [--runs 500] [--browsers 200] [--seconds 20]
 """

@@ -1,9 +1,11 @@
 """What the live view costs a real coordinator: its process's CPU time without a view, with one, and with two.
 
-A coordinator process on a state folder of its own lists 2,000 workers and 500 open runs. They registered once over Zenoh and are
-silent since, so that all further work is the view's. Each view is a process of `evopolicy web` whose pages 100 browsers follow.
+A coordinator process on a state folder of its own lists 2,000 workers and 500 open runs. They registered once over
+Zenoh and are silent since, so that all further work is the view's. Each view is a process of `evopolicy web` whose
+pages 100 browsers follow.
 
-    PYTHONPATH=tests/support python tests/bench/web_live.py [--workers 2000] [--runs 500] [--browsers 100] [--seconds 60]
+    PYTHONPATH=tests/support python tests/bench/web_live.py [--workers 2000] [--runs 500] [--browsers 100] [--seconds
+    60]
 """
 
 from __future__ import annotations

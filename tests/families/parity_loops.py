@@ -1,7 +1,7 @@
-"""Bare loops, as each library's documentation has them, beside episodes of this software. Two programs for two processes, so that
-nothing of ours is loaded where a library is played: `python parity_loops.py ours FAMILY FILE` plays a sample and writes it
-with its actions; `python parity_loops.py bare FILE [ID…]` plays the same actions again, and prints one JSON object, id to the first
-difference."""
+"""Bare loops, as each library's documentation has them, beside episodes of this software. Two programs for two
+processes, so that nothing of ours is loaded where a library is played: `python parity_loops.py ours FAMILY FILE` plays
+a sample and writes it with its actions; `python parity_loops.py bare FILE [ID…]` plays the same actions again, and
+prints one JSON object, id to the first difference."""
 
 from __future__ import annotations
 
@@ -81,8 +81,8 @@ def gymnasium_loop(told: Given) -> Played:
 
 
 def nle_loop(told: Given) -> Played:
-    """NLE seeds the game's two generators by a method of its own, before `reset`. Its third argument keeps the game from seeding
-    itself again in the middle, and `fix_moon_phase` from looking at the clock."""
+    """NLE seeds the game's two generators by a method of its own, before `reset`. Its third argument keeps the game
+    from seeding itself again in the middle, and `fix_moon_phase` from looking at the clock."""
     import gymnasium
     import minihack  # noqa: F401
     import nle  # noqa: F401

@@ -1,5 +1,6 @@
-"""Policies that are written from task texts alone: each cites the text for every component that it reads and every action that
-it takes. The citations stand in the text at these components, nothing else is read, and each policy beats random."""
+"""Policies that are written from task texts alone: each cites the text for every component that it reads and every
+action that it takes. The citations stand in the text at these components, nothing else is read, and each policy beats
+random."""
 
 from __future__ import annotations
 
@@ -94,7 +95,8 @@ def test_a_policy_from_the_text_alone_beats_random_on_drawn_cases(env_id: str) -
     environment.close()
     told = f"{env_id}: {ours.mean():.4g} beside {random.mean():.4g}, better on {(ours > random).sum()} of {N_CASES}"
     print(told)
-    # Returns of random actions can have long tails: signs count. A policy no better than random gets there once in 478 times.
+    # Returns of random actions can have long tails: signs count. A policy no better than random gets there once in 478
+    # times.
     assert (ours > random).sum() >= 14, told
 
 

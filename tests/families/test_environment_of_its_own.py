@@ -1,6 +1,6 @@
-"""A family whose packages exclude those installed here: `setup` installs it for real, `check-env` finds nothing, a policy
-beats random, and `evolve` plays a whole run with a worker from its virtual environment. Three workers of different
-installations play a mixed suite together."""
+"""A family whose packages exclude those installed here: `setup` installs it for real, `check-env` finds nothing, a
+policy beats random, and `evolve` plays a whole run with a worker from its virtual environment. Three workers of
+different installations play a mixed suite together."""
 
 from __future__ import annotations
 
@@ -65,8 +65,8 @@ print(json.dumps(found))
 
 
 def from_a_wheel(folder: Path) -> Path:
-    """The `evopolicy-worker` of a virtual environment in which a wheel is installed: no clone is near. What it requires is
-    read from this one."""
+    """The `evopolicy-worker` of a virtual environment in which a wheel is installed: no clone is near. What it requires
+    is read from this one."""
     build = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(folder)]
     subprocess.run(build, cwd=ROOT, check=True, capture_output=True)
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(folder / "venv")], check=True)

@@ -1,4 +1,5 @@
-"""Episodes beside the libraries' own loops: for each family a seeded sample, bit for bit, with dtypes and the last observation."""
+"""Episodes beside the libraries' own loops: for each family a seeded sample, bit for bit, with dtypes and the last
+observation."""
 
 from __future__ import annotations
 

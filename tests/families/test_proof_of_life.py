@@ -1,4 +1,5 @@
-"""Each family of environments lives: a policy of ours beats random on cases fixed beforehand, and `check-env` finds nothing."""
+"""Each family of environments lives: a policy of ours beats random on cases fixed beforehand, and `check-env` finds
+nothing."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""`evolve` plays a whole run in each family of environments, through gateway, coordinator and worker, with videos where the
-family renders. One local cluster plays them all."""
+"""`evolve` plays a whole run in each family of environments, through gateway, coordinator and worker, with videos where
+the family renders. One local cluster plays them all."""
 
 from __future__ import annotations
 

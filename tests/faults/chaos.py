@@ -1,9 +1,10 @@
 """Several faults at once, at random: `fault_matrix.py --chaos SECONDS`.
 
-Processes of every role are killed, or stopped for a while, by a Poisson process that hits up to three at a time. Meanwhile
-a coordinator, two workers and operators' commands play single runs and sweeps, several at once, over and over. A command
-that was killed is given again. Every run must be that of its undisturbed twin, up to the published list, its budget spent
-to the episode; afterwards no process, no folder and no semaphore may be left over, and no log may hold a traceback.
+Processes of every role are killed, or stopped for a while, by a Poisson process that hits up to three at a time.
+Meanwhile a coordinator, two workers and operators' commands play single runs and sweeps, several at once, over and
+over. A command that was killed is given again. Every run must be that of its undisturbed twin, up to the published
+list, its budget spent to the episode; afterwards no process, no folder and no semaphore may be left over, and no log
+may hold a traceback.
 """
 
 from __future__ import annotations
@@ -64,7 +65,8 @@ Tell = Callable[[str], None]
 def slowness() -> float:
     """How much longer all takes here than on a machine that does nothing else; from 1.
 
-    Rounds are hit as often, by their own measure, and are as patient: what is killed before it has started comes to no end.
+    Rounds are hit as often, by their own measure, and are as patient: what is killed before it has started comes to no
+    end.
     """
     return max(1.0, os.getloadavg()[0] / (2 * (os.cpu_count() or 1)))
 

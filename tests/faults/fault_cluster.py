@@ -51,8 +51,8 @@ KINDS = {
 """Words of a process's program, and of its command line."""
 ZYGOTE_DEPTH = 2 if os.geteuid() == 0 else 0
 Site = Literal["one host", "two hosts", "relay", "clock that jumps", "bad disks"]
-"""One host: worker and coordinator by a unix socket that `WeakLink` passes on. Two hosts: by TCP over a cable. Relay: all by TCP
-that `WeakLink` passes on, gateways and commands too."""
+"""One host: worker and coordinator by a unix socket that `WeakLink` passes on. Two hosts: by TCP over a cable. Relay:
+all by TCP that `WeakLink` passes on, gateways and commands too."""
 
 AGENT = '''
 import http.client, json, os, pathlib, sys, time, urllib.error, urllib.request

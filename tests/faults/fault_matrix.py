@@ -1,10 +1,10 @@
 """Kills, freezes and starves real processes at seeded instants of whole runs: `python tests/faults/fault_matrix.py`.
 
-A row: what was done to what, after how many episodes of the run, and what came of it. A run must end by itself (when its
-command was killed: after that was given again, with `--resume`), its directory be that of the undisturbed run up to the
-published list (`evopolicy_common.records.run_difference`), its budget spent to the episode, and no process be left over. A worker
-that was frozen past its leases must say so. Exit code 1 when anything is not as it must be. With `--chaos SECONDS` instead:
-several faults at once, at random (`chaos.py`); another seed by `--first-seed`.
+A row: what was done to what, after how many episodes of the run, and what came of it. A run must end by itself (when
+its command was killed: after that was given again, with `--resume`), its directory be that of the undisturbed run up to
+the published list (`evopolicy_common.records.run_difference`), its budget spent to the episode, and no process be left
+over. A worker that was frozen past its leases must say so. Exit code 1 when anything is not as it must be. With
+`--chaos SECONDS` instead: several faults at once, at random (`chaos.py`); another seed by `--first-seed`.
 """
 
 from __future__ import annotations

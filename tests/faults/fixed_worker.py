@@ -1,5 +1,5 @@
-"""The worker's command, of one code version through all its restarts, also where its files are edited meanwhile: a run is
-pinned to the version it began with, and would rightly wait for it."""
+"""The worker's command, of one code version through all its restarts, also where its files are edited meanwhile: a run
+is pinned to the version it began with, and would rightly wait for it."""
 
 from __future__ import annotations
 

@@ -53,8 +53,8 @@ def full_file_system(folder: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def read_only_mount(folder: Path) -> Iterator[None]:
-    """Whatever is opened for writing below `folder` ends with EROFS. What is open already can be written: the kernel refuses to
-    remount a file system with such files."""
+    """Whatever is opened for writing below `folder` ends with EROFS. What is open already can be written: the kernel
+    refuses to remount a file system with such files."""
     subprocess.run(["mount", "--bind", folder, folder], check=True)
     subprocess.run(["mount", "-o", "remount,bind,ro", folder], check=True)
     try:

@@ -1,7 +1,8 @@
 """Real processes are killed, frozen and starved at seeded instants of whole runs, and every run comes to the same.
 
-All runs are played by `fault_matrix.py`, in a process of its own because it adopts whatever is left over; each test waits
-for its row. All kinds of faults: `pytest tests/faults --fault-seeds 1`, more instants of each by a larger number; the table:
+All runs are played by `fault_matrix.py`, in a process of its own because it adopts whatever is left over; each test
+waits for its row. All kinds of faults: `pytest tests/faults --fault-seeds 1`, more instants of each by a larger number;
+the table:
 `make faults`.
 """
 

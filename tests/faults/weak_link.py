@@ -1,4 +1,5 @@
-"""A link to the coordinator that can be cut, stalled, slowed or garbled: bytes passed on between sockets, unix or TCP."""
+"""A link to the coordinator that can be cut, stalled, slowed or garbled: bytes passed on between sockets, unix or
+TCP."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Whoever reads a command's output may stop reading, as `head -1` does: the command ends quietly, as SIGPIPE would have it."""
+"""Whoever reads a command's output may stop reading, as `head -1` does: the command ends quietly, as SIGPIPE would have
+it."""
 
 from __future__ import annotations
 
@@ -25,7 +26,8 @@ TIMEOUT_S = 300
 
 
 def closed(*words: str, lines: int = 0, cwd: Path | None = None) -> tuple[int, str]:
-    """Exit status of a command whose output is read for so many lines and no further, and its stderr but for what it waits for."""
+    """Exit status of a command whose output is read for so many lines and no further, and its stderr but for what it
+    waits for."""
     reader, writer = os.pipe()
     program = [sys.executable, "-m", MODULES[words[0]], *words[1:]]
     if not lines:

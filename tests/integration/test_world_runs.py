@@ -1,4 +1,5 @@
-"""A whole run in a world: its key reaches nothing that the agent or the operator can read, and the run can be verified."""
+"""A whole run in a world: its key reaches nothing that the agent or the operator can read, and the run can be
+verified."""
 
 from __future__ import annotations
 

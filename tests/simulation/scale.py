@@ -1,8 +1,8 @@
 """Scale run: the core alone, from 10 to 2,000 workers, with a hundred thousand jobs; prints what a job costs it.
 
-A job's cost is the CPU time of the core and nothing else: the workers here answer at once and the store drops its rows. It
-must stay flat, and memory must not grow with finished jobs: it is measured in a second pass, after two fifths of them (when
-the core's trace, of fixed size, is full) and at the end.
+A job's cost is the CPU time of the core and nothing else: the workers here answer at once and the store drops its rows.
+It must stay flat, and memory must not grow with finished jobs: it is measured in a second pass, after two fifths of
+them (when the core's trace, of fixed size, is full) and at the end.
 
     python tests/simulation/scale.py [--jobs 1000000] [--workers 10,100,1000,2000]
 """

@@ -26,7 +26,8 @@ APPS = {
 
 
 def blocks_of_commands(path: Path) -> list[list[list[str]]]:
-    """For each fenced block that has any, our own commands in order, as words, whatever they are started with; none of diagrams."""
+    """For each fenced block that has any, our own commands in order, as words, whatever they are started with; none of
+    diagrams."""
     blocks = re.findall(r"^```(\w*)\n(.*?)^```$", path.read_text(), re.DOTALL | re.MULTILINE)
     plain = [text for language, text in blocks if not language and "─" not in text]
     found = [[_command(line) for line in text.splitlines()] for text in plain]

@@ -1,4 +1,5 @@
-"""Commands of ours as processes that are forked where all that commands import is imported: without the start of Python."""
+"""Commands of ours as processes that are forked where all that commands import is imported: without the start of
+Python."""
 
 from __future__ import annotations
 

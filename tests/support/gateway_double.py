@@ -1,5 +1,5 @@
-"""The coordinator of one gateway: its real service and core in this process, over a real Zenoh session, and a worker whose
-results are scripted. What a gateway is told (statuses, budgets, refusals, pages) is the core's."""
+"""The coordinator of one gateway: its real service and core in this process, over a real Zenoh session, and a worker
+whose results are scripted. What a gateway is told (statuses, budgets, refusals, pages) is the core's."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Tools whose requirements exclude versions that are tested here: installations of their own, which also have everything of this
-one. They are made once and kept in `build/`."""
+"""Tools whose requirements exclude versions that are tested here: installations of their own, which also have
+everything of this one. They are made once and kept in `build/`."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Gives every option and argument of every command bad values, and tells the command's faults.
 
-A command runs in a fork of a process that has imported it, in a folder of its own. It is stopped where it would start another program:
-by then it has accepted its options.
+A command runs in a fork of a process that has imported it, in a folder of its own. It is stopped where it would start
+another program: by then it has accepted its options.
 """
 
 from __future__ import annotations
@@ -100,7 +100,8 @@ BASES = {
     "evopolicy-worker check-env": ["{env}", "--steps=2"],
     "evopolicy-worker setup": ["{family}", "--into=installed"],
 }
-"""The words of a command that is otherwise right. Where a command has no words here, its required arguments stand alone."""
+"""The words of a command that is otherwise right. Where a command has no words here, its required arguments stand
+alone."""
 ARGUMENTS = {
     "policy_dir": "policy",
     "run_directory": "runs/Agent-A/gym_acrobot/exp",

@@ -1,4 +1,5 @@
-"""The families of environments whose proof of life is tested: `tests/families/table.toml`, a row each, and the cases."""
+"""The families of environments whose proof of life is tested: `tests/families/table.toml`, a row each, and the
+cases."""
 
 from __future__ import annotations
 
@@ -49,7 +50,8 @@ def table() -> list[Proof]:
 
 
 def together() -> list[Proof]:
-    """The rows of families that share one installation; a family that excludes the others' packages has tests with its own."""
+    """The rows of families that share one installation; a family that excludes the others' packages has tests with its
+    own."""
     return [each for each in table() if not installs.installs()[installs.family_of(each.env)].pins]
 
 

@@ -137,7 +137,8 @@ class Forger:
         self.files[contents.JOURNAL] = contents.journal_lines(lines)
 
     def begin_anew(self, change: Callable[[dict[str, Any]], Any], folder: str = "runs/0000") -> None:
-        """Changes a run's result as a coordinator could that cheats from the start: journal, `run.json`, and returns agree."""
+        """Changes a run's result as a coordinator could that cheats from the start: journal, `run.json`, and returns
+        agree."""
         name = f"{folder}/{contents.RESULT}"
         self.json(name, change)
         result = json.loads(self.files[name])
@@ -180,7 +181,8 @@ class Forger:
             self.put(name, record)
 
     def sign(self, state: Path | None = None) -> None:
-        """Makes digests, head and signature anew, with the key of the coordinator in `state`, or a key of the forger's."""
+        """Makes digests, head and signature anew, with the key of the coordinator in `state`, or a key of the
+        forger's."""
         folders = sorted({name[:9] for name in self.files if name.startswith("runs/")})
         manifest = json.loads(self.files[contents.MANIFEST])
         manifest["files"] = {}

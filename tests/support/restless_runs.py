@@ -14,7 +14,8 @@ SIZE = ("--budget", str(BUDGET), "--validation", "4", "--heldout", "4")
 
 
 def agent_code(pause_s: float) -> str:
-    """An agent for `toy/line` that makes three submits; each episode begins with a pause, so that the second takes a while."""
+    """An agent for `toy/line` that makes three submits; each episode begins with a pause, so that the second takes a
+    while."""
     return f'''
 open("system/policy.py", "w").write("""
 import time

@@ -53,13 +53,16 @@ COLUMNS = (
 
 
 class InASlot(msgspec.Struct, frozen=True, kw_only=True):
-    """The cost of a worker's slot that plays the environment, with its policy, and of the bare environment beside it."""
+    """The cost of a worker's slot that plays the environment, with its policy, and of the bare environment beside
+    it."""
 
     bare_us: float = 0.0
-    """Processor time of a step of the library's environment without the adapter, and without accelerations, µs; the median of
+    """Processor time of a step of the library's environment without the adapter, and without accelerations, µs; the
+    median of
     `TURNS`. 0: not measured, as of an episode of one step."""
     slot_us: float = 0.0
-    """Processor time of the same steps in the slot, with its policy, recording and accelerations, in turns, µs; 0: not measured, as where they take less than `LEAST_S` together."""
+    """Processor time of the same steps in the slot, with its policy, recording and accelerations, in turns, µs; 0: not
+    measured, as where they take less than `LEAST_S` together."""
     busy: bool = False
     """Whether the machine had more to do than it has cores."""
     memory_mb: int = 0
@@ -112,8 +115,8 @@ class Checked(msgspec.Struct, frozen=True):
 
 
 def check(env_ids: Sequence[str], steps: int, definitions: Iterable[Entry]) -> Iterator[Checked]:
-    """Yields each environment when both processes and a slot have played it. Raises WorkerError when one of the processes ends
-    too early."""
+    """Yields each environment when both processes and a slot have played it. Raises WorkerError when one of the
+    processes ends too early."""
     definitions = tuple(definitions)
     encoded = msgspec.json.encode(definitions)
     processes = []
@@ -198,8 +201,8 @@ def bare_loop(definitions: tuple[Entry, ...]) -> Iterator[Callable[[str], Stretc
 
 
 async def in_a_slot(env_id: str, definitions: tuple[Entry, ...], bare: Callable[[str], Stretch]) -> InASlot:
-    """Plays the begin of one train episode bare, and in a slot of its own once for one step and once for all its steps: the
-    difference is of steps alone."""
+    """Plays the begin of one train episode bare, and in a slot of its own once for one step and once for all its steps:
+    the difference is of steps alone."""
     tier = available_tiers(unsandboxed=True)[0]
     with scratch_folder("check") as scratch:
         slot = Slot(None, tier, scratch / "slot", definitions=definitions)
@@ -290,10 +293,10 @@ def command(
 
     Example: evopolicy-worker check-env gymnasium/CartPole-v1 my_pkg:MyEnv-v0
 
-    The rules: observations within their spaces; invalid actions repaired; the same episode when repeated (fresh, reused, in
-    another process, rendered); no seed in observations or info; the step limit; nothing pickled. The table also shows the time of
-    a step, alone and in a worker's slot, and the memory of the slot. Environments run with your rights, except in the slot. Exit
-    code 1 if one breaks a rule.
+    The rules: observations within their spaces; invalid actions repaired; the same episode when repeated (fresh,
+    reused, in another process, rendered); no seed in observations or info; the step limit; nothing pickled. The table
+    also shows the time of a step, alone and in a worker's slot, and the memory of the slot. Environments run with your
+    rights, except in the slot. Exit code 1 if one breaks a rule.
     """
     use_browser(browser)
     with fail_on_our_errors():
@@ -347,8 +350,8 @@ def read(results: Path) -> dict[str, Checked]:
 
 
 def page(results: Path, earlier: str = "", ids: Sequence[str] | None = None) -> str:
-    """A Markdown table of the results in a file, with the number of environments played. `earlier`: a text whose rows stay
-    where the file has none. `ids`: the environments, in order; by default the catalogue's."""
+    """A Markdown table of the results in a file, with the number of environments played. `earlier`: a text whose rows
+    stay where the file has none. `ids`: the environments, in order; by default the catalogue's."""
     rows = {
         row[0].strip("`"): row for line in earlier.splitlines() if len(row := _cells(line)) == len(COLUMNS)
     }

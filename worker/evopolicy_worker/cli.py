@@ -135,7 +135,8 @@ def work(
 
     Example: evopolicy-worker --env core16 --connect tls/10.0.0.5:7447 --credentials gpu-7
 
-    Waits until the coordinator answers. After SIGTERM or Ctrl-C it finishes running episodes, returns its other leases, and exits.
+    Waits until the coordinator answers. After SIGTERM or Ctrl-C it finishes running episodes, returns its other leases,
+    and exits.
     """
     if context.invoked_subcommand is not None:
         return

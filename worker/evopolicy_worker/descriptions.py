@@ -2,12 +2,12 @@
 
 Rules:
 - A description holds for one fingerprint: this software's code, the environment's definition, the versions of its
-  packages, Python. The cache has the last description of each shipped environment whose fingerprint is known without making
-  it. This process makes none: it has the worker's credentials and is in no jail.
-- At the start a worker describes what does not ship, since operators approve it by its digest, and at most `AT_ONCE` shipped
-  environments. It announces other shipped ones undescribed, and describes them once runs wait for them.
-- An environment that cannot be described, or fails its try-out, is not offered. The worker announces the reason, goes on with
-  the others, and tries it again from time to time.
+  packages, Python. The cache has the last description of each shipped environment whose fingerprint is known without
+  making it. This process makes none: it has the worker's credentials and is in no jail.
+- At the start a worker describes what does not ship, since operators approve it by its digest, and at most `AT_ONCE`
+  shipped environments. It announces other shipped ones undescribed, and describes them once runs wait for them.
+- An environment that cannot be described, or fails its try-out, is not offered. The worker announces the reason, goes
+  on with the others, and tries it again from time to time.
 """
 
 from __future__ import annotations
@@ -123,11 +123,11 @@ def sorted_out(
 async def describe_all(
     env_ids: Sequence[str], slot: Describes, cache: Cache | None = None
 ) -> tuple[tuple[EnvironmentDescription, ...], dict[str, str]]:
-    """Descriptions of environments, and by id the reasons why others have none. They are made in the slot, as this process must
-    not import simulators. It stays started.
+    """Descriptions of environments, and by id the reasons why others have none. They are made in the slot, as this
+    process must not import simulators. It stays started.
 
-    Starts the slot again when its processes are killed meanwhile; at most `TRIES` attempts for each. Raises WorkerError when
-    the slot does not start.
+    Starts the slot again when its processes are killed meanwhile; at most `TRIES` attempts for each. Raises WorkerError
+    when the slot does not start.
     """
     found: list[EnvironmentDescription] = []
     failed: dict[str, str] = {}

@@ -73,8 +73,8 @@ class Outbox:
         on_settled: Callable[[JobResult], None],
         more_follow: Callable[[], bool],
     ) -> None:
-        """`register_again` receives a session and its refusal, and tells whether it registered anew; `on_settled` each result that
-        left. `more_follow`: whether leased jobs wait for a slot; when none does any more, call `hurry`."""
+        """`register_again` receives a session and its refusal, and tells whether it registered anew; `on_settled` each
+        result that left. `more_follow`: whether leased jobs wait for a slot; when none does any more, call `hurry`."""
         self._ask = ask
         self._worker = worker
         self._session = session

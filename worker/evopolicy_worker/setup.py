@@ -73,8 +73,8 @@ def command(
 
     Example: evopolicy-worker setup mo_gymnasium
 
-    Use this for families whose packages conflict with those installed here, or to keep this installation unchanged. Local
-    commands find the virtual environment and start a worker from it.
+    Use this for families whose packages conflict with those installed here, or to keep this installation unchanged.
+    Local commands find the virtual environment and start a worker from it.
     """
     use_browser(browser)
     with fail_on_our_errors():
@@ -316,8 +316,8 @@ def _try(made: Made, family: str) -> None:
 
 
 def _link(folder: Path, name: str) -> None:
-    """Makes local commands find a virtual environment in another folder. They use the latest, so that one in the default
-    folder stays beside it."""
+    """Makes local commands find a virtual environment in another folder. They use the latest, so that one in the
+    default folder stays beside it."""
     root = installs.root()
     if folder.parent.resolve() == root.resolve():
         return

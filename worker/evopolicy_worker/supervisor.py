@@ -315,8 +315,8 @@ class Supervisor:
             self._describing = asyncio.create_task(self._describe_wanted(wanted))
 
     async def _describe_wanted(self, wanted: Sequence[str]) -> None:
-        """Describes environments that runs wait for, or that failed before, and registers with the outcome. Where no slot starts,
-        it is tried again when the next heartbeat asks."""
+        """Describes environments that runs wait for, or that failed before, and registers with the outcome. Where no
+        slot starts, it is tried again when the next heartbeat asks."""
         assert self._describe is not None
         log.info("describing", environments=wanted)
         try:
@@ -334,8 +334,8 @@ class Supervisor:
                 await self._register()
 
     async def _try_again(self) -> None:
-        """Tries tiers and environments that do not work from time to time, and registers with each that does, or has another
-        reason."""
+        """Tries tiers and environments that do not work from time to time, and registers with each that does, or has
+        another reason."""
         pause_s = PROBE_PAUSE_S
         while True:
             await asyncio.sleep(pause_s)

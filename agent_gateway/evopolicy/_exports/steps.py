@@ -1,8 +1,8 @@
 """An agent's log as steps: prompts, messages with tool calls and their results, notes of ours.
 
-`logs/agent.jsonl` holds a harness's raw stream. The known forms are those of `stream-json` (Claude Code, the built-in LLM
-agent, agents of the Agent Client Protocol), Codex's `exec --json`, the turn protocol, and plain lines. Other lines are
-skipped. An agent may write anything there, so reading takes linear time and bounded memory, and raises for nothing.
+`logs/agent.jsonl` holds a harness's raw stream. The known forms are those of `stream-json` (Claude Code, the built-in
+LLM agent, agents of the Agent Client Protocol), Codex's `exec --json`, the turn protocol, and plain lines. Other lines
+are skipped. An agent may write anything there, so reading takes linear time and bounded memory, and raises for nothing.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ MAX_LOG_BYTES = 64 << 20
 """Later bytes of a log are not read; a last step says so."""
 _MAX_DEPTH = 8
 _MAX_LEVELS = 100
-"""Lines whose values are nested deeper are skipped: no reader or writer of JSON here may run out of stack on what another one read."""
+"""Lines whose values are nested deeper are skipped: no reader or writer of JSON here may run out of stack on what
+another one read."""
 _NOTES = ("turn_failed", "paused", "permission", "log_full")
 """Lines of our own that explain what the agent met."""
 

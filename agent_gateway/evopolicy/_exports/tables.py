@@ -14,7 +14,8 @@ from evopolicy_common.terminal import csv_cell
 
 
 def names(runs: Runs) -> dict[str, str]:
-    """The name of each run below the folder that all have in common, by its path: files for others hold no path of this machine."""
+    """The name of each run below the folder that all have in common, by its path: files for others hold no path of this
+    machine."""
     folders = [run.folder for run in runs]
     common = os.path.commonpath([(folder, *folder.parents)[:4][-1] for folder in folders]) if folders else ""
     return {str(folder): os.path.relpath(folder, common) for folder in folders}

@@ -1,8 +1,8 @@
 """Runs in experiment trackers: TensorBoard, MLflow, Weights & Biases.
 
 Rules that this module owns:
-- While a run is open, only what its agent sees is sent: the summaries of its submits. Hidden scores follow when `run.json` is
-  there.
+- While a run is open, only what its agent sees is sent: the summaries of its submits. Hidden scores follow when
+  `run.json` is there.
 - A metric's step is the number of train episodes charged so far, so that runs are compared by budget.
 - A tracker remembers how many submits of a run it has, so an export that is repeated or goes on after a stop adds only
   what is missing.
@@ -100,8 +100,9 @@ class Tracker(Protocol):
 def track(paths: list[Path], tracker: Tracker, *, follow: bool) -> Iterator[str]:
     """Sends runs to a tracker, and yields the name of each that is finished.
 
-    With `follow` it continues until every run that is found, and every run of a sweep whose folder is given, is finished; the
-    first may appear later. Raises ConfigError when there is no run and `follow` is off, and for a damaged record.
+    With `follow` it continues until every run that is found, and every run of a sweep whose folder is given, is
+    finished; the first may appear later. Raises ConfigError when there is no run and `follow` is off, and for a damaged
+    record.
     """
     done: set[Path] = set()
     try:
@@ -291,7 +292,8 @@ class MLflow:
                 f"--out {out} is a folder, and MLflow keeps no runs in folders: name a database, such as"
                 " --out sqlite:///mlflow.db, or a server, such as --out http://HOST:5000"
             )
-        # Without it, a local database names a folder of this machine as the place of artifacts, of which there are none.
+        # Without it, a local database names a folder of this machine as the place of artifacts, of which there are
+        # none.
         os.environ.setdefault("_MLFLOW_SERVER_ARTIFACT_ROOT", "mlflow-artifacts:/")
         from mlflow import MlflowClient
 

@@ -1,8 +1,8 @@
 """Train episodes as Minari datasets, one for each environment and entry.
 
-Minari wants the observation after the last step, which feedback does not hold: the last observation is repeated there. The
-spaces are those of the recorded values, since runs do not record their environment's: unbounded boxes of double precision for
-numbers, bytes for pictures, and `Discrete` for whole numbers.
+Minari wants the observation after the last step, which feedback does not hold: the last observation is repeated there.
+The spaces are those of the recorded values, since runs do not record their environment's: unbounded boxes of double
+precision for numbers, bytes for pictures, and `Discrete` for whole numbers.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ _LAST = "The observation after an episode's last step is a copy of the one befor
 def write_minari(runs: Runs, out: Path) -> list[Path]:
     """Writes datasets named `evopolicy/<environment>/<entry>-v0` below `out`; `MINARI_DATASETS_PATH=out` reads them.
 
-    Episodes whose values fit no space, or not that of the others, are left out and named on stderr. Raises ConfigError when
-    a dataset is there already, or when no run has trajectories.
+    Episodes whose values fit no space, or not that of the others, are left out and named on stderr. Raises ConfigError
+    when a dataset is there already, or when no run has trajectories.
     """
     os.environ["MINARI_DATASETS_PATH"] = str(out.absolute())
     import minari
@@ -82,7 +82,8 @@ def write_minari(runs: Runs, out: Path) -> list[Path]:
 
 
 def _of_one_form(buffers: list[Any], about: list[dict[str, Any]]) -> tuple[list[Any], list[dict[str, Any]]]:
-    """The episodes whose values have the most common form; the others, whose policy returned something else, are named."""
+    """The episodes whose values have the most common form; the others, whose policy returned something else, are
+    named."""
     forms = [str((_form(each.observations), _form(each.actions))) for each in buffers]
     usual = Counter(forms).most_common(1)[0][0]
     kept = [index for index, form in enumerate(forms) if form == usual]

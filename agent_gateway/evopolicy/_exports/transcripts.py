@@ -1,4 +1,5 @@
-"""Agents' logs in Harbor's Agent Trajectory Interchange Format (ATIF), and as logs of Inspect. Neither tool is needed."""
+"""Agents' logs in Harbor's Agent Trajectory Interchange Format (ATIF), and as logs of Inspect. Neither tool is
+needed."""
 
 from __future__ import annotations
 

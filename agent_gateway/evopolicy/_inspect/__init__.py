@@ -1,5 +1,5 @@
-"""Tasks for Inspect: `inspect eval evopolicy/core16 --model …`. Inspect's model and solver are the agent; budget, hidden cases
-and score are those of a run of ours.
+"""Tasks for Inspect: `inspect eval evopolicy/core16 --model …`. Inspect's model and solver are the agent; budget,
+hidden cases and score are those of a run of ours.
 
 Each sample is one run. The task's setup opens it, and its scorer closes it. Meanwhile an agent counts as alive on this
 machine, so no hidden case of the run is played here. The model works through tools that read the workspace, write the
@@ -82,7 +82,8 @@ class _Live(NamedTuple):
 
 
 _live: dict[str, _Live] = {}
-"""Runs of this process by their folders. A sample's store holds the folder only, because Inspect writes it to its log."""
+"""Runs of this process by their folders. A sample's store holds the folder only, because Inspect writes it to its
+log."""
 Where = tuple[str | None, str | None, int, str | None]
 """Endpoint and credentials of a running cluster, or two None; slots and state folder of a local one."""
 _clusters: dict[Where, Cluster] = {}

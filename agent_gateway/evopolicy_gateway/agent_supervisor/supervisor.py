@@ -186,7 +186,8 @@ async def _play(
 
 
 def secrets_in(environment: Mapping[str, str], config: AgentConfig | None) -> dict[str, str]:
-    """Variables whose values may be secrets; those that the agent's settings pass on always count, whatever their names."""
+    """Variables whose values may be secrets; those that the agent's settings pass on always count, whatever their
+    names."""
     named = {} if config is None else {f"{name}_KEY": environment.get(name, "") for name in config.secret}
     return {**environment, **named}
 

@@ -1,8 +1,8 @@
 """A client of the HTTP protocol for agents: `/info`, `/task` and `/submit`, with retries while the gateway is busy or
 away.
 
-It knows the three URLs, and a remote agent's token. It sends a submit with an idempotency key and `?wait=false`, then polls until
-the submit is done. So no single request lasts long, and a lost reply loses nothing.
+It knows the three URLs, and a remote agent's token. It sends a submit with an idempotency key and `?wait=false`, then
+polls until the submit is done. So no single request lasts long, and a lost reply loses nothing.
 """
 
 from __future__ import annotations

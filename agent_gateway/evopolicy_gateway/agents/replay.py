@@ -3,8 +3,8 @@
 Run as `python -m evopolicy_gateway.agents.replay DIR` in the workspace, with the `EVOPOLICYGYM_*` URLs set. A policy is
 a folder with a `policy.py` (such as a run's `checkpoints/submit_NNN/`), or with a `system/` that has one (such as a
 workspace). DIR is either a policy, or its subfolders are policies, which are submitted in sorted order. If DIR has a
-folder named like the environment, with `_` for `/` and `:`, that folder is used instead: so one DIR serves many environments,
-such as `examples/policies`.
+folder named like the environment, with `_` for `/` and `:`, that folder is used instead: so one DIR serves many
+environments, such as `examples/policies`.
 """
 
 from __future__ import annotations

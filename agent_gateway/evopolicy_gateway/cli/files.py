@@ -1,4 +1,5 @@
-"""`evopolicy files` and `evopolicy texts`: the files in the package that are not code, for installations without a clone."""
+"""`evopolicy files` and `evopolicy texts`: the files in the package that are not code, for installations without a
+clone."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """`evopolicy`: a table of all commands. A command's module is imported when it is called.
 
-Help and completion therefore cost little more than typer itself. `tests/unit/test_start.py` checks the imports of this module, and
-compares the table with the commands' own help.
+Help and completion therefore cost little more than typer itself. `tests/unit/test_start.py` checks the imports of this
+module, and compares the table with the commands' own help.
 """
 
 from __future__ import annotations
@@ -177,8 +177,9 @@ app = App(cls=_TopLevel, no_args_is_help=True, add_completion=True)
 def evopolicy(_: Version = False) -> None:
     """Evaluate agents that improve executable policies: play runs, and report their results.
 
-    Exit codes of commands that play runs: 0 every run completed, 1 something failed, 2 a wrong option, 3 a run ended without
-    an ok submit, 4 an agent failed, 5 a run was cancelled, 130 Ctrl-C. Of several runs, the most serious counts: 1, 5, 4, 3.
+    Exit codes of commands that play runs: 0 every run completed, 1 something failed, 2 a wrong option, 3 a run ended
+    without an ok submit, 4 an agent failed, 5 a run was cancelled, 130 Ctrl-C. Of several runs, the most serious
+    counts: 1, 5, 4, 3.
     """
 
 

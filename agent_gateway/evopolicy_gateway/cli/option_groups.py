@@ -1,6 +1,7 @@
 """Options of commands, made from their declarations (`evopolicy_gateway/declared.py`).
 
-A command takes a Struct of options as one parameter, `Annotated[…, Shown(…)]` where its options differ, or a single one as
+A command takes a Struct of options as one parameter, `Annotated[…, Shown(…)]` where its options differ, or a single one
+as
 `Annotated[type, Of(Struct)]`.
 """
 

@@ -61,7 +61,8 @@ def run(
 ) -> None:
     """Play one run on a cluster.
 
-    Opens the run at the coordinator, starts its gateway and its agent on this machine, and ends when run.json is written.
+    Opens the run at the coordinator, starts its gateway and its agent on this machine, and ends when run.json is
+    written.
     """
     with fail_on_our_errors():
         if local and (connect or credentials_file):
@@ -160,8 +161,9 @@ def try_policy(
 ) -> None:
     """Play a policy on train cases, without a run or an agent.
 
-    Prints the return of each episode. Starts a local cluster unless --connect or --credentials name one; a policy in a run's
-    directory gets the packages of its run, unless --policy-package names others. Exit code 1 if the policy failed.
+    Prints the return of each episode. Starts a local cluster unless --connect or --credentials name one; a policy in a
+    run's directory gets the packages of its run, unless --policy-package names others. Exit code 1 if the policy
+    failed.
     """
     # With numpy, which a command that plays runs does without.
     from evopolicy_gateway.operator import trials

@@ -1,7 +1,7 @@
 """JSON Schemas of the files that people and programs read or write, made from the types that decode these files.
 
-Each schema follows draft 2020-12. Field descriptions are the docstrings that stand below the fields in the source, so the
-schema, the code and `docs/reference/files.md` cannot disagree.
+Each schema follows draft 2020-12. Field descriptions are the docstrings that stand below the fields in the source, so
+the schema, the code and `docs/reference/files.md` cannot disagree.
 """
 
 from __future__ import annotations

@@ -68,8 +68,9 @@ def serve(
 
     Example: evopolicy-gateway runs/evolve/gym_acrobot/first
 
-    `evopolicy run` starts this command itself. Start it by hand to continue an open run after a crash, on the same port. Nothing
-    supervises the agent then: close the run with `evopolicy finish` when the agent has ended. Ctrl-C leaves the run open.
+    `evopolicy run` starts this command itself. Start it by hand to continue an open run after a crash, on the same
+    port. Nothing supervises the agent then: close the run with `evopolicy finish` when the agent has ended. Ctrl-C
+    leaves the run open.
     """
     setup_logging()
     with _failures_in_the_log() if controlled else fail_on_our_errors():

@@ -1,7 +1,7 @@
 """`evopolicy suite`: prints the plan of a sweep and plays it; when repeated, continues it.
 
-Exit codes: 0 every run completed, 1 something failed or was not begun, 2 a wrong option or file, 3 a run ended without an ok
-submit, 4 an agent failed, 5 a run was cancelled, 130 interrupted.
+Exit codes: 0 every run completed, 1 something failed or was not begun, 2 a wrong option or file, 3 a run ended without
+an ok submit, 4 an agent failed, 5 a run was cancelled, 130 interrupted.
 """
 
 from __future__ import annotations

@@ -43,9 +43,11 @@ def harbor(
     ] = None,
     agent_s: Annotated[float, typer.Option(min=1.0, help="Time of the agent in Harbor, seconds.")] = 86400.0,
 ) -> None:
-    """Write a Harbor task for each open run of a remote agent, and serve the runs' scores to Harbor's verifiers until Ctrl-C.
+    """Write a Harbor task for each open run of a remote agent, and serve the runs' scores to Harbor's verifiers until
+    Ctrl-C.
 
-    Called again with the same --tasks and --http, it serves the same tasks. A task is one run, so Harbor can play it once.
+    Called again with the same --tasks and --http, it serves the same tasks. A task is one run, so Harbor can play it
+    once.
     """
     with fail_on_our_errors():
         run_to_end(_serve(listener_of(http, http_url), runs or [], tasks, agent_s))

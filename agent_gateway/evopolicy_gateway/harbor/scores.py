@@ -1,6 +1,7 @@
 """Writes Harbor tasks of open runs, and answers their verifiers with the runs' scores.
 
-- A verifier's request reports the end of its run's agent, as `evopolicy finish` does, and gets the score once it is there.
+- A verifier's request reports the end of its run's agent, as `evopolicy finish` does, and gets the score once it is
+  there.
 - Every request needs the token, which only the tasks' `tests/` have: Harbor's verifier gets them, its agent does not.
 - Nothing but a run's score is told, and only after the run is finished.
 """

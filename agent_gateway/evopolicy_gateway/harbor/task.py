@@ -1,8 +1,8 @@
 """The files of a Harbor task for one open run of a remote agent (`run --agent remote`). Pure.
 
-Harbor starts the agent in a container, with the run's workspace as its working directory and the run's bearer token in its
-environment. Its verifier runs `tests/test.sh` in a container of its own after the agent's container has been stopped: the agent
-has ended then and cannot write the reward.
+Harbor starts the agent in a container, with the run's workspace as its working directory and the run's bearer token in
+its environment. Its verifier runs `tests/test.sh` in a container of its own after the agent's container has been
+stopped: the agent has ended then and cannot write the reward.
 """
 
 from __future__ import annotations
@@ -58,7 +58,8 @@ def _toml(text: str) -> str:
 
 
 def task_files(folder: RunFolder, *, env: str, url: str, token: str, agent_s: float) -> Mapping[str, str]:
-    """The task's files by path. `url`, `token`: where its verifier gets the score; `agent_s`: the agent's time, seconds."""
+    """The task's files by path. `url`, `token`: where its verifier gets the score; `agent_s`: the agent's time,
+    seconds."""
     name = task_name(folder)
     volumes = [
         {

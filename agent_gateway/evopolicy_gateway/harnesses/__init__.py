@@ -44,7 +44,8 @@ _DIALECTS: dict[str, type[Dialect]] = {"codex": Codex, "claude-code": ClaudeCode
 
 
 def entry_name(agent: str) -> str:
-    """An agent's default leaderboard entry: `evolve`, `replay-gaits`; of a command the program's name, such as `my_agent`."""
+    """An agent's default leaderboard entry: `evolve`, `replay-gaits`; of a command the program's name, such as
+    `my_agent`."""
     kind, _, rest = agent.partition(":")
     if kind == "replay":
         return f"replay-{Path(rest).resolve().name}"

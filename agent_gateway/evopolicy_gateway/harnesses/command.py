@@ -1,10 +1,10 @@
 """Any program as an agent: started in the workspace with the published variables.
 
 It may also use the published turn protocol, JSON lines: it receives `{"type": "prompt", "turn": N, "message": …}` on
-stdin and answers each with one object on stdout, until it sends stop or exits. Once the budget is spent, it gets no more
-prompts, and its stdin is closed. `turn`, `text` and `stop` are optional
-in an answer; an answer that names an earlier turn is ignored. A program that never reads its stdin runs until it exits,
-whatever it prints. An inactive program is ended (`clock.Activity`).
+stdin and answers each with one object on stdout, until it sends stop or exits. Once the budget is spent, it gets no
+more prompts, and its stdin is closed. `turn`, `text` and `stop` are optional in an answer; an answer that names an
+earlier turn is ignored. A program that never reads its stdin runs until it exits, whatever it prints. An inactive
+program is ended (`clock.Activity`).
 """
 
 from __future__ import annotations

@@ -158,7 +158,8 @@ def _below(field: str, path: str, started_in: Path) -> Path:
 
 
 def _files(field: str, root: Path, prefix: str) -> Iterator[tuple[str, File]]:
-    """A file, or all files of a folder, by path from `prefix` on. ConfigError for links, devices, and too many or too large ones."""
+    """A file, or all files of a folder, by path from `prefix` on. ConfigError for links, devices, and too many or too
+    large ones."""
     left, n, pending = MAX_BYTES, 0, [(root, prefix)]
     while pending:
         path, name = pending.pop()

@@ -64,8 +64,8 @@ def keep(
     folder: Path,
     expected: Sequence[AgentInput],
 ) -> Kept:
-    """The copies in `folder`, made where there are none. ConfigError when the declared files, or the copies, are not those
-    with which the run was opened."""
+    """The copies in `folder`, made where there are none. ConfigError when the declared files, or the copies, are not
+    those with which the run was opened."""
     declared = read(skills, servers, started_in)
     _compare([each.recorded for each in declared], expected, "in the agent's file")
     if not (folder / "mcp.json").exists():

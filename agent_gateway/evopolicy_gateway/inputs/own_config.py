@@ -1,4 +1,5 @@
-"""A CLI's configuration and login as a run's own copy: the agent may change it, and nothing of it reaches the operator's folder.
+"""A CLI's configuration and login as a run's own copy: the agent may change it, and nothing of it reaches the
+operator's folder.
 
 Sessions, histories and logs are not copied: they tell of other runs.
 """

@@ -154,11 +154,11 @@ class Jail:
         pids: int | None = None,
         fixed_cores: bool = False,
     ) -> None:
-        """`command`: words that the operator gave, never the agent's. `variables`, `hosts`: names that the agent's settings
-        pass on and let it reach. `packages`: distributions of our Python that it imports. `inputs`: folders and files, each
-        with its place in the jail, which starts with `~/` in the agent's home. `more_programs`: command lines of programs
-        that the agent starts. `pids`: greatest number of processes, by a resource limit. `fixed_cores`:
-        programs cannot change their affinity.
+        """`command`: words that the operator gave, never the agent's. `variables`, `hosts`: names that the agent's
+        settings pass on and let it reach. `packages`: distributions of our Python that it imports. `inputs`: folders
+        and files, each with its place in the jail, which starts with `~/` in the agent's home. `more_programs`: command
+        lines of programs that the agent starts. `pids`: greatest number of processes, by a resource limit.
+        `fixed_cores`: programs cannot change their affinity.
 
         `started_in`: folder to which the operator's paths are relative.
         """

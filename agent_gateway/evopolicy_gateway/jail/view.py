@@ -126,8 +126,8 @@ class View(msgspec.Struct, frozen=True, kw_only=True):
         return words
 
     def _make_way(self, path: str) -> None:
-        """Removes links that an earlier program of the agent left in its home or /tmp on the way to a mount or link, or in its
-        place: bubblewrap would follow them while it still sees the whole machine."""
+        """Removes links that an earlier program of the agent left in its home or /tmp on the way to a mount or link, or
+        in its place: bubblewrap would follow them while it still sees the whole machine."""
         for shown, name in ((self.home, "home"), ("/tmp", "tmp")):
             if not _is_in(path, shown):
                 continue
@@ -173,7 +173,8 @@ def _bubblewrap() -> list[str]:
 
 
 def confined(read: Sequence[Path], write: Sequence[Path]) -> list[str]:
-    """The bubblewrap command, up to the program, for a process of our own that needs the network: it sees the system, `read` and
+    """The bubblewrap command, up to the program, for a process of our own that needs the network: it sees the system,
+    `read` and
     `write`, and no variable but those of its proxy and certificates."""
     command = [
         *_bubblewrap(),

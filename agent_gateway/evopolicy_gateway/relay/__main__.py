@@ -1,4 +1,5 @@
-"""The relay's process: `python -m evopolicy_gateway.relay FD`. FD is the listening socket; the order comes as a line on stdin.
+"""The relay's process: `python -m evopolicy_gateway.relay FD`. FD is the listening socket; the order comes as a line on
+stdin.
 
 It prints events of `processes/child_messages.py` on stdout, and ends with its stdin.
 """

@@ -1,6 +1,7 @@
 """Reads token counts from a model API's answers, in JSON or as a stream of events (SSE). No I/O.
 
-Each API is one row of `SHAPES`. An answer is whatever its sender says: a count that is no count is estimated from the text, at
+Each API is one row of `SHAPES`. An answer is whatever its sender says: a count that is no count is estimated from the
+text, at
 `CHARS_PER_TOKEN`, and so is one that a broken stream or a server without counts did not send.
 """
 
@@ -102,8 +103,8 @@ class AnswerReader:
     """Reads one answer as it comes."""
 
     def __init__(self, shape: Shape, *, events: bool, drops_usage: bool = False) -> None:
-        """`events`: a stream of events, else one JSON document. `drops_usage`: an event with nothing but counts, which the agent did
-        not ask for, is left out of what passes on."""
+        """`events`: a stream of events, else one JSON document. `drops_usage`: an event with nothing but counts, which
+        the agent did not ask for, is left out of what passes on."""
         self.complete = False
         """Whether the answer has told its last counts."""
         self._shape = shape
@@ -117,7 +118,8 @@ class AnswerReader:
         self._model = ""
 
     def feed(self, data: bytes) -> bytes:
-        """Reads the next bytes. Returns those that pass on: whole events, and all of a JSON document at once with `end`."""
+        """Reads the next bytes. Returns those that pass on: whole events, and all of a JSON document at once with
+        `end`."""
         searched = max(0, len(self._held) - 3)
         self._held += data
         if len(self._held) > MAX_EVENT_BYTES:

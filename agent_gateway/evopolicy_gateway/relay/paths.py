@@ -7,8 +7,8 @@ from typing import Any
 
 
 def values(document: Any, path: str) -> Iterator[Any]:
-    """Yields every value at a dotted path; nothing for an empty path. `*` stands for each element of a list, and `[name=value]` for an
-    object with that value."""
+    """Yields every value at a dotted path; nothing for an empty path. `*` stands for each element of a list, and
+    `[name=value]` for an object with that value."""
     if not path:
         return
     if path.startswith("["):

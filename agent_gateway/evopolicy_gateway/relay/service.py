@@ -253,8 +253,8 @@ class Relay:
             self._note(text)
 
     def trouble(self, what: str, stated_s: float | None) -> float:
-        """Seconds until the next try, after a failure that another try may resolve: as stated, or longer each time. Tells the operator
-        of the first."""
+        """Seconds until the next try, after a failure that another try may resolve: as stated, or longer each time.
+        Tells the operator of the first."""
         wait_s = stated_s if stated_s is not None else min(MAX_RETRY_S, _FIRST_RETRY_S * 2.0**self._troubles)
         self._troubles = min(self._troubles + 1, 10)
         if self._troubles == 1:
@@ -424,7 +424,8 @@ async def _all(answer: Answer, limit: int) -> bytes:
 
 
 async def _unpacked(answer: Answer) -> AsyncIterator[bytes]:
-    """The answer's bytes, unpacked in pieces of bounded size: a small compressed answer may hold very many. Raises ValueError."""
+    """The answer's bytes, unpacked in pieces of bounded size: a small compressed answer may hold very many. Raises
+    ValueError."""
     coding = answer.headers.get("content-encoding", "identity").strip().lower()
     if coding not in ("identity", "gzip", "x-gzip", "deflate"):
         raise ValueError(

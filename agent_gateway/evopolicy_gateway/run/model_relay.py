@@ -1,7 +1,7 @@
 """The relay of one run: its process, which is started again when it dies, and the address and token for the agent.
 
-It is a child of the command that plays the run and not of the agent's supervisor, which ends all that is below it and holds no
-credentials. The command keeps the listening socket, so that a relay that is started again has its address.
+It is a child of the command that plays the run and not of the agent's supervisor, which ends all that is below it and
+holds no credentials. The command keeps the listening socket, so that a relay that is started again has its address.
 """
 
 from __future__ import annotations

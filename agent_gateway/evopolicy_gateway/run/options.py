@@ -43,7 +43,8 @@ OWN = {
 
 
 def settings_of(profile: str | None, **given: str | None) -> dict[str, str]:
-    """The settings that a profile decides, and the profile; `given` by name of `RunSettings`, None for what was not given.
+    """The settings that a profile decides, and the profile; `given` by name of `RunSettings`, None for what was not
+    given.
 
     ConfigError for a profile that there is not, or that sets otherwise what was given.
     """
@@ -172,7 +173,8 @@ def cases_of(text: str) -> tuple[int, ...]:
 
 
 def packages_for(policy: Path, requested: Sequence[str] | None) -> tuple[str, ...]:
-    """The packages of `--policy-package`; where it is not given, those of the run to whose directory the policy belongs.
+    """The packages of `--policy-package`; where it is not given, those of the run to whose directory the policy
+    belongs.
 
     Raises ConfigError when policies cannot have one of those."""
     if requested:

@@ -3,8 +3,9 @@
 These are `checkpoints/`, `replays/`, `logs/env.log`, the selected policy in `workspace/system/`, and `run.json` last.
 They hold hidden scores, so `write` is called only when the agent and all its children are gone.
 
-The run's result is fixed by then, and no file costs it: one that a bug keeps from being written is left out, with a note.
-A full disk, a lost connection, or a folder of another user ends `write`; `--resume` then writes all files without the agent.
+The run's result is fixed by then, and no file costs it: one that a bug keeps from being written is left out, with a
+note. A full disk, a lost connection, or a folder of another user ends `write`; `--resume` then writes all files without
+the agent.
 """
 
 from __future__ import annotations
@@ -112,7 +113,8 @@ async def write(
 ) -> RunRecord:
     """Writes all files and removes the gateway's folder. Raises StorageError when the disk refuses.
 
-    `note` receives each part that was left out. `error`: why this command gave the run up, unless the operator cancelled it.
+    `note` receives each part that was left out. `error`: why this command gave the run up, unless the operator
+    cancelled it.
     """
     parts = _Parts(folder.harness_log)
     selected: Bundle | None = None
@@ -249,7 +251,8 @@ def told_at_close(folder: RunFolder, plan: Plan, facts: dict[str, Any], times: T
 
 
 def _complete(folder: RunFolder, plan: Plan, facts: dict[str, Any]) -> dict[str, Any]:
-    """The facts about the agent, with those of its settings, its session's file and the relay's ledger: however the run ended."""
+    """The facts about the agent, with those of its settings, its session's file and the relay's ledger: however the run
+    ended."""
     try:
         harness = plan.harness()
     except EvopolicyError:  # its file or its key has gone meanwhile

@@ -1,4 +1,5 @@
-"""Every option of a run, declared once as `evopolicy_gateway/declared.py` describes; those of its jail are in `jail/settings.py`."""
+"""Every option of a run, declared once as `evopolicy_gateway/declared.py` describes; those of its jail are in
+`jail/settings.py`."""
 
 from __future__ import annotations
 
@@ -37,12 +38,13 @@ class RunPart(msgspec.Struct, frozen=True, kw_only=True):
     group: ClassVar[str] = "Run"
 
     agent: Annotated[str, OF_ONE_RUN]
-    """evolve, random, replay:DIR, command:PROGRAM…, codex, claude-code, llm:openai/MODEL, acp:PROGRAM…, file:AGENT.toml, remote"""
+    """evolve, random, replay:DIR, command:PROGRAM…, codex, claude-code, llm:openai/MODEL, acp:PROGRAM…,
+    file:AGENT.toml, remote"""
     budget: Count | None = None
     """Train episodes; default: the suite's."""
     profile: Annotated[Profile, Option(command=Literal["published", "published-data"] | None)] | None = None
-    """published: all settings of the published protocol (docs/reference/protocol.md), with its case files in --data and the
-    paper's 16 validation and 32 held-out cases; published-data: with all 64 and 256 of the files."""
+    """published: all settings of the published protocol (docs/reference/protocol.md), with its case files in --data and
+    the paper's 16 validation and 32 held-out cases; published-data: with all 64 and 256 of the files."""
     runs: Annotated[Path, OF_ONE_RUN] = Path("runs")
     """Folder of run directories."""
     exp_id: Annotated[str | None, OF_ONE_RUN] = None
@@ -67,7 +69,8 @@ class ScorePart(RunPart, frozen=True, kw_only=True):
     heldout: Count | None = None
     """Hidden held-out cases."""
     hidden_cases: Literal["shared", "per-run"] | None = None
-    """shared: the same for all runs of an environment (default); per-run: the run's own, so that runs cannot be paired."""
+    """shared: the same for all runs of an environment (default); per-run: the run's own, so that runs cannot be
+    paired."""
     replays: VideoOption | None = None
     """Videos of the held-out episodes; default: as --video."""
 
@@ -86,8 +89,8 @@ class PolicyPart(ScorePart, frozen=True, kw_only=True):
     step_limit: StepLimit | None = None
     """published: the step limits of the published software (default); natural: those of the environment."""
     failed_episodes: FailedEpisodes | None = None
-    """An episode in which the policy fails: play-on with random actions (default), or end-submit, as published: it ends, and the
-    submit is not eligible."""
+    """An episode in which the policy fails: play-on with random actions (default), or end-submit, as published: it
+    ends, and the submit is not eligible."""
     tier: Tier = "bwrap"
     """Sandbox around the policy."""
     limits: Annotated[
@@ -133,7 +136,8 @@ class RunOptions(PolicyPart, frozen=True, kw_only=True):
     """Space for the agent's workspace, home, and /tmp, in bytes: with more, it is ended. Default: 2e10."""
 
     def texts(self, started_in: Path, config: AgentConfig | None = None) -> Texts:
-        """The texts of the agent, which may have its settings from a suite file. ConfigError naming the file that is wrong."""
+        """The texts of the agent, which may have its settings from a suite file. ConfigError naming the file that is
+        wrong."""
         known = config or harnesses.config_of(self.agent, started_in)
         return texts.read(self.agents_md, self.prompts, known, started_in)
 
@@ -149,7 +153,8 @@ class RunOptions(PolicyPart, frozen=True, kw_only=True):
     def plan(
         self, settings: RunSettings, started_in: Path, config: AgentConfig | None = None, **more: Any
     ) -> Plan:
-        """The run with these settings. `config`: as for `texts`; `more`: further fields of the plan. Raises ConfigError."""
+        """The run with these settings. `config`: as for `texts`; `more`: further fields of the plan. Raises
+        ConfigError."""
         known = config or harnesses.config_of(self.agent, started_in)
         return Plan(
             settings=settings,
@@ -187,9 +192,9 @@ class ListenerOptions(msgspec.Struct, frozen=True, kw_only=True):
     http_url: Annotated[str | None, Option(metavar="URL")] = None
     """URL for the agent, if it differs from --http, such as that of a TLS proxy."""
     agent_host: Annotated[str | None, Option(metavar="BOOT_ID|elsewhere")] = None
-    """Boot id of the agent's machine (there: cat /proc/sys/kernel/random/boot_id): no hidden episode is played on it while the agent
-    is alive. elsewhere: you vouch that the agent is on no machine of the cluster. Default: the agent may be on any machine, so no
-    hidden episode is played before it has ended."""
+    """Boot id of the agent's machine (there: cat /proc/sys/kernel/random/boot_id): no hidden episode is played on it
+    while the agent is alive. elsewhere: you vouch that the agent is on no machine of the cluster. Default: the agent
+    may be on any machine, so no hidden episode is played before it has ended."""
 
     def host_of(self, agent: str) -> str:
         """`RunSettings.agent_host`. ConfigError for what names no kernel, or an agent that is started here."""
@@ -208,11 +213,11 @@ class ClusterOptions(msgspec.Struct, frozen=True, kw_only=True):
     group: ClassVar[str] = "Local cluster"
 
     slots: Annotated[int, Meta(ge=1, le=1024)] = 2
-    """Episodes that the local worker plays at the same time. Environments in a virtual environment of their own have a worker with
-    as many."""
+    """Episodes that the local worker plays at the same time. Environments in a virtual environment of their own have a
+    worker with as many."""
     state: Path | None = None
-    """State folder of the local cluster. Default: $XDG_STATE_HOME/evopolicy/local, which all your local runs share, so that they have
-    the same cases."""
+    """State folder of the local cluster. Default: $XDG_STATE_HOME/evopolicy/local, which all your local runs share, so
+    that they have the same cases."""
     fresh: bool = False
     """Use a temporary state folder: new cases, and no later comparison or `verify`."""
     data: Path | None = None
@@ -220,8 +225,8 @@ class ClusterOptions(msgspec.Struct, frozen=True, kw_only=True):
     audit: Annotated[float, Meta(ge=0.0, le=1.0), Option(metavar="SHARE")] = 0.0
     """Share of the episodes whose actions a second local worker replays, compared bit for bit."""
     hidden_isolation: Literal["related", "strict", "off"] | None = None
-    """Agents beside which no hidden episode is played on a kernel: those of runs with the same hidden cases (related, the default),
-    all (strict), or none (off)."""
+    """Agents beside which no hidden episode is played on a kernel: those of runs with the same hidden cases (related,
+    the default), all (strict), or none (off)."""
     policy_package: Annotated[Several, Option(metavar="NAME")] = None
     """Package that policies may import in addition to numpy."""
     browser: Annotated[Path | None, Option(exists=True)] = None

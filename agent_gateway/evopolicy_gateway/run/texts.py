@@ -1,4 +1,5 @@
-"""An operator's texts for an agent in place of the standard ones, and its skills and MCP servers, read before a run is opened.
+"""An operator's texts for an agent in place of the standard ones, and its skills and MCP servers, read before a run is
+opened.
 
 The digests are settings of the run, which its commitment covers; the texts and files themselves stay with the gateway.
 """
@@ -37,8 +38,8 @@ class Texts(msgspec.Struct, frozen=True, kw_only=True):
 def read(
     agents_md: str | Path | None, prompts: str | Path | None, config: AgentConfig | None, started_in: Path
 ) -> Texts:
-    """The texts in these files, which are relative to `started_in`. A coding agent's own prompts (`config`) count where no
-    file of prompts is given. Raises ConfigError that names the file and the fault."""
+    """The texts in these files, which are relative to `started_in`. A coding agent's own prompts (`config`) count where
+    no file of prompts is given. Raises ConfigError that names the file and the fault."""
     text = ""
     if agents_md is not None:
         path = shipped.found(agents_md, started_in)

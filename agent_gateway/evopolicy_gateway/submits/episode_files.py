@@ -1,7 +1,7 @@
 """One episode's folder in the feedback tree, as file names and bytes; pure.
 
-A level of detail that hides observations also leaves out the policy's own texts (stdout, stderr, messages of its errors),
-since a policy could write its observations there.
+A level of detail that hides observations also leaves out the policy's own texts (stdout, stderr, messages of its
+errors), since a policy could write its observations there.
 """
 
 from __future__ import annotations
@@ -83,7 +83,8 @@ def episode_files(
     At the level `scores` these are only the lines of `error.txt`, without messages; `packed` is not read then.
 
     `packed`: a rendered episode or, from workers of earlier versions, a trajectory. `at`: Unix time for `error.txt`,
-    seconds. `published`: observations are where the published software has them. Raises ProtocolError when `packed` is neither, or has another length or return than declared.
+    seconds. `published`: observations are where the published software has them. Raises ProtocolError when `packed` is
+    neither, or has another length or return than declared.
     """
     texts = _text_files(episode, at, whole=shows_texts(detail, storage))
     if detail == "scores":

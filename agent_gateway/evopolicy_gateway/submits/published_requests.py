@@ -1,5 +1,5 @@
-"""The published service's reading of `POST /submit` (v0.1.0) where it differs from ours, and its answers as a table. They
-apply in the published profiles.
+"""The published service's reading of `POST /submit` (v0.1.0) where it differs from ours, and its answers as a table.
+They apply in the published profiles.
 
 A request that counts takes the next submit index and raises `n_submits`, without a charge. Its folder, if it has one,
 holds `summary.json` and `errors.txt`. Where the published handler drops the connection, a 400 says why.

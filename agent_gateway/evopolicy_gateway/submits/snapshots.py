@@ -30,8 +30,8 @@ def take(system: Path, blobs: BlobStore, *, published: bool = False) -> Snapshot
     """Snapshots the current `system` and stores the bundle.
 
     A folder that cannot be a bundle is the policy's failure and is charged: `missing_policy` when `policy.py` is
-    missing or no regular file, else `import_error`; the message names file, value and limit. `published`: the source decides
-    too, as in the published software. Raises StorageError when the store refuses.
+    missing or no regular file, else `import_error`; the message names file, value and limit. `published`: the source
+    decides too, as in the published software. Raises StorageError when the store refuses.
     """
     try:
         bundle = bundles.snapshot(system)
@@ -50,8 +50,8 @@ def take(system: Path, blobs: BlobStore, *, published: bool = False) -> Snapshot
 
 
 def _fault_of_source(files: dict[str, bytes]) -> PolicyFailure | None:
-    """The verdict of the published software on sources that it does not run: `import_error` for a Python file that cannot
-    be parsed, `missing_policy` for a `policy.py` without a class statement `Policy` at its top level."""
+    """The verdict of the published software on sources that it does not run: `import_error` for a Python file that
+    cannot be parsed, `missing_policy` for a `policy.py` without a class statement `Policy` at its top level."""
     category: FailureCategory = "import_error"
     left = MAX_PARSED_BYTES
     for path in sorted(path for path in files if path.endswith(".py")):

@@ -1,8 +1,10 @@
-"""Observations in feedback as the published software (v0.1.0) has them: by the size of an episode's stacked observations.
+"""Observations in feedback as the published software (v0.1.0) has them: by the size of an episode's stacked
+observations.
 
-Above `MOST_INLINE_BYTES` they are in `observations.npy`, or in `observations.npz` for flat dictionaries, whose arrays are
-summed, and every row has `obs: null`; otherwise they are in the rows. Whole numbers that are all within 0 to 255 are stacked
-as uint8. Observations that do not stack, such as ragged ones, nested dictionaries and texts, stay in the rows.
+Above `MOST_INLINE_BYTES` they are in `observations.npy`, or in `observations.npz` for flat dictionaries, whose arrays
+are summed, and every row has `obs: null`; otherwise they are in the rows. Whole numbers that are all within 0 to 255
+are stacked as uint8. Observations that do not stack, such as ragged ones, nested dictionaries and texts, stay in the
+rows.
 """
 
 from __future__ import annotations

@@ -3,7 +3,8 @@
 Rules, in addition to those of every sweep:
 
 - A run is played only while this host holds its claim at the coordinator. If another host has taken the claim, the run
-  ends here and its folder stays unchanged. A host that takes a claim cancels the run that an earlier holder played for it.
+  ends here and its folder stays unchanged. A host that takes a claim cancels the run that an earlier holder played for
+  it.
 - Cancelled, the sweep leaves runs open and keeps its claims: the same host can resume them, and others can take them
   over once the claims expire.
 - A provider that is away also holds back further runs of that provider; running ones wait by themselves.

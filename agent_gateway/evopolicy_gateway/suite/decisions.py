@@ -45,7 +45,8 @@ class Found(msgspec.Struct, frozen=True, kw_only=True):
     opened: bool = False
     """Whether its folder holds an unfinished run."""
     intended: bool = False
-    """Whether its folder holds no run but the request to open one with the run's settings, which may have been served."""
+    """Whether its folder holds no run but the request to open one with the run's settings, which may have been
+    served."""
     phase: str | None = None
     """That run's phase at the cluster; None when the cluster does not know it."""
     has_session: bool = False

@@ -223,8 +223,8 @@ def results_table(entries: list[Entry]) -> Table:
 def _columns(width: int, longest: int) -> dict[str, int]:
     """Columns of the live table with their widths. `width`: the terminal's; `longest`: length of the longest name.
 
-    Names are whole if the terminal has room for them beside a state; otherwise they fold. A narrow terminal gets only the first
-    columns of `_ORDER` that fit, and states get their full width before less important columns are added.
+    Names are whole if the terminal has room for them beside a state; otherwise they fold. A narrow terminal gets only
+    the first columns of `_ORDER` that fit, and states get their full width before less important columns are added.
     """
     found = {"run": min(longest, max(_LEAST_NAME, width - _LEAST_STATE - _GAP))}
     room = width - found["run"]

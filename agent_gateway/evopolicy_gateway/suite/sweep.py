@@ -32,7 +32,8 @@ MAX_SCORED = 256
 
 
 FINISH_AGAIN_S = (1.0, 5.0, 30.0)
-"""Pauses before a run whose agent is gone is finished again after an error: on the last one, it is left to `--resume`."""
+"""Pauses before a run whose agent is gone is finished again after an error: on the last one, it is left to
+`--resume`."""
 
 
 class Sweep(ABC):

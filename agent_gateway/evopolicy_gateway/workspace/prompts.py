@@ -1,7 +1,7 @@
 """Prompts for agents, by turn. The rules themselves are in the workspace's `AGENTS.md`.
 
-An operator may replace each text. `$standard` in a replacement stands for the standard text, and `$left` for the episodes
-that are left; `$$` is a dollar sign.
+An operator may replace each text. `$standard` in a replacement stands for the standard text, and `$left` for the
+episodes that are left; `$$` is a dollar sign.
 """
 
 from __future__ import annotations

@@ -87,8 +87,8 @@ class Entry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     deterministic: bool = True
     """False when even a fresh environment does not repeat an episode from its seed and actions."""
     data: tuple[str, ...] = ()
-    """Files and folders that the environment reads besides its modules, relative to its file's folder; read from a file,
-    absolute."""
+    """Files and folders that the environment reads besides its modules, relative to its file's folder; read from a
+    file, absolute."""
     world: int = 0
     """Which world of an environment it is (see `worlds`); 0: the environment itself."""
     info_strings: tuple[str, ...] = ()

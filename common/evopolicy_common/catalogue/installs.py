@@ -46,8 +46,8 @@ class Install(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     pins: Mapping[str, str] = {}
     """Versions beside, and in place of, those of `constraints.txt`. Empty: it shares an installation with others."""
     apart: Mapping[str, str] = {}
-    """Distributions, and their versions, that are installed without what they require, because that excludes others' versions
-    with which they work. The extra has the rest of what they need."""
+    """Distributions, and their versions, that are installed without what they require, because that excludes others'
+    versions with which they work. The extra has the rest of what they need."""
     browser: bool = False
     """Whether it needs Chromium, which belongs to the machine and to no virtual environment."""
     python: tuple[str, str] = ("3.11", "3.14")
@@ -106,7 +106,8 @@ def is_here(family: str) -> bool:
 
 @cache
 def own() -> str:
-    """This interpreter's installation as `NAME@DIGEST`: the families for which `setup` made it, joined with `+`, or else
+    """This interpreter's installation as `NAME@DIGEST`: the families for which `setup` made it, joined with `+`, or
+    else
     `base`; and 12 hex digits of the SHA-256 of the names and versions of all packages in it. Tells no path."""
     here = read(Path(sys.prefix))
     found = {

@@ -133,7 +133,8 @@ def code_of(error: ConfigError | DamagedStoreError) -> int:
 
 @contextlib.contextmanager
 def fail_on_our_errors() -> Iterator[None]:
-    """Turns our errors into one line, their notes, and an exit code: 2 for wrong options and files, 1 for all others."""
+    """Turns our errors into one line, their notes, and an exit code: 2 for wrong options and files, 1 for all
+    others."""
     try:
         yield
     except (ConfigError, DamagedStoreError) as error:

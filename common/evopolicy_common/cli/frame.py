@@ -29,7 +29,8 @@ _WRONG = {
     "greater_than_equal": "is less than {ge}",
     "less_than_equal": "is more than {le}",
 }
-"""What typer's library finds wrong with an option's value, by its name of the error; its own texts do not tell the value."""
+"""What typer's library finds wrong with an option's value, by its name of the error; its own texts do not tell the
+value."""
 _MOST_CHARACTERS = 32_768
 """Of an option's value: no list of cases and no agent's command is longer."""
 SEVERAL_LINES = frozenset({"agent"})
@@ -159,7 +160,8 @@ class App(typer.Typer):
 
 
 def run_app(app: typer.Typer, extra: str | None = None) -> NoReturn:
-    """Runs the command that `sys.argv` names, and exits. `extra`: the extra that it needs; None: that of a missing module."""
+    """Runs the command that `sys.argv` names, and exits. `extra`: the extra that it needs; None: that of a missing
+    module."""
     open_streams()
     end_without_reader()
     try:

@@ -132,10 +132,11 @@ async def local_cluster(
 
     `kind` names its logs and its folder. `state` None: a temporary folder. `audit`: share of the episodes that a second
     worker replays, 0 to 1. `hidden_isolation`: the coordinator's option, None for its default. `unjailed`: agents could
-    read the folder; see the coordinator's `--unjailed-agents`. `policy_packages`: those that policies may import besides numpy.
-    `browser`: the workers' Chromium; None for the machine's own. `env_timeout`, `env_memory`: the workers' options (seconds,
-    MiB), None for their defaults. `workers`: workers to start at once, in parallel with the coordinator. Raises
-    ConfigError when the coordinator does not start (the folder may be in use).
+    read the folder; see the coordinator's `--unjailed-agents`. `policy_packages`: those that policies may import
+    besides numpy.
+    `browser`: the workers' Chromium; None for the machine's own. `env_timeout`, `env_memory`: the workers' options
+    (seconds, MiB), None for their defaults. `workers`: workers to start at once, in parallel with the coordinator.
+    Raises ConfigError when the coordinator does not start (the folder may be in use).
     """
     with contextlib.ExitStack() as folders:
         root = folders.enter_context(scratch_folder(kind)) if state is None else state

@@ -28,8 +28,8 @@ Int = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
 Number = Annotated[float, Meta(ge=-sys.float_info.max, le=sys.float_info.max)]
 """A finite float."""
 LARGEST = 1e100
-"""Greatest magnitude of a return and of every other number of a run, so that sums over many runs and sums of squares stay
-finite. Not a part of `Number`, since earlier versions stored larger ones."""
+"""Greatest magnitude of a return and of every other number of a run, so that sums over many runs and sums of squares
+stay finite. Not a part of `Number`, since earlier versions stored larger ones."""
 Many = Annotated[tuple[T, ...], Meta(max_length=1 << 20)]
 Named = Annotated[dict[Word, T], Meta(max_length=1 << 16)]
 Numbered = Annotated[dict[Int, T], Meta(max_length=1 << 20)]
@@ -38,8 +38,8 @@ Plain = Annotated[dict[str, Any], Meta(max_length=1 << 16, extra={"plain": True}
 
 
 def check_plausible(record: object) -> None:
-    """Raises ValueError naming the field of a decoded record with a number beyond `LARGEST`, which JSON allows: sums, texts and
-    conversions of such numbers fail."""
+    """Raises ValueError naming the field of a decoded record with a number beyond `LARGEST`, which JSON allows: sums,
+    texts and conversions of such numbers fail."""
     queue: list[tuple[str, Any]] = [("", to_builtins(record))]
     while queue:
         name, value = queue.pop()

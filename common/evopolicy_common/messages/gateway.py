@@ -36,7 +36,8 @@ SubmitStatus = Literal[
     "quarantined",
     "cancelled",
 ]
-"""All verdicts are charged, except `cancelled` and the first two (`RejectedStatus`). `cancelled`: the operator ended the run in the meantime.
+"""All verdicts are charged, except `cancelled` and the first two (`RejectedStatus`). `cancelled`: the operator ended
+the run in the meantime.
 `quarantined`: only of submits that a coordinator of an earlier version ended."""
 
 CANCELLED = "cancelled"
@@ -63,7 +64,8 @@ class OpenRun(Message, frozen=True, kw_only=True, tag="open_run"):
     asks_permit: bool = False
     """The gateway sends `RequestPermit` before its agent starts. Otherwise the agent may already be on any machine."""
     reads_rendered: bool = False
-    """The gateway reads episodes rendered by workers (`records.episodes.rendered`); gateways of earlier versions do not."""
+    """The gateway reads episodes rendered by workers (`records.episodes.rendered`); gateways of earlier versions do
+    not."""
 
 
 class RequestPermit(Message, frozen=True, kw_only=True, tag="request_permit"):
@@ -179,8 +181,8 @@ class Submit(Message, frozen=True, kw_only=True, tag="submit"):
     bundle_error: PolicyFailure | None = None
     """Why there is no bundle: becomes the verdict, charged as `protocol.md` describes for a bundle without a Policy."""
     rejected: RejectedStatus | None = None
-    """In the published profiles: the request takes an index, plays nothing, and has this verdict. It has no cases, bundle
-    or `bundle_error` then."""
+    """In the published profiles: the request takes an index, plays nothing, and has this verdict. It has no cases,
+    bundle or `bundle_error` then."""
 
 
 class SubmitAccepted(Message, frozen=True, kw_only=True, tag="submit_accepted"):

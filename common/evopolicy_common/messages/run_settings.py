@@ -116,7 +116,8 @@ def off_profile(settings: RunSettings) -> str:
 
 
 def episode_counts(settings: RunSettings, suite: Suite) -> tuple[int, int, int]:
-    """Budget, least and greatest number of episodes of a submit of a run. Raises ConfigError for numbers that no run can have."""
+    """Budget, least and greatest number of episodes of a submit of a run. Raises ConfigError for numbers that no run
+    can have."""
 
     def given(number: int | None, usual: int) -> int:
         return usual if number is None else number

@@ -1,7 +1,8 @@
-"""Mean and standard deviation of returns, and the selection by them, as the coordinator, `summary.json` and `run.json` have them: whoever checks them needs
-the same bits.
+"""Mean and standard deviation of returns, and the selection by them, as the coordinator, `summary.json` and `run.json`
+have them: whoever checks them needs the same bits.
 
-Returns beyond `bounds.LARGEST`, which earlier versions stored, have finite results too, although their sums are not finite.
+Returns beyond `bounds.LARGEST`, which earlier versions stored, have finite results too, although their sums are not
+finite.
 """
 
 from __future__ import annotations
@@ -16,7 +17,8 @@ _SCALE = 520
 
 
 def mean(values: Sequence[float]) -> float:
-    """Arithmetic mean, correctly rounded, so independent of the order; NaN without values, NaN or infinite if a value is."""
+    """Arithmetic mean, correctly rounded, so independent of the order; NaN without values, NaN or infinite if a value
+    is."""
     try:
         return math.fsum(values) / len(values) if values else math.nan
     except (ValueError, OverflowError):

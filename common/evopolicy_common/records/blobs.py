@@ -67,7 +67,8 @@ def sync_filesystem(path: Path) -> None:
 def write_atomically(path: Path, data: bytes, *, mode: int = 0o644, durable: bool = True) -> None:
     """Replaces `path` by a file with `data`: readers see either the old bytes or the new, never a part.
 
-    Raises StorageError with the path when the file cannot be written, ConfigError for a pipe, a device or a folder of that name.
+    Raises StorageError with the path when the file cannot be written, ConfigError for a pipe, a device or a folder of
+    that name.
     """
     try:
         if path.exists() and not path.is_file():
@@ -92,7 +93,8 @@ def write_atomically(path: Path, data: bytes, *, mode: int = 0o644, durable: boo
 
 @contextlib.contextmanager
 def announcing(path: Path | None) -> Iterator[Callable[[bytes], None]]:
-    """Yields a function that writes the private file at `path` (None: nowhere); a file that it wrote is removed at the end."""
+    """Yields a function that writes the private file at `path` (None: nowhere); a file that it wrote is removed at the
+    end."""
     with contextlib.ExitStack() as written:
 
         def write(data: bytes) -> None:
@@ -171,8 +173,8 @@ class BlobStore:
 
         A chunk that does not continue them changes nothing; the returned offset is where to continue. The last chunk
         checks the digest and stores the blob; StorageError when the digest does not match.
-        `on_whole` is called once the sender has sent the whole blob, with the state of its file, or None if the blob was
-        stored before; with it, a copy stored before is ignored.
+        `on_whole` is called once the sender has sent the whole blob, with the state of its file, or None if the blob
+        was stored before; with it, a copy stored before is ignored.
         """
         if on_whole is None and self._touched(digest):
             return size

@@ -1,6 +1,7 @@
 """Finds finished runs below folders and the submits of a run's folder, and reads the runs' records.
 
-Rule that this module owns: no link is followed below a run directory, which could lead to files of the reader's machine.
+Rule that this module owns: no link is followed below a run directory, which could lead to files of the reader's
+machine.
 """
 
 from __future__ import annotations
@@ -25,16 +26,16 @@ _PLACES = ("workspace/feedback", "checkpoints", "logs")
 
 
 def read_record(folder: Path) -> RunRecord:
-    """The record of a finished run. Raises OSError when `run.json` cannot be read, ProtocolError when it is damaged or a folder that
-    it names is outside the run directory."""
+    """The record of a finished run. Raises OSError when `run.json` cannot be read, ProtocolError when it is damaged or
+    a folder that it names is outside the run directory."""
     record = decode_run_record(read_regular(folder / RUN_JSON))
     check_places(folder, record.artifacts)
     return record
 
 
 def check_places(folder: Path, artifacts: Artifacts) -> None:
-    """Raises ProtocolError when a place of a run's files is outside its directory, also by a link: a report quotes and copies what it
-    finds there."""
+    """Raises ProtocolError when a place of a run's files is outside its directory, also by a link: a report quotes and
+    copies what it finds there."""
     named = msgspec.structs.asdict(artifacts)
     places = {f"artifacts.{name}": place for name, place in named.items() if place is not None}
     for name, place in {**dict(zip(_PLACES, _PLACES, strict=True)), **places}.items():

@@ -35,8 +35,8 @@ from evopolicy_common.records.code_metrics import PUBLISHED_SCHEMA
 from evopolicy_common.records.newest import described_data
 
 RECORD_VERSION = 3
-"""Version of our own fields. Incremented only when older readers would misunderstand a file, not for added fields: since 3, `tokens` are
-counted at the wire where `model_use` says so."""
+"""Version of our own fields. Incremented only when older readers would misunderstand a file, not for added fields:
+since 3, `tokens` are counted at the wire where `model_use` says so."""
 READABLE_VERSIONS = (2, 3)
 
 PROTOCOL_VERSION = "protocol/v2.0-draft"
@@ -77,8 +77,8 @@ class ModelUse(msgspec.Struct, frozen=True, kw_only=True):
     """How the agent used its model, besides `tokens`."""
 
     metering: Literal["relay", "agent"]
-    """`relay`: every request of the run was counted at the wire, and the agent did not have the key. `agent`: `tokens` are the
-    agent's own count, and `requests` and what follows are unknown."""
+    """`relay`: every request of the run was counted at the wire, and the agent did not have the key. `agent`: `tokens`
+    are the agent's own count, and `requests` and what follows are unknown."""
     limits: ModelLimits | None = None
     """None: this software sets none."""
     requests: int | None = None
@@ -179,7 +179,8 @@ class Agent(msgspec.Struct, frozen=True, kw_only=True):
     """`codex`, `claude-code`, `command`, `replay`, `evolve`, …"""
     cli_version: str | None = None
     model_string: str | None = None
-    """The model that the harness was configured with, or else the one that answered most; None for agents without a model."""
+    """The model that the harness was configured with, or else the one that answered most; None for agents without a
+    model."""
     prompts: str = ""
     """SHA-256 (`sha256:…`) of the operator's prompts; empty: the standard ones."""
     inputs: tuple[AgentInput, ...] = ()
@@ -219,8 +220,8 @@ class ExperimentDimensions(msgspec.Struct, frozen=True, kw_only=True):
     """Step limit: that of the published software, or only the environment's own limit, as in all runs from before
     this field existed."""
     failed_episodes: FailedEpisodes = "play-on"
-    """Whether random actions play an episode on in which the policy failed (`play-on`), or it ends, and the submit has no
-    mean return and its checkpoint is not eligible (`end-submit`)."""
+    """Whether random actions play an episode on in which the policy failed (`play-on`), or it ends, and the submit has
+    no mean return and its checkpoint is not eligible (`end-submit`)."""
     hidden_evaluation: HiddenEvaluation = "submit"
     """Arguments of a policy on hidden cases: those of its own submit, or those of one list of all cases (`pool`)."""
     profile: Profile = "own"
@@ -302,8 +303,8 @@ class Outcome(msgspec.Struct, frozen=True, kw_only=True):
     """Whether each of these episodes solved the task, as the environment reports it; empty where it reports nothing."""
     policy_failures: tuple[PolicyFailureRecord, ...] = ()
     quarantined_submits: tuple[int, ...] = ()
-    """`ok` checkpoints that are not eligible: their policy failed in validation with `failed_episodes` = "end-submit", or,
-    in runs of earlier versions, made its slot fail there."""
+    """`ok` checkpoints that are not eligible: their policy failed in validation with `failed_episodes` = "end-submit",
+    or, in runs of earlier versions, made its slot fail there."""
     random_reference: ReferenceScore | None = None
     closed_reason: str = ""
     """Why submits ended: `budget_spent`, `agent_stopped`, `agent_failed`, `silent`, `wall_limit`,
@@ -392,9 +393,9 @@ class Versions(msgspec.Struct, frozen=True, kw_only=True):
     fingerprint: dict[str, str] = {}
     """Library to version, as reported by the workers with which the run started."""
     installations: tuple[str, ...] = ()
-    """Python installations of the workers that played the run's episodes, in the order of their first ones: `NAME@DIGEST`, with
-    the families for which `evopolicy-worker setup` made it, or `base`, and 12 hex digits of a SHA-256 over the names and
-    versions of its packages. Empty in older files."""
+    """Python installations of the workers that played the run's episodes, in the order of their first ones:
+    `NAME@DIGEST`, with the families for which `evopolicy-worker setup` made it, or `base`, and 12 hex digits of a
+    SHA-256 over the names and versions of its packages. Empty in older files."""
     fingerprint_overrides: tuple[str, ...] = ()
     """`CLASS → CLASS: why` for each time an operator let the run continue with other versions; empty with one class."""
     data_secret: bool = True

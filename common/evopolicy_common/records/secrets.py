@@ -40,7 +40,8 @@ _KEY_OPTION = re.compile(
     r"(?:key|token|secret|passw(?:or)?d|passphrase|credentials?|auth|cookie|pat)",
     re.IGNORECASE,
 )
-"""An option or variable whose value is a secret, such as `--api-key` and `HF_TOKEN`, not `--max-tokens` or `--monkey`."""
+"""An option or variable whose value is a secret, such as `--api-key` and `HF_TOKEN`, not `--max-tokens` or
+`--monkey`."""
 # In a JSON line, the letter before a key may be that of an escape. Repetitions are bounded where a match may fail after
 # them: otherwise a line of many beginnings would take quadratic time.
 _START = rb"(?:\b|(?<=\\[nrtbf]))"
@@ -101,7 +102,8 @@ def patterns(data: bytes) -> Iterator[tuple[re.Pattern[bytes], str]]:
 def found(data: bytes, passed: Passed | None = None) -> Iterator[tuple[int, str]]:
     """Positions and kinds of secrets: of what looks like one, and of the values that a run has passed.
 
-    A text without a digit is none, and neither is one of few characters, such as the placeholder `sk-xxxxxxxxxxxxxxxx1`.
+    A text without a digit is none, and neither is one of few characters, such as the placeholder
+    `sk-xxxxxxxxxxxxxxxx1`.
     """
     for pattern, what in patterns(data):
         for match in pattern.finditer(data):
@@ -264,7 +266,8 @@ class Passed(msgspec.Struct, frozen=True, kw_only=True):
 
         key = bytes.fromhex(self.key)
         weights = np.frombuffer(self._weights(), np.uint8)
-        # A window's mark is the sum of its bytes' weights, a difference of two of these. One in 256 has that of a value.
+        # A window's mark is the sum of its bytes' weights, a difference of two of these. One in 256 has that of a
+        # value.
         sums = np.zeros(len(data) + 1, np.uint8)
         np.cumsum(weights[np.frombuffer(data, np.uint8)], dtype=np.uint8, out=sums[1:])
         for length in sorted({each.length for each in self.values}):
@@ -291,8 +294,8 @@ def note_passed(path: Path, values: Iterable[str]) -> None:
 
 
 def read_passed(folder: Path) -> Passed | None:
-    """What a run's folder records; None where it has no such file, as those of earlier versions. Raises ConfigError for a
-    damaged file."""
+    """What a run's folder records; None where it has no such file, as those of earlier versions. Raises ConfigError for
+    a damaged file."""
     path = folder / PASSED
     try:
         kept = msgspec.json.decode(read_regular(path, _MAX_FILE_BYTES), type=Passed)

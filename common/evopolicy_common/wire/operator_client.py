@@ -75,8 +75,8 @@ class OperatorClient:
     async def environments(
         self,
     ) -> tuple[list[OfferedEnvironment], dict[str, tuple[str, ...]], dict[str, dict[str, str]]]:
-        """The environments that connected workers offer; those that they describe on first use, with the workers; and those
-        that failed, with the reasons by worker."""
+        """The environments that connected workers offer; those that they describe on first use, with the workers; and
+        those that failed, with the reasons by worker."""
         found: list[OfferedEnvironment] = []
         while True:
             message = EnvironmentsRequest(token=self._token, cursor=len(found))

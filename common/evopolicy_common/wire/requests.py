@@ -115,8 +115,8 @@ class Requester(Generic[Reply]):
     async def download_to(
         self, file: IO[bytes], sender: str, token: str, digest: str, most: int = codec.MAX_BLOB_BYTES
     ) -> None:
-        """Writes a blob of at most `most` bytes to a file. Raises ProtocolError when it does not match its digest or is too
-        large."""
+        """Writes a blob of at most `most` bytes to a file. Raises ProtocolError when it does not match its digest or is
+        too large."""
         hashed, have = hashlib.sha256(), 0
         while True:
             chunk = await self.until_answered(

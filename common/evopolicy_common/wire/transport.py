@@ -220,7 +220,8 @@ class Link:
         self._alive[key] = self._session.liveliness().declare_token(key)
 
     async def renewed(self, token: str) -> bool:
-        """Whether the credentials have been renewed since they had this token. Waits for a session with those that are on disk."""
+        """Whether the credentials have been renewed since they had this token. Waits for a session with those that are
+        on disk."""
         while self.credentials.token == token:
             try:
                 found = None if self._read_again is None else await asyncio.to_thread(self._read_again)
@@ -232,7 +233,8 @@ class Link:
         return True
 
     def replace(self, session: zenoh.Session, credentials: Credentials) -> None:
-        """Goes on with another session. Open requests get no reply, and are sent again. Blocks until the old one is closed."""
+        """Goes on with another session. Open requests get no reply, and are sent again. Blocks until the old one is
+        closed."""
         old, self._session, self.credentials = self._session, session, credentials
         for key in self._alive:
             self.declare_alive(key)
@@ -256,8 +258,8 @@ async def connect(
     timeout_s: float | None = 10.0,
     read_again: Callable[[], Credentials] | None = None,
 ) -> AsyncIterator[Link]:
-    """A client session, open inside the `async with`. `read_again` reads the credentials anew, which may have been renewed: a
-    session with the renewed ones then replaces the first.
+    """A client session, open inside the `async with`. `read_again` reads the credentials anew, which may have been
+    renewed: a session with the renewed ones then replaces the first.
 
     Waits until a router accepts it. Raises TransportError after `timeout_s` seconds (None: waits forever); a wrong
     password has the same effect, as the router does not report it.
@@ -276,7 +278,8 @@ async def connect(
 
 
 async def _take_renewed(link: Link, read_again: Callable[[], Credentials]) -> None:
-    """Looks whether the credentials have been renewed. Zenoh reads certificates and password only when it opens a session."""
+    """Looks whether the credentials have been renewed. Zenoh reads certificates and password only when it opens a
+    session."""
     used = _content(link.credentials)
     while True:
         await asyncio.sleep(RENEWED_LOOK_S)

@@ -107,8 +107,8 @@ def issue(
 ) -> None:
     """Write the folder that a machine needs to join: certificates, key, user and password.
 
-    Copy the folder to that machine (scp -rp keeps its modes) and name it with --credentials there. A running coordinator
-    admits the machine within seconds. An operator's folder also starts gateways.
+    Copy the folder to that machine (scp -rp keeps its modes) and name it with --credentials there. A running
+    coordinator admits the machine within seconds. An operator's folder also starts gateways.
     """
     with fail_on_our_errors():
         root = state or default_state_dir()

@@ -1,4 +1,5 @@
-"""`evopolicy envs`: the environments that the cluster's workers offer, and the operator's word for those that do not ship."""
+"""`evopolicy envs`: the environments that the cluster's workers offer, and the operator's word for those that do not
+ship."""
 
 from __future__ import annotations
 

@@ -149,8 +149,8 @@ def serve(
 ) -> None:
     """Run the coordinator of a cluster.
 
-    Workers and gateways connect to it with the credentials that it writes. After SIGTERM or Ctrl-C it makes everything durable and
-    exits; when it is started again on the same folder, it continues.
+    Workers and gateways connect to it with the credentials that it writes. After SIGTERM or Ctrl-C it makes everything
+    durable and exits; when it is started again on the same folder, it continues.
     """
     if context.invoked_subcommand is not None:
         return
@@ -186,8 +186,8 @@ def backup(
     """Copy the state folder: a consistent database, blobs and keys. The coordinator may be running.
 
     To restore: stop the coordinator, copy the backup to where its state was, start it again. Workers and gateways
-    reconnect by themselves; episodes that came in after the backup are played again. Keep backups as private as the state:
-    they hold the hidden cases.
+    reconnect by themselves; episodes that came in after the backup are played again. Keep backups as private as the
+    state: they hold the hidden cases.
     """
     with fail_on_our_errors():
         copied = back_up(state or default_state_dir(), target)

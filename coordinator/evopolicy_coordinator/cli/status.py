@@ -241,8 +241,8 @@ def agent_gone(
 ) -> None:
     """Vouch that a run's agent has ended, after its machine was lost for good.
 
-    The cluster may then play hidden cases on that machine. If the agent is still alive, it could learn them: when in doubt,
-    resume the run or restart the machine.
+    The cluster may then play hidden cases on that machine. If the agent is still alive, it could learn them: when in
+    doubt, resume the run or restart the machine.
     """
     asking(connect, file, lambda operator: operator.agent_gone(run))
     say(f"the agent of {run} is recorded as ended")

@@ -100,9 +100,9 @@ def web(
 ) -> None:
     """Show sweeps, runs and the cluster in a browser, live.
 
-    Prints an address with a token, which is needed on this machine too. Without --connect and --credentials it asks this
-    machine's own coordinator, if one answers, and else shows the folders alone. Hidden scores of a run appear when no agent of
-    a related run is alive.
+    Prints an address with a token, which is needed on this machine too. Without --connect and --credentials it asks
+    this machine's own coordinator, if one answers, and else shows the folders alone. Hidden scores of a run appear when
+    no agent of a related run is alive.
     """
     with fail_on_our_errors():
         setup_logging("warning")

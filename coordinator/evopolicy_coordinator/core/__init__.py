@@ -10,7 +10,8 @@ deadline go out.
 
 Start with `transcripts/submit.txt` and `transcripts/result_report.txt`. They show the core's input, the rules that act,
 and the effects for the shell. Then read `machine`, whose tables map each event, piece of news and deadline to its
-rules, `contract`, its input and output, and `tables`, the data of the rules. The folders of rules build on each other in this order:
+rules, `contract`, its input and output, and `tables`, the data of the rules. The folders of rules build on each other
+in this order:
 `isolation` (conflicts on a kernel), `leasing` (from the queue to a worker and back), `agents` (permits and precedence),
 `workers` (requests of workers), `runs`.
 
@@ -21,10 +22,10 @@ core's life it never goes back, even if the wall clock is set. The shell calls `
 `next_deadline()`. While leases are out, the core requests a call at least every second. A late call shows that the loop
 was blocked; then no lease expires for one time to live.
 
-*Order and durability.* See `contract.effects`: strictly in order, and every `Persist` is durable before the effects after it.
-The shell may handle many events, then write all their `Persist`s in one transaction, then carry out the other effects.
-When a `Persist` fails, the shell carries out no effect after it, discards the core, and loads a new one from the store
-(incarnation + 1). Changes that were not persisted did not happen, and no reply has reported them.
+*Order and durability.* See `contract.effects`: strictly in order, and every `Persist` is durable before the effects
+after it. The shell may handle many events, then write all their `Persist`s in one transaction, then carry out the other
+effects. When a `Persist` fails, the shell carries out no effect after it, discards the core, and loads a new one from
+the store (incarnation + 1). Changes that were not persisted did not happen, and no reply has reported them.
 
 *Start.* Increment the incarnation durably, read the `Snapshot` (its docstring lists the contents), call `Core.load`,
 carry out the effects that it returns (they conclude groups that were complete but not concluded), and serve.

@@ -1,14 +1,14 @@
 """Keeps one core loaded: its clock and deadlines, its outbox, and its reloading after a failure.
 
 Rules that this module owns:
-- When the store refuses to write, the host drops the core and all undelivered effects, and loads a new core from disk as
-  soon as the disk allows. It does the same after a bug in the core, or a row that the store does not accept, but only a
-  few times in a row.
-- A failure that it cannot recover from (a store that cannot be loaded for another reason, a failure that recurs after each
-  load, a failure of the service itself) ends the process with the reason. Its supervisor restarts it from the state on
-  disk. See `failure`.
-- `now` is Unix time at the start, but no earlier than the latest time on disk, advanced by the monotonic clock. A change of
-  the wall clock has no effect.
+- When the store refuses to write, the host drops the core and all undelivered effects, and loads a new core from disk
+  as soon as the disk allows. It does the same after a bug in the core, or a row that the store does not accept, but
+  only a few times in a row.
+- A failure that it cannot recover from (a store that cannot be loaded for another reason, a failure that recurs after
+  each load, a failure of the service itself) ends the process with the reason. Its supervisor restarts it from the
+  state on disk. See `failure`.
+- `now` is Unix time at the start, but no earlier than the latest time on disk, advanced by the monotonic clock. A
+  change of the wall clock has no effect.
 """
 
 from __future__ import annotations
@@ -51,8 +51,8 @@ class CoreHost:
         carry_out: Callable[[Effect], None],
         dropped: Callable[[], None],
     ) -> None:
-        """`carry_out` receives the effects of the core, except `Persist`. `dropped` is called when the core is dropped: no
-        query that waits for it will be answered."""
+        """`carry_out` receives the effects of the core, except `Persist`. `dropped` is called when the core is dropped:
+        no query that waits for it will be answered."""
         self._settings = settings
         self._writer = writer
         self._carry_out = carry_out

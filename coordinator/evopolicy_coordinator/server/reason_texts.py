@@ -132,7 +132,8 @@ def words(reason: Reason | None) -> str:
 
 
 def env_failure(reason: Reason | None) -> str:
-    """Why the environment that is waited for failed, if no connected worker offers it; empty otherwise. For operators."""
+    """Why the environment that is waited for failed, if no connected worker offers it; empty otherwise. For
+    operators."""
     failed = () if reason is None or reason.code != "workers" else reason.about["failed"]
     return (failed[0][1] or "the worker's log has the reason") if failed else ""
 

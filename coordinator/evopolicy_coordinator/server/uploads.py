@@ -69,7 +69,8 @@ class Uploads:
             unclaimed[digest] = size
 
     def note(self, run: str, digest: str, stored: FileState | None = None) -> None:
-        """Records that the run's gateway has sent the whole blob. `stored`: its file, if nobody had stored it before."""
+        """Records that the run's gateway has sent the whole blob. `stored`: its file, if nobody had stored it
+        before."""
         with self._lock:
             found = self._of(run)
             found.sent[digest] = None

@@ -390,7 +390,8 @@ def storage_errors(path: Path) -> Iterator[None]:
 
 
 def rows(db: sqlite3.Connection, kind: type[T], where: str = "", args: tuple[Any, ...] = ()) -> Iterator[T]:
-    """Yields the rows of a kind. DamagedStoreError names the unreadable row; `storage_errors` adds the database's path."""
+    """Yields the rows of a kind. DamagedStoreError names the unreadable row; `storage_errors` adds the database's
+    path."""
     for row, _ in _sized_rows(db, kind, where, args):
         yield row
 

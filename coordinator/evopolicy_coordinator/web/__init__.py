@@ -1,1 +1,2 @@
-"""The live view in a browser: sweeps, runs, and the cluster, for operators. An operator's process beside the coordinator."""
+"""The live view in a browser: sweeps, runs, and the cluster, for operators. An operator's process beside the
+coordinator."""

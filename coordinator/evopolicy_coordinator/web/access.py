@@ -1,11 +1,12 @@
 """Access to the live view: tokens, cookies, and the checks of every request.
 
 Rules that this module owns:
-- A token is needed on loopback too, since an agent without a jail reaches loopback. It travels in the body of a sign-in, in
-  a cookie or in an `Authorization` header, never in a path or a query, which logs and histories keep. The printed URL has it
-  in its fragment, which browsers send to nobody.
+- A token is needed on loopback too, since an agent without a jail reaches loopback. It travels in the body of a
+  sign-in, in a cookie or in an `Authorization` header, never in a path or a query, which logs and histories keep. The
+  printed URL has it in its fragment, which browsers send to nobody.
 - The reading token and the acting token are different. Without `--act` there is no acting token at all.
-- `Host` must be an address or a name of this server, else a page elsewhere could be made to resolve to it (DNS rebinding).
+- `Host` must be an address or a name of this server, else a page elsewhere could be made to resolve to it (DNS
+  rebinding).
 - A request that another site's page caused is refused, whatever cookies come with it.
 """
 
@@ -67,7 +68,8 @@ class Tokens(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
 
 def kept_tokens(path: Path) -> Tokens:
-    """The tokens in a file of mode 0600, which is made where it is not there. ConfigError for a file that is no such file."""
+    """The tokens in a file of mode 0600, which is made where it is not there. ConfigError for a file that is no such
+    file."""
     try:
         if path.stat().st_mode & 0o077:
             raise ConfigError(f"--token-file {path} may be read by others: chmod 600 it")
@@ -156,7 +158,8 @@ class Access:
 
 
 class Guard:
-    """ASGI middleware: checks every request, and gives every answer its security headers. `scope["role"]` tells the rest."""
+    """ASGI middleware: checks every request, and gives every answer its security headers. `scope["role"]` tells the
+    rest."""
 
     def __init__(self, app: ASGIApp, access: Access) -> None:
         self._app = app

@@ -1,4 +1,5 @@
-"""Realised structure of selected policies, and edit size against improvement (paper, mechanism section and appendix)."""
+"""Realised structure of selected policies, and edit size against improvement (paper, mechanism section and
+appendix)."""
 
 from __future__ import annotations
 

@@ -59,9 +59,9 @@ class Where(msgspec.Struct, frozen=True, kw_only=True):
     ) -> AsyncIterator[tuple[transport.Link, LocalCluster | None]]:
         """A link to the cluster; with `--local` the cluster too, which has no workers yet.
 
-        `kind` names the logs of that cluster. `needs_state`: whether its state folder has to exist; otherwise a temporary one
-        replaces the usual one. `packages`: those that policies may import besides numpy. Raises ConfigError for a folder that does
-        not exist.
+        `kind` names the logs of that cluster. `needs_state`: whether its state folder has to exist; otherwise a
+        temporary one replaces the usual one. `packages`: those that policies may import besides numpy. Raises
+        ConfigError for a folder that does not exist.
         """
         async with contextlib.AsyncExitStack() as stack:
             file, cluster = self.file, None
@@ -86,7 +86,8 @@ async def play(
     slots: int,
     work: Callable[[], Coroutine[Any, Any, None]],
 ) -> None:
-    """Does the work; with a cluster of the command's own it starts workers first, and ends with an error when one fails."""
+    """Does the work; with a cluster of the command's own it starts workers first, and ends with an error when one
+    fails."""
     if cluster is not None:
         await cluster.start_workers(env_ids, slots=slots, tiers=tiers)
     await unless_failed(asyncio.create_task(work()), None if cluster is None else cluster.failed)

@@ -1,7 +1,7 @@
 """`evopolicy publish`, `evopolicy check`: results that others can check, and the check.
 
-Exit codes of `check`: 0 nothing contradicts, 1 something does, 2 wrong usage or no file of published results, 3 a replay that
-was asked for could not be done, or not of all parts of a run.
+Exit codes of `check`: 0 nothing contradicts, 1 something does, 2 wrong usage or no file of published results, 3 a
+replay that was asked for could not be done, or not of all parts of a run.
 """
 
 from __future__ import annotations
@@ -92,9 +92,9 @@ def publish(
 ) -> None:
     """Write finished runs into one signed file that anyone can check, and make their cases public.
 
-    This cannot be undone: no new run plays cases of the same epoch (see `evopolicy-coordinator epoch`). Paths, host names, users,
-    variables and tokens are removed; removed.json in the file lists them. Keys in policies or recordings, and values that a run
-    passed to its agent, stop the command: see --remove-findings and --accept-finding.
+    This cannot be undone: no new run plays cases of the same epoch (see `evopolicy-coordinator epoch`). Paths, host
+    names, users, variables and tokens are removed; removed.json in the file lists them. Keys in policies or recordings,
+    and values that a run passed to its agent, stop the command: see --remove-findings and --accept-finding.
     """
     where = where_of(connect, file, local, state, runs=runs)
     if out.exists():
@@ -189,9 +189,9 @@ def check(
 ) -> None:
     """Check published results.
 
-    Checks signature, digests, commitments, journal, selection and scores; with --replay also the recorded episodes. Executes nothing
-    of the file, except policies in the sandbox with --policies. Exit codes: 0 no contradiction, 1 a contradiction, 2 wrong usage or
-    no such file, 3 a replay was not possible, or some episodes have no recording.
+    Checks signature, digests, commitments, journal, selection and scores; with --replay also the recorded episodes.
+    Executes nothing of the file, except policies in the sandbox with --policies. Exit codes: 0 no contradiction, 1 a
+    contradiction, 2 wrong usage or no such file, 3 a replay was not possible, or some episodes have no recording.
     """
     if identity is not None and not re.fullmatch(r"[0-9a-fA-F]{64}", identity):
         fail(

@@ -1,7 +1,8 @@
 """`evopolicy report`: run directories in, a folder with the report out.
 
-It reads hidden scores, so it comes with the coordinator's extra. Needs no coordinator, worker or simulator. Exit codes: 0
-written, 1 no complete run among what was given or a disk that refuses, 2 wrong usage, 3 the runs are no fair comparison.
+It reads hidden scores, so it comes with the coordinator's extra. Needs no coordinator, worker or simulator. Exit codes:
+0 written, 1 no complete run among what was given or a disk that refuses, 2 wrong usage, 3 the runs are no fair
+comparison.
 """
 
 from __future__ import annotations

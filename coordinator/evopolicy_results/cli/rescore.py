@@ -1,7 +1,7 @@
 """`evopolicy rescore RUN…`: stored checkpoints on further hidden cases, written beside `run.json`.
 
-Exit codes: 0 every run is re-scored, 1 the cluster failed or refused, 2 wrong usage (also: no run can be re-scored), 3 some
-runs are re-scored and others cannot be, 130 Ctrl-C. The same command continues where an interrupted one stopped.
+Exit codes: 0 every run is re-scored, 1 the cluster failed or refused, 2 wrong usage (also: no run can be re-scored), 3
+some runs are re-scored and others cannot be, 130 Ctrl-C. The same command continues where an interrupted one stopped.
 """
 
 from __future__ import annotations
@@ -83,9 +83,10 @@ def rescore(
 ) -> None:
     """Play checkpoints of finished runs on further hidden cases, for tighter intervals.
 
-    Writes rescore/NAME.json beside run.json, which stays as it is. A re-score is post hoc: it never changes which checkpoint was
-    selected. `evopolicy report --scores NAME` uses it. Repeat an interrupted command to continue it.
-    Exit codes: 0 all re-scored, 1 the cluster failed, 2 wrong usage or no run can be re-scored, 3 some runs cannot be re-scored.
+    Writes rescore/NAME.json beside run.json, which stays as it is. A re-score is post hoc: it never changes which
+    checkpoint was selected. `evopolicy report --scores NAME` uses it. Repeat an interrupted command to continue it.
+    Exit codes: 0 all re-scored, 1 the cluster failed, 2 wrong usage or no run can be re-scored, 3 some runs cannot be
+    re-scored.
     """
     if cases is None and data is None:
         fail("name the new cases: --cases 256 for their number, or --data FOLDER for split files")

@@ -93,11 +93,10 @@ def verify(
 ) -> None:
     """Replay a run's recorded actions, and compare rewards, observations and returns bit for bit.
 
-    Also checks all other numbers of the run directory against each other, and against the coordinator's own result if it has the run.
-    Without that coordinator, edits that agree with each other are found only where a train episode shows them. Returns of re-scores
-    (rescore/NAME.json) are not played again.
-    Exit codes: 0 identical, 1 something differs, 2 wrong usage or other cases than the run's, 3 could not be checked, or not all
-    of it.
+    Also checks all other numbers of the run directory against each other, and against the coordinator's own result if
+    it has the run. Without that coordinator, edits that agree with each other are found only where a train episode
+    shows them. Returns of re-scores (rescore/NAME.json) are not played again. Exit codes: 0 identical, 1 something
+    differs, 2 wrong usage or other cases than the run's, 3 could not be checked, or not all of it.
     """
     order = _Order(
         run=run,

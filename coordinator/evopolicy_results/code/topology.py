@@ -26,7 +26,8 @@ _DIGITS = re.compile(r"\d+")
 
 
 class Features(msgspec.Struct, frozen=True, kw_only=True):
-    """Deterministic AST features of a source bundle: the columns of the paper's Table "Realized computational structure"."""
+    """Deterministic AST features of a source bundle: the columns of the paper's Table "Realized computational
+    structure"."""
 
     functions: int = 0
     """`def` and `async def`, methods included; lambdas are not."""

@@ -3,8 +3,8 @@
 Rules that this module owns:
 - A file is untrusted. Its check comes first, and nothing is unpacked of a file that fails.
 - Entries of different signers are different entries, also under one name.
-- Files of one signer are of one journal. If no journal can have led to both of two files, the check `order` fails for both; their
-  runs are shown, since nothing tells which file is true.
+- Files of one signer are of one journal. If no journal can have led to both of two files, the check `order` fails for
+  both; their runs are shown, since nothing tells which file is true.
 - Differences of processors do not make labs incomparable (`cpu` of the fingerprint); they are shown instead.
 """
 
@@ -271,8 +271,8 @@ def _compare_journals(found: Sequence[LabBundle]) -> None:
 
 
 def _tell_apart(found: Sequence[LabBundle]) -> None:
-    """Adds the signer to entries that several signers have, until none is shared: a signer may have chosen the name that
-    another's entry gets. Of a signer's runs with one name, the later ones get their ids."""
+    """Adds the signer to entries that several signers have, until none is shared: a signer may have chosen the name
+    that another's entry gets. Of a signer's runs with one name, the later ones get their ids."""
     names = [bundle.label for bundle in found]
     while shared := _shared(found):
         for bundle, name in zip(found, names, strict=True):

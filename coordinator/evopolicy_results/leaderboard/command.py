@@ -67,8 +67,8 @@ def leaderboard(
 ) -> None:
     """Write a leaderboard of several labs' published results as a static site.
 
-    Checks each file first. Files that fail are listed with the reason and not ranked. Results that cannot be compared get separate
-    tables.
+    Checks each file first. Files that fail are listed with the reason and not ranked. Results that cannot be compared
+    get separate tables.
     """
     labs: dict[str, str] = {}
     for each in identity or ():

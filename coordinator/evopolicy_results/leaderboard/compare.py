@@ -28,8 +28,8 @@ class Board(msgspec.Struct, kw_only=True):
 
 
 def boards(bundles: Sequence[LabBundle]) -> list[Board]:
-    """The boards, the one with most runs first. A bundle joins the first board that it is comparable with. Its runs with episodes
-    that have no recording stand on boards of their own, after the others."""
+    """The boards, the one with most runs first. A bundle joins the first board that it is comparable with. Its runs
+    with episodes that have no recording stand on boards of their own, after the others."""
     found: list[Board] = []
     parts = [
         (unrecorded, msgspec.structs.replace(bundle, runs=runs))

@@ -2,9 +2,10 @@
 
 Rules that this module owns:
 - The coordinator is asked to disclose the runs' cases before anything of them is read: it refuses while it must.
-- What is collected depends on the runs and the journal alone, and is written in a fixed order: publishing again gives the same bytes.
-- Every file goes through the searches of `scrub` before it is written. A secret stops the publication, before anything is
-  disclosed if it is in a file of a run directory, unless its line is accepted or its file left out.
+- What is collected depends on the runs and the journal alone, and is written in a fixed order: publishing again gives
+  the same bytes.
+- Every file goes through the searches of `scrub` before it is written. A secret stops the publication, before anything
+  is disclosed if it is in a file of a run directory, unless its line is accepted or its file left out.
 """
 
 from __future__ import annotations
@@ -80,8 +81,8 @@ class _GoneError(EvopolicyError):
 
 
 def find_runs(paths: Sequence[Path]) -> tuple[list[tuple[Path, RunRecord]], list[Removed]]:
-    """The finished runs in and below these folders, in the order of the coordinator's names, and the folders that are left out.
-    ConfigError where no run is left."""
+    """The finished runs in and below these folders, in the order of the coordinator's names, and the folders that are
+    left out. ConfigError where no run is left."""
     found: dict[str, tuple[Path, RunRecord]] = {}
     folders, without = run_folders(paths)
     left = [(path, "no run directory in it or below") for path in without]
@@ -125,8 +126,9 @@ class Publisher:
         remove_findings: bool = False,
         accepted: Sequence[str] = (),
     ) -> None:
-        """`with_logs`: publish agents' logs too, with everything replaced that the search finds. `remove_findings`: leave
-        out policies and recordings with secrets. `accepted`: `FILE:LINE` of each secret to be published as it is."""
+        """`with_logs`: publish agents' logs too, with everything replaced that the search finds. `remove_findings`:
+        leave out policies and recordings with secrets. `accepted`: `FILE:LINE` of each secret to be published as it
+        is."""
         self._remove_findings = remove_findings
         self._accepted = frozenset(map(os.path.abspath, accepted))
         self._with_logs = with_logs

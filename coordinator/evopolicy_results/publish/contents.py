@@ -214,7 +214,8 @@ class Listed(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def listing(entries: Iterable[journal.Entry], published: Iterable[str]) -> tuple[Listed, ...]:
-    """Every run that the journal has of the entries that `published` runs are of, in the order in which they were opened."""
+    """Every run that the journal has of the entries that `published` runs are of, in the order in which they were
+    opened."""
     chosen = set(published)
     opened: list[journal.Opened] = []
     status: dict[str, str] = {}

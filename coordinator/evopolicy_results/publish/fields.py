@@ -3,7 +3,8 @@
 Rules that this module owns:
 - Files are JSON in one spelling: a key that occurs twice, another order or other spaces are refused.
 - A file or field that the table does not name is refused: no check would look at it.
-- A field of `run.json` that the journal's entry should cover is a claim where it does not, as in results of earlier versions.
+- A field of `run.json` that the journal's entry should cover is a claim where it does not, as in results of earlier
+  versions.
 """
 
 from __future__ import annotations
@@ -22,8 +23,9 @@ from evopolicy_common.records.run_record import Tokens
 from evopolicy_results.publish import contents
 
 Cover = Literal["derived", "committed", "removed", "replayed", "claim"]
-"""`derived`: compared with what follows from other files. `committed`: a journal entry holds a digest of it. `removed`: empty in every
-publication. `replayed`: compared by `--replay`. `claim`: the publisher's word, which nobody can check."""
+"""`derived`: compared with what follows from other files. `committed`: a journal entry holds a digest of it. `removed`:
+empty in every publication. `replayed`: compared by `--replay`. `claim`: the publisher's word, which nobody can
+check."""
 
 
 def _all(path: str, kind: type[msgspec.Struct]) -> str:
@@ -96,9 +98,9 @@ FIELDS: dict[str, dict[Cover, str]] = {
     "runs/*/checkpoints/*": {"committed": ""},
     f"runs/*/{contents.LOG}": {"claim": ""},
 }
-"""Fields by file and cover; `*` is any key, index or folder, `**` everything below. A file that is no JSON has one field without a name.
-Where a recording or policy is withheld, what follows from it is a claim too. The journal is a chain: what it says is fixed only up to a
-head that was noted elsewhere."""
+"""Fields by file and cover; `*` is any key, index or folder, `**` everything below. A file that is no JSON has one
+field without a name. Where a recording or policy is withheld, what follows from it is a claim too. The journal is a
+chain: what it says is fixed only up to a head that was noted elsewhere."""
 
 
 def _tree(by_cover: dict[Cover, str]) -> dict[str, Any]:
@@ -117,7 +119,8 @@ _FILES = {file: re.compile(re.escape(file).replace(r"\*", "[^/]+")) for file in 
 
 
 def parsed(name: str, data: bytes) -> Any:
-    """The content of a JSON file of published results. Raises ProtocolError where publication would have spelt it in another way."""
+    """The content of a JSON file of published results. Raises ProtocolError where publication would have spelt it in
+    another way."""
     try:
         value = msgspec.json.decode(data)
     except (*DECODE_ERRORS, ValueError) as error:
@@ -153,7 +156,8 @@ def leaves(value: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, 
 
 
 def unknown_and_claims(name: str, value: Any, committed: dict[str, Any]) -> tuple[list[str], list[str]]:
-    """The fields that the table does not name or that publication empties, and those that are claims. `committed`: the fields of
+    """The fields that the table does not name or that publication empties, and those that are claims. `committed`: the
+    fields of
     `run.json` that the run's result holds."""
     tree = _TREES[file_kind(name) or ""]
     unknown: dict[str, None] = {}

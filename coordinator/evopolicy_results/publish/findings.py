@@ -1,4 +1,5 @@
-"""Findings of a check of published results, and what it reads: the files, the journal's entries, one run's documents."""
+"""Findings of a check of published results, and what it reads: the files, the journal's entries, one run's
+documents."""
 
 from __future__ import annotations
 
@@ -89,14 +90,16 @@ class PublishedRun(msgspec.Struct, frozen=True, kw_only=True):
         }[split]
 
     def recordings(self, files: Files, group: str) -> list[bytes | None]:
-        """The packed recordings of a group's episodes, by its name; empty without any. ProtocolError for damaged ones."""
+        """The packed recordings of a group's episodes, by its name; empty without any. ProtocolError for damaged
+        ones."""
         path = f"{self.folder}/actions/{group}"
         if path not in files.names:
             return []
         return contents.unpack_recordings(files.read(path, contents.MAX_RECORDING_BYTES))
 
     def bundles(self, files: Files) -> Iterator[tuple[int, Bundle]]:
-        """The published policies by submit index. Leaves out damaged bundles, which the check of checkpoints reports."""
+        """The published policies by submit index. Leaves out damaged bundles, which the check of checkpoints
+        reports."""
         for submit in self.result.submits:
             path = f"{self.folder}/{contents.checkpoint_path(submit.submit_index)}"
             if submit.bundle is not None and path in files.names:

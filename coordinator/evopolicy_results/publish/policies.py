@@ -1,12 +1,13 @@
-"""Plays published policies again that declare themselves deterministic, and compares their actions with the recorded ones.
+"""Plays published policies again that declare themselves deterministic, and compares their actions with the recorded
+ones.
 
 Rules that this module owns:
 - A policy is untrusted code: it runs in the worker's sandbox, with default limits, like any agent's.
-- Policies receive the published arguments (`env_meta`, episode indexes) and other random seeds than in the run, which are secret.
-  Only policies that declare `deterministic = True` are played.
+- Policies receive the published arguments (`env_meta`, episode indexes) and other random seeds than in the run, which
+  are secret. Only policies that declare `deterministic = True` are played.
 - A policy that fails here, or failed in the run, shows nothing: limits and machines differ.
-- The packages that a run's policies import are those that its `run.json` names, and only if the operator names them too: names in
-  the file alone make nothing of this machine visible or imported.
+- The packages that a run's policies import are those that its `run.json` names, and only if the operator names them
+  too: names in the file alone make nothing of this machine visible or imported.
 """
 
 from __future__ import annotations

@@ -1,11 +1,11 @@
 """Plays recorded actions of published results again, on a cluster of this machine's own.
 
 Rules that this module owns:
-- Nothing of the file is executed, and no limit of it is taken over: actions are data, the environments are the installed ones,
-  and the worker's slots run them in its jail.
-- The splits are those of the opening, which the commitment fixes. A run whose environment is not installed, or in other versions
-  than the run tells, is not played: other versions give other numbers. Nor is one whose environment does not repeat episodes
-  according to this machine; the file's own statement does not count.
+- Nothing of the file is executed, and no limit of it is taken over: actions are data, the environments are the
+  installed ones, and the worker's slots run them in its jail.
+- The splits are those of the opening, which the commitment fixes. A run whose environment is not installed, or in other
+  versions than the run tells, is not played: other versions give other numbers. Nor is one whose environment does not
+  repeat episodes according to this machine; the file's own statement does not count.
 """
 
 from __future__ import annotations
@@ -51,7 +51,8 @@ class Chosen(msgspec.Struct, frozen=True):
 
 
 PlayRun = Callable[[Evaluations, PublishedRun, Sequence[Chosen], bool], Awaitable[None]]
-"""Plays the chosen episodes of one run, and adds findings. Last: whether this processor has other features than the run's."""
+"""Plays the chosen episodes of one run, and adds findings. Last: whether this processor has other features than the
+run's."""
 
 
 async def replay(files: Files, checked: Checked, share: float, seed: int, slots: int, tell: Tell) -> None:
@@ -77,7 +78,8 @@ async def play_runs(
     play_run: PlayRun,
     packages_of: Callable[[PublishedRun], tuple[str, ...]] = lambda run: (),
 ) -> None:
-    """Plays runs on as many clusters, one after another, as their cases and packages ask for. Adds to `checked` those that cannot be."""
+    """Plays runs on as many clusters, one after another, as their cases and packages ask for. Adds to `checked` those
+    that cannot be."""
     total = sum(len(each.indexes) for parts in by_run.values() for each in parts)
     by_packages: dict[tuple[str, ...], list[PublishedRun]] = {}
     for part, *_ in by_run.values():
@@ -119,7 +121,8 @@ def installed(chosen: Sequence[Chosen], checked: Checked, kind: str) -> dict[str
 
 
 def layers(runs: Sequence[PublishedRun]) -> list[list[PublishedRun]]:
-    """The runs in groups in which no two have other cases of one environment: a cluster has one set of cases of each."""
+    """The runs in groups in which no two have other cases of one environment: a cluster has one set of cases of
+    each."""
     layers: list[tuple[dict[str, str], list[PublishedRun]]] = []
     for run in runs:
         env, cases = (
@@ -219,8 +222,8 @@ async def cluster_of(
 
 
 async def unplayable(evaluations: Evaluations, run: PublishedRun) -> tuple[str, bool]:
-    """Why episodes of the run cannot be compared on this machine: its environment does not repeat them, or in other versions.
-    Empty where they can. And whether the processor's features differ from those in the run."""
+    """Why episodes of the run cannot be compared on this machine: its environment does not repeat them, or in other
+    versions. Empty where they can. And whether the processor's features differ from those in the run."""
     env, known = run.opening.settings.env, run.record.versions.fingerprint
     try:
         state = await evaluations.versions(DescribeEnvironment(token="", env=env), wait=True)
@@ -294,8 +297,9 @@ async def _play(evaluations: Evaluations, files: Files, part: Chosen) -> tuple[i
 
 
 def rounded(recorded: Trajectory, again: Trajectory) -> bool:
-    """Whether two episodes of the same actions first differ in a reward, by `LAST_PLACES` units in the last place at most, and in
-    nothing else at that step. Later steps are not compared: an environment can enlarge such a difference."""
+    """Whether two episodes of the same actions first differ in a reward, by `LAST_PLACES` units in the last place at
+    most, and in nothing else at that step. Later steps are not compared: an environment can enlarge such a
+    difference."""
     for t in range(min(recorded.n, again.n)):
         ours, theirs = float(recorded.rewards[t]), float(again.rewards[t])
         if (recorded.terminated[t], recorded.truncated[t]) != (again.terminated[t], again.truncated[t]):

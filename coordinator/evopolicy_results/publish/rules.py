@@ -28,7 +28,8 @@ from evopolicy_results.publish.signatures import HEAD, signed_by
 def check(files: Files, identity: str = "", heads: Sequence[str | Countersignature] = ()) -> Checked:
     """All but the replay. `identity`: the public key (hex) that the signer must have; empty: any.
 
-    `heads`: of the journal, as they were noted elsewhere: hexadecimal digits, or another coordinator's countersignature.
+    `heads`: of the journal, as they were noted elsewhere: hexadecimal digits, or another coordinator's
+    countersignature.
     """
     checked = Checked()
     manifest = _manifest(files, identity, checked)

@@ -1,4 +1,5 @@
-"""The rules of `evopolicy check` for one run: its documents against the journal, against each other, and against its recordings."""
+"""The rules of `evopolicy check` for one run: its documents against the journal, against each other, and against its
+recordings."""
 
 from __future__ import annotations
 

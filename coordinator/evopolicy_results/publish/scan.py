@@ -1,4 +1,5 @@
-"""The transcript scan of published results: places in checkpoints and logs that a person should look at. Adds findings that are never `failed`."""
+"""The transcript scan of published results: places in checkpoints and logs that a person should look at. Adds findings
+that are never `failed`."""
 
 from __future__ import annotations
 

@@ -123,8 +123,8 @@ def needles(
 
 
 def search(data: bytes, needles: Iterable[Needle]) -> list[str]:
-    """The kinds of terms of this machine in `data`, without their texts; a name counts only if no letter or digit adjoins
-    it."""
+    """The kinds of terms of this machine in `data`, without their texts; a name counts only if no letter or digit
+    adjoins it."""
     found = ["a home folder"] if _HOME.search(data) else []
     found += [needle.what for needle in needles if next(_places(data, needle.text), None) is not None]
     return found

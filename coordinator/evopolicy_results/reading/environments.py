@@ -50,8 +50,8 @@ def _shipped_titles() -> frozenset[str]:
 
 
 def title_of(env: str) -> str:
-    """Short name for tables; the id itself if neither the catalogue nor the runs that were read have one, or if these tell the
-    title of an environment that ships."""
+    """Short name for tables; the id itself if neither the catalogue nor the runs that were read have one, or if these
+    tell the title of an environment that ships."""
     title = " ".join(one_line(_name(env)[0])[:_MAX_TITLE].split())
     foreign = env not in catalogue.entries()
     return env if not title or (foreign and title.casefold() in _shipped_titles()) else title

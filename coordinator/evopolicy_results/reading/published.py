@@ -194,7 +194,8 @@ def _number(value: Any) -> float:
 
 
 def decode(data: bytes) -> Any:
-    """`run.json` as plain values. Raises ProtocolError when it is not JSON, which has no NaN, half characters or numbers beyond floats."""
+    """`run.json` as plain values. Raises ProtocolError when it is not JSON, which has no NaN, half characters or
+    numbers beyond floats."""
     try:
         return msgspec.json.decode(data)
     except DECODE_ERRORS as error:

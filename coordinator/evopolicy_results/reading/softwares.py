@@ -18,8 +18,8 @@ SPLITS: tuple[Split, ...] = ("train", "validation", "heldout")
 
 
 def reconciled(runs: Sequence[Run]) -> tuple[Run, ...]:
-    """The runs, where a published run has the splits of our runs on its files, and an entry of its own if one of ours has
-    its name."""
+    """The runs, where a published run has the splits of our runs on its files, and an entry of its own if one of ours
+    has its name."""
     ours = [run for run in runs if not run.is_published]
     entries = {run.entry for run in ours}
     used: dict[tuple[Split, str], dict[str, set[int]]] = {}

@@ -1,8 +1,8 @@
 """Plays finished runs' checkpoints on further hidden cases and writes `rescore/NAME.json`.
 
 Rules that this module owns:
-- The cases are disjoint from the run's three splits. The coordinator checks this and takes everything else (policy, seeds,
-  limits, scope, definition) from its own record of the run.
+- The cases are disjoint from the run's three splits. The coordinator checks this and takes everything else (policy,
+  seeds, limits, scope, definition) from its own record of the run.
 - All runs of an environment get the same cases under the same name. An existing file with other cases is refused.
 - Only workers of the run's own versions play. A re-score never changes `run.json`.
 - The coordinator keeps outcomes under keys that follow from run, checkpoint and cases. An interrupted command therefore
@@ -87,7 +87,8 @@ class Written(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def read_finished(folders: Sequence[Path]) -> tuple[list[Finished], list[str], list[str]]:
-    """The runs in these directories, those without anything to re-score, and damaged or unfinished ones; with reasons."""
+    """The runs in these directories, those without anything to re-score, and damaged or unfinished ones; with
+    reasons."""
     found, without, unreadable = [], [], []
     for folder in folders:
         path = folder / RUN_JSON
@@ -122,8 +123,8 @@ class Rescorer:
         self._own_workers = own_workers
 
     async def rescore(self, run: Finished) -> Written:
-        """Plays the missing episodes of one run and writes its file. Raises ConfigError for runs, cases or versions that
-        do not fit."""
+        """Plays the missing episodes of one run and writes its file. Raises ConfigError for runs, cases or versions
+        that do not fit."""
         with _refusals():
             return await self._rescore(run)
 

@@ -2,7 +2,8 @@
 observation hashes or cases.
 
 A table keyed by observations or cases is memory of single episodes. Two forms are found:
-- a lookup (`table[key]`, `.get(key)`) whose key is a hash or the bytes of a value (`hash`, `hashlib`, `crc32`, `tobytes`);
+- a lookup (`table[key]`, `.get(key)`) whose key is a hash or the bytes of a value (`hash`, `hashlib`, `crc32`,
+  `tobytes`);
 - a lookup in a literal of sequences by `episode_index`, directly or through a variable or attribute that holds it.
 Digests of at least `_HEX` hexadecimal digits as keys of a literal count too.
 """

@@ -1,7 +1,8 @@
-"""Signals of policies that copy recorded train actions: a run of numbers in a checkpoint that an earlier trajectory has.
+"""Signals of policies that copy recorded train actions: a run of numbers in a checkpoint that an earlier trajectory
+has.
 
-A window of consecutive actions is compared as a whole, and only if it varies. Numbers that an earlier checkpoint already held
-are not copied from a trajectory: an open-loop policy's own plan comes back in its feedback.
+A window of consecutive actions is compared as a whole, and only if it varies. Numbers that an earlier checkpoint
+already held are not copied from a trajectory: an open-loop policy's own plan comes back in its feedback.
 """
 
 from __future__ import annotations
@@ -22,7 +23,8 @@ from evopolicy_results.scan.signals import Files, Signal, Trajectories, signal
 _WINDOW = 24
 """Consecutive numbers that must agree."""
 _FEWEST_VALUES, _FEWEST_CHANGES = 3, 8
-"""Different numbers, and changes from one to the next, that a window must have: constant and periodic plans have few."""
+"""Different numbers, and changes from one to the next, that a window must have: constant and periodic plans have
+few."""
 _MAX_FILE, _MAX_UNPACKED = 4 << 20, 64 << 20
 _MAX_NUMBERS = 400_000
 """Of a run's checkpoints, and of its trajectories."""
@@ -58,7 +60,8 @@ def copied_actions(checkpoints: Sequence[tuple[int, Files]], trajectories: Traje
 
 
 def _fresh(checkpoints: Sequence[tuple[int, Files]]) -> Iterator[tuple[int, dict[str, list[Window]]]]:
-    """The windows of each checkpoint's files that no earlier checkpoint held, until `_MAX_NUMBERS` numbers were read."""
+    """The windows of each checkpoint's files that no earlier checkpoint held, until `_MAX_NUMBERS` numbers were
+    read."""
     left = _MAX_NUMBERS
     own: set[Window] = set()
     known: set[tuple[str, bytes]] = set()

@@ -1,7 +1,7 @@
 """Signals in an agent's log: commands that reach for the network, for files outside the workspace, or for a simulator.
 
-Only what the agent had a tool do counts: commands and code of tool calls, in the forms of Claude Code, Codex and command agents.
-Its prose does not, and neither does the output of tools.
+Only what the agent had a tool do counts: commands and code of tool calls, in the forms of Claude Code, Codex and
+command agents. Its prose does not, and neither does the output of tools.
 """
 
 from __future__ import annotations

@@ -185,7 +185,8 @@ def _cell(sample: Sample, draws: _Draws | None, scale: Scale, low: Floats, width
     scores = (np.array(known, dtype=np.float64) - scale.random) / (scale.best - scale.random)
 
     def normalised(drawn: Floats) -> Floats:
-        # Without a width, a resample's scores are infinite: the interval of an aggregate that rests on them has no bounds.
+        # Without a width, a resample's scores are infinite: the interval of an aggregate that rests on them has no
+        # bounds.
         with np.errstate(divide="ignore", invalid="ignore"):
             found: Floats = np.nan_to_num((drawn - low) / width, nan=0.0, posinf=np.inf, neginf=-np.inf)
         return found

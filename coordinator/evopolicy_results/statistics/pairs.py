@@ -50,13 +50,14 @@ class Pair(msgspec.Struct, frozen=True, kw_only=True):
     p_holm: float | None
     """Corrected over all pairs of the suite, those with the random reference included."""
     p_these_cases: float | None
-    """p value of an exchange of runs, which takes these cases as given; None unless both have several runs. No verdict rests
-    on it."""
+    """p value of an exchange of runs, which takes these cases as given; None unless both have several runs. No verdict
+    rests on it."""
     verdict: Verdict
     """The better entry by the corrected p at 5 %."""
     n_needed: int | None
-    """Where agents are not told apart, runs of each (else held-out cases) with which every second experiment would resolve a
-    difference of this size at the level that Holm's correction leaves; None where unknown or where more do not help."""
+    """Where agents are not told apart, runs of each (else held-out cases) with which every second experiment would
+    resolve a difference of this size at the level that Holm's correction leaves; None where unknown or where more do
+    not help."""
     reason: str
     """Why there is no interval; empty otherwise."""
 

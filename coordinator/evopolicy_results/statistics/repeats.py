@@ -50,9 +50,9 @@ def half_width(spread: Spread, n: int) -> float:
 
 
 def repeats_needed(spread: Spread, gap: float, *, level: float = ALPHA) -> Repeats:
-    """The fewest runs per agent, from 2, whose interval of a difference, at 1 − `level`, is no wider than ± `gap`. A true
-    gap of that size is then distinguished from 0 in half of all experiments. Raises ValueError for a gap that is not
-    above 0."""
+    """The fewest runs per agent, from 2, whose interval of a difference, at 1 − `level`, is no wider than ± `gap`. A
+    true gap of that size is then distinguished from 0 in half of all experiments. Raises ValueError for a gap that is
+    not above 0."""
     if not gap > 0.0:
         raise ValueError(f"a gap of {gap} cannot be resolved; give one above 0")
     if not _resolves(spread, MAX_REPEATS, gap, level):

@@ -65,8 +65,8 @@ def standings(
     found: Sequence[Pair] = (),
     resamples: int = RESAMPLES,
 ) -> Standings:
-    """Rank estimates of the entries of `scores` (entry to its observed rank score), best first. All have a sample on each
-    environment.
+    """Rank estimates of the entries of `scores` (entry to its observed rank score), best first. All have a sample on
+    each environment.
 
     On a single environment two entries are distinguished only if `found` tells them apart as well.
     """

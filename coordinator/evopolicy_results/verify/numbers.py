@@ -1,9 +1,11 @@
-"""Checks the numbers of a run directory without playing an episode: against each other, and against the coordinator's result.
+"""Checks the numbers of a run directory without playing an episode: against each other, and against the coordinator's
+result.
 
 Rules that this module owns:
-- A number that follows from others in the directory must be what follows, bit for bit: means, spreads, the selection, the
-  budget.
-- If the coordinator still has the run, its result decides the rest: which submits there were, of which policies, and all scores.
+- A number that follows from others in the directory must be what follows, bit for bit: means, spreads, the selection,
+  the budget.
+- If the coordinator still has the run, its result decides the rest: which submits there were, of which policies, and
+  all scores.
 - Every difference names the file and both values. Missing fields of earlier versions are no difference.
 """
 
@@ -219,7 +221,8 @@ def _stored(submit: SubmitFiles, known: SubmitResult) -> Told:
 
 
 def _checkpoint(submit: SubmitFiles, known: SubmitResult | None) -> str | None:
-    """Whether the checkpoint's files are those that were submitted; without the coordinator, that its metadata names."""
+    """Whether the checkpoint's files are those that were submitted; without the coordinator, that its metadata
+    names."""
     named = "" if submit.meta is None else submit.meta.bundle
     submitted = None if known is None else known.bundle
     wanted = submitted or named

@@ -49,7 +49,8 @@ NEEDS_MORE_THAN_NO_JAIL = {
         "open a socket by a system call of 32-bit programs",
     ),
 }
-"""Whether they succeed without a jail depends on the machine: on root, on a route, on what processes keep to themselves."""
+"""Whether they succeed without a jail depends on the machine: on root, on a route, on what processes keep to
+themselves."""
 
 
 @pytest.mark.parametrize("cheat", STOPPED)

@@ -1,4 +1,5 @@
-"""What a jailed agent reads of a policy at work on its machine: the ways that are closed, and those that SECURITY.md says are open.
+"""What a jailed agent reads of a policy at work on its machine: the ways that are closed, and those that SECURITY.md
+says are open.
 
 Open ones are why hidden episodes and agents never share a kernel.
 """

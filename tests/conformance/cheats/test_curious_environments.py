@@ -1,4 +1,5 @@
-"""A user's environment sees its own modules and declared data of the folder in which it lies, and info brings no other text."""
+"""A user's environment sees its own modules and declared data of the folder in which it lies, and info brings no other
+text."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Everything that crossed to a gateway in a whole run, its memory, its logs and the workspace hold no hidden seed and no
-hidden return, in any form; and a leak that is planted is found in each of these places."""
+"""Everything that crossed to a gateway in a whole run, its memory, its logs and the workspace hold no hidden seed and
+no hidden return, in any form; and a leak that is planted is found in each of these places."""
 
 from __future__ import annotations
 
@@ -43,7 +43,8 @@ def leaky(cluster: GoldenCluster, golden: GoldenRun) -> Iterator[GoldenRun]:
 
 
 def hidden_of(run: GoldenRun) -> Needles:
-    """All that a gateway must not learn: every seed, those of the train cases too, and all that hidden episodes came to."""
+    """All that a gateway must not learn: every seed, those of the train cases too, and all that hidden episodes came
+    to."""
     needles = Needles()
     for split, cases in run.cluster.cases.items():
         for number, case in enumerate(cases):

@@ -1,9 +1,9 @@
-"""An agent listens to its machine while hidden episodes of its environment would be played: it hears nothing, as none is
-played there before it is gone. With the rule switched off the same agent hears which cases are played.
+"""An agent listens to its machine while hidden episodes of its environment would be played: it hears nothing, as none
+is played there before it is gone. With the rule switched off the same agent hears which cases are played.
 
-The channel stands for all that sandbox and jail cannot close: memory shared by processes, which the kernel counts for the whole
-machine. They do close this one, so policies and agents have neither here: the rule holds without them, and the records of who was
-where hold for every channel.
+The channel stands for all that sandbox and jail cannot close: memory shared by processes, which the kernel counts for
+the whole machine. They do close this one, so policies and agents have neither here: the rule holds without them, and
+the records of who was where hold for every channel.
 """
 
 from __future__ import annotations
@@ -139,7 +139,8 @@ def recognised(heard: list[float], wanted: list[int]) -> int:
 
 
 def hears(run: Listening, wanted: list[int]) -> bool:
-    """Whether the listener recognises one of the wanted pulses within a while: other programs' memory can cover some."""
+    """Whether the listener recognises one of the wanted pulses within a while: other programs' memory can cover
+    some."""
     deadline = time.monotonic() + HEARD_S
     while time.monotonic() < deadline:
         if recognised(run.heard(), wanted):

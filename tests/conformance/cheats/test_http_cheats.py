@@ -1,4 +1,5 @@
-"""What an agent can send to its gateway's port beyond the three requests: raw bytes over real sockets, beside honest ones.
+"""What an agent can send to its gateway's port beyond the three requests: raw bytes over real sockets, beside honest
+ones.
 
 Each test ends with an honest submit, which is charged for itself and nothing else.
 """
@@ -195,7 +196,8 @@ def test_a_request_inside_another_body_is_served_only_with_the_token(tmp_path: P
             assert status(answer) in (0, 400, 501), answer_text
             assert answer.count(b"HTTP/1.1") <= 1, answer_text
         assert w.served.double.submits == []
-        # Chunks go before a length, here as for every server that a front would hand this on to: the rest is no request.
+        # Chunks go before a length, here as for every server that a front would hand this on to: the rest is no
+        # request.
         both = f"{head}Transfer-Encoding: chunked\r\nContent-Length: {len(chunk) + 10}\r\nConnection: close\r\n\r\n"
         answer = await w.send(both.encode() + chunk + inner)
         assert answer.count(b"HTTP/1.1 200") <= 1

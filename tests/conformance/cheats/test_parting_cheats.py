@@ -1,4 +1,5 @@
-"""What an agent leaves in its workspace does not keep its run from being scored, nor lead anybody astray who reads it."""
+"""What an agent leaves in its workspace does not keep its run from being scored, nor lead anybody astray who reads
+it."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """A policy that wants to know whether it is validated: what it can observe is the same in every split.
 
-The policy tells what it sees through its actions, which is all that is kept of a hidden episode: 24 bits of a hash of each
-fact. The operator reads them from the coordinator once the run is over.
+The policy tells what it sees through its actions, which is all that is kept of a hidden episode: 24 bits of a hash of
+each fact. The operator reads them from the coordinator once the run is over.
 """
 
 from __future__ import annotations

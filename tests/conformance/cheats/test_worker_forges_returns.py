@@ -1,5 +1,5 @@
-"""A worker that reports what did not happen is caught by audits and named, next to honest ones that are not; and one with
-an old version is refused with the reason.
+"""A worker that reports what did not happen is caught by audits and named, next to honest ones that are not; and one
+with an old version is refused with the reason.
 
 The coordinator and the workers are the real processes, the sandbox too; what a worker cheats with is in
 `programs/cheating_worker.py`.

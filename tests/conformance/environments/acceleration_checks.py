@@ -2,8 +2,8 @@
 
 `python acceleration_checks.py --seeds 128 [ID …]` plays whole episodes of every accelerated environment, half of the
 seeds with random actions and half with a competent driver, on an accelerated and a plain environment side by side, and
-compares every bit of observation, reward, flags and info of every step, and of the state of the simulator. It says how many steps were compared and the
-ratio of the times they took, and ends with code 1 at the first difference.
+compares every bit of observation, reward, flags and info of every step, and of the state of the simulator. It says how
+many steps were compared and the ratio of the times they took, and ends with code 1 at the first difference.
 """
 
 from __future__ import annotations

@@ -56,7 +56,8 @@ MARKUP = {
 
 
 def flags(text: str) -> list[str]:
-    """Which signs of equations and constants stand in a text, tables of observations aside: they give units and scales."""
+    """Which signs of equations and constants stand in a text, tables of observations aside: they give units and
+    scales."""
     head, _, rest = text.partition("## Observation")
     observation, _, rest = rest.partition("## Action")
     prose = "\n".join(line for line in observation.splitlines() if not line.startswith("|"))

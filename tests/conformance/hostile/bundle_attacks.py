@@ -27,7 +27,8 @@ class BundleAttack(msgspec.Struct, frozen=True, kw_only=True):
     words: str
     """In the verdict's message."""
     harm: Callable[[Path], bool] | None = None
-    """Whether somebody who copies and reads such a folder without looking is harmed; None where to see it is not safe."""
+    """Whether somebody who copies and reads such a folder without looking is harmed; None where to see it is not
+    safe."""
 
 
 def _link(system: Path, secret: Path) -> None:

@@ -1,8 +1,8 @@
 """The corpus of hostile policies: what each does, the verdict it must get, and how its defence is switched off.
 
-Two kinds. *Probes* (files in `policies/`) try one attack after another and print `held: …` or `THROUGH: …`: their verdict
-is an ordinary episode in which every attempt fails. *Breakers* (`breakers.py`) misbehave at step 3 of an episode, or before its
-first; their verdict is the failure's category. docs/explanation/hostile-policies.md is made by
+Two kinds. *Probes* (files in `policies/`) try one attack after another and print `held: …` or `THROUGH: …`: their
+verdict is an ordinary episode in which every attempt fails. *Breakers* (`breakers.py`) misbehave at step 3 of an
+episode, or before its first; their verdict is the failure's category. docs/explanation/hostile-policies.md is made by
 
     PYTHONPATH=tests/support python tests/conformance/hostile/corpus.py > docs/explanation/hostile-policies.md
 """
@@ -47,8 +47,8 @@ class Probe(msgspec.Struct, frozen=True, kw_only=True):
 
     name: str
     off: dict[str, Any] | None
-    """Options under which every attempt not in `stays_shut` is seen to succeed: a weaker tier, or no seal; None where no
-    unprivileged process of an ordinary machine gets through."""
+    """Options under which every attempt not in `stays_shut` is seen to succeed: a weaker tier, or no seal; None where
+    no unprivileged process of an ordinary machine gets through."""
     stays_shut: frozenset[str] = frozenset()
     """Attempts that still fail when this defence is off, or that this machine may not support."""
     opens_for_root: frozenset[str] = frozenset()

@@ -1,4 +1,5 @@
-"""Every attack of the corpus gets its verdict, the slot plays honestly afterwards, and each is seen to succeed undefended."""
+"""Every attack of the corpus gets its verdict, the slot plays honestly afterwards, and each is seen to succeed
+undefended."""
 
 from __future__ import annotations
 
@@ -114,7 +115,8 @@ def serves_honestly(slots: Slots, tier: str = "bwrap", packages: tuple[str, ...]
 
 
 def with_packages(attacks: Iterable[Any]) -> list[Any]:
-    """Each attack with each of `PACKAGES` that it can be tried with; in the system's layer where it does not use them."""
+    """Each attack with each of `PACKAGES` that it can be tried with; in the system's layer where it does not use
+    them."""
     return [
         pytest.param(
             attack,

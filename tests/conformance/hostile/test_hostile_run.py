@@ -1,4 +1,5 @@
-"""The breakers as submits of one run: a worker of two slots gives each its verdict, then plays an honest policy as ever.
+"""The breakers as submits of one run: a worker of two slots gives each its verdict, then plays an honest policy as
+ever.
 
 While one is played, another's hidden episodes are: hostile policies are beside each other all the time.
 """

@@ -1,8 +1,9 @@
-"""A player without any defence: the policy lives in the environment's own process, and its results are pickles on a pipe.
+"""A player without any defence: the policy lives in the environment's own process, and its results are pickles on a
+pipe.
 
-What a breaker does to it is what it is worth; `harmed` tells. Run as a program, with descriptors 3 (a byte for each step)
-and 4 (results: length and pickle), it plays the `policy.py` of the folder that it is given. The results are opened in a
-process of their own, as one that believes them would open them.
+What a breaker does to it is what it is worth; `harmed` tells. Run as a program, with descriptors 3 (a byte for each
+step) and 4 (results: length and pickle), it plays the `policy.py` of the folder that it is given. The results are
+opened in a process of their own, as one that believes them would open them.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
-"""Checks a run directory against the published protocol, from `published-protocol.md` beside this file and nothing else.
+"""Checks a run directory against the published protocol, from `published-protocol.md` beside this file and nothing
+else.
 
-Each finding cites the line of that file it rests on. Written without knowledge of the code that writes run directories, and
-shares none with it: standard library only.
+Each finding cites the line of that file it rests on. Written without knowledge of the code that writes run directories,
+and shares none with it: standard library only.
 
     python tests/conformance/protocol/published_checker.py RUN_DIRECTORY…
 """

@@ -1,4 +1,5 @@
-"""Run directories that earlier versions wrote stay readable: `earlier_run` was played before the published names came."""
+"""Run directories that earlier versions wrote stay readable: `earlier_run` was played before the published names
+came."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Agents of the published protocol, unchanged, through a real cluster: with the published profile, and what a few of them
-meet without it."""
+"""Agents of the published protocol, unchanged, through a real cluster: with the published profile, and what a few of
+them meet without it."""
 
 from __future__ import annotations
 

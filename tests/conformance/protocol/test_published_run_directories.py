@@ -145,7 +145,8 @@ def edited(folder: Path, **parts: dict[str, Any]) -> None:
 
 
 def both_softwares(runs: Path, n_ours: int = 3) -> None:
-    """A run of each software of the same name on the same case files, of which ours has used `n_ours` held-out cases."""
+    """A run of each software of the same name on the same case files, of which ours has used `n_ours` held-out
+    cases."""
     published = write_published_run(runs / "published")
     edited(published, outcome={"heldout_returns": [-90.0, -95.0, -100.0], "final_score": -95.0})
     hashes = json.loads((published / "run.json").read_text())["versions"]

@@ -1,4 +1,5 @@
-"""Run directories of all Core16 environments pass the published checker, and hold the documented artifacts to the letter."""
+"""Run directories of all Core16 environments pass the published checker, and hold the documented artifacts to the
+letter."""
 
 from __future__ import annotations
 

@@ -2,8 +2,9 @@
 
     python tests/conformance/simulator_flags/simulator_rates.py
 
-The cases of `held_out/` were written before any rule. A case is a file, or a folder whose files belong together. Each is
-searched as code of each environment whose numbers are known. The command names the cases that it misses or flags wrongly.
+The cases of `held_out/` were written before any rule. A case is a file, or a folder whose files belong together. Each
+is searched as code of each environment whose numbers are known. The command names the cases that it misses or flags
+wrongly.
 """
 
 from __future__ import annotations

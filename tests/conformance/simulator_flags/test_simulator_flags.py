@@ -1,4 +1,5 @@
-"""Few simulators are found, and no honest agent is flagged; `simulator_rates.py` prints the rates of docs/how-to/reports.md."""
+"""Few simulators are found, and no honest agent is flagged; `simulator_rates.py` prints the rates of
+docs/how-to/reports.md."""
 
 from __future__ import annotations
 

@@ -88,7 +88,8 @@ def test_coordinator_killed_through_a_whole_run_ends_with_the_same_outcome(tmp_p
 
 @pytest.mark.slow
 def test_a_run_goes_on_from_a_backup_on_another_machine(tmp_path: Path) -> None:
-    """Another path, socket, worker and kernels; the first machine is gone with its worker's leases and its agent's permit."""
+    """Another path, socket, worker and kernels; the first machine is gone with its worker's leases and its agent's
+    permit."""
     state, backup, moved = tmp_path / "state", tmp_path / "backup", tmp_path / "elsewhere" / "state"
     first = Coordinator(state)
 

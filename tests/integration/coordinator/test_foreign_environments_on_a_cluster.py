@@ -1,4 +1,5 @@
-"""An environment that is installed on the worker alone: from its announcement through the operator's approval to a report."""
+"""An environment that is installed on the worker alone: from its announcement through the operator's approval to a
+report."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Each field of each published file, changed and signed again by its own publisher: refused, contradicted, or listed as a claim."""
+"""Each field of each published file, changed and signed again by its own publisher: refused, contradicted, or listed as
+a claim."""
 
 from __future__ import annotations
 

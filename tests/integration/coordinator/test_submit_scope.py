@@ -1,4 +1,5 @@
-"""Policy scope `submit` from the option to the report: told, played in order by one Policy, recorded, verified, not mixed.
+"""Policy scope `submit` from the option to the report: told, played in order by one Policy, recorded, verified, not
+mixed.
 
 Its policy also reads the clock, which a verification's second check is to find.
 """

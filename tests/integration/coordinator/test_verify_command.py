@@ -45,7 +45,8 @@ ENVIRONMENTS = ("toy/line", "gym/acrobot", "gymnasium/MiniGrid-FourRooms-v0")
 
 
 class Played:
-    """A state folder, the runs that were made with it, and a cluster that has it, on which most of them are verified."""
+    """A state folder, the runs that were made with it, and a cluster that has it, on which most of them are
+    verified."""
 
     def __init__(self, root: Path) -> None:
         self.root = root

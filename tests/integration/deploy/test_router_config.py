@@ -1,4 +1,5 @@
-"""A site's router, opened from the file that `evopolicy-coordinator router-config` writes, between real sessions over TLS."""
+"""A site's router, opened from the file that `evopolicy-coordinator router-config` writes, between real sessions over
+TLS."""
 
 from __future__ import annotations
 
@@ -32,7 +33,8 @@ OWN_KEY = {
 
 
 class Site:
-    """A coordinator's certificates, and a router of a site where a worker and an operator belong, and one worker does not."""
+    """A coordinator's certificates, and a router of a site where a worker and an operator belong, and one worker does
+    not."""
 
     def __init__(self, root: Path) -> None:
         self.certs = OwnCerts(root)

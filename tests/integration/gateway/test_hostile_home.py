@@ -1,4 +1,5 @@
-"""A home that refuses: read-only, full, named in no known letters, without a loopback. A line with path and remedy, at once."""
+"""A home that refuses: read-only, full, named in no known letters, without a loopback. A line with path and remedy, at
+once."""
 
 from __future__ import annotations
 
@@ -75,7 +76,8 @@ def home(tmp_path: Path) -> Path:
 
 
 def refused(where: str, command: str, folder: Path, *namespaces: str, code: int = 2) -> str:
-    """What the command says, in a line on stderr, when it is started where the shell words `where` have been carried out.
+    """What the command says, in a line on stderr, when it is started where the shell words `where` have been carried
+    out.
 
     `code`: what it ends with: 2 for an option, 1 for what the machine may give later.
     """

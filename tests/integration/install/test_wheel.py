@@ -1,7 +1,7 @@
 """Installed from a wheel, without a clone: everything that messages and pages name is there, and a run is played.
 
-Third-party packages are those of the environment that runs the tests: its site-packages stand behind the clean ones. Its
-editable evopolicy is not seen there, since nested .pth files are not read.
+Third-party packages are those of the environment that runs the tests: its site-packages stand behind the clean ones.
+Its editable evopolicy is not seen there, since nested .pth files are not read.
 """
 
 from __future__ import annotations

@@ -5,9 +5,9 @@
     one         10.92.3.2 ──cable─ 10.92.3.1 │
     two         10.92.4.2 ──cable─ 10.92.4.1 ┘
 
-Each host has a network namespace and a disk (its folder; the others' are hidden from it). The desk, where agents run, and
-worker `one` speak to the coordinator over routed TLS; worker `two` speaks to the site's router, which has a certificate of
-its own. Every machine's folder comes from `evopolicy-coordinator certs issue`.
+Each host has a network namespace and a disk (its folder; the others' are hidden from it). The desk, where agents run,
+and worker `one` speak to the coordinator over routed TLS; worker `two` speaks to the site's router, which has a
+certificate of its own. Every machine's folder comes from `evopolicy-coordinator certs issue`.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Whole runs over several hosts, and what befalls the network meanwhile: the run is that of one machine, byte for byte.
 
-Coordinator, two workers, a desk with gateway and agent, and a router between them, each in namespaces of its own, mutual
-TLS on every link (`sites.py`). What it is compared with is played on the coordinator's host alone.
+Coordinator, two workers, a desk with gateway and agent, and a router between them, each in namespaces of its own,
+mutual TLS on every link (`sites.py`). What it is compared with is played on the coordinator's host alone.
 """
 
 from __future__ import annotations
@@ -66,7 +66,8 @@ def ended_well(cluster: Sites, command: subprocess.Popen[bytes], host: str, name
 def play(
     cluster: Sites, name: str, env: str = TOY, meanwhile: Callable[[Command], object] | None = None
 ) -> None:
-    """A run from the desk; `meanwhile` happens when a third of its episodes are done. It must be that of one machine."""
+    """A run from the desk; `meanwhile` happens when a third of its episodes are done. It must be that of one
+    machine."""
     before = cluster.status_until(lambda reply: True).episodes_done
     command = cluster.begin("desk", name, env, cluster.root / "desk" / "keys")
     if meanwhile is not None:

@@ -1,4 +1,5 @@
-"""The five lines of docs/how-to/second-machine.md, run as they stand on two hosts with nothing in common but a cable."""
+"""The five lines of docs/how-to/second-machine.md, run as they stand on two hosts with nothing in common but a
+cable."""
 
 from __future__ import annotations
 

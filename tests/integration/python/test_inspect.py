@@ -1,4 +1,5 @@
-"""Inspect at work with the real library: it plays our tasks and gets our scores, and reads agents' logs that we export."""
+"""Inspect at work with the real library: it plays our tasks and gets our scores, and reads agents' logs that we
+export."""
 
 from __future__ import annotations
 

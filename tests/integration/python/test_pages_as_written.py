@@ -115,8 +115,8 @@ def stand_ins(folder: Path) -> Path:
 
 
 def test_the_page_about_coding_agents_runs_its_agents(tmp_path: Path) -> None:
-    """Its commands with the shortest runs on the smallest environment. Codex and Gemini CLI are stand-ins here, the built-in
-    agent is itself; `test_real_clis.py` plays the real ones."""
+    """Its commands with the shortest runs on the smallest environment. Codex and Gemini CLI are stand-ins here, the
+    built-in agent is itself; `test_real_clis.py` plays the real ones."""
     pages = [
         f"how-to/{name}.md" for name in ("coding-agents", "agents-prompts", "agents-api-key", "agents-clis")
     ]

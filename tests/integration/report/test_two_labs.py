@@ -1,4 +1,5 @@
-"""The two labs of docs/how-to/leaderboard.md: the page's own commands, a clean installation, and the site in Chromium."""
+"""The two labs of docs/how-to/leaderboard.md: the page's own commands, a clean installation, and the site in
+Chromium."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""An operator's acts from the page, in a real browser on a real cluster: each is confirmed, has its effect, and is written down."""
+"""An operator's acts from the page, in a real browser on a real cluster: each is confirmed, has its effect, and is
+written down."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""The live view in a real browser, over a real cluster: a sweep is watched from its start to its end, whatever dies meanwhile."""
+"""The live view in a real browser, over a real cluster: a sweep is watched from its start to its end, whatever dies
+meanwhile."""
 
 from __future__ import annotations
 
@@ -141,7 +142,8 @@ def test_a_sweep_is_watched_from_start_to_end(tmp_path: Path) -> None:
                         page.until("document.getElementById('live')?.dataset.state === 'live'")
                         page.problems.clear()
 
-                        # The first run is scored while the second one's agent is alive: its scores are hidden until that ends.
+                        # The first run is scored while the second one's agent is alive: its scores are hidden until
+                        # that ends.
                         page.visit(f"http://127.0.0.1:{web}/")
                         (first / "go").touch()
                         wait_until(

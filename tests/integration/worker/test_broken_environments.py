@@ -1,4 +1,5 @@
-"""Environments that break on a real worker beside a sound one: told by name, charged to nobody, and the other slot goes on."""
+"""Environments that break on a real worker beside a sound one: told by name, charged to nobody, and the other slot goes
+on."""
 
 from __future__ import annotations
 

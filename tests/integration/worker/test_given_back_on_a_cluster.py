@@ -1,7 +1,9 @@
-"""An agent times its submits so that its hidden validation is stopped again and again: its policy's dice are thrown once.
+"""An agent times its submits so that its hidden validation is stopped again and again: its policy's dice are thrown
+once.
 
-A real coordinator, a real supervisor and its real slot; the agent is on another machine, so that its submits may be played.
-The environment is the test's own: a hidden episode of it goes on until the test writes its length to a file, however slow the machine is.
+A real coordinator, a real supervisor and its real slot; the agent is on another machine, so that its submits may be
+played. The environment is the test's own: a hidden episode of it goes on until the test writes its length to a file,
+however slow the machine is.
 """
 
 from __future__ import annotations

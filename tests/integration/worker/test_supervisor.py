@@ -131,7 +131,8 @@ async def supervising(
     failed: dict[str, str] | None = None,
     describe: Describe | None = None,
 ) -> AsyncIterator[Supervisor]:
-    """A supervisor that works in the background and is drained at the end. `failed`: in place of the environment that works."""
+    """A supervisor that works in the background and is drained at the end. `failed`: in place of the environment that
+    works."""
     options = Options(
         name=name,
         slots=slots,
@@ -461,7 +462,8 @@ def test_a_result_that_is_refused_for_good_blocks_no_other(
     broken: list[int] = []
 
     def wrong(outcome: EpisodeOutcome) -> EpisodeOutcome:
-        """Bytes that are not those of their digest: as a part of the message, as a blob, or as a part of a packed blob."""
+        """Bytes that are not those of their digest: as a part of the message, as a blob, or as a part of a packed
+        blob."""
         if outcome.index in (2, 3) and len(broken) < 4:
             broken.append(outcome.index)
             size = bulk if bulk == 200_000 else 40

@@ -1,8 +1,8 @@
 """Ways for a policy to send bits to other processes of its machine, and the share that arrives.
 
-A writer (a policy in a sealed slot) sends bits by the clock, one a period. A reader (a program in an agent's jail, or another
-policy) samples what it can see. What it makes of it, with a threshold learnt from the first half of the bits, says how many of
-the others arrive.
+A writer (a policy in a sealed slot) sends bits by the clock, one a period. A reader (a program in an agent's jail, or
+another policy) samples what it can see. What it makes of it, with a threshold learnt from the first half of the bits,
+says how many of the others arrive.
 """
 
 from __future__ import annotations
@@ -276,7 +276,8 @@ def between_policies(slots: Slots, cores: tuple[int, int], n: int = 80) -> float
 
 
 def afterwards(slots: Slots, reader: JailedReader, wait_s: float, n: int) -> dict[str, float]:
-    """Of `n` episodes, half of which did all that lasts: which share each reading tells apart, `wait_s` after they ended."""
+    """Of `n` episodes, half of which did all that lasts: which share each reading tells apart, `wait_s` after they
+    ended."""
     kinds = [k % 2 for k in range(n)]
     random.shuffle(kinds)
     moved: dict[str, list[float | None]] = {}

@@ -1,7 +1,8 @@
 """A policy that guesses its split from the time between its calls, and how often such guesses are right.
 
-The policy reads the clock at the begin and the end of each call, and prints the gaps (ns) at one step of its episode. Train and
-hidden episodes of the same cases are played in one slot in random order, by jobs with what `core/leasing/jobs.py` gives each.
+The policy reads the clock at the begin and the end of each call, and prints the gaps (ns) at one step of its episode.
+Train and hidden episodes of the same cases are played in one slot in random order, by jobs with what
+`core/leasing/jobs.py` gives each.
 """
 
 from __future__ import annotations

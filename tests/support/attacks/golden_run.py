@@ -1,5 +1,5 @@
-"""Whole runs with everything that crosses to a gateway kept, and its memory read: while hidden episodes are played, and when
-all of them are done but the gateway has not yet been let go."""
+"""Whole runs with everything that crosses to a gateway kept, and its memory read: while hidden episodes are played, and
+when all of them are done but the gateway has not yet been let go."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """Looks for numbers and texts that must not be somewhere, in whatever form they could be written there.
 
-A value is looked for as text (its digits, JSON, hexadecimal, base64) and as bytes (integers and floats of 4 and 8 bytes in
-both orders, msgpack, a Python integer's own digits), in the bytes as they are and in every zstd, gzip or zlib stream that
-begins anywhere in them, streams inside streams too.
+A value is looked for as text (its digits, JSON, hexadecimal, base64) and as bytes (integers and floats of 4 and 8 bytes
+in both orders, msgpack, a Python integer's own digits), in the bytes as they are and in every zstd, gzip or zlib stream
+that begins anywhere in them, streams inside streams too.
 """
 
 from __future__ import annotations

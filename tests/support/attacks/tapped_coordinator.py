@@ -2,8 +2,8 @@
 
 Started as `python tapped_coordinator.py TAP LEAK OPTIONS…`. TAP becomes a stream of msgpack `[way, key, payload]`, each
 after its length in four bytes. While the
-file LEAK exists, the numbers in it go into the task's text, and they and every return that a worker reports go, compressed,
-into the output of the episodes that gateways are told of: leaks that a search has to find.
+file LEAK exists, the numbers in it go into the task's text, and they and every return that a worker reports go,
+compressed, into the output of the episodes that gateways are told of: leaks that a search has to find.
 """
 
 from __future__ import annotations

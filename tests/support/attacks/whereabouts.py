@@ -1,4 +1,5 @@
-"""Who was alive where, as a tapped coordinator's questions and answers tell it: agents by their permits, episodes by leases."""
+"""Who was alive where, as a tapped coordinator's questions and answers tell it: agents by their permits, episodes by
+leases."""
 
 from __future__ import annotations
 

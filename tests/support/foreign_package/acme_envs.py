@@ -1,4 +1,5 @@
-"""Environments of somebody else's, as a package that Gymnasium imports by name: a good one, one with every space, and bad ones."""
+"""Environments of somebody else's, as a package that Gymnasium imports by name: a good one, one with every space, and
+bad ones."""
 
 from __future__ import annotations
 
@@ -245,8 +246,8 @@ class Grumbles(gymnasium.Wrapper[Any, Any, Any, Any]):
 
 
 class Keeper(Glider):
-    """Keeps how many episodes it has begun, in memory and in a file, and rewards each step by that. Ends its process on an
-    action above `dies_of`."""
+    """Keeps how many episodes it has begun, in memory and in a file, and rewards each step by that. Ends its process on
+    an action above `dies_of`."""
 
     def __init__(self, dies_of: float = 1.0, render_mode: str | None = None) -> None:
         super().__init__(render_mode=render_mode)

@@ -1,6 +1,7 @@
 """Loaded by Harbor's own processes in tests: a stand-in for Docker, and a scripted agent.
 
-The stand-in reads a task's volumes and variables as Docker would, and plays commands in a namespace of bubblewrap, whose
+The stand-in reads a task's volumes and variables as Docker would, and plays commands in a namespace of bubblewrap,
+whose
 `/work`, `/logs`, `/tests` and `/tmp` are its own. It builds no image: programs are those of this machine.
 """
 

@@ -10,7 +10,8 @@ from invented.policies import Version
 
 
 def claude_log(versions: Sequence[Version]) -> list[dict[str, Any]]:
-    """A stream of the `stream-json` kind: assistant messages with text and tool calls, tool results as user messages."""
+    """A stream of the `stream-json` kind: assistant messages with text and tool calls, tool results as user
+    messages."""
     lines: list[dict[str, Any]] = [{"type": "system", "subtype": "init", "model": "test"}]
     for index, version in enumerate(versions):
         content: list[dict[str, Any]] = []

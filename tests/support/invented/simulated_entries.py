@@ -407,8 +407,8 @@ def aggregate_rates(
 
 
 def resolved(n_runs: int, trials: int, *, level: float = 0.05, seed: int = 0) -> Rate:
-    """How often a true gap as large as the smallest difference of `n_runs` runs is resolved; for 0 runs, a gap of 1 with
-    the runs that it needs at `level`."""
+    """How often a true gap as large as the smallest difference of `n_runs` runs is resolved; for 0 runs, a gap of 1
+    with the runs that it needs at `level`."""
     g = np.random.default_rng(seed)
     spread = Spread(run=0.5**2 + 1.0 / 32, case=2 * 0.5**2 / 32, n_cases=32)
     if n_runs:
@@ -426,8 +426,8 @@ def resolved(n_runs: int, trials: int, *, level: float = 0.05, seed: int = 0) ->
 
 
 def optimism_rates(trials: int, *, n_submits: int = 10, seed: int = 0) -> tuple[Rate, Rate]:
-    """Of agents whose submits are all equally good: how often the mean optimism over 16 environments is above 0, and how
-    often its interval holds the true one."""
+    """Of agents whose submits are all equally good: how often the mean optimism over 16 environments is above 0, and
+    how often its interval holds the true one."""
     g = np.random.default_rng(seed)
     true = float(np.random.default_rng(1).normal(0, 1, (200_000, n_submits)).max(axis=1).mean())
     above = held = 0

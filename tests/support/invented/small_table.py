@@ -1,4 +1,5 @@
-"""A small table with what written forms must take care of: special characters, gaps, ties, a value that rounds to -0."""
+"""A small table with what written forms must take care of: special characters, gaps, ties, a value that rounds to
+-0."""
 
 from __future__ import annotations
 

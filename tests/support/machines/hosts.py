@@ -1,8 +1,10 @@
-"""Hosts on this machine: network, mount and name namespaces, joined by cables that can be pulled and wires that are bad.
+"""Hosts on this machine: network, mount and name namespaces, joined by cables that can be pulled and wires that are
+bad.
 
 A host is its holder, a process that only sleeps: what runs on the host is started by `nsenter` into the holder's
 namespaces, and when the holder is gone and nothing runs there any more, the kernel takes namespaces, devices and routes
-away. Holders, and what was started on hosts, are ended with the thread that made them: a test that is killed leaves nothing.
+away. Holders, and what was started on hosts, are ended with the thread that made them: a test that is killed leaves
+nothing.
 
 Root makes the namespaces as it is; other users make them inside a user namespace, where the kernel lets them. `require`
 says why not. Call from the main thread.

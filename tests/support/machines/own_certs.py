@@ -1,4 +1,5 @@
-"""A coordinator's state folder with certificates, and machines' folders made from it, as `evopolicy-coordinator certs` does."""
+"""A coordinator's state folder with certificates, and machines' folders made from it, as `evopolicy-coordinator certs`
+does."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Environments that do odd things, each once it has been made or stepped, as a package that Gymnasium imports by name."""
+"""Environments that do odd things, each once it has been made or stepped, as a package that Gymnasium imports by
+name."""
 
 from __future__ import annotations
 

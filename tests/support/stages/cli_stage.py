@@ -1,4 +1,5 @@
-"""A stage for a coding agent's CLI without a cluster: a gateway that only counts, a log, and the fake CLIs on the PATH."""
+"""A stage for a coding agent's CLI without a cluster: a gateway that only counts, a log, and the fake CLIs on the
+PATH."""
 
 from __future__ import annotations
 

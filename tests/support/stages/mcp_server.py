@@ -1,4 +1,5 @@
-"""A server of the Model Context Protocol on stdin and stdout: its one tool reads the file beside it, and tries to change it."""
+"""A server of the Model Context Protocol on stdin and stdout: its one tool reads the file beside it, and tries to
+change it."""
 
 import json
 import os

@@ -1,9 +1,10 @@
-"""A model API on loopback that plays a script: enough of OpenAI's Responses and Chat Completions, Anthropic's Messages and
-Google's generateContent for the real CLIs.
+"""A model API on loopback that plays a script: enough of OpenAI's Responses and Chat Completions, Anthropic's Messages
+and Google's generateContent for the real CLIs.
 
-Each request with tools is answered by the next step of the script: a shell command to run, or a text that ends the turn.
-Requests beside the conversation (titles, token counts, suggestions, an agent's notes) get a short text and move nothing. Codex and Qwen Code list the tools of MCP servers only
-when their model searches for them: the script's model then searches first, which moves nothing either.
+Each request with tools is answered by the next step of the script: a shell command to run, or a text that ends the
+turn. Requests beside the conversation (titles, token counts, suggestions, an agent's notes) get a short text and move
+nothing. Codex and Qwen Code list the tools of MCP servers only when their model searches for them: the script's model
+then searches first, which moves nothing either.
 """
 
 from __future__ import annotations
@@ -20,13 +21,14 @@ INPUT, CACHED, CREATED, OUTPUT, REASONING = 1000, 700, 50, 20, 5
 
 
 BESIDE = ("[SUGGESTION MODE", "Managed memory has")
-"""What the last message of a request with tools says that Claude Code or Qwen Code makes beside the conversation, after a turn."""
+"""What the last message of a request with tools says that Claude Code or Qwen Code makes beside the conversation, after
+a turn."""
 
 
 class Step:
-    """`command`: run it in the agent's shell. `tool`: call the offered tool whose name ends so, without arguments. `text`: say it
-    and end the turn. `status`: an HTTP error instead. `unknown`: call a tool of this name, which the agent does not offer. `odd`:
-    answer in a way of its own (`odd_answers.py`)."""
+    """`command`: run it in the agent's shell. `tool`: call the offered tool whose name ends so, without arguments.
+    `text`: say it and end the turn. `status`: an HTTP error instead. `unknown`: call a tool of this name, which the
+    agent does not offer. `odd`: answer in a way of its own (`odd_answers.py`)."""
 
     def __init__(
         self,
@@ -66,7 +68,8 @@ class ModelApi:
         self.requests: list[dict[str, Any]] = []
         """Bodies of the requests that moved the script on."""
         self.n_asked = self.n_answered = 0
-        """Requests that cost tokens, and those of them that were answered as `INPUT` and the others say; beside the conversation too."""
+        """Requests that cost tokens, and those of them that were answered as `INPUT` and the others say; beside the
+        conversation too."""
         self.bodies: list[bytes] = []
         """Of all requests, as they came."""
         self.keys: set[str] = set()

@@ -1,6 +1,8 @@
-"""What is in `deploy/` fits the commands, the sandbox, and the tools that will read it, as far as these are here to ask.
+"""What is in `deploy/` fits the commands, the sandbox, and the tools that will read it, as far as these are here to
+ask.
 
-`systemd-analyze verify` and `docker compose config` are asked where they are installed; the rest is checked on the files.
+`systemd-analyze verify` and `docker compose config` are asked where they are installed; the rest is checked on the
+files.
 """
 
 from __future__ import annotations

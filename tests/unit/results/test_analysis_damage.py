@@ -1,4 +1,5 @@
-"""Runs damaged at random, in a value of one of their files or in a few bytes: each is read, or left out with a reason."""
+"""Runs damaged at random, in a value of one of their files or in a few bytes: each is read, or left out with a
+reason."""
 
 from __future__ import annotations
 

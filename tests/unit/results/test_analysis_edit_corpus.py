@@ -1,4 +1,5 @@
-"""More labelled edits, of a policy with most of the language in it: nested functions, classes that inherit, patterns, globals."""
+"""More labelled edits, of a policy with most of the language in it: nested functions, classes that inherit, patterns,
+globals."""
 
 from __future__ import annotations
 

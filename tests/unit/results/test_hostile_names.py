@@ -1,4 +1,5 @@
-r"""Names and texts of strangers in reports: no script, no `\\input`, no control characters, nothing that reverses the text after it."""
+r"""Names and texts of strangers in reports: no script, no `\\input`, no control characters, nothing that reverses the
+text after it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Entries of several signers stay apart whatever they call themselves, and a published run names no file of this machine."""
+"""Entries of several signers stay apart whatever they call themselves, and a published run names no file of this
+machine."""
 
 from __future__ import annotations
 

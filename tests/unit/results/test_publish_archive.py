@@ -1,4 +1,5 @@
-"""Files of published results come from strangers: whatever the writer would not have made is refused, with the reason."""
+"""Files of published results come from strangers: whatever the writer would not have made is refused, with the
+reason."""
 
 from __future__ import annotations
 

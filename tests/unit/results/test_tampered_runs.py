@@ -1,6 +1,8 @@
-"""Run directories of strangers: whatever is in place of their files, each command that reads them refuses or is unaffected.
+"""Run directories of strangers: whatever is in place of their files, each command that reads them refuses or is
+unaffected.
 
-No reader waits for a pipe, follows a link to this machine's files, reads a file without end, or raises what no command reports.
+No reader waits for a pipe, follows a link to this machine's files, reads a file without end, or raises what no command
+reports.
 """
 
 from __future__ import annotations

@@ -105,7 +105,8 @@ printf '' > {folder}/chromium && chmod +x {folder}/chromium
 
 @pytest.fixture
 def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """A machine without a browser. Its apt-get writes down what it is asked, and installs one once it has been updated."""
+    """A machine without a browser. Its apt-get writes down what it is asked, and installs one once it has been
+    updated."""
     folder = tmp_path / "machine"
     folder.mkdir()
     (folder / "apt-get").write_text(APT.format(folder=folder))

@@ -127,8 +127,8 @@ def measured(environment: Environment) -> EnvironmentDescription:
 
 
 def packages(env_id: str) -> dict[str, str] | None:
-    """Versions of the distributions that decide this environment's numbers; None where they are measured in an environment
-    that has been made. Imports no simulator."""
+    """Versions of the distributions that decide this environment's numbers; None where they are measured in an
+    environment that has been made. Imports no simulator."""
     found = _entry(env_id)
     if found.adapter == "toy":
         return versions(("numpy",))

@@ -107,7 +107,8 @@ class EnvProcess:
         with env_jail.expendable():
             zygote = Zygote(plan, scratch)
         env_jail.seal(start.tier, scratch, plan.user, draws=start.draws)
-        # In addition to the monitor, for memory allocated between two of its checks; programs often reserve this much more than they use.
+        # In addition to the monitor, for memory allocated between two of its checks; programs often reserve this much
+        # more than they use.
         most = 2 * start.limits.memory_bytes
         resource.setrlimit(resource.RLIMIT_DATA, (most, most))
         faulthandler.enable(all_threads=False)  # so that a crash names the environment's lines

@@ -33,7 +33,8 @@ MAX_AXES = 16
 MAX_USED = 1 << 53
 """No process has more bytes than this; a float still counts them one by one."""
 VALUE_BYTES = 16
-"""Bytes of an action's limit per value that it may contain, since Python's objects take more memory than their bytes."""
+"""Bytes of an action's limit per value that it may contain, since Python's objects take more memory than their
+bytes."""
 
 Writer = Callable[[Any], list[Any]]
 """From an observation to the buffers of its payload, in order."""
@@ -168,7 +169,8 @@ def _varying_step(path: tuple[Any, ...], spell: Callable[[Any, list[Any]], None]
 
 
 def _spelled(space: SpaceSchema) -> Step:
-    """How a value is laid out whose form the space leaves open: counts before what they count, nothing on a multiple of 8."""
+    """How a value is laid out whose form the space leaves open: counts before what they count, nothing on a multiple of
+    8."""
     kind = space["type"]
     if kind == "Sequence":
         item = _spelled(space["space"])
@@ -256,7 +258,8 @@ def init_frame(init: dict[str, Any], files: bytes) -> list[bytes]:
 
 
 def action(tag: int, payload: bytes, max_values: int = 1024) -> Any:
-    """The value that `act` returned. Raises BadReplyError if the bytes encode no value; its validity is not checked here.
+    """The value that `act` returned. Raises BadReplyError if the bytes encode no value; its validity is not checked
+    here.
 
     `max_values`: how many numbers, texts, lists and dicts, with what is in them, it may be made of; of arrays the
     numbers count, or the innermost lists where there are none.
@@ -303,7 +306,8 @@ def _array(data: bytes | memoryview) -> NDArray[Any]:
 
 
 def _numbers(array: NDArray[Any]) -> int:
-    """How many numbers an array is written as, or innermost lists where it holds none: (4000000000, 0) takes no byte."""
+    """How many numbers an array is written as, or innermost lists where it holds none: (4000000000, 0) takes no
+    byte."""
     return array.size or math.prod(max(1, n) for n in array.shape)
 
 
@@ -324,7 +328,8 @@ _COUNTED = (dict, list, np.ndarray, datetime.datetime)
 def _values(value: Any, left: int) -> int:
     """How many values it is made of.
 
-    ValueError when it nests deeper than `left`, or holds what the shim never sends: timestamps, and keys that are not texts.
+    ValueError when it nests deeper than `left`, or holds what the shim never sends: timestamps, and keys that are not
+    texts.
     """
     if left < 0:
         raise ValueError(f"it nests deeper than {MAX_DEPTH}")

@@ -102,8 +102,8 @@ class Watch:
         """Whether it was ended because it stood stopped."""
         self._held = held
         self._looked = self._next = time.monotonic()
-        # Excused seconds: in the episode; in the answer that was owed at the last look, and its start; separately, the waits
-        # for a processor, which the kernel counts.
+        # Excused seconds: in the episode; in the answer that was owed at the last look, and its start; separately, the
+        # waits for a processor, which the kernel counts.
         self._excused_s = self._in_episode_s = 0.0
         self._answer = self._answer_excused_s = self._in_answer_s = 0.0
         self._episode_waited = 0.0
@@ -229,7 +229,8 @@ class Watch:
         return in_answer, self.spent_s + owed_s - self._excused_s - self._in_episode_s
 
     def _waited_s(self, cpu_s: float) -> float:
-        """How long the process's first thread has waited so far for a processor that its other threads did not have, seconds.
+        """How long the process's first thread has waited so far for a processor that its other threads did not have,
+        seconds.
 
         0.0 where the kernel does not tell.
         """
@@ -246,7 +247,8 @@ class Monitor(threading.Thread):
     """Watches one policy at a time, and one descriptor for commands."""
 
     def __init__(self, commands: int, on_command: Callable[[], None], on_tick: Callable[[], None]) -> None:
-        """`on_command` reads from `commands` when there is something; `on_tick` runs every tick while one is watched."""
+        """`on_command` reads from `commands` when there is something; `on_tick` runs every tick while one is
+        watched."""
         super().__init__(name="monitor", daemon=True)
         self._commands = commands
         self._on_command = on_command

@@ -31,8 +31,8 @@ from evopolicy_worker.sandbox.zygote import Child, Zygote
 MAX_CODES = 8
 """Policies whose compiled code is kept, at most 1 MiB each."""
 _COUNT_S = 1.0
-"""Interval at which the processes are counted that the machine ended for want of memory. The kernel's list of counters takes it
-50 µs and more."""
+"""Interval at which the processes are counted that the machine ended for want of memory. The kernel's list of counters
+takes it 50 µs and more."""
 
 
 class Policies:

@@ -73,8 +73,8 @@ _STAGES: dict[str, FailureCategory] = {
 def address_space(base_bytes: int, memory_bytes: int) -> int:
     """The limit of a policy's address space, bytes, which the policy can read.
 
-    `base_bytes`: its size with Python alone. It differs by a page between the zygotes of a machine, depending on where the
-    kernel put the heap, so that a policy could tell slots apart; rounded up to 1 MiB, it does not.
+    `base_bytes`: its size with Python alone. It differs by a page between the zygotes of a machine, depending on where
+    the kernel put the heap, so that a policy could tell slots apart; rounded up to 1 MiB, it does not.
     """
     return -(-base_bytes // _ROUND_BYTES) * _ROUND_BYTES + memory_bytes
 
@@ -126,8 +126,8 @@ class PolicyProcess:
         folder: str,
         oom_kills: int | None = None,
     ) -> None:
-        """`folder` is where its files are when the jail gives it no home of its own; `oom_kills`, what that function gave
-        before."""
+        """`folder` is where its files are when the jail gives it no home of its own; `oom_kills`, what that function
+        gave before."""
         self._zygote = zygote
         self._child = child
         self._monitor = monitor
@@ -152,7 +152,8 @@ class PolicyProcess:
         self.dead = False
 
     def compiled(self, source: bytes, env_meta: dict[str, Any]) -> bytes:
-        """The code of a `policy.py`, for the `load` of other processes; nothing where they are to compile it themselves.
+        """The code of a `policy.py`, for the `load` of other processes; nothing where they are to compile it
+        themselves.
 
         Only Python's compiler reads it here: this process runs none of it.
         """

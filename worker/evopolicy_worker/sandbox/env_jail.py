@@ -45,7 +45,8 @@ them."""
 _SCOPES_SIGNALS = 6
 """First ABI version of Landlock that blocks signals to processes outside."""
 _UNHEEDING = ("/bin/sh", "-c", 'trap "" TERM; exec "$@"', "sh")
-"""Runs a program that ignores SIGTERM: a batch system sends it to bubblewrap too, and the worker decides when a slot ends."""
+"""Runs a program that ignores SIGTERM: a batch system sends it to bubblewrap too, and the worker decides when a slot
+ends."""
 _SHELLS_OWN = ("PWD", "OLDPWD", "SHLVL", "_")
 """Variables that some shells add."""
 _SET_MODE_FILTER, _ALL_THREADS, _SPECULATION = 1, 1, 4
@@ -95,7 +96,8 @@ def command(
 ) -> tuple[str, ...]:
     """The command line that starts an environment process in that tier.
 
-    `draws`: whether this machine's graphics devices are visible. `definitions`: environments that do not ship. Raises SandboxError when bubblewrap is not installed.
+    `draws`: whether this machine's graphics devices are visible. `definitions`: environments that do not ship. Raises
+    SandboxError when bubblewrap is not installed.
     """
     python = (sys.executable, "-P", "-m", "evopolicy_worker.episodes.env_process")
     if tier != "bwrap":
@@ -256,8 +258,8 @@ def _etc() -> list[str]:
 
 
 def _code(declared: Sequence[str]) -> list[str]:
-    """Python, its installed packages, the folders of libraries, the modules in the operator's other folders, and what is
-    declared. Paths inside other ones are left out."""
+    """Python, its installed packages, the folders of libraries, the modules in the operator's other folders, and what
+    is declared. Paths inside other ones are left out."""
     path = [*_python_path(), *_folders("PYTHONPATH"), *_folders(_LATER_PATH)]
     named = _folders("LD_LIBRARY_PATH")
     named += [os.path.dirname(os.path.realpath(path)) for path in (os.environ.get(BROWSER, ""),) if path]
@@ -284,8 +286,8 @@ def _installation() -> list[str]:
 
 
 def _is_installed(path: str) -> bool:
-    """Whether a place on the module search path is Python's, ours, or a folder of installed packages, and no folder of the
-    operator's, which may hold anything."""
+    """Whether a place on the module search path is Python's, ours, or a folder of installed packages, and no folder of
+    the operator's, which may hold anything."""
     real = os.path.realpath(path)
     if os.path.basename(real) in _INSTALLATIONS or not os.path.isdir(real):
         return True

@@ -67,8 +67,8 @@ def declared(definitions: Iterable[Entry], folders: Sequence[str]) -> list[str]:
 
 
 def mirror(folder: str, shown: Iterable[str], place: Path) -> None:
-    """Makes the folder `place`, in which links to the shown files of `folder` have their relative paths. Landlock can show a
-    file in a folder, but not that the folder has it, and a module is found by listing its folder."""
+    """Makes the folder `place`, in which links to the shown files of `folder` have their relative paths. Landlock can
+    show a file in a folder, but not that the folder has it, and a module is found by listing its folder."""
     for path in shown:
         for base, _, names in (
             os.walk(path) if os.path.isdir(path) else [(os.path.dirname(path), [], [os.path.basename(path)])]
@@ -93,7 +93,8 @@ def _place(top: str, folders: Sequence[str]) -> str:
 
 
 def _entries(folder: str) -> list[os.DirEntry[str]]:
-    """The entries of a folder that may be shown; none of a run directory or state folder, or of one that cannot be read."""
+    """The entries of a folder that may be shown; none of a run directory or state folder, or of one that cannot be
+    read."""
     try:
         with os.scandir(folder) as listed:
             found = sorted(listed, key=lambda entry: entry.name)

@@ -95,8 +95,8 @@ class PackedBegun(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Log:
-    """The file of the running episode: its head, then each further action. Mapped, as a system call for each step would take
-    longer. If the disk is full, it has the first actions only."""
+    """The file of the running episode: its head, then each further action. Mapped, as a system call for each step would
+    take longer. If the disk is full, it has the first actions only."""
 
     def __init__(self, folder: Path) -> None:
         flags = os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC | os.O_NOFOLLOW

@@ -24,8 +24,8 @@ signal but SIGKILL. `stop`: stopped and not resumed. `pipe`: it closed its pipe 
 invalid frame. `overrun`, of the environment: a call took too long, or its memory was too large, and it was ended."""
 
 AGAIN = 3
-"""If an environment has ended so many attempts at a job, and overruns once more after a policy's actions, the actions are
-the cause."""
+"""If an environment has ended so many attempts at a job, and overruns once more after a policy's actions, the actions
+are the cause."""
 
 FAULTS = frozenset(
     {
@@ -53,7 +53,8 @@ class Ending(NamedTuple):
     """Whether the policy's process cannot have killed or stopped itself: it is sealed, and has no CPU limit of the
     system."""
     again: bool = False
-    """For the environment: whether it overran on the policy's actions, and has ended `AGAIN` earlier attempts at the job."""
+    """For the environment: whether it overran on the policy's actions, and has ended `AGAIN` earlier attempts at the
+    job."""
 
 
 class Row(NamedTuple):

@@ -3,8 +3,8 @@
 Rules:
 - A job's failure is its policy's (an outcome) or an infrastructure failure (WorkerError, SandboxError, SlotDiedError:
   the job is played elsewhere), as the table in `endings` decides.
-- If the environment's process crashes on a policy's actions, or hangs on them as in earlier attempts, a new process plays
-  the episode with random actions, and then the rest of the job.
+- If the environment's process crashes on a policy's actions, or hangs on them as in earlier attempts, a new process
+  plays the episode with random actions, and then the rest of the job.
 - If the process ends otherwise, the actions that the policy had returned are read from the scratch folder.
 - After `cancel` the slot is usable. After an error `start` restarts it.
 """
@@ -282,7 +282,8 @@ class Slot:
         return tuple(found)
 
     def memory_bytes(self) -> int:
-        """Resident memory of all of the slot's processes; each has its part of what several share, as a browser's do."""
+        """Resident memory of all of the slot's processes; each has its part of what several share, as a browser's
+        do."""
         return 0 if self._process is None else _memory(self._process.pid)
 
     def cpu_s(self) -> float:
@@ -353,8 +354,8 @@ class Slot:
             raise SlotDiedError(await self._last_words()) from error
 
     async def _end_what_stands_still(self, env_id: str) -> None:
-        """Kills the slot's processes when one of them has been stopped from outside for `STOPPED_S`, or when they say nothing
-        although they tell twelve times a minute that they are alive."""
+        """Kills the slot's processes when one of them has been stopped from outside for `STOPPED_S`, or when they say
+        nothing although they tell twelve times a minute that they are alive."""
         stood_s = silent_s = 0.0
         n_replies = -1
         longest_s = self._start.limits.call_s + SILENT_S

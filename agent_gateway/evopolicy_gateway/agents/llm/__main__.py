@@ -1,4 +1,5 @@
-"""One turn: reads the API's key and the prompt on stdin, as JSON, works until the model ends its turn, prints events as JSON lines.
+"""One turn: reads the API's key and the prompt on stdin, as JSON, works until the model ends its turn, prints events as
+JSON lines.
 
 Exit status: 0 the turn is done, 1 it failed; the last event tells which.
 """

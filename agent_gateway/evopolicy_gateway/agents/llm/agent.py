@@ -76,7 +76,8 @@ class Events:
 
 
 MAX_FAULTY = 5
-"""Faulty calls in a row that end a turn: a model that has not understood the tool would go on without end, and be paid for it."""
+"""Faulty calls in a row that end a turn: a model that has not understood the tool would go on without end, and be paid
+for it."""
 
 
 def play_turn(api: Api, prompt: str, session: Session, events: Events) -> int:

@@ -1,7 +1,7 @@
 """OpenAI's Chat Completions and Anthropic's Messages, through the vendors' own libraries, behind one interface.
 
-Both retry a request by themselves after rate limits, overload and lost connections, and honour `retry-after`. Answers are
-streamed, so that a long one meets no timeout on the way.
+Both retry a request by themselves after rate limits, overload and lost connections, and honour `retry-after`. Answers
+are streamed, so that a long one meets no timeout on the way.
 """
 
 from __future__ import annotations
@@ -317,7 +317,8 @@ def _checked(identity: str, name: str, given: Any) -> Call:
 
 
 def _sent_back(arguments: str) -> str:
-    """A call's arguments for the requests to come, which some endpoints refuse for good when these are no JSON object."""
+    """A call's arguments for the requests to come, which some endpoints refuse for good when these are no JSON
+    object."""
     try:
         return arguments if isinstance(json.loads(arguments), dict) else "{}"
     except (ValueError, RecursionError):

@@ -94,7 +94,8 @@ class AcpAgent(CliAgent):
             stage.log.note(entry)
 
     async def _linked(self, stage: Stage, session: str | None) -> _Link:
-        """The connection, in the session; a new session for None. Raises _LostError when the session cannot be resumed."""
+        """The connection, in the session; a new session for None. Raises _LostError when the session cannot be
+        resumed."""
         from acp.exceptions import RequestError
 
         if session is not None and self._link is not None and self._link.session == session:
@@ -147,8 +148,8 @@ class AcpAgent(CliAgent):
     async def _set(self, link: _Link, answer: dict[str, Any]) -> None:
         """Chooses the mode, the model and the effort of a session, as the agent's settings say.
 
-        Raises AgentError when the agent offers no choice of models and is not started with this one: `run.json` would name a
-        model that did not play. Likewise for the effort.
+        Raises AgentError when the agent offers no choice of models and is not started with this one: `run.json` would
+        name a model that did not play. Likewise for the effort.
         """
         modes = offered_modes(answer)
         mode = self._acp.table.mode or (MODE_THAT_ASKS if judges_itself(modes) else "")

@@ -1,7 +1,7 @@
 """The Agent Client Protocol's messages as a turn's stream: what an agent says, does and asks for. No I/O.
 
-Chunks of text are put together; the log then gets whole messages in the form of Claude Code's `stream-json`, which the live
-page and the reports read. Its raw messages are in the log too.
+Chunks of text are put together; the log then gets whole messages in the form of Claude Code's `stream-json`, which the
+live page and the reports read. Its raw messages are in the log too.
 
 https://agentclientprotocol.com
 """
@@ -186,7 +186,8 @@ def offered_modes(answer: Mapping[str, Any]) -> Choice | None:
 
 
 def judges_itself(modes: Choice | None) -> bool:
-    """Whether a session began in the mode in which a model of the agent's own decides what is allowed, and could ask instead.
+    """Whether a session began in the mode in which a model of the agent's own decides what is allowed, and could ask
+    instead.
 
     That model costs tokens and may refuse what the rules of the run allow. Qwen Code and Claude Code begin in it."""
     return modes is not None and modes.current == "auto" and MODE_THAT_ASKS in modes.values
@@ -210,8 +211,8 @@ def usage_of(usage: Mapping[str, Any]) -> Usage:
 
 
 def permission(request: Mapping[str, Any], workspace: PurePosixPath) -> dict[str, Any]:
-    """The answer to `session/request_permission`: the jail confines an agent, so everything is allowed but to change what the
-    rules protect, the feedback and `AGENTS.md`."""
+    """The answer to `session/request_permission`: the jail confines an agent, so everything is allowed but to change
+    what the rules protect, the feedback and `AGENTS.md`."""
     call = mapping(request.get("toolCall"))
     paths = [string(place.get("path")) for place in mappings(call.get("locations"))]
     forbidden = call.get("kind") in _CHANGES and any(_is_protected(path, workspace) for path in paths)

@@ -27,7 +27,8 @@ TOOLS = "Bash,Read,Edit,Write,Glob,Grep"
 _MAX_OPEN_MESSAGES = 1000
 _ISOLATION = (("--safe-mode",), ("--strict-mcp-config",))
 _WITH_INPUTS = (("--setting-sources", "user"), ("--strict-mcp-config",))
-"""`--safe-mode` would leave out skills and MCP servers. The user's own settings are not in the jail, unless they are bound."""
+"""`--safe-mode` would leave out skills and MCP servers. The user's own settings are not in the jail, unless they are
+bound."""
 
 
 class ClaudeCode(Dialect):

@@ -223,7 +223,8 @@ class CliAgent(Harness):
         stage.on_doing(AgentDoing(action="tries again", provider=config.provider_name))
 
     async def _prompt_after_failure(self, stage: Stage) -> AgentEnded | str:
-        """The first prompt of a session, or the prompt that resumes an interrupted one; the end if the budget is spent."""
+        """The first prompt of a session, or the prompt that resumes an interrupted one; the end if the budget is
+        spent."""
         left = await left_of(stage)
         if left == 0:
             return self._ending()

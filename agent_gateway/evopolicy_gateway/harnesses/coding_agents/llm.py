@@ -1,7 +1,7 @@
 """The built-in LLM agent (`agents/llm/`) as a CLI: it prints Claude Code's stream, so its turns are read as those.
 
-It gets the relay's token on stdin, and its memory is closed to its commands, which therefore use the model only through it. The
-API's key stays outside its jail.
+It gets the relay's token on stdin, and its memory is closed to its commands, which therefore use the model only through
+it. The API's key stays outside its jail.
 """
 
 from __future__ import annotations

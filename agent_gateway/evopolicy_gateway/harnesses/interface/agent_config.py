@@ -86,8 +86,8 @@ class AcpTable(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     auth: str = ""
     """Id of the login method to choose, where the agent wants one."""
     mode: str = ""
-    """Id of the session mode to choose. Empty: the agent's own, or `default` where that is `auto`: then the rules of the run decide
-    what the agent may do, and no model of the agent's."""
+    """Id of the session mode to choose. Empty: the agent's own, or `default` where that is `auto`: then the rules of
+    the run decide what the agent may do, and no model of the agent's."""
     counts: Literal["turn", "session"] = "turn"
     """Whether the tokens that end a turn are those of the turn, or of the session so far."""
 
@@ -165,8 +165,8 @@ class AgentConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     provider: str | None = None
     """Provider whose outage or quota pauses this agent; None: the harness's usual one."""
     user_config: bool | tuple[str, ...] = False
-    """Gives the CLI the user's own settings, rules, memory and login, as a copy for the run; off, so that a run depends on this
-    file alone. Paths in `~/` name the files to copy for a CLI whose places evopolicy does not know."""
+    """Gives the CLI the user's own settings, rules, memory and login, as a copy for the run; off, so that a run depends
+    on this file alone. Paths in `~/` name the files to copy for a CLI whose places evopolicy does not know."""
     retries: int = 5
     """Most retries in a row, for one turn."""
     backoff_s: float = 4.0
@@ -191,12 +191,14 @@ class AgentConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     skills: tuple[str, ...] = ()
     """Folders of skills, each with a file SKILL.md; below the folder in which the command is started."""
     skills_at: str = ""
-    """Folder in which the agent looks for skills, as `~/.agents/skills`; empty: the one that is known for its program."""
+    """Folder in which the agent looks for skills, as `~/.agents/skills`; empty: the one that is known for its
+    program."""
     mcp: dict[str, McpServer] = {}
     """MCP servers by name."""
     cli: Cli | None = None
     api: ApiTable | None = None
-    """The model's API, for the built-in agent and for other agents that take its address and key from the usual variables."""
+    """The model's API, for the built-in agent and for other agents that take its address and key from the usual
+    variables."""
     acp: AcpTable | None = None
     """Of an agent that speaks the Agent Client Protocol."""
 
@@ -249,8 +251,8 @@ class AgentConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
         return Limits(**{name: value for name, value in found.items() if value is not None})
 
     def upstream(self, environment: Mapping[str, str]) -> Upstream | None:
-        """The API behind the relay, with its key; None for an agent that cannot use the relay: one with a subscription's login, or a
-        provider of its own. `environment`: the operator's variables."""
+        """The API behind the relay, with its key; None for an agent that cannot use the relay: one with a
+        subscription's login, or a provider of its own. `environment`: the operator's variables."""
         variables = {**environment, **self.environment}
         if self.api is not None:
             return Upstream(

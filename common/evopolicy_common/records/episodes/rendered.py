@@ -306,7 +306,8 @@ def checked_files(data: bytes, length: int, episode_return: float) -> dict[str, 
 
 
 def _rewards(rows: bytes) -> list[float]:
-    """The rewards of all rows, each of which is parsed. Raises ProtocolError for what is no row, or not the next one."""
+    """The rewards of all rows, each of which is parsed. Raises ProtocolError for what is no row, or not the next
+    one."""
     rewards: list[float] = []
     view, at = memoryview(rows), 0
     while at < len(rows):

@@ -36,7 +36,8 @@ IGNORED_FOLDERS = frozenset(
 )
 """Folders that tools create; never part of a bundle."""
 COMPILED = ".pyc"
-"""How compiled code ends, which Python may load in place of the source that readers see; never part of a bundle either."""
+"""How compiled code ends, which Python may load in place of the source that readers see; never part of a bundle
+either."""
 
 
 class BundleFile(msgspec.Struct, frozen=True, array_like=True):

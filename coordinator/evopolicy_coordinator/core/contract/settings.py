@@ -31,7 +31,8 @@ class CoreSettings(msgspec.Struct, frozen=True, kw_only=True):
     """First back-off after an infrastructure failure; it doubles with each further one."""
     retry_max_s: float = 60.0
     environment_wait_s: float = 900.0
-    """An environment that ends every attempt at a job for at least this long is given up, and its run ends with an error."""
+    """An environment that ends every attempt at a job for at least this long is given up, and its run ends with an
+    error."""
     avoid_s: float = 5.0
     """A retried job is kept from the worker that it failed on for this long after its back-off, so that
     another may take it."""
@@ -58,8 +59,8 @@ class CoreSettings(msgspec.Struct, frozen=True, kw_only=True):
     hidden_wait_s: float = 60.0
     """After hidden jobs of closed runs were barred from all kernels for this long, one kernel is reserved for them."""
     agent_wait_s: float = 7 * 86_400.0
-    """An agent that keeps hidden jobs of closed runs from a reserved kernel is stopped, and its run cancelled, this long
-    after its permit was granted. Must be longer than any agent's wall limit."""
+    """An agent that keeps hidden jobs of closed runs from a reserved kernel is stopped, and its run cancelled, this
+    long after its permit was granted. Must be longer than any agent's wall limit."""
     silent_bar_s: float = 60.0
     """After this time, a silent worker has surely stopped its hidden jobs. Well above `lease_ttl_s`, the time after
     which the worker stops them itself."""

@@ -1,8 +1,8 @@
 """A job as its worker receives it.
 
 Rule that this module owns: a job's content follows from its group and its position, so it is not stored, and every
-attempt is the same job, except for the actions that the policy returned in an earlier one (`BegunRow`), and the number of
-those that the environment has ended.
+attempt is the same job, except for the actions that the policy returned in an earlier one (`BegunRow`), and the number
+of those that the environment has ended.
 """
 
 from __future__ import annotations

@@ -43,7 +43,8 @@ def backoff_s(settings: CoreSettings, failures: int) -> float:
 
 
 def in_vain(settings: CoreSettings, faults: EnvironmentFaults, able: set[str], now: float) -> bool:
-    """Whether another attempt at a job would only meet the same fault of its environment. `able`: machines that can play it."""
+    """Whether another attempt at a job would only meet the same fault of its environment. `able`: machines that can
+    play it."""
     lasted = now - faults.since >= settings.environment_wait_s
     return faults.n >= FAULTS_MAX and lasted and len(faults.on) >= min(2, len(able))
 

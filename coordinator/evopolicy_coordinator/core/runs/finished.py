@@ -54,8 +54,8 @@ def select(run: Run) -> SubmitRow | None:
 def result(
     state: State, run: Run, best: SubmitRow | None, now: float, *, cancelled: bool, error: str | None = None
 ) -> operator.RunFinished:
-    """Builds the record of a run that is over; `best` is its selected submit. `now` is Unix time in seconds. `error`: why it
-    cannot be scored."""
+    """Builds the record of a run that is over; `best` is its selected submit. `now` is Unix time in seconds. `error`:
+    why it cannot be scored."""
     row, stored, ok = run.row, run.state, ok_submits(run)
     status: operator.RunEnd = "completed"
     if cancelled:

@@ -2,11 +2,11 @@
 
     kind        cases                    plays                record    video              priority
     train       those of the submit      its bundle           full      the run's          TRAIN
-    validation  all of the split         the submit's bundle  actions   off                EARLY_VALIDATION, closed HELDOUT
-    heldout     all of the split         the submit's bundle  actions   recorded_heldout   HELDOUT
-    random      held-out                 random actions       actions   off                REFERENCE
-    evaluation  as requested             as requested         requested off                REFERENCE, hidden HELDOUT
-    audit       the audited episode      its actions          as above  off                AUDIT, hidden HIDDEN_AUDIT
+    validation  all of the split         the submit's bundle  actions   off                EARLY_VALIDATION, closed
+    HELDOUT heldout     all of the split         the submit's bundle  actions   recorded_heldout   HELDOUT random
+    held-out                 random actions       actions   off                REFERENCE evaluation  as requested
+    as requested         requested off                REFERENCE, hidden HELDOUT audit       the audited episode      its
+    actions          as above  off                AUDIT, hidden HIDDEN_AUDIT
 
 Rule that this module owns: a group follows from stored rows alone, so it is the same after a restart.
 """

@@ -14,7 +14,8 @@ Rules that this module owns:
   gateway is the worker's failure.
 - The time that an episode took counts for the fair share only up to the time for which its worker had the lease.
 - A failure that a policy can cause in its slot is an outcome. A failure that it cannot cause is retried without limit:
-  `failed`, or `slot_died` from workers of earlier versions. An environment that keeps ending a job is given up (`retry`).
+  `failed`, or `slot_died` from workers of earlier versions. An environment that keeps ending a job is given up
+  (`retry`).
 """
 
 from __future__ import annotations
@@ -36,8 +37,8 @@ from evopolicy_coordinator.core.tables.step import (
 )
 
 MAX_OUTCOME_BYTES = 2 << 20
-"""Largest sum of an outcome's texts, names and bytes. A worker uploads larger recordings as blobs. A page has at least one
-episode, whatever its size, so a run with a larger outcome could never tell its gateway."""
+"""Largest sum of an outcome's texts, names and bytes. A worker uploads larger recordings as blobs. A page has at least
+one episode, whatever its size, so a run with a larger outcome could never tell its gateway."""
 MAX_LENGTH = 2**31 - 1
 
 

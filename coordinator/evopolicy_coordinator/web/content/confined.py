@@ -1,7 +1,7 @@
 """Files below one folder, read without being led out of it.
 
-Agents write the names and the files in a run directory. No link is followed, in no component of a path; pipes and devices
-are not opened; every read has a limit.
+Agents write the names and the files in a run directory. No link is followed, in no component of a path; pipes and
+devices are not opened; every read has a limit.
 """
 
 from __future__ import annotations

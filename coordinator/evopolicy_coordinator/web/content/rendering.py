@@ -1,4 +1,5 @@
-"""From templates to HTML, and how numbers and states are written in it. Markup is in `templates/`; every value is escaped there."""
+"""From templates to HTML, and how numbers and states are written in it. Markup is in `templates/`; every value is
+escaped there."""
 
 from __future__ import annotations
 
@@ -83,7 +84,8 @@ def part(name: str, /, **values: Any) -> str:
 
 
 def page(template: str, *, view: View | None = None, live: str = "", cursor: str = "", **values: Any) -> str:
-    """A whole page. In it `part(name)` and `listed(name)` put the view's parts; `live` is where its updates come from."""
+    """A whole page. In it `part(name)` and `listed(name)` put the view's parts; `live` is where its updates come
+    from."""
     shown = View(parts={}) if view is None else view
 
     def one(name: str) -> Markup:

@@ -1,8 +1,8 @@
 """The runs in some folders, finished and open, as far as their files tell, and which of their results are hidden still.
 
-Rule: hidden results of a run are shown only when no agent of a related run is alive. Related are the runs of one environment
-whose hidden cases are shared. An agent counts as alive where the cluster says so, or where its supervisor holds its lock here.
-A cluster that does not answer might have such agents: then nothing hidden is shown.
+Rule: hidden results of a run are shown only when no agent of a related run is alive. Related are the runs of one
+environment whose hidden cases are shared. An agent counts as alive where the cluster says so, or where its supervisor
+holds its lock here. A cluster that does not answer might have such agents: then nothing hidden is shown.
 """
 
 from __future__ import annotations
@@ -148,8 +148,8 @@ class Reader:
         self._known: frozenset[Path] = frozenset()
 
     def read(self, cluster: Sequence[RunStatus] | None, *, cluster_is_known: bool) -> Runs:
-        """All runs as they are now. `cluster`: its unfinished runs; `cluster_is_known` False: it should be asked and does not
-        answer."""
+        """All runs as they are now. `cluster`: its unfinished runs; `cluster_is_known` False: it should be asked and
+        does not answer."""
         by_run = {status.run: status for status in cluster or ()}
         by_name = {(status.entry, status.env, status.exp_id): status for status in by_run.values()}
         sweeps: list[Sweep] = []
@@ -425,7 +425,8 @@ def _may_be_alive(status: RunStatus) -> bool:
 
 
 def _sweep_folders(roots: Iterable[Path]) -> list[tuple[Path, Index | None]]:
-    """The sweeps at and directly below the roots, with their indexes. A root that is no sweep has the index None: single runs may lie in it."""
+    """The sweeps at and directly below the roots, with their indexes. A root that is no sweep has the index None:
+    single runs may lie in it."""
     found: dict[Path, Index | None] = {}
     for root in roots:
         if (root / INDEX).exists():

@@ -1,7 +1,7 @@
 """An agent that plays one honest submit, and tries everything else that it could gain by. Its report: `report.json`.
 
-Started as `python cheating_agent.py TARGETS`, a JSON object of what there is to attack on this machine: in a real run an
-agent would have to guess it, and what it may guess it may know.
+Started as `python cheating_agent.py TARGETS`, a JSON object of what there is to attack on this machine: in a real run
+an agent would have to guess it, and what it may guess it may know.
 """
 
 import ctypes

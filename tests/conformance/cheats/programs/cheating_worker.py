@@ -1,8 +1,8 @@
 """A real worker process that cheats: `cheating_worker.py HOW OPTIONS…`, the options being the worker's own.
 
 HOW: `honest`; `rewards` adds to every reward that it reports, returns and recordings in accord; `return` to the returns
-alone; `old-code` reports another code version and another adapter; `old-protocol` speaks another wire version. All but the last two tell the
-same fingerprint, whatever is edited meanwhile.
+alone; `old-code` reports another code version and another adapter; `old-protocol` speaks another wire version. All but
+the last two tell the same fingerprint, whatever is edited meanwhile.
 """
 
 from __future__ import annotations

@@ -1,4 +1,5 @@
-"""An agent without a jail that takes its gateway's credentials, opens a Zenoh session of its own, and listens to everything."""
+"""An agent without a jail that takes its gateway's credentials, opens a Zenoh session of its own, and listens to
+everything."""
 
 import json
 import os

@@ -1,7 +1,7 @@
 """Listens to the machine's memory for what a policy tells of hidden cases: `hearing_agent.py POLICY SUBMITS`.
 
-Submits the policy so many times, then listens until a file `stop` is there. `heard.json` has the height of every pulse in MiB,
-and how often it has looked.
+Submits the policy so many times, then listens until a file `stop` is there. `heard.json` has the height of every pulse
+in MiB, and how often it has looked.
 """
 
 import json

@@ -1,7 +1,7 @@
 """Leaves data wherever it can, for its agent and for its own next episodes, and looks for what others of its kind left.
 
-It says what it did on its output, which the protocol hands on from train episodes. `AGENT` is filled in by its agent: where
-that agent looks.
+It says what it did on its output, which the protocol hands on from train episodes. `AGENT` is filled in by its agent:
+where that agent looks.
 """
 
 import glob

@@ -1,6 +1,8 @@
-"""An agent that plays one honest submit and leaves traps behind for what comes after it: who scores the run, who reports it.
+"""An agent that plays one honest submit and leaves traps behind for what comes after it: who scores the run, who
+reports it.
 
-Started as `python parting_agent.py HOW OUTSIDE`: what it leaves in place of `system/`, and a folder that is not its own.
+Started as `python parting_agent.py HOW OUTSIDE`: what it leaves in place of `system/`, and a folder that is not its
+own.
 """
 
 import contextlib

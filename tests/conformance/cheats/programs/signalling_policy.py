@@ -1,4 +1,5 @@
-"""Tells whoever looks at the machine's memory which case it plays: the kernel counts shared pages for the whole machine."""
+"""Tells whoever looks at the machine's memory which case it plays: the kernel counts shared pages for the whole
+machine."""
 
 import mmap
 import time

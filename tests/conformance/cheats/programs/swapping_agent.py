@@ -1,5 +1,6 @@
-"""An agent that has its gateway read other files for it: `system/` and what is in it change places with links, pipes and
-hard links while a submit is taken. In a jail a link may point to what only the gateway sees: relative to the workspace.
+"""An agent that has its gateway read other files for it: `system/` and what is in it change places with links, pipes
+and hard links while a submit is taken. In a jail a link may point to what only the gateway sees: relative to the
+workspace.
 
 Its report: `report.json`, the status of each submit and what it was told.
 """
@@ -43,7 +44,8 @@ def linked(path, target):
 
 
 def swap_files():
-    """`policy.py` and a file beside it: a file, a link to a secret, a pipe, a hard link, a folder's link; again and again."""
+    """`policy.py` and a file beside it: a file, a link to a secret, a pipe, a hard link, a folder's link; again and
+    again."""
     write("honest", POLICY)
     for number in itertools.count():
         if over.is_set():

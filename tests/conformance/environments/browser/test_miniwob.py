@@ -205,7 +205,8 @@ def test_an_environment_keeps_what_the_interface_promises(env_id: str) -> None:
     assert played.verdict(None) == "ok"
 
 
-# Episodes in which the browser scrolls a dragged selection, or takes the focus from what is no longer shown, in its own time.
+# Episodes in which the browser scrolls a dragged selection, or takes the focus from what is no longer shown, in its own
+# time.
 @pytest.mark.parametrize(
     ("env_id", "seed", "steps"),
     [("miniwob/text-editor-v1", 20_011_117, 40), ("miniwob/choose-date-v1", 1, 15)],

@@ -1,4 +1,5 @@
-"""Look around until the one object of the room is in view, go forward until it is beside, turn to it, and go up to it."""
+"""Look around until the one object of the room is in view, go forward until it is beside, turn to it, and go up to
+it."""
 
 LEFT, RIGHT, FORWARD = 0, 1, 2
 WALL, OBJECTS = 2, (5, 6, 7)

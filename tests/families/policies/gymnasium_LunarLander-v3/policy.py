@@ -1,4 +1,5 @@
-"""Steer the tilt by where the pad is, and the descent by the height: proportional and derivative terms, whichever is larger acts."""
+"""Steer the tilt by where the pad is, and the descent by the height: proportional and derivative terms, whichever is
+larger acts."""
 
 NOTHING, LEFT, MAIN, RIGHT = range(4)
 

@@ -1,5 +1,5 @@
-"""Walk to the stairs when they are seen, otherwise to the nearest cell beside unknown ones; kick locked doors, and search where
-nothing is left."""
+"""Walk to the stairs when they are seen, otherwise to the nearest cell beside unknown ones; kick locked doors, and
+search where nothing is left."""
 
 from collections import deque
 

@@ -1,4 +1,5 @@
-"""Drive the shortest way to the passenger, then to the destination; the way is found by a breadth-first search on the map."""
+"""Drive the shortest way to the passenger, then to the destination; the way is found by a breadth-first search on the
+map."""
 
 PLACES = ((0, 0), (0, 4), (4, 0), (4, 3))
 IN_TAXI = 4

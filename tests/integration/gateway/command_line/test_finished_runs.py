@@ -1,4 +1,5 @@
-"""No failure after a run's last episode costs the run: its result is written now or by `--resume`, without its agent."""
+"""No failure after a run's last episode costs the run: its result is written now or by `--resume`, without its
+agent."""
 
 from __future__ import annotations
 

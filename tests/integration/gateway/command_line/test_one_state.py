@@ -1,4 +1,5 @@
-"""Local runs share one state: what a user plays belongs together, and an agent without a jail learns nothing of later runs."""
+"""Local runs share one state: what a user plays belongs together, and an agent without a jail learns nothing of later
+runs."""
 
 from __future__ import annotations
 

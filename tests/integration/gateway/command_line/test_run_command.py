@@ -1,4 +1,5 @@
-"""`evopolicy run` on a cluster that is up: whole runs on the toy environments, by agents that do well, badly and nothing."""
+"""`evopolicy run` on a cluster that is up: whole runs on the toy environments, by agents that do well, badly and
+nothing."""
 
 from __future__ import annotations
 

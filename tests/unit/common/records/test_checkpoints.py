@@ -134,8 +134,9 @@ class A:
             "data.bin": b"\x00\xff",
         }
     )
-    # outer: 1, inner's conditional expression 1 and its two operators 2, except handlers 2 and the try's two 2, async for 1,
-    # two cases 2, two conditions of the comprehension 2, while 1; inner: 1 + 1 + 2; the module of test_a.py: 1 + 1.
+    # outer: 1, inner's conditional expression 1 and its two operators 2, except handlers 2 and the try's two 2, async
+    # for 1, two cases 2, two conditions of the comprehension 2, while 1; inner: 1 + 1 + 2; the module of test_a.py: 1 +
+    # 1.
     assert (found.cyclomatic_max, found.cyclomatic_total) == (14, 14 + 4 + 2)
     assert (found.files, found.python_files, found.test_files) == (4, 3, 1)
     assert (found.functions, found.classes) == (2, 1)

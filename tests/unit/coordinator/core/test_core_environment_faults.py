@@ -1,4 +1,5 @@
-"""An environment that keeps ending the same job is given up, and its run ends with an error; nothing waits for it for ever."""
+"""An environment that keeps ending the same job is given up, and its run ends with an error; nothing waits for it for
+ever."""
 
 from __future__ import annotations
 
@@ -20,7 +21,8 @@ WHY = "environment toy/line, step 7: it has not returned for 300 s"
 def failing(
     rig: Rig, *sessions: str, where: str, ends: Callable[[], bool], most_s: float = 5000.0, busy: str = ""
 ) -> list[wire.Job]:
-    """Lets workers play, whose environment ends each job of that list (any if empty); gives its attempts. A busy worker is there."""
+    """Lets workers play, whose environment ends each job of that list (any if empty); gives its attempts. A busy worker
+    is there."""
     attempts: list[wire.Job] = []
     until = rig.now + most_s
     while rig.now < until and not ends():

@@ -1,5 +1,5 @@
-"""`failed_episodes` = "end-submit": submits, selection and score of runs whose policies fail, as in the published software
-v0.1.0."""
+"""`failed_episodes` = "end-submit": submits, selection and score of runs whose policies fail, as in the published
+software v0.1.0."""
 
 from __future__ import annotations
 

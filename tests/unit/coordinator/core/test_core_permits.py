@@ -1,4 +1,5 @@
-"""An agent starts once no related hidden episode is played on its kernel, and none starts there while it may be alive."""
+"""An agent starts once no related hidden episode is played on its kernel, and none starts there while it may be
+alive."""
 
 from __future__ import annotations
 
@@ -310,7 +311,8 @@ def test_an_operators_word_ends_a_permit_and_silence_does_not() -> None:
 
 
 def earlier_version(rig: Rig, message: type[wire.Message], **fields: Any) -> Any:
-    """A request with `machine_id`, a field of earlier versions, from which they concluded that a machine was restarted."""
+    """A request with `machine_id`, a field of earlier versions, from which they concluded that a machine was
+    restarted."""
     given = asked(message, request=rig.request(), **fields)
     sent = {**msgspec.to_builtins(given.message), "machine_id": "m"}
     return rig.tell(msgspec.structs.replace(given, message=msgspec.convert(sent, message)))

@@ -1,6 +1,7 @@
 """The core's worked examples: what it is told, which rules act, what it asks of its shell.
 
-A transcript is a list of steps, parted by empty lines: a comment, what happens, `----`, and what comes of it. The lines under
+A transcript is a list of steps, parted by empty lines: a comment, what happens, `----`, and what comes of it. The lines
+under
 `----` are compared with what the core does; `pytest --rewrite-transcripts` writes them anew.
 """
 

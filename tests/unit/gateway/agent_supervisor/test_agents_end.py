@@ -1,4 +1,5 @@
-"""An agent is gone when nothing of it lives, and not before: a real agent supervisor with processes that cannot be killed."""
+"""An agent is gone when nothing of it lives, and not before: a real agent supervisor with processes that cannot be
+killed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""The `evolve` agent against a gateway of the test's own: it spends its budget, beats its opening, survives refusals."""
+"""The `evolve` agent against a gateway of the test's own: it spends its budget, beats its opening, survives
+refusals."""
 
 from __future__ import annotations
 

@@ -28,7 +28,8 @@ ACTION_SPACE = {"type": "Discrete", "n": 4}
 
 
 class Rooms:
-    """Two rooms with a door between them, opened by TAKE; the goal, in the second room, ends the episode with reward 1."""
+    """Two rooms with a door between them, opened by TAKE; the goal, in the second room, ends the episode with reward
+    1."""
 
     def __init__(self, seed: int) -> None:
         rng = np.random.default_rng(seed)

@@ -1,4 +1,5 @@
-"""Agents that speak the Agent Client Protocol: a made-up one that does well, fails and asks, and the messages by themselves."""
+"""Agents that speak the Agent Client Protocol: a made-up one that does well, fails and asks, and the messages by
+themselves."""
 
 from __future__ import annotations
 

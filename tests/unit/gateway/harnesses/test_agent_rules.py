@@ -1,4 +1,5 @@
-"""The rules of coding agents that need no process: troubles, back-off, redaction, settings, configured CLIs, the clock."""
+"""The rules of coding agents that need no process: troubles, back-off, redaction, settings, configured CLIs, the
+clock."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Skills and MCP servers as inputs: read without following links, digested, copied for the run, and compared at each start."""
+"""Skills and MCP servers as inputs: read without following links, digested, copied for the run, and compared at each
+start."""
 
 from __future__ import annotations
 

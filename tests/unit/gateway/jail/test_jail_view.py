@@ -143,7 +143,8 @@ def test_an_agents_second_program_finds_the_firsts_links(
 
 @pytest.mark.parametrize("what", ["inputs", "read"])
 def test_links_towards_a_mount_are_removed_before_bubblewrap_follows(tmp_path: Path, what: str) -> None:
-    """bubblewrap creates missing folders of a mount's place while it sees the whole machine, and follows links meanwhile."""
+    """bubblewrap creates missing folders of a mount's place while it sees the whole machine, and follows links
+    meanwhile."""
     private, outside, home = tmp_path / "private", tmp_path / "outside", tmp_path / "home"
     skill = home / ".agents" / "skills" / "lamps"
     for folder in (private / "home", outside, skill):

@@ -1,4 +1,5 @@
-"""Statistics against values computed once with rliable 1.2 (Agarwal et al. 2021) and scipy 1.17, and against small cases by hand."""
+"""Statistics against values computed once with rliable 1.2 (Agarwal et al. 2021) and scipy 1.17, and against small
+cases by hand."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Edited numbers of a run directory: each is found without playing, by the other numbers or by the coordinator's result."""
+"""Edited numbers of a run directory: each is found without playing, by the other numbers or by the coordinator's
+result."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Environments that do not ship: made from files and by module, in every space, and refused where they break their word."""
+"""Environments that do not ship: made from files and by module, in every space, and refused where they break their
+word."""
 
 from __future__ import annotations
 

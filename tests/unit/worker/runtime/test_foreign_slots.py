@@ -1,4 +1,5 @@
-"""Slots that play environments of anyone's: what a hidden episode taught them reaches no train episode, and what they break is told."""
+"""Slots that play environments of anyone's: what a hidden episode taught them reaches no train episode, and what they
+break is told."""
 
 from __future__ import annotations
 

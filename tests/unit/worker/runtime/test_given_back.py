@@ -1,4 +1,5 @@
-"""A hidden episode that is given back unfinished: what its policy had returned, and how it had failed, stands in the next attempt."""
+"""A hidden episode that is given back unfinished: what its policy had returned, and how it had failed, stands in the
+next attempt."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Whatever a policy's process sends is bounded and checked before it is used, and never costs the slot or the episode."""
+"""Whatever a policy's process sends is bounded and checked before it is used, and never costs the slot or the
+episode."""
 
 from __future__ import annotations
 

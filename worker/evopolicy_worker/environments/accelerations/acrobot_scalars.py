@@ -1,10 +1,10 @@
 """Acrobot: the equations of motion on plain numbers.
 
-Replaces `AcrobotEnv.step`, which integrates one step with arrays of five numbers and computes with numpy's scalars. Sums,
-products, quotients and `**` are those of C doubles in both, and here they are in the library's order, so the results are
-the same. The sines and cosines stay numpy's, which are not those of the C library; those of several angles are
-computed in one call, and `holds` checks that this gives the same bits as one call for each. With noise on the torque, or
-with the equations of the paper, the library's method is used.
+Replaces `AcrobotEnv.step`, which integrates one step with arrays of five numbers and computes with numpy's scalars.
+Sums, products, quotients and `**` are those of C doubles in both, and here they are in the library's order, so the
+results are the same. The sines and cosines stay numpy's, which are not those of the C library; those of several angles
+are computed in one call, and `holds` checks that this gives the same bits as one call for each. With noise on the
+torque, or with the equations of the paper, the library's method is used.
 """
 
 from __future__ import annotations

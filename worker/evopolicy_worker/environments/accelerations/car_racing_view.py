@@ -20,7 +20,8 @@ MARGIN = 4.0
 
 
 def covers(zoom: float, translation: tuple[float, float], angle: float) -> bool:
-    """Whether the playing field, the first polygon to be drawn, covers the canvas with MARGIN to spare on every side."""
+    """Whether the playing field, the first polygon to be drawn, covers the canvas with MARGIN to spare on every
+    side."""
     cos, sin = math.cos(angle), math.sin(angle)
     limit = PLAYFIELD * zoom
     for corner_x in (-MARGIN, WINDOW_W + MARGIN):

@@ -1,12 +1,12 @@
 """MiniGrid: the agent's view read straight off the grid.
 
-Replaces `MiniGridEnv.gen_obs`, which copies the 7 × 7 window into a new grid of walls and cells, rotates that up to four
-times cell by cell, spreads visibility through a mask array, and encodes what is left one cell after the other. Here the
-cells are read row by row, away from the agent, in its own axes; a row's visibility is seven bits, and what it passes on
-to the next depends only on these and on which of its cells are transparent, so it is looked up in a table that is
-filled by the library's rule; behind a row of which nothing is seen there is nothing to read. All of it is integers and
-object identity; cells still tell themselves what they are (`encode`, `see_behind`). With see-through walls or a view of
-another size the library's method is used.
+Replaces `MiniGridEnv.gen_obs`, which copies the 7 × 7 window into a new grid of walls and cells, rotates that up to
+four times cell by cell, spreads visibility through a mask array, and encodes what is left one cell after the other.
+Here the cells are read row by row, away from the agent, in its own axes; a row's visibility is seven bits, and what it
+passes on to the next depends only on these and on which of its cells are transparent, so it is looked up in a table
+that is filled by the library's rule; behind a row of which nothing is seen there is nothing to read. All of it is
+integers and object identity; cells still tell themselves what they are (`encode`, `see_behind`). With see-through walls
+or a view of another size the library's method is used.
 """
 
 from __future__ import annotations

@@ -2,10 +2,11 @@
 
 Replaces `step` and `_get_obs` of HalfCheetah, Reacher and Pusher. The library asks the simulator's bindings anew for
 each array, and for each body by its name, on every step, which takes longer than the physics of Reacher. All
-of them are views of memory that a simulation keeps for its whole life (a reset overwrites it), so here they are made once.
-The library also has the simulator work out contact forces after each step (`mj_rnePostConstraint`), which the observations
-and rewards of these three do not contain and the next step does not read; here it does not. The remaining operations are the
-library's, with the same types and in the same order: single precision for the cost of an action, doubles for all else.
+of them are views of memory that a simulation keeps for its whole life (a reset overwrites it), so here they are made
+once. The library also has the simulator work out contact forces after each step (`mj_rnePostConstraint`), which the
+observations and rewards of these three do not contain and the next step does not read; here it does not. The remaining
+operations are the library's, with the same types and in the same order: single precision for the cost of an action,
+doubles for all else.
 """
 
 from __future__ import annotations

@@ -1,4 +1,5 @@
-"""BrowserGym's actions: texts of function calls, such as `click('12')` or `fill('a3', 'hello')`, taken apart and never run."""
+"""BrowserGym's actions: texts of function calls, such as `click('12')` or `fill('a3', 'hello')`, taken apart and never
+run."""
 
 from __future__ import annotations
 
@@ -65,9 +66,9 @@ _CALL = re.compile(
 
 
 def calls(text: str) -> list[tuple[str, dict[str, Any]]]:
-    """The calls of an action, in order: functions and their arguments by name. As BrowserGym does, it finds them anywhere in
-    the text, skips comments and the words in between, and lets a text have several lines. ValueError, in words, for an
-    action without calls."""
+    """The calls of an action, in order: functions and their arguments by name. As BrowserGym does, it finds them
+    anywhere in the text, skips comments and the words in between, and lets a text have several lines. ValueError, in
+    words, for an action without calls."""
     found = [
         (match[1], given)
         for match in _CALL.finditer(text)

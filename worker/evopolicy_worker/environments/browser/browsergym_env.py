@@ -35,8 +35,8 @@ class BrowserGymEnv(PageEnv):
     """A page of MiniWoB++ with BrowserGym's spaces."""
 
     def __init__(self, page: str, *, dom_object: bool = False, **options: Any) -> None:
-        """`dom_object`: whether observations have a snapshot of the page's documents; the page is then loaded for each episode,
-        since the order of an element's attributes outlasts an episode. `options`: those of `PageEnv`."""
+        """`dom_object`: whether observations have a snapshot of the page's documents; the page is then loaded for each
+        episode, since the order of an element's attributes outlasts an episode. `options`: those of `PageEnv`."""
         if dom_object:
             options["load"] = "each"
         self._dom = dom_object

@@ -4,9 +4,9 @@ Rules:
 - The process that starts it is an environment process in its jail; the browser is inside that jail too, where there is
   no network and no file of the machine's but installed programs. The browser's own sandbox is off: it needs namespaces,
   which the jail refuses.
-- Its profile is a folder in the process's temporary folder, and is removed when the process ends. A killed process leaves
-  it to the owner of that temporary folder: a slot, or `check-env`. Pages run in a browser context that keeps everything in
-  memory.
+- Its profile is a folder in the process's temporary folder, and is removed when the process ends. A killed process
+  leaves it to the owner of that temporary folder: a slot, or `check-env`. Pages run in a browser context that keeps
+  everything in memory.
 - It ends with the process that started it: it ends when the debugging pipe closes.
 """
 
@@ -198,7 +198,8 @@ class Chromium:
         return sum(proc.proportional_bytes(pid) or 0 for pid in _session(self.pid)) >> 20
 
     def close(self) -> None:
-        """Ends all its processes and removes its profile. A second close, or one in a fork of its process, does nothing."""
+        """Ends all its processes and removes its profile. A second close, or one in a fork of its process, does
+        nothing."""
         if self._closed or os.getpid() != self._owner:
             return
         self._closed = True

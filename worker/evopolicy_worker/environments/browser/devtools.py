@@ -36,7 +36,8 @@ class _Answer(msgspec.Struct):
 
 
 class DevTools:
-    """Both ends of the pipe. `on_event(method, params, session)` is called for every event, while a result is waited for."""
+    """Both ends of the pipe. `on_event(method, params, session)` is called for every event, while a result is waited
+    for."""
 
     def __init__(
         self, commands: int, replies: int, on_event: Callable[[str, dict[str, Any], str], None]

@@ -138,7 +138,8 @@ def miniwob(name: str) -> tuple[Key, int] | None:
 
 
 def combined(name: str) -> tuple[Key, int] | None:
-    """Key and modifiers by BrowserGym's name: `Enter`, `Control+a`, `Shift+Tab`, `Control++`. None for an unknown one."""
+    """Key and modifiers by BrowserGym's name: `Enter`, `Control+a`, `Shift+Tab`, `Control++`. None for an unknown
+    one."""
     parts = [""]
     for character in name:
         if character == "+" and parts[-1]:

@@ -108,8 +108,8 @@ class Page:
         return self._browser
 
     def open(self, address: Address, seed: str) -> None:
-        """Loads it anew. `seed`: of the random numbers that its scripts draw while it loads. Raises BrowserLostError when
-        it does not load."""
+        """Loads it anew. `seed`: of the random numbers that its scripts draw while it loads. Raises BrowserLostError
+        when it does not load."""
         if self.opened != address:
             self._begin_context()
             for method, params in _first(address):
@@ -132,7 +132,8 @@ class Page:
         self.run("__evopolicy.preload().then(__evopolicy.settle)")
 
     def _begin_context(self) -> None:
-        """An empty page in a new context. BrowserLostError, which names the program and the remedy, when there is none."""
+        """An empty page in a new context. BrowserLostError, which names the program and the remedy, when there is
+        none."""
         try:
             self._open_context()
         except BrowserLostError as error:
@@ -181,8 +182,8 @@ class Page:
         return found["result"].get("value")
 
     def tell(self, script: str) -> Any:
-        """As `run`, for large values: the page writes them as JSON, which is quicker than the browser's own way. Half of a
-        surrogate pair, which no observation can have, becomes U+FFFD."""
+        """As `run`, for large values: the page writes them as JSON, which is quicker than the browser's own way. Half
+        of a surrogate pair, which no observation can have, becomes U+FFFD."""
         found = self.run(f"(async () => __evopolicy.json(await ({script})))()")
         try:
             # Whole pairs are not escaped.
@@ -309,8 +310,8 @@ class Page:
         return base64.b64decode(shot["data"])
 
     def snapshot(self) -> dict[str, Any]:
-        """The page's documents with their layout, as `DOMSnapshot.captureSnapshot` gives them, but for what differs each time
-        (numbers of nodes and frames) and the texts of scripts and styles."""
+        """The page's documents with their layout, as `DOMSnapshot.captureSnapshot` gives them, but for what differs
+        each time (numbers of nodes and frames) and the texts of scripts and styles."""
         found = self.send(
             "DOMSnapshot.captureSnapshot", computedStyles=[], includeDOMRects=True, includePaintOrder=True
         )
@@ -333,7 +334,8 @@ class Page:
         self.mouse(*(("mouseReleased", *self.mouse_at, button, 1) for button in held))
 
     def rest(self) -> None:
-        """Clicks where there is neither a task nor a scrollbar: the page keeps nothing of earlier places of mouse and keyboard."""
+        """Clicks where there is neither a task nor a scrollbar: the page keeps nothing of earlier places of mouse and
+        keyboard."""
         assert self.opened is not None
         if not self._touched:
             return
@@ -457,7 +459,8 @@ def _first(address: Address) -> list[tuple[str, dict[str, Any]]]:
         ("Fetch.enable", {"patterns": [{"urlPattern": "*"}]}),
         ("Target.setAutoAttach", {"autoAttach": True, "waitForDebuggerOnStart": True, "flatten": True}),
         ("Emulation.setFocusEmulationEnabled", {"enabled": True}),
-        # Keeps the accessibility tree between two questions. Without it, each element's role and name builds a tree anew.
+        # Keeps the accessibility tree between two questions. Without it, each element's role and name builds a tree
+        # anew.
         *([("Accessibility.enable", {})] if address.accessible else []),
         (
             "Emulation.setDeviceMetricsOverride",

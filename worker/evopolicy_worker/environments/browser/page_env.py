@@ -31,8 +31,8 @@ from evopolicy_worker.environments.interface.base import Frame
 STEP_MS = 200
 """Of the episode's clock that pass at each step."""
 Reward = Literal["decayed", "raw", "binary", "positive"]
-"""`decayed`: as the page gives it, which is less the later it comes. `raw`: before that. `binary`: 1 for a raw reward of 1,
--1 for any other end. `positive`: 1 for a raw reward above 0, 0 for any other end."""
+"""`decayed`: as the page gives it, which is less the later it comes. `raw`: before that. `binary`: 1 for a raw reward
+of 1, -1 for any other end. `positive`: 1 for a raw reward above 0, 0 for any other end."""
 _CHOICES: dict[str, tuple[str, ...]] = {
     "reward": ("decayed", "raw", "binary", "positive"),
     "clock": ("steps", "wall"),
@@ -170,7 +170,8 @@ class PageEnv(gymnasium.Env[Any, Any]):
         """Reward, whether the episode has ended, and `info`, from the page's report."""
         done, raw = bool(found["done"]), float(found["raw"])
         if found["left"]:
-            # MiniWoB++'s reward at the timeout. The page is loaded anew for the next episode: it may have grown too large.
+            # MiniWoB++'s reward at the timeout. The page is loaded anew for the next episode: it may have grown too
+            # large.
             self.page.opened = None
             done, raw, found = True, -1.0, {**found, "reward": -1.0, "reason": found["left"]}
         reward = {

@@ -1,7 +1,8 @@
 """Checks by playing whether environments follow the rules of the interface.
 
-As a program, `python -m evopolicy_worker.environments.checks.conformance STEPS ID…` prints one line of JSON, a `CheckResult`, for
-each id. It loads a family once and forks a process per id, so that a crash or hang affects only that environment.
+As a program, `python -m evopolicy_worker.environments.checks.conformance STEPS ID…` prints one line of JSON, a
+`CheckResult`, for each id. It loads a family once and forks a process per id, so that a crash or hang affects only that
+environment.
 `evopolicy-worker check-env` runs two such programs with different hash seeds and compares the results.
 """
 
@@ -40,10 +41,11 @@ from evopolicy_worker.environments.interface.base import Environment, Step
 SEEDS = (20_011_117, 20_011_229)
 """Large, so that an occurrence in an observation or info is recognisable as a leak."""
 TIMEOUT_S = 300.0
-"""Most processor time that one environment may use, all its processes together, and longest time in which it may use none,
-seconds. A short limit on time alone would also count what else the machine does."""
+"""Most processor time that one environment may use, all its processes together, and longest time in which it may use
+none, seconds. A short limit on time alone would also count what else the machine does."""
 LONGEST_S = 3600.0
-"""Longest time for one environment, seconds: one that polls for what never comes uses a little processor time for days."""
+"""Longest time for one environment, seconds: one that polls for what never comes uses a little processor time for
+days."""
 _LOOK_S = 1.0
 _WORKS_S = 0.05
 """A process that has used so much more processor time since the last look has not hung, seconds."""
@@ -78,8 +80,8 @@ class CheckResult(msgspec.Struct, kw_only=True):
     memory_mb: int = 0
     """Peak memory of the process, MiB."""
     rendered: str = ""
-    """`same`: an episode that is drawn is the same. `none`: it is never drawn. Empty: not tried, as in older results, or where
-    this machine cannot draw."""
+    """`same`: an episode that is drawn is the same. `none`: it is never drawn. Empty: not tried, as in older results,
+    or where this machine cannot draw."""
     seconds: float = 0.0
     observation: str = ""
     action: str = ""

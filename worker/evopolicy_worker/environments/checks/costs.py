@@ -1,8 +1,8 @@
 """The processor time of a bare step, for the table of `evopolicy-worker check-env`.
 
-As a program, `python -m evopolicy_worker.environments.checks.costs` reads a line of JSON with the definitions of environments
-that do not ship, then an environment id a line, and answers each with a line of JSON, a `Stretch`. The same id again plays
-the same stretch again, so that a slot can play it in turns.
+As a program, `python -m evopolicy_worker.environments.checks.costs` reads a line of JSON with the definitions of
+environments that do not ship, then an environment id a line, and answers each with a line of JSON, a `Stretch`. The
+same id again plays the same stretch again, so that a slot can play it in turns.
 """
 
 from __future__ import annotations

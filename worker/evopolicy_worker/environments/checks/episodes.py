@@ -15,8 +15,8 @@ from evopolicy_worker.environments.interface.base import Environment, Step
 def rollout(
     environment: Environment, seed: int, steps: int, *, drawn: bool = False
 ) -> Iterator[tuple[Any, Step]]:
-    """Plays at most `steps` steps with random actions drawn from `seed` (`Environment.draw`). Yields each action with its step; the first item is
-    None with the first observation. `drawn`: draws each state before the action."""
+    """Plays at most `steps` steps with random actions drawn from `seed` (`Environment.draw`). Yields each action with
+    its step; the first item is None with the first observation. `drawn`: draws each state before the action."""
     rng = np.random.default_rng(seed)
     step = Step(environment.reset(Case(seed=seed)), 0.0, False, False, {})
     yield None, step

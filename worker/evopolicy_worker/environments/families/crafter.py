@@ -1,7 +1,7 @@
 """Crafter: survive, collect and build in a world seen from above.
 
-The package walks through sets of objects, whose order depends on addresses in memory: sets in order of insertion take their
-place. Its pictures draw from the world's random numbers, so these are put back after a frame for people.
+The package walks through sets of objects, whose order depends on addresses in memory: sets in order of insertion take
+their place. Its pictures draw from the world's random numbers, so these are put back after a frame for people.
 """
 
 from __future__ import annotations
@@ -81,8 +81,8 @@ class CrafterFamily(GymnasiumFamily):
 
 
 def _hasten() -> None:
-    """Gives the noise that makes worlds its tables as lists, from which Python reads a number much faster than from arrays. The
-    noise is the same, bit for bit. (Where numba compiles it, it needs arrays.)"""
+    """Gives the noise that makes worlds its tables as lists, from which Python reads a number much faster than from
+    arrays. The noise is the same, bit for bit. (Where numba compiles it, it needs arrays.)"""
     import opensimplex
     from crafter import worldgen
     from opensimplex import internals

@@ -1,7 +1,7 @@
 """Environments that do not ship: any that Gymnasium can create from an environment file or from `module:Id`.
 
-Nothing about them is trusted: each episode gets a fresh environment, and their source is part of their fingerprint. Texts
-in `info` may tell of the machine, so only those that the definition declares are passed on.
+Nothing about them is trusted: each episode gets a fresh environment, and their source is part of their fingerprint.
+Texts in `info` may tell of the machine, so only those that the definition declares are passed on.
 """
 
 from __future__ import annotations
@@ -32,7 +32,8 @@ _PAGES = "evopolicy_worker.environments.browser.registered"
 """Registers pages with options of one's own."""
 
 left_out: dict[str, dict[str, None]] = {}
-"""By id, the keys of `info` whose texts were left out since it was last made for a description or a job, the first `_MAX_NAMED`."""
+"""By id, the keys of `info` whose texts were left out since it was last made for a description or a job, the first
+`_MAX_NAMED`."""
 
 
 class ForeignFamily(GymnasiumFamily):
@@ -101,8 +102,8 @@ def _package(module: str) -> Path | None:
 
 @cache
 def _own(top: str, data: tuple[str, ...] = ()) -> dict[str, str]:
-    """The package's version, where it is a distribution's, and a digest of its files and its data: code that is edited in
-    place has no other version."""
+    """The package's version, where it is a distribution's, and a digest of its files and its data: code that is edited
+    in place has no other version."""
     place = _package(top)
     named = packages_distributions().get(top, [])
     digest = hashlib.sha256()

@@ -117,8 +117,8 @@ def _root() -> Any:
 def _in_its_context(room: Any) -> None:
     """Makes an environment draw in the context in which it was made, and free that when it is closed.
 
-    MiniWorld draws in whichever context is current, and leaves its own to the garbage collector. Once that frees one, none
-    is current, and another environment in the middle of an episode cannot draw.
+    MiniWorld draws in whichever context is current, and leaves its own to the garbage collector. Once that frees one,
+    none is current, and another environment in the middle of an episode cannot draw.
     """
     window = room.shadow_window
 

@@ -30,8 +30,8 @@ class MoGymnasiumFamily(MujocoFamily):
         return True
 
     def make(self, entry: Entry, *, render: bool) -> gymnasium.Env[Any, Any]:
-        """As others. A minecart's mines are drawn while it is made, and its ore in each step, from numpy's global generator:
-        it is made for each episode with that generator seeded."""
+        """As others. A minecart's mines are drawn while it is made, and its ore in each step, from numpy's global
+        generator: it is made for each episode with that generator seeded."""
 
         def usual() -> gymnasium.Env[Any, Any]:
             return super(MoGymnasiumFamily, self).make(entry, render=render)
@@ -73,7 +73,8 @@ class _MadeFromSeed:
         return self._env.step(action)
 
     def render(self) -> Any:
-        # The first frame turns each mine by a number of the same generator: an episode that is drawn stays the same one.
+        # The first frame turns each mine by a number of the same generator: an episode that is drawn stays the same
+        # one.
         state = np.random.get_state()
         try:
             return self._env.render()

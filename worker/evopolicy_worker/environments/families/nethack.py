@@ -1,7 +1,8 @@
 """NetHack: the whole game with several goals (NLE), and small levels made for one skill each (MiniHack).
 
-`reset(seed=)` of the packages has no effect: a game's generators are seeded beside it. Of what else decides a game, the date's
-moon follows from the seed too, the game's birthday is set, and the folder in which a game keeps its files is emptied.
+`reset(seed=)` of the packages has no effect: a game's generators are seeded beside it. Of what else decides a game, the
+date's moon follows from the seed too, the game's birthday is set, and the folder in which a game keeps its files is
+emptied.
 """
 
 from __future__ import annotations

@@ -22,8 +22,8 @@ class RoboticsFamily(MujocoFamily):
     solved_by = {"FetchPush-v4": "is_success", "FetchPickAndPlace-v4": "is_success"}
 
     def make(self, entry: Entry, *, render: bool) -> gymnasium.Env[Any, Any]:
-        """As others. A maze's model is written to a file of a fixed name beside Python's temporary folders, and read again: with a
-        folder of its own no other process comes between."""
+        """As others. A maze's model is written to a file of a fixed name beside Python's temporary folders, and read
+        again: with a folder of its own no other process comes between."""
         usual = tempfile.tempdir
         with tempfile.TemporaryDirectory() as own:
             tempfile.tempdir = own

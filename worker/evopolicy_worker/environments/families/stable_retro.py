@@ -52,7 +52,8 @@ class StableRetroFamily(GymnasiumFamily):
 
 
 class _Console:
-    """A game in the emulator, of which a process can have only one: the console that begins an episode takes it from another."""
+    """A game in the emulator, of which a process can have only one: the console that begins an episode takes it from
+    another."""
 
     metadata = {"render_modes": ["rgb_array"]}
     spec = None

@@ -1,9 +1,9 @@
 """ViZDoom: the scenarios of its wheel, and the levels of Freedoom, seen by the player.
 
-The game is a process of its own, which plays one step when it is told to. It shares memory with this process and writes into the
-folder in which it was started; here that is a temporary one, which goes with the environment. It waits for its next step for ever,
-so the kernel ends it with this process, which may be killed. The names of the shared memory are removed once both have it, so that
-nothing of it outlasts them.
+The game is a process of its own, which plays one step when it is told to. It shares memory with this process and writes
+into the folder in which it was started; here that is a temporary one, which goes with the environment. It waits for its
+next step for ever, so the kernel ends it with this process, which may be killed. The names of the shared memory are
+removed once both have it, so that nothing of it outlasts them.
 """
 
 from __future__ import annotations
@@ -31,7 +31,8 @@ if TYPE_CHECKING:
     import gymnasium
 
 MOST_DELTA = 50.0
-"""Most that a step may turn or look, degrees, or move to the side, units of the map. The package has the largest float."""
+"""Most that a step may turn or look, degrees, or move to the side, units of the map. The package has the largest
+float."""
 _SHARED = "/dev/shm"
 
 
@@ -167,7 +168,8 @@ def _check_shared_memory() -> None:
 
 
 def _remove_names() -> None:
-    """Removes the names of the shared memory of this process's games. They opened it when they began, and need them no more."""
+    """Removes the names of the shared memory of this process's games. They opened it when they began, and need them no
+    more."""
     with open("/proc/self/maps", encoding="utf-8", errors="surrogateescape") as maps:
         shared = {line.split(maxsplit=5)[-1].rstrip("\n") for line in maps if f" {_SHARED}/ViZDoom" in line}
     for path in shared:

@@ -1,1 +1,2 @@
-"""The interface to every environment: spaces, actions, observations and rewards as values, and the Gymnasium adapter."""
+"""The interface to every environment: spaces, actions, observations and rewards as values, and the Gymnasium
+adapter."""

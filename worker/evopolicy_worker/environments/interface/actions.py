@@ -5,10 +5,12 @@ Works from the schema of the action space alone, compiled once: `repair` runs on
   lists, tuples, arrays of any number type; axes of length one more or fewer; a bool counts as 0 or 1; a float without
   fraction counts as an integer; a Box action is cast to the dtype of the space, and may stick out of its bounds by the
   rounding of a float32.
-- A Sequence is any list, an action of OneOf a pair of index and value, a Graph a dict of `nodes`, `edges` and `edge_links`.
+- A Sequence is any list, an action of OneOf a pair of index and value, a Graph a dict of `nodes`, `edges` and
+  `edge_links`.
 - Everything else is marked `invalid` and repaired: a number out of bounds is clipped; a wrong shape is broadcast where
-  that is possible; NaN becomes the neutral value of its element; a missing part of a Dict or Tuple, the neutral value of
-  that part; and anything that is no number at all (None, strings, ragged lists, objects) the neutral value of the space.
+  that is possible; NaN becomes the neutral value of its element; a missing part of a Dict or Tuple, the neutral value
+  of that part; and anything that is no number at all (None, strings, ragged lists, objects) the neutral value of the
+  space.
 - The neutral value of a Box is zero, or the bound nearest to it; that of the discrete spaces is the lowest one.
 - What is returned is fresh, of exactly the dtype and shape of the space, and finite.
 """
@@ -348,7 +350,8 @@ class _OneOf:
 
 
 class _Graph:
-    """Nodes, and edges between them where the space has any: Gymnasium's `GraphInstance` from a dict of its three fields."""
+    """Nodes, and edges between them where the space has any: Gymnasium's `GraphInstance` from a dict of its three
+    fields."""
 
     def __init__(self, node: ActionCodec, edge: ActionCodec | None) -> None:
         self._nodes = _Sequence(node, stacked=True)

@@ -48,8 +48,8 @@ class Environment(ABC):
     action_codec: ActionCodec
     """Repairs what a policy returns, and draws uniform random actions."""
     solved_by: str = ""
-    """Key of `info` that reports at the last step whether the task was solved, where the definition names none. Not part of the
-    definition, so that runs of earlier versions stay comparable."""
+    """Key of `info` that reports at the last step whether the task was solved, where the definition names none. Not
+    part of the definition, so that runs of earlier versions stay comparable."""
 
     @abstractmethod
     def reset(self, case: Case) -> Observation:
@@ -60,7 +60,8 @@ class Environment(ABC):
         """Play one valid action. Not defined after an episode has ended."""
 
     def draw(self, rng: np.random.Generator, obs: Observation) -> Any:
-        """A random action after an observation, for checks: of the action space, or one that means more where its family knows."""
+        """A random action after an observation, for checks: of the action space, or one that means more where its
+        family knows."""
         return self.action_codec.sample(rng)
 
     def render(self) -> Frame:

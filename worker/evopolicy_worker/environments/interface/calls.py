@@ -142,7 +142,8 @@ def described(error: BaseException) -> str:
 
 
 def traced(error: BaseException | None) -> str:
-    """The last lines of the traceback that are the environment's own, to be appended to a text; empty if there are none."""
+    """The last lines of the traceback that are the environment's own, to be appended to a text; empty if there are
+    none."""
     if error is None:
         return ""
     lines = _own(
@@ -154,7 +155,8 @@ def traced(error: BaseException | None) -> str:
 
 
 def last_words(stderr: Iterable[str]) -> str:
-    """The last lines that a process wrote to its standard error, as one text; of a crash's stack only the environment's own."""
+    """The last lines that a process wrote to its standard error, as one text; of a crash's stack only the environment's
+    own."""
     said: list[str] = []
     stack: list[tuple[str, str]] = []
     for line in stderr:
@@ -191,7 +193,8 @@ def _not_shown(error: BaseException, text: str) -> str:
 
 
 def raised(error: BaseException, text: str, limits: Limits) -> str:
-    """Which call raised the error, with `text` of it and the remedy; empty for an error that is not the environment's."""
+    """Which call raised the error, with `text` of it and the remedy; empty for an error that is not the
+    environment's."""
     if not current.what or isinstance(error, SandboxError | SlotDiedError):
         return ""
     if isinstance(error, MemoryError):

@@ -96,7 +96,8 @@ class GymnasiumFamily:
         except TypeError as error:
             if not render or "unexpected keyword argument 'render_mode'" not in str(error):
                 raise
-        # It renders, but its constructor does not take the mode (HighwayEnv's lane-keeping-v0): the attribute is all that
+        # It renders, but its constructor does not take the mode (HighwayEnv's lane-keeping-v0): the attribute is all
+        # that
         # `Env.render` reads.
         env = gymnasium.make(entry.gymnasium_id, disable_env_checker=True, **entry.kwargs)
         env.unwrapped.render_mode = "rgb_array"
@@ -125,7 +126,8 @@ class GymnasiumFamily:
         return plain_info(info) if info else {}
 
     def draw(self, codec: ActionCodec, rng: np.random.Generator, obs: Any) -> Any:
-        """A random action after an observation, for checks. Override where hardly one of the action space does anything."""
+        """A random action after an observation, for checks. Override where hardly one of the action space does
+        anything."""
         return codec.sample(rng)
 
     def render(self, env: gymnasium.Env[Any, Any]) -> Any:
@@ -332,8 +334,8 @@ class GymnasiumEnvironment(Environment):
             raise WorkerError(f"environment {self._entry.id}, {name}: {error}") from error
 
     def try_out(self) -> None:
-        """Plays a few random steps. WorkerError that names the environment, the field and the remedy where an observation, a
-        reward or an info is not as the environment's spaces promise."""
+        """Plays a few random steps. WorkerError that names the environment, the field and the remedy where an
+        observation, a reward or an info is not as the environment's spaces promise."""
         if self._promises is not None:
             self._promises.strict = True
         trial.play(self)

@@ -1,8 +1,9 @@
 """From what a simulator returns to a plain observation, compiled once per space because it runs on every step.
 
 The result holds numpy arrays that are fresh, C-contiguous and of exactly the dtype of the space; ints for Discrete;
-strings for Text; dicts in the order of the schema; tuples, of any length for Sequence (one array where it is stacked); an index and
-a value for OneOf; for Graph a dict of `nodes`, `edges` and `edge_links`, the last two None where there are none.
+strings for Text; dicts in the order of the schema; tuples, of any length for Sequence (one array where it is stacked);
+an index and a value for OneOf; for Graph a dict of `nodes`, `edges` and `edge_links`, the last two None where there are
+none.
 """
 
 from __future__ import annotations

@@ -1,9 +1,11 @@
 """Spaces as plain dicts: from a Gymnasium space to the schema that policies, `/info` and the codecs read.
 
-Forms (as in the published protocol): `Discrete {n, start?}`, `Box {shape, dtype, low, high}`, `Image {shape, dtype, layout,
-value_range, storage}`, `MultiDiscrete {nvec, start?, dtype?}` (`dtype`: that of actions, unless int64), `MultiBinary {n}`, `Tuple {spaces}`, `Dict {spaces}`, `Text
-{min_length, max_length, characters?}`, and beyond it `Sequence {space, stacked}`, `Graph {node_space, edge_space}`, `OneOf {spaces}`. Infinities are `"inf"` and `"-inf"`. `low` and `high` are nested lists, or one number for all values
-where a Box has more than 32 and they are equal. A schema is JSON and msgpack by construction.
+Forms (as in the published protocol): `Discrete {n, start?}`, `Box {shape, dtype, low, high}`, `Image {shape, dtype,
+layout, value_range, storage}`, `MultiDiscrete {nvec, start?, dtype?}` (`dtype`: that of actions, unless int64),
+`MultiBinary {n}`, `Tuple {spaces}`, `Dict {spaces}`, `Text {min_length, max_length, characters?}`, and beyond it
+`Sequence {space, stacked}`, `Graph {node_space, edge_space}`, `OneOf {spaces}`. Infinities are `"inf"` and `"-inf"`.
+`low` and `high` are nested lists, or one number for all values where a Box has more than 32 and they are equal. A
+schema is JSON and msgpack by construction.
 """
 
 from __future__ import annotations

@@ -39,7 +39,8 @@ class Promises:
         schema_of: Callable[[str], SpaceSchema],
         success: str = "",
     ) -> None:
-        """`schema_of`: the environment's present `observation_space` or `action_space`. `success`: the key in `info`."""
+        """`schema_of`: the environment's present `observation_space` or `action_space`. `success`: the key in
+        `info`."""
         self._schema_of = schema_of
         self._success = success
         self.strict = False
@@ -112,7 +113,8 @@ def _beyond(bound: Any, part: float) -> Any:
 
 
 def _altered(obs: Any, raw: Any) -> str:
-    """How the observation differs from the raw one, as integers and texts are made of anything; empty where it does not."""
+    """How the observation differs from the raw one, as integers and texts are made of anything; empty where it does
+    not."""
     if isinstance(obs, dict):
         parts = [(key, raw[key] if isinstance(raw, Mapping) else getattr(raw, key)) for key in obs]
         return next((f"[{key!r}] {why}" for key, each in parts if (why := _altered(obs[key], each))), "")

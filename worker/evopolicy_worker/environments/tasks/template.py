@@ -132,11 +132,12 @@ def groups(family: str) -> tuple[dict[str, Any], ...]:
 
 
 def _of_groups(entry: Entry, own: Mapping[str, str]) -> dict[str, str]:
-    """The sections of all groups of the family's file to which the environment belongs, in order and below `own`. Rows of
-    tables come together below what is written before the first of each, and get their head.
+    """The sections of all groups of the family's file to which the environment belongs, in order and below `own`. Rows
+    of tables come together below what is written before the first of each, and get their head.
 
-    A group has `ids` (patterns of Gymnasium's ids) and `except` (of those left out), `about`, and sections by their headings; `like` takes the sections of
-    another text, `within` puts the rows' components into a part of the observation.
+    A group has `ids` (patterns of Gymnasium's ids) and `except` (of those left out), `about`, and sections by their
+    headings; `like` takes the sections of another text, `within` puts the rows' components into a part of the
+    observation.
     """
     chosen = [
         each

@@ -69,7 +69,8 @@ def copy_folder(source: str, target: str) -> None:
 
 
 def copy_file(source: str, target: str) -> None:
-    """With its time, by which Python knows whether compiled code is of this source. What may not be read is left out."""
+    """With its time, by which Python knows whether compiled code is of this source. What may not be read is left
+    out."""
     try:
         fd = os.open(source, os.O_RDONLY)
     except PermissionError:
@@ -90,8 +91,8 @@ def copy_file(source: str, target: str) -> None:
 
 
 def needed(folders: list[str]) -> list[str]:
-    """Paths of the shared libraries that extension modules in these folders load. Found by loading them, in a process that
-    ends."""
+    """Paths of the shared libraries that extension modules in these folders load. Found by loading them, in a process
+    that ends."""
     read, write = os.pipe()
     child = os.fork()
     if child == 0:

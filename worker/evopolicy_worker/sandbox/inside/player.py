@@ -2,8 +2,8 @@
 
 Runs inside the sandbox, in one process with the policy, which may change all of it: nothing here is trusted by the
 worker. Frames: a request is `<u32 length, u8 kind, 3 pad, i64 argument>` and its payload, a reply is `<u32 length,
-u8 tag, 3 pad>` and its payload; a question, then its answer, on two pipes. `evopolicy_worker.episodes.frames` is the other end.
-Standard library and numpy only: the sandbox shows nothing else.
+u8 tag, 3 pad>` and its payload; a question, then its answer, on two pipes. `evopolicy_worker.episodes.frames` is the
+other end. Standard library and numpy only: the sandbox shows nothing else.
 """
 
 import _random
@@ -112,8 +112,8 @@ def play(init: dict[str, Any]) -> NoReturn:
 
 
 def compiled(path: str) -> bytes:
-    """The file's code for other processes, in which it is the same as if they had compiled it; nothing where they are to
-    compile it themselves, because that fails or warns. Runs none of it."""
+    """The file's code for other processes, in which it is the same as if they had compiled it; nothing where they are
+    to compile it themselves, because that fails or warns. Runs none of it."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")
@@ -209,11 +209,12 @@ def seed_generators(seed: bytes) -> None:
 
 
 def copy_key(seed: bytes) -> bool:
-    """Sets numpy's generator as `np.random.seed` with the seed's four words does; False where they end with zeros, which
-    Python leaves out.
+    """Sets numpy's generator as `np.random.seed` with the seed's four words does; False where they end with zeros,
+    which Python leaves out.
 
     Python's generator, made from the same words, has the same 624 words of state. Passed on as Python's numbers, they
-    would touch ten times as much memory, which each policy's process has to copy. For a generator that has drawn nothing yet.
+    would touch ten times as much memory, which each policy's process has to copy. For a generator that has drawn
+    nothing yet.
     """
     number = int.from_bytes(seed[:16], "little")
     if number >> 96:

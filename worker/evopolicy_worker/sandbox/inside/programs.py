@@ -1,4 +1,5 @@
-"""Policies of the newest published form (`policy/v2`): `make_policy(context)` returns an object with `act(observation)`.
+"""Policies of the newest published form (`policy/v2`): `make_policy(context)` returns an object with
+`act(observation)`.
 
 - Such a policy plays unchanged in place of a `Policy`: each episode has a new one.
 - Arrays reach it as `TensorValue`, and its actions may be `TensorValue`. An action that the published software refuses

@@ -57,7 +57,8 @@ _PIECES = (ctypes.c_size_t * 2)(ctypes.addressof(_WORD), len(_WORD))
 LETTER = (ctypes.c_size_t * 7)(
     0, 0, ctypes.addressof(_PIECES), 1, ctypes.addressof(ENVELOPE), len(ENVELOPE), 0
 )
-"""`struct msghdr` of one byte with the envelope. A `socket` asks the kernel for its kind first, which touches many objects."""
+"""`struct msghdr` of one byte with the envelope. A `socket` asks the kernel for its kind first, which touches many
+objects."""
 player: Any = None
 """The module `player`: imports numpy, so not before the path to it is known."""
 scan_json = vars(json.JSONDecoder())["scan_once"]
@@ -129,7 +130,8 @@ def wait_if_parent(child: int, control: socket.socket) -> None:
 
 
 def protect(device: str) -> None:
-    """Read-only, which leaves a device's data as it is: who may write could set its times, for all the machine to see."""
+    """Read-only, which leaves a device's data as it is: who may write could set its times, for all the machine to
+    see."""
     # These may not be taken away in a namespace, so they are named again; ST_ and MS_ are the same numbers.
     flags = os.statvfs(device).f_flag & (os.ST_NOSUID | os.ST_NODEV | os.ST_NOEXEC)
     flags |= MS_REMOUNT | MS_BIND | MS_RDONLY
@@ -185,8 +187,8 @@ def huge_pages() -> Iterator[None]:
     """Puts what is allocated inside into huge pages, which a fork and the end of a process handle as one.
 
     Python's arenas usually lie between libraries, where no huge page fits. Here they extend the C library's heap. A
-    page that a policy's process writes to is copied alone. Without effect on kernels before 6.1, with other C libraries,
-    from Python 3.14 on, and where the heap cannot grow by `HEAP_ROOM`.
+    page that a policy's process writes to is copied alone. Without effect on kernels before 6.1, with other C
+    libraries, from Python 3.14 on, and where the heap cannot grow by `HEAP_ROOM`.
     """
     if not hasattr(libc, "gnu_get_libc_version") or sys.version_info >= (3, 14) or not heap_can_grow():
         yield
@@ -217,8 +219,8 @@ def heap_can_grow() -> bool:
 
 
 def zygote(control: int, namespaces: bool, then: Callable[[int], None]) -> NoReturn:
-    """Serves the worker, on the socket `control`, until it is told to end. In a fork for each policy it calls `then` with
-    a socket to the worker.
+    """Serves the worker, on the socket `control`, until it is told to end. In a fork for each policy it calls `then`
+    with a socket to the worker.
 
     A policy can read all memory that it was forked with. So this process must learn nothing of the policies before, nor
     count them. It runs no Python between two forks, whose interpreter counts what it does: the same calls in a circle,

@@ -23,7 +23,8 @@ IMAGE_CELLS = 4
 MAX_ONE_HOT = 64
 """A Discrete space with more values than this becomes one number in [-1, 1]."""
 MAX_CHOICES = 1024
-"""An action of a Discrete space with more values than this is one output, on a scale on which low values have most room."""
+"""An action of a Discrete space with more values than this is one output, on a scale on which low values have most
+room."""
 
 
 def bounds(schema: Schema) -> tuple[Vector, Vector]:
