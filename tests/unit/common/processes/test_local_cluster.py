@@ -156,7 +156,8 @@ def test_a_worker_keeps_the_lock_of_its_command(tmp_path: Path, monkeypatch: pyt
     async def main() -> None:
         async with local_cluster.local_cluster("test", state=tmp_path) as cluster:
             await cluster.start_workers(["toy/line"], slots=1)
-            for child in cluster._processes._running:
+            processes, *_ = cluster._start_workers.args
+            for child in processes._running:
                 held = [fd.resolve() for fd in Path(f"/proc/{child.pid}/fd").iterdir()]
                 assert tmp_path / local_cluster.PROCESSES in held, child.log
 

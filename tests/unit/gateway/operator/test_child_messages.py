@@ -22,6 +22,8 @@ def filled(kind: type[child_messages.Event]) -> child_messages.Event:
         elif "dict" in str(field.type):
             # Only maps of anything come from agents.
             required[field.encode_name] = LONG if "Any" in str(field.type) else {"name": "value"}
+        elif isinstance(field.type, type) and issubclass(field.type, msgspec.Struct):
+            required[field.encode_name] = {"limits": {}} if "limits" in field.type.__struct_fields__ else {}
         elif field.required:
             required[field.encode_name] = [1] if "tuple" in str(field.type) else 1
     return msgspec.convert(required | {"event": kind.__struct_config__.tag}, kind)
