@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     from slots import Slots
 
 _LEFT_OUT: dict[str, Callable[[bytes], object]] = {
-    "not system and not families": re.compile(
-        rb"^pytestmark = \[?\s*pytest\.mark\.(system|families)\b", re.MULTILINE
-    ).search,
+    "not system and not families": (
+        re.compile(rb"^pytestmark = \[?\s*pytest\.mark\.(system|families)\b", re.MULTILINE).search
+    ),
     "system or families": lambda text: (
         b"pytest.mark.system" not in text and b"pytest.mark.families" not in text
     ),
@@ -63,7 +63,10 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
         "--rewrite-transcripts",
         action="store_true",
-        help="write the core's transcripts (coordinator/evopolicy_coordinator/core/transcripts) anew from what it does now",
+        help=(
+            "write the core's transcripts (coordinator/evopolicy_coordinator/core/transcripts) anew from what it"
+            " does now"
+        ),
     )
 
 

@@ -128,14 +128,17 @@ def secret_of(state: Path, *, unjailed: bool = False) -> tuple[bytes, str]:
         with contextlib.suppress(FileNotFoundError):
             usual.unlink()
             fsync_directory(state)
-        return data, (
-            "agents of this run have no full jail and could read the cluster's state: its cases are of its own, and later"
-            " runs with jailed agents get new ones"
+        return (
+            data,
+            (
+                "agents of this run have no full jail and could read the cluster's state: its cases are of its own, and"
+                " later runs with jailed agents get new ones"
+            ),
         )
     is_new = own.exists() and not usual.exists()
     return load_or_create_secret(usual), (
-        "an agent without a full jail has run on this state: the cases are new from here on, and do not compare with those of"
-        " earlier runs"
+        "an agent without a full jail has run on this state: the cases are new from here on, and do not compare with"
+        " those of earlier runs"
         if is_new
         else ""
     )
@@ -252,8 +255,8 @@ class SplitSource:
             return EnvironmentSplits(env=env, secret=True, epoch=epoch_of(self._secret), files={}, **cases)
         if own:
             raise ConfigError(
-                "--hidden-cases per-run needs cases that are derived from the coordinator's secret; this one takes them from"
-                f" {self._data}, so all runs share them"
+                "--hidden-cases per-run needs cases that are derived from the coordinator's secret; this one takes"
+                f" them from {self._data}, so all runs share them"
             )
         folder = folder_of(self._data, env)
         splits, findings = load(folder)
@@ -265,7 +268,8 @@ class SplitSource:
         known = {(case.options or {}).get(OPTION) for split in SPLITS for case in splits.cases(split)}
         if unchanged(env) != env and (len(known) > 1 or not KEY.fullmatch(str(*known))):
             raise ConfigError(
-                f"splits of {env} in {folder} cannot be used: all cases of a world have the same key; give each the options"
+                f"splits of {env} in {folder} cannot be used: all cases of a world have the same key; give each the"
+                " options"
                 f' {{"{OPTION}": "32 hexadecimal digits"}}, as `evopolicy data create` does'
             )
         if splits.env != env:
@@ -282,7 +286,8 @@ class SplitSource:
         """
         if self._data is not None:
             raise ConfigError(
-                f"this coordinator takes its cases from {self._data} and derives none: name a folder with further cases (--data)"
+                f"this coordinator takes its cases from {self._data} and derives none: name a folder with further cases"
+                " (--data)"
             )
         key = hmac.digest(self._secret, f"further hidden cases {name}".encode(), "sha256")
         cases = derive(key, suite, env, {"heldout": n}, (case.seed for case in taken))
@@ -295,6 +300,7 @@ def _cut(folder: Path, split: Split, cases: Sequence[Case], count: int | None) -
         return tuple(cases)
     if count > len(cases):
         raise ConfigError(
-            f"{folder / FILE_STEMS[split]}.json has {len(cases)} cases, and {count} are requested; extend the file or request fewer"
+            f"{folder / FILE_STEMS[split]}.json has {len(cases)} cases, and {count} are requested; extend the file or"
+            " request fewer"
         )
     return tuple(cases[:count])

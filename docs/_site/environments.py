@@ -19,7 +19,7 @@ HEAD = """# {title}
 `--env {name}` plays all environments of this page. [Environments](../environments.md#played-environments) explains the columns.
 
 {mark}
-"""
+"""  # noqa: E501
 
 
 def shown() -> list[catalogue.Suite]:

@@ -20,7 +20,7 @@ DOCUMENTS = (TOP / "README.md", LIST)
 END = "<!-- End of what it writes. -->"
 
 CPU = """*CPU ms a step*: processor time of a step of the library's environment alone, without accelerations, and in a worker's slot
-with its policy and recording; the median of the suite's ids."""
+with its policy and recording; the median of the suite's ids."""  # noqa: E501
 
 
 def table() -> str:
@@ -28,7 +28,10 @@ def table() -> str:
     original, families, costs = _original(), _families(), _costs()
     named, newest = original["paper"]["families"], original["newest"]
     lines = [
-        "| suite | environments | named in the paper | deterministic | played | CPU ms a step: bare, slot | to install |",
+        (
+            "| suite | environments | named in the paper | deterministic | played | CPU ms a step: bare, slot | to"
+            " install |"
+        ),
         "|---|--:|---|--:|--:|--:|---|",
     ]
     for suite in families:
@@ -49,9 +52,18 @@ def table() -> str:
         lines.append(f"| {' | '.join(cells)} |")
     lines += [
         "",
-        f"The {len(families)} suites hold {_total(families):,} environments; the suite `paper13` holds the {len(named)} families that the paper",
-        f"names. The paper validates its protocol on {original['paper']['validated']} tasks. The newest version of the original software has",
-        f"about {newest['profiles']} environment profiles in {newest['ecosystems']} ecosystems, each with its own lock file. *Deterministic*: ids whose episodes depend",
+        (
+            f"The {len(families)} suites hold {_total(families):,} environments; the suite `paper13` holds the"
+            f" {len(named)} families that the paper"
+        ),
+        (
+            f"names. The paper validates its protocol on {original['paper']['validated']} tasks. The newest version of"
+            " the original software has"
+        ),
+        (
+            f"about {newest['profiles']} environment profiles in {newest['ecosystems']} ecosystems, each with its own"
+            " lock file. *Deterministic*: ids whose episodes depend"
+        ),
         "only on seed and actions. *Played*: ids that `check-env` has played.",
         CPU,
         "",
@@ -67,7 +79,8 @@ def short() -> str:
     original, families, costs = _original(), _families(), _costs()
     named = original["paper"]["families"]
     cells = [
-        f"{f'**`{suite.name}`**' if suite.name in named else f'`{suite.name}`'} | {len(suite.environments):,} | {_cost(suite, costs)}"
+        f"{f'**`{suite.name}`**' if suite.name in named else f'`{suite.name}`'} | {len(suite.environments):,} |"
+        f" {_cost(suite, costs)}"
         for suite in families
     ]
     half = (len(cells) + 1) // 2
@@ -85,8 +98,14 @@ def short() -> str:
             "|---|--:|--:|---|--:|--:|",
             *(f"| {left} | {right} |" for left, right in rows),
             "",
-            f"The {len(families)} suites hold {total:,} environments; the paper names the families in bold (together `paper13`). {every}",
-            "deterministic: seed and actions determine the episode. `evopolicy-worker check-env ID` plays an environment in two processes",
+            (
+                f"The {len(families)} suites hold {total:,} environments; the paper names the families in bold"
+                f" (together `paper13`). {every}"
+            ),
+            (
+                "deterministic: seed and actions determine the episode. `evopolicy-worker check-env ID` plays an"
+                " environment in two processes"
+            ),
             f"and compares the episodes; it has confirmed {'all' if played == total else f'{played:,}'} ids.",
             CPU,
         ]

@@ -52,6 +52,6 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str
             return label
         if uri is None or files.get_file_from_path(uri) is None:
             return match.group(0)
-        return f"{picture}[{label}]({posixpath.relpath(uri, posixpath.dirname(page.file.src_uri) or '.')}{anchor or ''})"
+        return f"{picture}[{label}]({posixpath.relpath(uri, posixpath.dirname(page.file.src_uri) or '.')}{anchor or ''})"  # noqa: E501
 
     return LINK.sub(led, markdown)

@@ -18,8 +18,9 @@ def page() -> Iterator[str]:
     """The page's lines."""
     yield "# Options of a run\n"
     yield (
-        "One table for the command line (`evopolicy run`, `local`), for `[defaults]`, `[agents.run]` and `[[overrides]]` of a suite file"
-        " (`jail.…`: in `[agents.jail]`), and for `evp.run` in Python. [Commands](cli.md) has the options of every command, with those of a local cluster."
+        "One table for the command line (`evopolicy run`, `local`), for `[defaults]`, `[agents.run]` and"
+        " `[[overrides]]` of a suite file (`jail.…`: in `[agents.jail]`), and for `evp.run` in Python."
+        " [Commands](cli.md) has the options of every command, with those of a local cluster."
     )
     options = [one for each in (RunOptions, JailSettings, ListenerOptions) for one in declared(each).items()]
     for group, found in groupby(options, lambda each: each[1].group):

@@ -143,7 +143,7 @@ CLAIMS: dict[str, Claim] = {
             "2, 10, 3 and 5 runs, variances 1, 4, 1/4 and 1, agent × case 0.5": (
                 _gaps(World(n_runs=(2, 10, 3, 5), noise=(1.0, 2.0, 0.5, 1.0), interaction=0.5)), 0.4
             ),
-            "1 environment, 3 runs, agent × case 0.5": (_gaps(World(n_environments=1, n_runs=(3,), interaction=0.5)), 1.0),
+            "1 environment, 3 runs, agent × case 0.5": (_gaps(World(n_environments=1, n_runs=(3,), interaction=0.5)), 1.0),  # noqa: E501
             "4 runs, 0/1, agent × case 0.5": (_gaps(World(shape="0/1", interaction=0.5)), 0.4),
             "1 run, 0/1": (_gaps(World(shape="0/1", n_runs=(1,))), 0.4),
             "4 runs, skewed, agent × case 0.5": (_gaps(World(shape="skewed", interaction=0.5)), 0.4),

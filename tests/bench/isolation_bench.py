@@ -55,11 +55,13 @@ def main() -> None:
             walls[rule], records[rule] = sweep(Path(root) / rule, text, rule, options.slots)
     n = len(records["related"])
     print(
-        f"{n} runs of {options.agents} agents, {options.parallel} at once, {options.slots} slots, {os.cpu_count()} cores"
+        f"{n} runs of {options.agents} agents, {options.parallel} at once, {options.slots} slots, {os.cpu_count()}"
+        " cores"
     )
     print(f"load average before: {load:.1f}")
     print(
-        f"wall time: {walls['related']:.0f} s with the rule, {walls['off']:.0f} s without: {walls['related'] / walls['off']:.2f}"
+        f"wall time: {walls['related']:.0f} s with the rule, {walls['off']:.0f} s without:"
+        f" {walls['related'] / walls['off']:.2f}"
     )
     print("seconds a run, in the mean:")
     for phase in PHASES:

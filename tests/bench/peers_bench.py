@@ -35,7 +35,7 @@ import bare_loop
 
 def report(package, seconds, steps):
     print(json.dumps({"version": f"{package} {importlib.metadata.version(package)}", "seconds": seconds, "steps": steps}))
-"""
+"""  # noqa: E501
 BARE = """
 env = bare_loop.make(gymnasium_id)
 bare_loop.play(env, 1)
@@ -116,7 +116,7 @@ if __name__ == "__main__":
         tasks = [client.submit(episode, gymnasium_id, seed, pure=False) for seed in bare_loop.seeds(n)]
         steps = sum(client.gather(tasks))
         report("distributed", time.perf_counter() - started, steps)
-"""
+"""  # noqa: E501
 PEERS = {
     "Gymnasium AsyncVectorEnv": ("gymnasium", BEGIN + VECTOR),
     "Ray": ("ray", BEGIN + RAY),

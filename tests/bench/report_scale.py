@@ -29,7 +29,8 @@ def main() -> None:
         files = [path for path in (folder / "report").rglob("*") if path.is_file()]
         size_mib = sum(path.stat().st_size for path in files) / 2**20
         print(
-            f"{n_runs} runs: {wall_s:.0f} s, {peak_mib:.0f} MiB at most; a report of {len(files)} files, {size_mib:.0f} MiB"
+            f"{n_runs} runs: {wall_s:.0f} s, {peak_mib:.0f} MiB at most; a report of {len(files)} files,"
+            f" {size_mib:.0f} MiB"
         )
 
 

@@ -258,7 +258,8 @@ def main() -> None:
         found = [each(folder, options.times) for each in chosen] or rows(folder, options.times)
     console = Console()
     console.print(
-        f"seconds, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}; over floor: CPU, or wall where there is no other"
+        f"seconds, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}; over floor: CPU, or wall where there is no"
+        " other"
     )
     table = Table()
     for heading in (

@@ -140,17 +140,20 @@ async def watch(options: argparse.Namespace) -> int:
     share = cost / (cost + pause)
     rate = n_events / lasted / max(1, options.browsers)
     print(
-        f"status of {options.workers:,} workers, {options.runs} runs: {cost * 1e3:.1f} ms of the coordinator, {len(data):,} bytes"
+        f"status of {options.workers:,} workers, {options.runs} runs: {cost * 1e3:.1f} ms of the coordinator,"
+        f" {len(data):,} bytes"
     )
     print(
         f"views ask every {pause:.1f} s: {100 * share:.2f} % of one core for any number of them"
         f" (wanted: under {100 * CORE_SHARE:g} %)"
     )
     print(
-        f"{options.browsers} browsers: {rate:.2f} updates a second each, {n_bytes / max(1, n_events):,.0f} bytes an update"
+        f"{options.browsers} browsers: {rate:.2f} updates a second each, {n_bytes / max(1, n_events):,.0f} bytes an"
+        " update"
     )
     print(
-        f"the view's own process: {1e3 * busy_s / max(1, updates):.0f} ms an update of both pages, whatever the browsers"
+        f"the view's own process: {1e3 * busy_s / max(1, updates):.0f} ms an update of both pages, whatever the"
+        " browsers"
     )
     if options.json:
         Path(options.json).write_text(

@@ -112,7 +112,8 @@ async def measure(options: argparse.Namespace) -> int:
                 one = await share(pid, options.seconds) - without
                 rate = (seen[0] - before) / options.seconds / options.browsers
                 print(
-                    f"one view, {options.browsers} browsers with {rate:.2f} updates a second each: {100 * one:.2f} % more"
+                    f"one view, {options.browsers} browsers with {rate:.2f} updates a second each: {100 * one:.2f} %"
+                    " more"
                 )
                 async with viewed(coordinator, Path(folder) / "two", options.browsers):
                     await asyncio.sleep(10.0)

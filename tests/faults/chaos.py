@@ -254,7 +254,8 @@ class _Twins:
                 timeout_s, looked = timeout_s - (now - looked) / slowness(), now
                 if timeout_s < 0.0:
                     wrong.append(
-                        f"{', '.join(commands)}: did not end within {TIMEOUT_S:g} s of a machine's own that does nothing else"
+                        f"{', '.join(commands)}: did not end within {TIMEOUT_S:g} s of a machine's own that does"
+                        " nothing else"
                     )
                     for command in commands.values():
                         command.kill()

@@ -111,7 +111,9 @@ def test_commands_in_a_documents_blocks_are_taken(document: str) -> None:
 @pytest.mark.parametrize("document", DOCUMENTS)
 def test_options_that_a_document_names_are_ours(document: str) -> None:
     ours = {option for _, command in commands() for each in command.params for option in each.opts}
-    code = [word for word in code_in(document) if " pytest " not in word and not word.startswith("systemd-run")]
+    code = [
+        word for word in code_in(document) if " pytest " not in word and not word.startswith("systemd-run")
+    ]
     named = {option for word in code for option in re.findall(r"(?<![\w-])--[a-z][\w-]*", word)}
     assert {option for option in named - ours - {"--help"} if f'"{option}"' not in text_of_tests()} == set()
 

@@ -53,8 +53,10 @@ def work(
     env: Annotated[
         list[str] | None,
         typer.Option(
-            help="Suite (core16), suite id (gym/acrobot), glob (gymnasium/MiniGrid-*), environment file (lander.toml) or"
-            " Gymnasium id (my_pkg:MyEnv-v0); may be repeated."
+            help=(
+                "Suite (core16), suite id (gym/acrobot), glob (gymnasium/MiniGrid-*), environment file (lander.toml) or"
+                " Gymnasium id (my_pkg:MyEnv-v0); may be repeated."
+            )
         ),
     ] = None,
     connect: Annotated[
@@ -180,8 +182,8 @@ def work(
         tell_missing(missing)
         if not tiers:
             raise MachineError(
-                "no sandbox works on this machine: `evopolicy-worker doctor` names the cause and the remedy; --unsandboxed plays"
-                " runs with --tier none"
+                "no sandbox works on this machine: `evopolicy-worker doctor` names the cause and the remedy;"
+                " --unsandboxed plays runs with --tier none"
             )
         for tier in needed:
             if tier not in tiers:

@@ -179,8 +179,8 @@ def _announceable(env_id: str, found: Sequence[EnvironmentDescription]) -> Envir
     size = len(msgspec.msgpack.encode(description))
     if size > MAX_BYTES:
         raise WorkerError(
-            f"environment {env_id}: its description has {size:,} bytes, and {MAX_BYTES:,} are the limit; give elements of a"
-            " Box the same bounds, or shorten the texts"
+            f"environment {env_id}: its description has {size:,} bytes, and {MAX_BYTES:,} are the limit; give elements"
+            " of a Box the same bounds, or shorten the texts"
         )
     return description
 

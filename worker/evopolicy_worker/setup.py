@@ -43,7 +43,8 @@ from evopolicy_worker.environments.interface.settings import BROWSER, use_browse
 DISTRIBUTION = "evopolicy"
 _PIP = ("-m", "pip", "--disable-pip-version-check", "--no-input")
 _NO_NETWORK = re.compile(
-    r"NewConnectionError|name resolution|Network is unreachable|Connection refused|ConnectTimeout|Max retries|ProxyError"
+    r"NewConnectionError|name resolution|Network is unreachable|Connection refused|ConnectTimeout|Max"
+    r" retries|ProxyError"
     r"|from versions: none",
     re.IGNORECASE,
 )
@@ -65,7 +66,10 @@ def command(
         typer.Option(
             exists=True,
             dir_okay=False,
-            help="Chromium's program, for environments that are web pages; default: the machine's own, which root installs.",
+            help=(
+                "Chromium's program, for environments that are web pages; default: the machine's own, which root"
+                " installs."
+            ),
         ),
     ] = None,
 ) -> None:
@@ -129,7 +133,8 @@ def _alone(folder: Path) -> Iterator[None]:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise ConfigError(
-                f"another setup is installing into {folder}: wait until it has ended, or name another folder with --into"
+                f"another setup is installing into {folder}: wait until it has ended, or name another folder with"
+                " --into"
             ) from None
         yield
 
@@ -178,7 +183,8 @@ def install_browser() -> None:
         if program is install and done.returncode == 0 and not chromium.lacking():
             return
     raise MachineError(
-        f"chromium cannot be installed: {last_line(done.stderr + done.stdout)}; install it by hand, or name one with --browser PATH"
+        f"chromium cannot be installed: {last_line(done.stderr + done.stdout)}; install it by hand, or name one with"
+        " --browser PATH"
     )
 
 
@@ -194,15 +200,15 @@ def _check_python(wanted: Mapping[str, Install], python: str) -> None:
         raise ConfigError(f"--python {python} cannot be started: {error.strerror}") from error
     if done.returncode:
         raise ConfigError(
-            f"{python} makes no virtual environments: {last_line(done.stderr)}; install its venv module (Debian: python3-venv)"
-            " or name another with --python"
+            f"{python} makes no virtual environments: {last_line(done.stderr)}; install its venv module (Debian:"
+            " python3-venv) or name another with --python"
         )
     found = _numbers(done.stdout)
     for name, each in wanted.items():
         if not _numbers(each.python[0]) <= found < _numbers(each.python[1]):
             raise ConfigError(
-                f"{name} is tested with Python {each.python[0]} up to, but not including, {each.python[1]}, and {python} is"
-                f" {done.stdout.strip()}: name another with --python"
+                f"{name} is tested with Python {each.python[0]} up to, but not including, {each.python[1]}, and"
+                f" {python} is {done.stdout.strip()}: name another with --python"
             )
 
 
@@ -280,13 +286,15 @@ def failure(what: str, output: str) -> ConfigError:
     """The error for a failed step of the installation, from the program's output."""
     if _NO_NETWORK.search(output):
         return MachineError(
-            f"{what}: no package index with it can be reached: check the network, and pip's index-url and proxy (`pip config list`)"
+            f"{what}: no package index with it can be reached: check the network, and pip's index-url and proxy (`pip"
+            " config list`)"
         )
     if "No space left" in output or "Errno 28" in output:
         return MachineError(f"{what}: no space is left; make room, or name another folder with --into")
     if found := _NO_VERSION.search(output):
         return ConfigError(
-            f"{what}: the package index has no {found[1]} for this Python and platform; name another interpreter with --python"
+            f"{what}: the package index has no {found[1]} for this Python and platform; name another interpreter with"
+            " --python"
         )
     return ConfigError(f"{what} cannot be installed: {last_line(output)}")
 

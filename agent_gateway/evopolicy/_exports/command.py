@@ -42,8 +42,11 @@ def export(
     to: Annotated[
         Format,
         typer.Option(
-            help="csv and parquet: tables of runs, submits and episodes. tensorboard, mlflow, wandb: returns over the budget."
-            " minari: train episodes as datasets. atif, inspect: agents' logs."
+            help=(
+                "csv and parquet: tables of runs, submits and episodes. tensorboard, mlflow, wandb: returns over the"
+                " budget."
+                " minari: train episodes as datasets. atif, inspect: agents' logs."
+            )
         ),
     ],
     out: Annotated[

@@ -70,7 +70,7 @@ workspace, write_file for files below system/, and submit_episodes for POST /sub
 # The task (GET /task)
 
 {task}
-"""
+"""  # noqa: E501
 
 
 class _Live(NamedTuple):

@@ -44,8 +44,8 @@ GROUPS = {
         "finish": Place(_PLAY, "Close the run of a remote agent."),
         "harbor": Place(
             "evopolicy_gateway.harbor.command:app",
-            "Write a Harbor task for each open run of a remote agent, and serve the runs' scores to Harbor's verifiers until"
-            " Ctrl-C.",
+            "Write a Harbor task for each open run of a remote agent, and serve the runs' scores to Harbor's verifiers"
+            " until Ctrl-C.",
         ),
         "suite": Place("evopolicy_gateway.cli.suite:app", "Play a sweep: agents × environments × repeats."),
     },

@@ -71,8 +71,8 @@ def run(
             )
         if not local and (cluster.data is not None or cluster.state is not None or cluster.fresh):
             raise ConfigError(
-                "--data, --state and --fresh apply only with --local; otherwise set them at the coordinator: evopolicy-coordinator"
-                " --data, --state"
+                "--data, --state and --fresh apply only with --local; otherwise set them at the coordinator:"
+                " evopolicy-coordinator --data, --state"
             )
         if local:
             check_installed(LOCAL)
@@ -90,7 +90,9 @@ def local(
     env: Annotated[
         list[str],
         typer.Option(
-            help="Suite (core16), suite id, glob (gymnasium/MiniGrid-*), environment file or module:Id; may be repeated.",
+            help=(
+                "Suite (core16), suite id, glob (gymnasium/MiniGrid-*), environment file or module:Id; may be repeated."
+            ),
             show_default=False,
             rich_help_panel=options.RUN,
         ),

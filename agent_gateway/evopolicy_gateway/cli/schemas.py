@@ -101,10 +101,12 @@ def page() -> str:
     """`docs/reference/files.md`: the fields of each kind of file, as Markdown."""
     parts = [
         "# Files, field by field\n",
-        "`evopolicy schema NAME` prints the JSON Schema of each of these files (draft 2020-12); this page is made from the"
-        " same source.\n\n"
-        "An editor with TOML schemas completes and checks a suite file whose first line names its schema: run `evopolicy"
-        " schema suite.toml > suite.schema.json`, and begin the file with `#:schema ./suite.schema.json`.\n",
+        (
+            "`evopolicy schema NAME` prints the JSON Schema of each of these files (draft 2020-12); this page is made"
+            " from the same source.\n\nAn editor with TOML schemas completes and checks a suite file whose first line"
+            " names its schema: run `evopolicy schema suite.toml > suite.schema.json`, and begin the file with"
+            " `#:schema ./suite.schema.json`.\n"
+        ),
     ]
     for name, kind in KINDS.items():
         whole = schema(name)

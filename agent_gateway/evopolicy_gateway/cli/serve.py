@@ -51,8 +51,11 @@ def serve(
         str | None,
         typer.Option(
             metavar="BOOT_ID|unknown",
-            help="Boot id of the agent's machine (there: cat /proc/sys/kernel/random/boot_id), or unknown; default: that of this"
-            " machine.",
+            help=(
+                "Boot id of the agent's machine (there: cat /proc/sys/kernel/random/boot_id), or unknown; default: that"
+                " of this"
+                " machine."
+            ),
         ),
     ] = None,
     json_output: Annotated[

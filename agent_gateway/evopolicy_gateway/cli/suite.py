@@ -67,7 +67,10 @@ def suite(
     file: Annotated[
         str,
         typer.Argument(
-            help="TOML file, or one of smoke.toml, breadth.toml, core16.toml, core16-paper.toml, core16-published.toml, which come with evopolicy."
+            help=(
+                "TOML file, or one of smoke.toml, breadth.toml, core16.toml, core16-paper.toml, core16-published.toml,"
+                " which come with evopolicy."
+            )
         ),
     ],
     connect: Connect = None,

@@ -67,6 +67,7 @@ async def _serve(listener: Listener, runs: list[Path], tasks: Path, agent_s: flo
         raise ConfigError(f"{tasks} has no tasks; name open runs, such as runs/theirs/gym_acrobot/first")
     async with serving(make_app(known, token_of(tasks)), sock) as task:
         say(
-            f"scores are served at {url}; next, in another terminal: harbor run --path {tasks} --agent AGENT --model MODEL"
+            f"scores are served at {url}; next, in another terminal: harbor run --path {tasks} --agent AGENT --model"
+            " MODEL"
         )
         await task

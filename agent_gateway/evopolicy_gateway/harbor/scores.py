@@ -37,7 +37,8 @@ def write_task(tasks: Path, run: Path, url: str, agent_s: float) -> Path:
     folder = folder_of(run)
     if not folder.bearer.exists():
         raise ConfigError(
-            f"{folder.root} is no open run of a remote agent; start one with `evopolicy run --agent remote --http HOST:PORT`"
+            f"{folder.root} is no open run of a remote agent; start one with `evopolicy run --agent remote --http"
+            " HOST:PORT`"
         )
     place = tasks / task_name(folder)
     if (place / "task.toml").exists():

@@ -157,7 +157,8 @@ def _cli_agent(config: AgentConfig, started_in: Path) -> CliAgent:
     if config.acp is not None:
         if config.harness in _DIALECTS or config.cli is not None or not config.program:
             raise ConfigError(
-                f"harness {config.harness}: an [acp] table needs `program` and a name of its own, and goes with no [cli] table"
+                f"harness {config.harness}: an [acp] table needs `program` and a name of its own, and goes with no"
+                " [cli] table"
             )
         return AcpAgent(Acp(config))
     dialect = _DIALECTS.get(config.harness)
@@ -189,8 +190,8 @@ def _program(agent: str, words: list[str], started_in: Path) -> list[str]:
     # An interpreter's first argument is its script; the workspace begins with `system/` and has no other scripts.
     if lost and _INTERPRETER.fullmatch(Path(words[0]).name) and Path(lost[0]).parts[0] != "system":
         raise ConfigError(
-            f"--agent {agent}: {os.path.abspath(started_in / lost[0])} not found; paths are relative to the folder in which the"
-            " command is started"
+            f"--agent {agent}: {os.path.abspath(started_in / lost[0])} not found; paths are relative to the folder in"
+            " which the command is started"
         )
     return resolved
 

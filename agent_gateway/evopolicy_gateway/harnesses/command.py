@@ -104,8 +104,8 @@ class ReplayHarness(CommandHarness):
             raise ConfigError(f"--agent replay: cannot read {folder}: {error.strerror}") from error
         if not found:
             raise ConfigError(
-                f"--agent replay: {folder} holds no policy; name a folder with policy.py in it, or with folders that have one,"
-                " such as a run's checkpoints"
+                f"--agent replay: {folder} holds no policy; name a folder with policy.py in it, or with folders that"
+                " have one, such as a run's checkpoints"
             )
 
 

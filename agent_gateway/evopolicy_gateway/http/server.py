@@ -78,6 +78,6 @@ async def _rebind(address: Address) -> socket.socket:
             reason = error
         await asyncio.sleep(_REBIND_PAUSE_S)
     raise ConfigError(
-        f"port {address.port} on {address.host}, which is the address of this run's agent, cannot be used: {reason.strerror};"
-        " end what listens there and start the gateway again"
+        f"port {address.port} on {address.host}, which is the address of this run's agent, cannot be used:"
+        f" {reason.strerror}; end what listens there and start the gateway again"
     )

@@ -95,7 +95,8 @@ def changed(now: Sequence[AgentInput], then: Sequence[AgentInput]) -> str:
 def _compare(now: Sequence[AgentInput], then: Sequence[AgentInput], where: str) -> None:
     if differing := changed(now, then):
         raise ConfigError(
-            f"{differing} {where} changed after the run was opened: restore what was there, or start the run anew with --overwrite"
+            f"{differing} {where} changed after the run was opened: restore what was there, or start the run anew with"
+            " --overwrite"
         )
 
 

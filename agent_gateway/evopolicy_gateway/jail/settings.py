@@ -107,7 +107,8 @@ def check_bubblewrap() -> None:
     program = shutil.which("bwrap")
     if program is None:
         raise ConfigError(
-            f"the agent's jail needs bubblewrap, which is not installed: {distribution.install('bubblewrap')}; {GIVE_UP}"
+            f"the agent's jail needs bubblewrap, which is not installed: {distribution.install('bubblewrap')};"
+            f" {GIVE_UP}"
         )
     flags = ("--unshare-user", "--unshare-pid", "--unshare-net", "--unshare-ipc", "--unshare-uts")
     command = [program, *flags, "--ro-bind", "/", "/", "--proc", "/proc", "--dev", "/dev", "true"]

@@ -56,7 +56,8 @@ def filter_program(*, fixed_cores: bool = False) -> bytes:
     if machine not in AUDIT_ARCH:
         known = " and ".join(sorted(AUDIT_ARCH))
         raise ConfigError(
-            f"the agent's jail filters system calls on {known} processors, not on {machine}: play the run on one of those, {GIVE_UP}"
+            f"the agent's jail filters system calls on {known} processors, not on {machine}: play the run on one of"
+            f" those, {GIVE_UP}"
         )
     body: list[Instruction] = []
     for number, calls in _REFUSED.items():

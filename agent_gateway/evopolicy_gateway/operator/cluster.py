@@ -51,8 +51,8 @@ class Cluster(msgspec.Struct, frozen=True, kw_only=True):
         """Raises ConfigError when a local cluster lacks the case files that a run plays."""
         if self._without_data and any(run.profile != "own" for run in runs):
             raise ConfigError(
-                "--profile published plays the published case files: give --data FOLDER, the folder data/main-128 of the"
-                " published software, which holds gym/acrobot/train.json and so on"
+                "--profile published plays the published case files: give --data FOLDER, the folder data/main-128 of"
+                " the published software, which holds gym/acrobot/train.json and so on"
             )
 
     def check_ids(self, env_ids: Iterable[str], split: Split, cases: Sequence[int]) -> None:

@@ -76,7 +76,8 @@ def run_settings(given: Any, **named: Any) -> RunSettings:
     )
     if chosen["feedback"] != "pictures" and given.video != "off":
         raise ConfigError(
-            f"feedback {chosen['feedback']} shows no videos, and video {given.video} is asked for: leave out one of them"
+            f"feedback {chosen['feedback']} shows no videos, and video {given.video} is asked for: leave out one of"
+            " them"
         )
     counts = {"n_validation": given.validation, "n_heldout": given.heldout}
     for (name, n), fixed in zip(counts.items(), HIDDEN_COUNTS.get(chosen["profile"], ()), strict=False):
@@ -187,7 +188,8 @@ def packages_for(policy: Path, requested: Sequence[str] | None) -> tuple[str, ..
                 policy_versions(found)
             except ConfigError as error:
                 raise ConfigError(
-                    f"{run / 'run.json'} names packages of its policies: {error}; --policy-package names others in their place"
+                    f"{run / 'run.json'} names packages of its policies: {error}; --policy-package names others in"
+                    " their place"
                 ) from error
             return found
     return ()

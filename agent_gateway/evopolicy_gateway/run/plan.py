@@ -167,8 +167,8 @@ class Plan(msgspec.Struct, frozen=True, kw_only=True):
             intended = self.intended()
             if intended is not None and intended.settings.inputs != self.settings.inputs:
                 raise ConfigError(
-                    f"{folder.root} holds a run whose agent has other skills or MCP servers than are declared now: restore their files,"
-                    " or start the run anew with --overwrite"
+                    f"{folder.root} holds a run whose agent has other skills or MCP servers than are declared now:"
+                    " restore their files, or start the run anew with --overwrite"
                 )
             if intended is not None and intended.settings != self.settings:
                 raise ConfigError(

@@ -326,7 +326,10 @@ def _outcome(
     completed = finished.status == "completed"
     error = finished.error
     if finished.status == "cancelled" and error is None:
-        error = "cancelled by the operator, or because other runs waited for its agent (the coordinator's log: run_cancelled)"
+        error = (
+            "cancelled by the operator, or because other runs waited for its agent (the coordinator's log:"
+            " run_cancelled)"
+        )
     best = finished.best_submit_index if completed else None
     auxiliary: dict[str, Any] = {
         "code_metrics_best": None if best is None else code.get(best),
@@ -352,14 +355,16 @@ def _outcome(
         heldout_returns=heldout if completed else (),
         heldout_successes=finished.heldout_successes if completed else (),
         quarantined_submits=tuple(sorted(finished.validation_ineligible)),
-        random_reference=ReferenceScore(
-            mean_return=mean(reference),
-            std_return=std(reference),
-            returns=reference,
-            seeded_by="case" if finished.reference_by_case else "run",
-        )
-        if reference
-        else None,
+        random_reference=(
+            ReferenceScore(
+                mean_return=mean(reference),
+                std_return=std(reference),
+                returns=reference,
+                seeded_by="case" if finished.reference_by_case else "run",
+            )
+            if reference
+            else None
+        ),
         closed_reason=finished.closed_reason,
         budget_used=finished.budget_used,
         auxiliary=auxiliary,
@@ -487,8 +492,8 @@ def _put_in_place(system: Path, bundle: Bundle) -> None:
         remove_tree(system)
         if system.exists():
             raise ConfigError(
-                f"{system} cannot be removed: another user owns folders in it, such as the root of the agent's container;"
-                f" make them yours (chown -R {os.getuid()} {system.parent}), then go on with --resume"
+                f"{system} cannot be removed: another user owns folders in it, such as the root of the agent's"
+                f" container; make them yours (chown -R {os.getuid()} {system.parent}), then go on with --resume"
             )
     else:
         system.unlink(missing_ok=True)

@@ -143,7 +143,8 @@ def finish(folder: RunFolder) -> None:
     """Reports the end of an open run's agent. Raises ConfigError unless the agent is remote or unwatched."""
     if not folder.listener.exists() and not folder.unwatched.exists():
         raise ConfigError(
-            f"{folder.root} is no open run of a remote agent; name its run directory, or wait for an agent that a command started"
+            f"{folder.root} is no open run of a remote agent; name its run directory, or wait for an agent that a"
+            " command started"
         )
     folder.finish.touch(mode=0o600)
 

@@ -103,8 +103,8 @@ class CoordinatorClient:
                 if error.status != "bad_message":
                     raise
                 raise ConfigError(
-                    "the coordinator is of an older version, which cannot keep hidden episodes from the agent's machine:"
-                    f" update it, or install its version of evopolicy here ({error.message})"
+                    "the coordinator is of an older version, which cannot keep hidden episodes from the agent's"
+                    f" machine: update it, or install its version of evopolicy here ({error.message})"
                 ) from error
             if permit.granted:
                 return True

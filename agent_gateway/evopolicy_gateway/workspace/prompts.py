@@ -16,10 +16,10 @@ from evopolicy_common.errors import DECODE_ERRORS, ConfigError
 from evopolicy_common.regular_files import read_given
 
 FIRST = (
-    "Read AGENTS.md in the current directory. It says what to improve, how to submit and what is allowed."
-    " Its rules are binding, above all the rule of the budget where it has one: no local environments, no other simulators,"
-    " no copied dynamics or rewards; what you learn of the environment comes from submits."
-    " Work until the episode budget is spent or, where AGENTS.md lets you stop earlier, you cannot improve the policy any further."
+    "Read AGENTS.md in the current directory. It says what to improve, how to submit and what is allowed. Its rules are"
+    " binding, above all the rule of the budget where it has one: no local environments, no other simulators, no copied"
+    " dynamics or rewards; what you learn of the environment comes from submits. Work until the episode budget is spent"
+    " or, where AGENTS.md lets you stop earlier, you cannot improve the policy any further."
 )
 GO_ON = (
     "You stopped, and $left episodes of the budget are left. Unspent episodes are lost, and every submit is one more"

@@ -219,8 +219,8 @@ def plugins() -> dict[str, tuple[Entry, str]]:
         path = next((each for each in paths if each.is_file()), None)
         if path is None or path.suffix != ".toml":
             raise ConfigError(
-                f"entry point {point.name} = {point.value!r} of {ENTRY_POINTS} names no environment file in the package:"
-                ' use the form "package:FILE.toml", and ship the file as package data'
+                f"entry point {point.name} = {point.value!r} of {ENTRY_POINTS} names no environment file in the"
+                ' package: use the form "package:FILE.toml", and ship the file as package data'
             )
         found |= {entry.id: (entry, str(path)) for entry in _checked(read_file(path), path)}
     return found

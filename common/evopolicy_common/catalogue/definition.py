@@ -215,8 +215,8 @@ def _data(where: str, path: Path, names: tuple[str, ...]) -> tuple[str, ...]:
             or any(part.startswith(".") for part in Path(name).parts)
         ):
             raise ConfigError(
-                f"{where}: data {name[:80]!r}: name files and folders in the environment file's folder, relative to it and"
-                " without a dot at the beginning"
+                f"{where}: data {name[:80]!r}: name files and folders in the environment file's folder, relative to it"
+                " and without a dot at the beginning"
             )
         if not real.exists():
             raise ConfigError(f"{where}: data {name[:80]!r}: there is no {place}")
@@ -233,7 +233,10 @@ def _faults(entry: Entry) -> list[tuple[bool, str]]:
     return [
         (
             not valid_id(entry.id),
-            f"id {entry.id[:80]!r}: letters, digits, '_', '.', '-', parts joined by '/' or ':', {_MAX_ID} characters at most",
+            (
+                f"id {entry.id[:80]!r}: letters, digits, '_', '.', '-', parts joined by '/' or ':', {_MAX_ID}"
+                " characters at most"
+            ),
         ),
         (
             not entry.gymnasium_id,
@@ -253,8 +256,10 @@ def _faults(entry: Entry) -> list[tuple[bool, str]]:
         ),
         (
             bool(long_name),
-            f"key of info {long_name[:80]!r}: one line of {_MAX_ID} characters at most, in success, reward_components,"
-            " reward_vector and info_strings",
+            (
+                f"key of info {long_name[:80]!r}: one line of {_MAX_ID} characters at most, in success,"
+                " reward_components, reward_vector and info_strings"
+            ),
         ),
         (
             bool(long_text),

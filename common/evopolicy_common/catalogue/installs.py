@@ -197,6 +197,6 @@ def divided(env_ids: Iterable[str]) -> dict[str, list[str]]:
 def _check_version(family: str, found: Made) -> None:
     if found.version != evopolicy_common.__version__:
         raise ConfigError(
-            f"{found.folder} has evopolicy {found.version}, and this is {evopolicy_common.__version__}: make it again with"
-            f" `{setup_line(family)}`"
+            f"{found.folder} has evopolicy {found.version}, and this is {evopolicy_common.__version__}: make it again"
+            f" with `{setup_line(family)}`"
         )

@@ -88,8 +88,8 @@ class EnvironmentDescription(msgspec.Struct, frozen=True, kw_only=True):
         if not self.info_left_out:
             return ""
         return (
-            f"{self.env}: feedback leaves out the texts of info under {', '.join(map(repr, self.info_left_out))}; to pass them"
-            " on, name their keys in info_strings of an environment file"
+            f"{self.env}: feedback leaves out the texts of info under {', '.join(map(repr, self.info_left_out))}; to"
+            " pass them on, name their keys in info_strings of an environment file"
         )
 
     def digest(self) -> str:

@@ -34,7 +34,10 @@ _SETTINGS = (
     (
         "kernel/apparmor_restrict_unprivileged_userns",
         "1",
-        "sudo sysctl -w kernel.apparmor_restrict_unprivileged_userns=0, or an AppArmor profile for bwrap with `userns,`",
+        (
+            "sudo sysctl -w kernel.apparmor_restrict_unprivileged_userns=0, or an AppArmor profile for bwrap with"
+            " `userns,`"
+        ),
     ),
 )
 """Files below `/proc/sys`, the value that forbids user namespaces, and the remedy. Without a file in
@@ -77,7 +80,7 @@ def permit_namespaces(settings: Path = Path("/proc/sys")) -> str:
     if found:
         return "; ".join(found)
     if any(Path(mark).exists() for mark in _CONTAINER_MARKS):
-        return "this is a container: start it with --security-opt seccomp=unconfined --security-opt systempaths=unconfined"
+        return "this is a container: start it with --security-opt seccomp=unconfined --security-opt systempaths=unconfined"  # noqa: E501
     names = ", ".join(name.replace("/", ".") for name, _, _ in _SETTINGS)
     return (
         f"none of {names} forbids them here: in a container, start it with --security-opt seccomp=unconfined"

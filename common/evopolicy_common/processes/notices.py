@@ -21,7 +21,8 @@ def notify_of_many_slots(slots: int) -> None:
     cores = len(os.sched_getaffinity(0))
     if slots > MANY_SLOTS * cores:
         log.warning(
-            f"{slots:,} slots on {cores} cores: each takes memory for a simulator, and they wait for each other; give fewer with --slots"
+            f"{slots:,} slots on {cores} cores: each takes memory for a simulator, and they wait for each other; give"
+            " fewer with --slots"
         )
 
 

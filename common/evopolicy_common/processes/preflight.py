@@ -83,7 +83,8 @@ def check_text(path: Path, choose: str) -> None:
         os.fspath(path).encode()
     except UnicodeEncodeError as error:
         raise ConfigError(
-            f"{os.fsencode(path).decode('utf-8', 'backslashreplace')}: this path is not UTF-8; choose another with {choose}"
+            f"{os.fsencode(path).decode('utf-8', 'backslashreplace')}: this path is not UTF-8; choose another with"
+            f" {choose}"
         ) from error
 
 
@@ -119,8 +120,9 @@ def check_writable(
     n_bytes, least_inodes = free.f_bavail * free.f_frsize, LEAST_INODES if free.f_files else 0
     if not may_be_full and (n_bytes < least_bytes or free.f_favail < least_inodes):
         raise MachineError(
-            f"cannot work in {folder}: {n_bytes >> 10:,} KiB and {free.f_favail:,} inodes are free, {least_bytes >> 10:,} KiB"
-            f" and {least_inodes} are needed; make room, or choose another folder with {choose}"
+            f"cannot work in {folder}: {n_bytes >> 10:,} KiB and {free.f_favail:,} inodes are free,"
+            f" {least_bytes >> 10:,} KiB and {least_inodes} are needed; make room, or choose another folder with"
+            f" {choose}"
         )
 
 
@@ -154,8 +156,8 @@ def check_loopback() -> None:
 def no_loopback(error: OSError) -> str:
     """An error text for a loopback address that cannot be used, with the remedy."""
     return (
-        f"cannot listen on {LOOPBACK}, where the agent's service is: {error.strerror or error}; bring IPv4 loopback up with"
-        " `ip link set lo up` (in a container: give it a network)"
+        f"cannot listen on {LOOPBACK}, where the agent's service is: {error.strerror or error}; bring IPv4 loopback up"
+        " with `ip link set lo up` (in a container: give it a network)"
     )
 
 

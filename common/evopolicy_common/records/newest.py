@@ -11,12 +11,18 @@ from evopolicy_common.errors import DECODE_ERRORS
 from evopolicy_common.regular_files import read_regular
 
 _NAMES = {
-    "evopolicygym/run-record/": "a run of EvoPolicyGym{version}, which evopolicy does not read; play a policy of it with"
-    " `evopolicy try RUN/submissions/ID/program --env ENVIRONMENT`",
-    "evopolicygym/leaderboard-results/": "leaderboard results of EvoPolicyGym{version}, whose scores are of other cases than"
-    " evopolicy's; play the entries' policies with `evopolicy try PROGRAM --env ENVIRONMENT` to compare them",
-    "evopolicygym/": "a file of EvoPolicyGym{version}, which evopolicy does not read; it plays policies of that software:"
-    " `evopolicy try PROGRAM --env ENVIRONMENT`",
+    "evopolicygym/run-record/": (
+        "a run of EvoPolicyGym{version}, which evopolicy does not read; play a policy of it with"
+        " `evopolicy try RUN/submissions/ID/program --env ENVIRONMENT`"
+    ),
+    "evopolicygym/leaderboard-results/": (
+        "leaderboard results of EvoPolicyGym{version}, whose scores are of other cases than"
+        " evopolicy's; play the entries' policies with `evopolicy try PROGRAM --env ENVIRONMENT` to compare them"
+    ),
+    "evopolicygym/": (
+        "a file of EvoPolicyGym{version}, which evopolicy does not read; it plays policies of that software:"
+        " `evopolicy try PROGRAM --env ENVIRONMENT`"
+    ),
 }
 """Start of a file's `schema` to a description, with one sentence on what can be done instead."""
 _POLICY = (

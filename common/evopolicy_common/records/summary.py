@@ -80,7 +80,8 @@ def decode_summary(data: bytes) -> Summary:
         raise ProtocolError(f"not a submit summary: {error}") from error
     if summary.schema_version not in _READ:
         raise ProtocolError(
-            f"summary has schema_version {summary.schema_version}, this version reads {SCHEMA_VERSION}: update evopolicy"
+            f"summary has schema_version {summary.schema_version}, this version reads {SCHEMA_VERSION}: update"
+            " evopolicy"
         )
     return summary
 

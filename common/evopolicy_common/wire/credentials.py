@@ -178,7 +178,10 @@ def find(role: Role, connect: tuple[str, ...] = (), file: Path | None = None) ->
             where = f" for {', '.join(connect)}" if connect else ""
             local = ""
             if role == "operator" and not connect:
-                local = ". A run on this machine alone needs none: evopolicy local --env gym/acrobot --agent llm:openai/MODEL"
+                local = (
+                    ". A run on this machine alone needs none: evopolicy local --env gym/acrobot --agent"
+                    " llm:openai/MODEL"
+                )
             raise ConfigError(
                 f"no {role} credentials{where}: looked at {file}. Start evopolicy-coordinator on this machine, or copy"
                 f" a folder here that its `certs issue {role} NAME` made, and name it with --credentials{local}"

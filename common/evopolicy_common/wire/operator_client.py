@@ -205,8 +205,8 @@ class OperatorClient:
             if cursor < started.episodes:
                 raise RefusedError(
                     Refusal.RUN_CANCELLED,
-                    f"an operator cancelled evaluation {started.evaluation} after {cursor} of {started.episodes} episodes; repeat the"
-                    " command",
+                    f"an operator cancelled evaluation {started.evaluation} after {cursor} of {started.episodes}"
+                    " episodes; repeat the command",
                 )
         finally:
             if not finished:

@@ -537,8 +537,8 @@ async def _open_client(
                     credentials = await asyncio.to_thread(read_again)
             if loop.time() > deadline:
                 text = (
-                    f"no connection to {', '.join(credentials.endpoints)} within {patience_s:g} s: is the coordinator up"
-                    f" there, and {_doubt_of(credentials)}"
+                    f"no connection to {', '.join(credentials.endpoints)} within {patience_s:g} s: is the coordinator"
+                    f" up there, and {_doubt_of(credentials)}"
                 )
                 if timeout_s is not None:
                     raise TransportError(text) from error

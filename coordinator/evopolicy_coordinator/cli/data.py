@@ -45,8 +45,11 @@ def make(
         int | None,
         typer.Option(
             min=0,
-            help="Public seed. Anyone who knows it can derive the cases, so the files say `secret: false`. Default: random bits that"
-            " are not stored.",
+            help=(
+                "Public seed. Anyone who knows it can derive the cases, so the files say `secret: false`. Default:"
+                " random bits that"
+                " are not stored."
+            ),
         ),
     ] = None,
     train: Annotated[

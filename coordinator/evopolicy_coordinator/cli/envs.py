@@ -155,8 +155,8 @@ def _show(
 ) -> None:
     if env in later:
         raise ConfigError(
-            f"{env} is described when its first run waits for it, by {', '.join(later[env])}; to see it before, start a worker"
-            " that offers it alone"
+            f"{env} is described when its first run waits for it, by {', '.join(later[env])}; to see it before, start a"
+            " worker that offers it alone"
         )
     if not found:
         if failed:

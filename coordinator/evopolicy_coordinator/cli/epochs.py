@@ -29,7 +29,9 @@ from evopolicy_results.publish.signatures import HEAD
 _PAGE_BYTES = 1 << 20
 
 app = App(
-    help="List epochs, and begin a new one. Runs of one epoch have cases derived from one secret; publishing reveals it.",
+    help=(
+        "List epochs, and begin a new one. Runs of one epoch have cases derived from one secret; publishing reveals it."
+    ),
     no_args_is_help=True,
 )
 

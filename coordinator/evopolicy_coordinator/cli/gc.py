@@ -49,8 +49,8 @@ def collect(
         return
     verb = "would remove" if dry_run else "removed"
     say(
-        f"{verb} {done.episodes:,} episodes of {done.runs} runs and {done.evaluations} evaluations, {done.blobs:,} blobs:"
-        f" {bytes_text(done.bytes)}; {bytes_text(done.free_bytes)} free"
+        f"{verb} {done.episodes:,} episodes of {done.runs} runs and {done.evaluations} evaluations, {done.blobs:,}"
+        f" blobs: {bytes_text(done.bytes)}; {bytes_text(done.free_bytes)} free"
     )
     if not dry_run and not done.shrunk:
         say("a coordinator is running: the database keeps its size, and new runs use the freed space")

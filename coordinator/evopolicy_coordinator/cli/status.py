@@ -355,6 +355,6 @@ def abandoned(runs: Iterable[RunStatus]) -> Iterator[str]:
     for run in runs:
         if run.abandoned:
             yield (
-                f"{run.run} has had no gateway for {duration(run.silent_s)}: give its command again with --resume, or end it with"
-                f" evopolicy runs cancel {run.run}"
+                f"{run.run} has had no gateway for {duration(run.silent_s)}: give its command again with --resume, or"
+                f" end it with evopolicy runs cancel {run.run}"
             )

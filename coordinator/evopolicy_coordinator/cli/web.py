@@ -72,7 +72,10 @@ def web(
     token_file: Annotated[
         Path | None,
         typer.Option(
-            help="File that keeps the tokens, mode 0600, so that browsers stay signed in after a restart; default: new tokens.",
+            help=(
+                "File that keeps the tokens, mode 0600, so that browsers stay signed in after a restart; default: new"
+                " tokens."
+            ),
             show_default=False,
         ),
     ] = None,
@@ -139,8 +142,8 @@ def _check_certificate(certificate: Path, key: Path) -> None:
         ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(certificate, key)
     except OSError as error:
         raise ConfigError(
-            f"--tls-certificate {certificate} with --tls-key {key}: {error.strerror or error}; name a certificate and its key,"
-            " both in PEM"
+            f"--tls-certificate {certificate} with --tls-key {key}: {error.strerror or error}; name a certificate and"
+            " its key, both in PEM"
         ) from error
 
 

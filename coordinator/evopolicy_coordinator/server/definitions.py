@@ -72,11 +72,14 @@ class Definitions:
         shipped = self._shipped.get(description.env)
         if shipped is not None and digest != shipped:
             return (
-                f"it ships with definition {shipped}, and the worker's is {digest}: install the same version of evopolicy and"
-                " of the environment's packages on both"
+                f"it ships with definition {shipped}, and the worker's is {digest}: install the same version of"
+                " evopolicy and of the environment's packages on both"
             )
         if shipped is None and not description.adapter:
-            return "a worker of an earlier version cannot tell its definition: install the same version of evopolicy on both"
+            return (
+                "a worker of an earlier version cannot tell its definition: install the same version of evopolicy on"
+                " both"
+            )
         return ""
 
     def pin(self, env: str, requested: str, workers: Iterable[Worker]) -> str:
@@ -105,8 +108,8 @@ class Definitions:
             known = {name for each in offering for name in each.descriptions}
             raise RefusedError(
                 Refusal.INVALID_SETTINGS,
-                f"no worker offers {env}{catalogue.near(env, sorted(known))}; install its package on a worker and start that"
-                " with --env; `evopolicy envs` lists what is offered",
+                f"no worker offers {env}{catalogue.near(env, sorted(known))}; install its package on a worker and start"
+                " that with --env; `evopolicy envs` lists what is offered",
             )
         approved = [each for each in reversed(self.approved.get(env, [])) if each in offers]
         if approved:
@@ -114,16 +117,17 @@ class Definitions:
         named = ", ".join(f"{env}@{each}" for each in offers)
         raise RefusedError(
             Refusal.INVALID_SETTINGS,
-            f"{env} does not ship with evopolicy, and its definition is not approved; workers offer {named}. Inspect it with"
-            f" `evopolicy envs --show {env}`, then give this name to --env, or approve it once: `evopolicy envs approve"
-            f" {env}@{next(iter(offers))}`",
+            f"{env} does not ship with evopolicy, and its definition is not approved; workers offer {named}. Inspect it"
+            f" with `evopolicy envs --show {env}`, then give this name to --env, or approve it once: `evopolicy envs"
+            f" approve {env}@{next(iter(offers))}`",
         )
 
     def _named(self, env: str, requested: str, offers: list[str]) -> str:
         if len(requested) < LEAST_DIGITS or not all(each in "0123456789abcdef" for each in requested):
             raise RefusedError(
                 Refusal.INVALID_SETTINGS,
-                f"{env}@{requested[:80]}: a definition's digest has {LEAST_DIGITS} hex digits or more, as `evopolicy envs` shows it",
+                f"{env}@{requested[:80]}: a definition's digest has {LEAST_DIGITS} hex digits or more, as `evopolicy"
+                " envs` shows it",
             )
         found = [each for each in offers if each.startswith(requested) or requested.startswith(each)]
         if len(found) == 1:

@@ -79,10 +79,14 @@ TEXTS: Mapping[Code, str | Callable[..., str]] = {
     "minimum_over_budget": "a submit takes at least {least} episodes, the budget is {budget}",
     "no_cases": "the {split} split has no cases",
     "evaluation_without_cases": "an evaluation needs at least one case",
-    "epoch_revealed": "the cases of epoch {epoch} are public, as runs on them were published: stop the coordinator, run"
-    " `evopolicy-coordinator epoch new` with its --state, and start it again (with --data: give it other cases)",
-    "epoch_in_use": "run {run!r} is not finished and plays cases of the same epoch, which publishing would reveal; wait for"
-    " its end, or cancel it",
+    "epoch_revealed": (
+        "the cases of epoch {epoch} are public, as runs on them were published: stop the coordinator, run"
+        " `evopolicy-coordinator epoch new` with its --state, and start it again (with --data: give it other cases)"
+    ),
+    "epoch_in_use": (
+        "run {run!r} is not finished and plays cases of the same epoch, which publishing would reveal; wait for"
+        " its end, or cancel it"
+    ),
     "busy": "submit {submit} is still running; one runs at a time",
     "key_used": "key {key!r} was used for submit {submit} with another request",
     "no_bundle": "a submit names a bundle, or says why there is none",
@@ -94,11 +98,16 @@ TEXTS: Mapping[Code, str | Callable[..., str]] = {
     "over_budget": "{n} episodes asked for; {left} of the budget remain",
     "no_worker_yet": "the run waits for {waits_for}",
     "may_not_start": "the run's agent may not start yet; it waits for {waits_for}",
-    "too_many_places": "the agent of run {run!r} has been on {n} kernels, which is the limit; if it is to start on another,"
-    " run `evopolicy runs agent-gone {run}` first",
+    "too_many_places": (
+        "the agent of run {run!r} has been on {n} kernels, which is the limit; if it is to start on another,"
+        " run `evopolicy runs agent-gone {run}` first"
+    ),
     "name_taken": "a worker of another machine has the name {worker!r}; choose another --name",
-    "no_room": "{n:,} workers, with {size:,} bytes of environments, may join with one token: stop some, wait an hour for lost"
-    " ones to be forgotten, or give other machines a folder of their own (`evopolicy-coordinator certs issue worker NAME`)",
+    "no_room": (
+        "{n:,} workers, with {size:,} bytes of environments, may join with one token: stop some, wait an hour for lost"
+        " ones to be forgotten, or give other machines a folder of their own (`evopolicy-coordinator certs issue worker"
+        " NAME`)"
+    ),
     "unknown_session": "the session of worker {worker!r} is unknown; register again",
     "forger": _forger,
     "quarantined": "{worker} is quarantined: {why}",

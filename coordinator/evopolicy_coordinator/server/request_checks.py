@@ -178,8 +178,8 @@ def check_begun(ref: BlobRef | None) -> None:
     if not 0 < ref.size <= codec.MAX_PACKED_BYTES or len(ref.inline or b"") > codec.INLINE_BEGUN_BYTES:
         raise RefusedError(
             Refusal.BAD_BLOB,
-            f"the recorded actions that a job resumes from take {ref.size:,} bytes; {codec.MAX_PACKED_BYTES:,} are the limit, and inside a message"
-            f" {codec.INLINE_BEGUN_BYTES:,}",
+            f"the recorded actions that a job resumes from take {ref.size:,} bytes; {codec.MAX_PACKED_BYTES:,} are the"
+            f" limit, and inside a message {codec.INLINE_BEGUN_BYTES:,}",
         )
 
 

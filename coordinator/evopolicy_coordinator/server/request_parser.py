@@ -264,8 +264,8 @@ class RequestParser:
         if not m.reads_rendered:
             raise RefusedError(
                 Refusal.WRONG_PROTOCOL,
-                "this gateway is of an earlier version, which cannot read what workers report now: install the coordinator's"
-                " version of evopolicy on the agent's host",
+                "this gateway is of an earlier version, which cannot read what workers report now: install the"
+                " coordinator's version of evopolicy on the agent's host",
             )
         return m
 
@@ -411,8 +411,9 @@ class RequestParser:
         if found.epoch in revealed:
             raise RefusedError(
                 Refusal.BAD_REQUEST,
-                f"the cases of epoch {found.epoch} are public, as runs on them were published: stop the coordinator, say"
-                " `evopolicy-coordinator epoch new` with its --state, and start it again, or name other cases with --data",
+                f"the cases of epoch {found.epoch} are public, as runs on them were published: stop the coordinator,"
+                " say `evopolicy-coordinator epoch new` with its --state, and start it again, or name other cases with"
+                " --data",
             )
         return found
 
@@ -485,8 +486,8 @@ class RequestParser:
             raise ConfigError(f"profile {wanted.profile} excludes {differences}")
         if not self._source.from_files:
             raise ConfigError(
-                f"profile {wanted.profile} plays the published case files, and this coordinator derives its cases from a secret:"
-                " start it with --data FOLDER, the folder data/main-128 of the published software"
+                f"profile {wanted.profile} plays the published case files, and this coordinator derives its cases from"
+                " a secret: start it with --data FOLDER, the folder data/main-128 of the published software"
             )
 
     def _check_published(self, n_train: int) -> None:

@@ -97,7 +97,7 @@ _MIGRATIONS: tuple[str, ...] = (
     CREATE TRIGGER journal_stays BEFORE UPDATE ON journal BEGIN SELECT RAISE(ABORT, 'the journal is never changed'); END;
     CREATE TRIGGER journal_grows BEFORE DELETE ON journal BEGIN SELECT RAISE(ABORT, 'the journal is never cut'); END;
     CREATE TABLE documents (run TEXT NOT NULL, kind TEXT NOT NULL, data BLOB NOT NULL, PRIMARY KEY (run, kind));
-    """,
+    """,  # noqa: E501
 )
 SCHEMA_VERSION = len(_MIGRATIONS)
 
@@ -169,7 +169,8 @@ class Store:
         version = self._db.execute("PRAGMA user_version").fetchone()[0]
         if version > SCHEMA_VERSION:
             raise ConfigError(
-                f"{self._path} has schema version {version}, and this version of evopolicy reads {SCHEMA_VERSION}: update evopolicy"
+                f"{self._path} has schema version {version}, and this version of evopolicy reads {SCHEMA_VERSION}:"
+                " update evopolicy"
             )
         for number in range(version, SCHEMA_VERSION):
             script = f"BEGIN IMMEDIATE; {_MIGRATIONS[number]} PRAGMA user_version={number + 1}; COMMIT;"

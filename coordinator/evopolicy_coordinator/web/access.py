@@ -35,8 +35,8 @@ from evopolicy_common.regular_files import read_given
 Role = Literal["read", "act"]
 
 POLICY = (
-    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; media-src 'self'; connect-src 'self'; "
-    "form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; media-src 'self'; connect-src"
+    " 'self'; form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
 )
 """Content security policy of every page: no inline script or style, nothing from elsewhere."""
 _HEADERS = {
@@ -142,8 +142,9 @@ class Access:
         """Why a request is refused before anything else is looked at; None for a good one."""
         host = headers.get("host", "")
         if not self.is_own_host(host):
-            return 421, (
-                f"This server is not called {host[:100]!r}. Use its address, or start it with --name for that name."
+            return (
+                421,
+                f"This server is not called {host[:100]!r}. Use its address, or start it with --name for that name.",
             )
         origin = headers.get("origin")
         same = origin is not None and origin.lower() == f"{scheme}://{host}".lower()

@@ -442,8 +442,8 @@ def report_policy() -> str:
     script = b"\n" + rendering.static_files()["report.js"][0]
     digest = base64.b64encode(hashlib.sha256(script).digest()).decode()
     return (
-        f"default-src 'none'; script-src 'sha256-{digest}'; style-src 'unsafe-inline'; img-src 'self' data:; media-src 'self'; "
-        "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+        f"default-src 'none'; script-src 'sha256-{digest}'; style-src 'unsafe-inline'; img-src 'self' data:; media-src"
+        " 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
     )
 
 
@@ -549,7 +549,8 @@ def listen(address: Address) -> socket.socket:
         return bound(address.host, address.port)
     except OSError as error:
         raise ConfigError(
-            f"cannot listen on {address.host}:{address.port}: {error.strerror or error}; choose another with --http HOST:PORT"
+            f"cannot listen on {address.host}:{address.port}: {error.strerror or error}; choose another with --http"
+            " HOST:PORT"
         ) from error
 
 

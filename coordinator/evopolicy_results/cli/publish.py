@@ -151,8 +151,11 @@ def check(
         str | None,
         typer.Option(
             metavar="SHARE",
-            help="Also play policies that declare themselves deterministic, in the sandbox, and compare their actions: `5%` of the"
-            " episodes, or `all`.",
+            help=(
+                "Also play policies that declare themselves deterministic, in the sandbox, and compare their actions:"
+                " `5%` of the"
+                " episodes, or `all`."
+            ),
             show_default=False,
         ),
     ] = None,
@@ -161,7 +164,10 @@ def check(
         typer.Option(
             "--policy-package",
             metavar="NAME",
-            help="With --policies: package that policies may import besides numpy, where their run names it; may be repeated.",
+            help=(
+                "With --policies: package that policies may import besides numpy, where their run names it; may be"
+                " repeated."
+            ),
             show_default=False,
         ),
     ] = None,
@@ -312,7 +318,10 @@ def _print(checked: Checked) -> None:
     )
     without = sum(bool(checked.unrecorded(run)) for run in checked.recorded)
     if without:
-        shown += f"; {without} of {len(checked.recorded)} runs have episodes without a recording, which no replay can confirm"
+        shown += (
+            f"; {without} of {len(checked.recorded)} runs have episodes without a recording, which no replay can"
+            " confirm"
+        )
     known = any(each.kind == "identity" and each.state == "ok" for each in checked.findings)
     say(f"verdict: {shown}; " + ("the signer is the one that you named" if known else "self-signed"))
 

@@ -46,8 +46,11 @@ def report(
     runs: Annotated[
         list[Path],
         typer.Argument(
-            help="Run directories, or folders that contain them. A CSV of held-out returns (entry,harness,<environment>,…) adds "
-            "entries without runs.",
+            help=(
+                "Run directories, or folders that contain them. A CSV of held-out returns"
+                " (entry,harness,<environment>,…) adds "
+                "entries without runs."
+            ),
             show_default=False,
         ),
     ],
@@ -67,8 +70,11 @@ def report(
         bool,
         typer.Option(
             "--allow-mixed",
-            help="Compare runs with different budgets, policy scopes, splits, fingerprints, jails or hidden isolation; the report "
-            "says so.",
+            help=(
+                "Compare runs with different budgets, policy scopes, splits, fingerprints, jails or hidden isolation;"
+                " the report "
+                "says so."
+            ),
         ),
     ] = False,
     allow_unknown: Annotated[
@@ -125,8 +131,8 @@ def report(
         run.record.hidden_isolation == "unknown" and not run.is_published for run in study.runs
     ):
         say(
-            f"warning: {unknown} of {len(study.runs)} runs do not tell whether hidden episodes and agents shared a kernel;"
-            " they are from before it was recorded",
+            f"warning: {unknown} of {len(study.runs)} runs do not tell whether hidden episodes and agents shared a"
+            " kernel; they are from before it was recorded",
             err=True,
         )
     if as_json:

@@ -37,7 +37,9 @@ app = App(name="rescore")
 
 @app.command(
     name="rescore",
-    epilog="Example: evopolicy rescore runs --cases 256 --local && evopolicy report runs --scores cases-256 --out report",
+    epilog=(
+        "Example: evopolicy rescore runs --cases 256 --local && evopolicy report runs --scores cases-256 --out report"
+    ),
 )
 def rescore(
     runs: Annotated[
@@ -175,6 +177,7 @@ def _packages(runs: list[Finished]) -> tuple[str, ...]:
             f"{folder}: {', '.join(names) or 'none'}" for names, folder in sorted(found.items())
         )
         raise ConfigError(
-            f"policies of these runs import different packages ({listed}): re-score runs with the same packages at a time"
+            f"policies of these runs import different packages ({listed}): re-score runs with the same packages at a"
+            " time"
         )
     return next(iter(found))

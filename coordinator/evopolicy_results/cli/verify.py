@@ -138,9 +138,9 @@ async def _verify(order: _Order, where: Where, console: Terminal) -> Report:
                 notes.append(f"the sample was drawn with --seed {order.seed}")
             if not knows_run:
                 notes.append(
-                    "this coordinator has no record of the run: actions are those of the feedback files, hidden episodes"
-                    " are not checked, policies get other seeds than they had, and edits that agree with each other are found"
-                    " only where a train episode that is played again shows them"
+                    "this coordinator has no record of the run: actions are those of the feedback files, hidden"
+                    " episodes are not checked, policies get other seeds than they had, and edits that agree with each"
+                    " other are found only where a train episode that is played again shows them"
                 )
             shown.update(
                 total=sum(

@@ -62,8 +62,10 @@ def structure(study: Study, looks: Mapping[str, Look]) -> Plot | None:
     return Plot(
         name="structure",
         title="Realised structure",
-        caption="AST features of validation-selected policies (policy.py and the local modules it reaches), mean over each demand "
-        "group's environments.",
+        caption=(
+            "AST features of validation-selected policies (policy.py and the local modules it reaches), mean over each"
+            " demand group's environments."
+        ),
         alt=f"Dot plots of five code features for {len(lines)} rows of agents and demand groups.",
         data=rows(lines),
         figure=figure,
@@ -114,8 +116,10 @@ def tokens(study: Study, looks: Mapping[str, Look]) -> Plot | None:
     return Plot(
         name="tokens",
         title="Tokens",
-        caption="Tokens of a run by environment (symbols) and their mean (bars). Diagnostic: no part of a score. Agents that tell "
-        "nothing of tokens are absent.",
+        caption=(
+            "Tokens of a run by environment (symbols) and their mean (bars). Diagnostic: no part of a score. Agents"
+            " that tell nothing of tokens are absent."
+        ),
         alt=f"Token use of {len(entries)} agents in three kinds.",
         data=rows(counted),
         figure=figure,
@@ -157,7 +161,10 @@ def wall_time(study: Study, looks: Mapping[str, Look]) -> Plot | None:
     return Plot(
         name="wall_time",
         title="Wall time by phase",
-        caption="Mean wall time of a run: the agent alone, waiting for a slot, train episodes, feedback, and hidden evaluation.",
+        caption=(
+            "Mean wall time of a run: the agent alone, waiting for a slot, train episodes, feedback, and hidden"
+            " evaluation."
+        ),
         alt=f"Stacked bars of wall time for {len(entries)} agents.",
         data=means,
         figure=figure,

@@ -54,8 +54,10 @@ def hit_rates(study: Study, looks: Mapping[str, Look]) -> Plot | None:
     return Plot(
         name="edit_hits",
         title="Which edits help",
-        caption="Share of edits that raise the best validation mean so far, with Wilson's 95 % interval and the number of edits. "
-        "Rollbacks, retests and first submits are in neither.",
+        caption=(
+            "Share of edits that raise the best validation mean so far, with Wilson's 95 % interval and the number of"
+            " edits. Rollbacks, retests and first submits are in neither."
+        ),
         alt=f"Hit rates of synthesis and parametric edits for {len(entries)} agents.",
         data=rows(study.edit_rates),
         figure=figure,
@@ -125,9 +127,11 @@ def edit_size(study: Study, looks: Mapping[str, Look]) -> Plot | None:
     return Plot(
         name="edit_size",
         title="Edit size and improvement",
-        caption="Transitions between adjacent score-bearing submits by size of the edit; a mark's area grows with their number. "
-        "An unchanged policy cannot raise the validation best; its visible mean can change, as it may play other cases. Data only: "
-        "files outside the source bundle changed, such as weights.",
+        caption=(
+            "Transitions between adjacent score-bearing submits by size of the edit; a mark's area grows with their"
+            " number. An unchanged policy cannot raise the validation best; its visible mean can change, as it may play"
+            " other cases. Data only: files outside the source bundle changed, such as weights."
+        ),
         alt=f"Probability of improvement over {len(labels)} edit sizes for {len(entries)} agents.",
         data=rows(study.edit_sizes),
         figure=figure,

@@ -25,13 +25,15 @@ def performance_profiles(suite: Suite, study: Study, looks: Mapping[str, Look]) 
         for one in found:
             look = looks[one.entry]
             panel.plot(
-                TAUS, [share.value for share in one.profile], color=look.colour, linestyle=look.dash, marker=look.marker,
+                TAUS, [share.value for share in one.profile], color=look.colour, linestyle=look.dash, marker=look.marker,  # noqa: E501
                 markersize=3.2, markevery=4, label=one.entry,
             )  # fmt: skip
             bounds = [
-                (share.low, share.high)
-                if share.low is not None and share.high is not None
-                else (share.value, share.value)
+                (
+                    (share.low, share.high)
+                    if share.low is not None and share.high is not None
+                    else (share.value, share.value)
+                )
                 for share in one.profile
             ]
             low, high = zip(*bounds, strict=True)
@@ -44,8 +46,11 @@ def performance_profiles(suite: Suite, study: Study, looks: Mapping[str, Look]) 
     return Plot(
         name=f"profiles_{suite.name}",
         title=f"{suite.title} performance profiles",
-        caption="Share of an agent's runs whose normalised score is above each value, over all environments with a scale; higher is better. "
-        "Bands: pointwise 95 % intervals of a stratified bootstrap over runs and their cases, or over the cases of single runs; none where resamples show no spread.",
+        caption=(
+            "Share of an agent's runs whose normalised score is above each value, over all environments with a scale;"
+            " higher is better. Bands: pointwise 95 % intervals of a stratified bootstrap over runs and their cases, or"
+            " over the cases of single runs; none where resamples show no spread."
+        ),
         alt=f"Performance profiles of {len(found)} agents.",
         data=rows(found),
         figure=figure,

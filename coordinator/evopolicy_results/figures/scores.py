@@ -104,9 +104,11 @@ def score_evolution(suite: Suite, study: Study, looks: Mapping[str, Look]) -> Pl
     return Plot(
         name=f"score_evolution_{suite.name}",
         title=f"{suite.title} score evolution",
-        caption="Best hidden-validation mean so far over the consumed train budget, one curve a run, rises marked; where an agent "
-        f"has more than {MAX_CURVES} runs, their mean and range from where all have a score. Reconstructed after the run: agents "
-        "never see it. Dotted: random reference on the held-out cases.",
+        caption=(
+            "Best hidden-validation mean so far over the consumed train budget, one curve a run, rises marked; where"
+            f" an agent has more than {MAX_CURVES} runs, their mean and range from where all have a score."
+            " Reconstructed after the run: agents never see it. Dotted: random reference on the held-out cases."
+        ),
         alt=f"Step curves for {len(envs)} environments and {len(shown)} agents.",
         data=rows(found),
         figure=figure,
@@ -230,8 +232,10 @@ def normalised_performance(suite: Suite, study: Study, looks: Mapping[str, Look]
     return Plot(
         name=f"normalised_{suite.name}",
         title=f"{suite.title} performance by task demand",
-        caption="Held-out return between the random reference (0) and the best agent (1), clipped. Bars: mean over the "
-        "environments of a demand group, given at the right. Symbols: single environments.",
+        caption=(
+            "Held-out return between the random reference (0) and the best agent (1), clipped. Bars: mean over the "
+            "environments of a demand group, given at the right. Symbols: single environments."
+        ),
         alt=f"Bars of normalised performance for {len(agents)} agents in {len(demands)} demand groups.",
         data=rows(suite.normalised.groups),
         figure=figure,

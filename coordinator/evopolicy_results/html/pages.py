@@ -236,7 +236,10 @@ def _notices(study: Study) -> list[dict[str, Any]]:
         ),
         (
             sum(one.hidden_cases == "per_run" for one in audit),
-            "had hidden cases of their own: no two scores are on the same cases, so differences between runs cannot be paired by case.",
+            (
+                "had hidden cases of their own: no two scores are on the same cases, so differences between runs cannot"
+                " be paired by case."
+            ),
         ),
     )
     return found + [notice(f"{count} of {n} runs {text}") for count, text in counts if count]

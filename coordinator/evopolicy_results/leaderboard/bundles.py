@@ -163,9 +163,11 @@ def _read(
     bundle.processors = [each for each in processors if each]
     loaded = load_runs([folder])
     bundle.left_out = [
-        msgspec.structs.replace(each, path=each.path.relative_to(folder.resolve()))
-        if each.path.is_relative_to(folder.resolve())
-        else each
+        (
+            msgspec.structs.replace(each, path=each.path.relative_to(folder.resolve()))
+            if each.path.is_relative_to(folder.resolve())
+            else each
+        )
         for each in loaded.left_out
     ]
     for loaded_run in loaded.runs:
@@ -266,7 +268,10 @@ def _compare_journals(found: Sequence[LabBundle]) -> None:
         n, other = len(bundle.heads), longest.get(bundle.signer)
         if n and other is not None and other.heads[n - 1] != bundle.heads[-1]:
             for one, another in ((bundle, other), (other, bundle)):
-                text = f"the first {n} entries are others in {another.file} of the same signer: one journal was begun anew, or cut"
+                text = (
+                    f"the first {n} entries are others in {another.file} of the same signer: one journal was begun"
+                    " anew, or cut"
+                )
                 one.checked.add("order", "failed", text)
 
 

@@ -32,7 +32,9 @@ app = App(name="leaderboard")
 
 @app.command(
     name="leaderboard",
-    epilog="Example: evopolicy leaderboard lab-a.evp lab-b.evp --identity KEY=Lab-A --out site && xdg-open site/index.html",
+    epilog=(
+        "Example: evopolicy leaderboard lab-a.evp lab-b.evp --identity KEY=Lab-A --out site && xdg-open site/index.html"
+    ),
 )
 def leaderboard(
     files: Annotated[
@@ -75,7 +77,8 @@ def leaderboard(
         key, _, name = each.partition("=")
         if not re.fullmatch(r"[0-9a-fA-F]{64}", key):
             fail(
-                f"--identity {each!r}: 64 hexadecimal digits, as `evopolicy-coordinator identity` prints them, then =NAME"
+                f"--identity {each!r}: 64 hexadecimal digits, as `evopolicy-coordinator identity` prints them, then"
+                " =NAME"
             )
         labs[key.lower()] = name
     share = None

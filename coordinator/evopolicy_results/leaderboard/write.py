@@ -82,8 +82,8 @@ def _write_pages(bundles: Sequence[LabBundle], out: Path, title: str, tell: Tell
     if run_rows:
         columns = ("Entry", "Environment", "Repeat", "Held-out mean", "Run", "Episodes", "File", "Signed by")
         caption = (
-            "Each run's page shows its submits, sources and their differences. Its recorded episodes are the held-out episodes of"
-            " the selected checkpoint."
+            "Each run's page shows its submits, sources and their differences. Its recorded episodes are the held-out"
+            " episodes of the selected checkpoint."
         )
         table = plain_view("runs", "Runs", caption, columns, run_rows)
         sections.append(section("runs", "Runs", tables=[table]))
@@ -99,8 +99,10 @@ def _write_pages(bundles: Sequence[LabBundle], out: Path, title: str, tell: Tell
     front = page(
         "index",
         title=title,
-        lead="Published results of several labs, each file checked before it is shown. Scores are held-out means of the checkpoints"
-        " that hidden validation selected.",
+        lead=(
+            "Published results of several labs, each file checked before it is shown. Scores are held-out means of the"
+            " checkpoints that hidden validation selected."
+        ),
         facts=[
             ("signers", len({bundle.signer for bundle in bundles if bundle.signer})),
             ("files", len(bundles)),
@@ -217,8 +219,9 @@ def _files(bundles: Sequence[LabBundle]) -> dict[str, Any]:
             ]
         )
     caption = (
-        "Each column after Left out is a check. ok: shown. open: this check cannot decide, or was not made. FAILED: the file"
-        " contradicts itself, or another file of its signer. Left out: runs that the same coordinator opened for the same entries and that are not in the file."
+        "Each column after Left out is a check. ok: shown. open: this check cannot decide, or was not made. FAILED: the"
+        " file contradicts itself, or another file of its signer. Left out: runs that the same coordinator opened for"
+        " the same entries and that are not in the file."
     )
     table = plain_view(
         "files", "Published results", caption, ("File", "Signed by", "Runs", "Left out", *kinds), rows
@@ -300,8 +303,10 @@ def _episodes(each: LabRun, bundle: LabBundle, run_page: str) -> str:
     return page(
         "site_episodes",
         title=f"{each.run.entry} on {title_of(each.run.env)}",
-        lead="The sum of the recorded rewards over each episode. The command plays the recorded actions again in the installed"
-        " environment and compares.",
+        lead=(
+            "The sum of the recorded rewards over each episode. The command plays the recorded actions again in the"
+            " installed environment and compares."
+        ),
         command=f"evopolicy check {shlex.quote(bundle.file)} --replay all",
         page=run_page,
         cards=cards,
@@ -318,8 +323,11 @@ def _checking(bundles: Sequence[LabBundle]) -> dict[str, Any]:
         "Check it yourself",
         texts=[
             "Take each signer's key from a place that you know to be theirs, not from this page.",
-            "No check shows that recorded actions came from the policy, that a publisher did not start over with a new journal"
-            " (unless you have an earlier head of it), or what a publisher states about jails and machines.",
+            (
+                "No check shows that recorded actions came from the policy, that a publisher did not start over with a"
+                " new journal (unless you have an earlier head of it), or what a publisher states about jails and"
+                " machines."
+            ),
         ],
         code="\n".join(lines),
     )
@@ -334,10 +342,13 @@ def _notices(bundles: Sequence[LabBundle]) -> list[dict[str, Any]]:
         out.append(notice(title, unknown))
     not_replayed = [bundle.file for bundle in shown if bundle.state_of("replay") != "ok"]
     if not_replayed:
-        title = f"{len(not_replayed)} of {len(shown)} files were not replayed for this site: their rewards rest on the publisher's word."
+        title = (
+            f"{len(not_replayed)} of {len(shown)} files were not replayed for this site: their rewards rest on the"
+            " publisher's word."
+        )
         out.append(notice(title, not_replayed))
     processors = {each for bundle in shown for each in bundle.processors}
     if len(processors) > 1:
-        title = "The runs were played on processors with different features, which can change numbers in their last digits."
+        title = "The runs were played on processors with different features, which can change numbers in their last digits."  # noqa: E501
         out.append(notice(title, sorted(each[:200] for each in processors)))
     return out

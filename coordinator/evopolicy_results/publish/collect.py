@@ -382,8 +382,8 @@ class Publisher:
         more = f"; and {len(found) - _SHOWN} more" if len(found) > _SHOWN else ""
         left_out = "" if always else "leave out these policies and recordings with --remove-findings, or "
         raise ConfigError(
-            f"nothing is published, as this looks like secrets: {shown}{more}. Revoke real keys; then {left_out}publish a"
-            " line as it is with --accept-finding FILE:LINE"
+            f"nothing is published, as this looks like secrets: {shown}{more}. Revoke real keys; then {left_out}publish"
+            " a line as it is with --accept-finding FILE:LINE"
         )
 
     def _log(self, folder: Path, record: RunRecord, place: str, passed: Passed | None) -> bytes | None:
@@ -407,8 +407,8 @@ class Publisher:
         self._stop_at(self._secrets(name, data, passed), always=True)
         if found := scrub.search(data, self._needles):
             raise ConfigError(
-                f"{name} would reveal {found[0]}; nothing is published. Names of entries, models and experiments are published as"
-                " they are: use other names for the runs, or unset a variable whose value is such a name"
+                f"{name} would reveal {found[0]}; nothing is published. Names of entries, models and experiments are"
+                " published as they are: use other names for the runs, or unset a variable whose value is such a name"
             )
 
 

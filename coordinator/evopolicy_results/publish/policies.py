@@ -126,7 +126,7 @@ def _add_findings(tally: _Tally, checked: Checked, name: str, other_cpu: bool) -
             text += "; this machine's processor has other features than the run's, which can change numbers"
         checked.add(_KIND, "open" if other_cpu else "failed", text, name)
     if tally.unknown:
-        text = f"{tally.unknown} episodes show nothing: their policy failed here or in the run, or they have no recording"
+        text = f"{tally.unknown} episodes show nothing: their policy failed here or in the run, or they have no recording"  # noqa: E501
         checked.add(_KIND, "open", text, name)
     if tally.same and not tally.differ:
         text = f"{tally.same} episodes of policies that declare themselves deterministic: the same actions"

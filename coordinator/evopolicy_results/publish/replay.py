@@ -156,7 +156,10 @@ async def _play_run(
         for fault, rounding in faults:
             alike = False
             if other_cpu and rounding:
-                text = f"{fault}, {LAST_PLACES} units in the last place at most: this machine's processor has other features than the run's"
+                text = (
+                    f"{fault}, {LAST_PLACES} units in the last place at most: this machine's processor has other"
+                    " features than the run's"
+                )
                 checked.add("replay", "open", text, name)
             elif other_cpu:
                 text = f"{fault}; other features of the processor do not explain this"

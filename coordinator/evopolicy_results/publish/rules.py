@@ -178,8 +178,8 @@ def _order(history: History, noted: Sequence[str | Countersignature], checked: C
     """Whether the journal had the heads that were noted elsewhere."""
     if not noted:
         text = (
-            "the journal is its owner's, who could have deleted it and begun another: compare its head with one that was noted"
-            " elsewhere in time (--head)"
+            "the journal is its owner's, who could have deleted it and begun another: compare its head with one that"
+            " was noted elsewhere in time (--head)"
         )
         checked.add("order", "open", text)
     for each in noted:

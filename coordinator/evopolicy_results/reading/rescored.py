@@ -46,8 +46,8 @@ def rescored(runs: Sequence[Run], name: str) -> list[Run]:
     if missing:
         more = f" and {len(missing) - _SHOWN} more" if len(missing) > _SHOWN else ""
         raise ConfigError(
-            f"no re-score {name} of {', '.join(missing[:_SHOWN])}{more}: play it with `evopolicy rescore RUN… --name {name}`,"
-            " or leave these runs out"
+            f"no re-score {name} of {', '.join(missing[:_SHOWN])}{more}: play it with `evopolicy rescore RUN… --name"
+            f" {name}`, or leave these runs out"
         )
     return found
 

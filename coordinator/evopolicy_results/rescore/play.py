@@ -139,7 +139,8 @@ class Rescorer:
             raise ConfigError(f"{error}; remove the file to play it again") from error
         if known is not None and (known.cases_hash, known.run) != (digest, record.run):
             raise ConfigError(
-                f"{rescore_path(run.folder, wanted.name)} holds {known.n_cases} other cases, or another run; choose another --name"
+                f"{rescore_path(run.folder, wanted.name)} holds {known.n_cases} other cases, or another run; choose"
+                " another --name"
             )
         began = self._evaluations.played
         result = known or RescoreRecord(
@@ -188,8 +189,8 @@ class Rescorer:
         state = await self._evaluations.versions(message, wait=self._own_workers)
         if not state.knows_run:
             raise ConfigError(
-                f"this cluster's coordinator has no finished run {record.run}: it is still open there, or another one played"
-                " it; use that one (--connect, or --local with its --state)"
+                f"this cluster's coordinator has no finished run {record.run}: it is still open there, or another one"
+                " played it; use that one (--connect, or --local with its --state)"
             )
         if not state.fingerprints:
             remedy = (
@@ -211,8 +212,8 @@ class Rescorer:
                 return state.classes[number] if state.classes else ""
             differences = differences or differing
         raise ConfigError(
-            f"no worker has the versions that run {record.run} was played with ({'; '.join(differences[:4])}): other versions"
-            " give other scores; start a worker with the run's versions"
+            f"no worker has the versions that run {record.run} was played with ({'; '.join(differences[:4])}): other"
+            " versions give other scores; start a worker with the run's versions"
         )
 
     async def _cases(self, record: RunRecord) -> tuple[tuple[Case, ...], bool, str]:

@@ -83,8 +83,8 @@ class Study(msgspec.Struct, frozen=True, kw_only=True):
         if found is None:
             return ""
         return (
-            f"Held-out scores are those of the re-score {found.name}: {found.n_cases} further hidden cases, played post hoc, after"
-            " the runs had ended. The selected checkpoints are those of the runs."
+            f"Held-out scores are those of the re-score {found.name}: {found.n_cases} further hidden cases, played post"
+            " hoc, after the runs had ended. The selected checkpoints are those of the runs."
         )
 
     @property

@@ -103,14 +103,14 @@ def _aggregate(suite: Suite, study: Study) -> Table:
     ]
     budget = " Budget: train episodes of a run." if budgets else ""
     caption = (
-        "Rank scores: within each environment entries are ranked by held-out mean return, ties sharing the better rank, and "
-        "s = 1 − (rank − 1)/(N − 1); families and the suite are means over their environments." + budget
+        "Rank scores: within each environment entries are ranked by held-out mean return, ties sharing the better rank,"
+        " and s = 1 − (rank − 1)/(N − 1); families and the suite are means over their environments." + budget
     )
     if standings.rows:
         caption += (
-            f" 95 % interval: of the rank score that a repetition with new {standings.over} would give on average. Tie group: "
-            "entries that share a letter do not differ significantly (all pairs together at 5 %, Holm); the rank interval "
-            "is what these comparisons leave."
+            f" 95 % interval: of the rank score that a repetition with new {standings.over} would give on average. Tie"
+            " group: entries that share a letter do not differ significantly (all pairs together at 5 %, Holm); the"
+            " rank interval is what these comparisons leave."
         )
         if has_single_runs(suite):
             caption += f" {CHECKPOINTS}"
@@ -137,8 +137,11 @@ def _incomplete(suite: Suite) -> Table:
         ),
         name=f"incomplete_{suite.name}",
         title=f"{suite.title} incomplete entries",
-        caption="Entries that have not played every environment of this report are not ranked and have no mean over environments: "
-        "it would not be comparable. Their returns are in the tables of single environments and of differences.",
+        caption=(
+            "Entries that have not played every environment of this report are not ranked and have no mean over"
+            " environments: it would not be comparable. Their returns are in the tables of single environments and of"
+            " differences."
+        ),
     )
 
 
@@ -151,9 +154,11 @@ def _sure(row: RankEstimate | None) -> dict[str, Any]:
     if row is None:
         return {}
     return {
-        "score_interval": span(row.score_low, row.score_high, 3)
-        if row.score_low < row.score_high
-        else "no spread: the same in each draw",
+        "score_interval": (
+            span(row.score_low, row.score_high, 3)
+            if row.score_low < row.score_high
+            else "no spread: the same in each draw"
+        ),
         "rank_interval": f"{row.rank_low} to {row.rank_high}",
         "ties": row.ties,
     }
@@ -185,9 +190,12 @@ def _heldout(suite: Suite) -> Table:
     return Table(
         name=f"heldout_{suite.name}",
         title=f"{suite.title} held-out returns",
-        caption="Mean return of the validation-selected policy on the held-out cases, in each environment's own units: compare "
-        "within a column only. Best and second-best are marked. The random reference plays the same cases. A dash is a cell "
-        "that was not run, or a run with no ok submit. Incomplete entries come last, without marks.",
+        caption=(
+            "Mean return of the validation-selected policy on the held-out cases, in each environment's own units:"
+            " compare within a column only. Best and second-best are marked. The random reference plays the same cases."
+            " A dash is a cell that was not run, or a run with no ok submit. Incomplete entries come last, without"
+            " marks."
+        ),
         columns=(ENTRY, HARNESS, *columns),
         rows=tuple(rows),
         marks=marks,
@@ -226,9 +234,11 @@ def _cells(suite: Suite) -> Table:
         ),
         name=f"cells_{suite.name}",
         title=f"{suite.title} cells",
-        caption="Every entry on every environment: mean over its runs, 95 % interval of the mean over what the column Over names, rank "
-        "and rank score (of entries that played every environment). Entries share their cases, so two of these intervals may overlap "
-        "where the difference is sure: compare by the table of differences.",
+        caption=(
+            "Every entry on every environment: mean over its runs, 95 % interval of the mean over what the column Over"
+            " names, rank and rank score (of entries that played every environment). Entries share their cases, so two"
+            " of these intervals may overlap where the difference is sure: compare by the table of differences."
+        ),
     )
     return table if suite.is_ranked else msgspec.structs.replace(table, columns=table.columns[:-1])
 
@@ -251,9 +261,12 @@ def _normalised(suite: Suite) -> Table:
     return Table(
         name=f"normalised_{suite.name}",
         title=f"{suite.title} normalised performance",
-        caption="Held-out return on the random-to-best scale, clipped to 0 … 1, by dominant task demand: 0 is the random reference "
-        "on the same cases, 1 the best agent on that environment. Bold: means of a group's environments. A dash: no agent beats random, no "
-        "reference, or no score; for a mean, no score on one of the group's environments.",
+        caption=(
+            "Held-out return on the random-to-best scale, clipped to 0 … 1, by dominant task demand: 0 is the random"
+            " reference on the same cases, 1 the best agent on that environment. Bold: means of a group's environments."
+            " A dash: no agent beats random, no reference, or no score; for a mean, no score on one of the group's"
+            " environments."
+        ),
         columns=(
             ENV,
             _DEMAND,
@@ -292,9 +305,11 @@ def _evolution(study: Study, link_of: LinkOf) -> Table:
         link=lambda one: link_of(one.run),
         name="evolution",
         title="Score evolution",
-        caption="Best validation mean so far over the budget. Scale of each environment: 0 is the random reference, 1 the best "
-        "validation mean of any run. Area: mean of the curve over the budget. To 50 % and 80 %: train episodes consumed when the "
-        "curve first gets there. Validation is hidden from agents during the run.",
+        caption=(
+            "Best validation mean so far over the budget. Scale of each environment: 0 is the random reference, 1 the"
+            " best validation mean of any run. Area: mean of the curve over the budget. To 50 % and 80 %: train"
+            " episodes consumed when the curve first gets there. Validation is hidden from agents during the run."
+        ),
     )
 
 
@@ -323,10 +338,13 @@ def _edit_types(study: Study) -> Table:
         ),
         name="edit_types",
         title="Edit types",
-        caption="Each score-bearing submit against the one before it. Synthesis: a numeric-constant-stripped AST topology that is new "
-        "to the run. Parametric: bytes changed, topology kept. A hit raises the validation best so far. The other columns are "
-        "excluded from both rates: rollbacks to an earlier topology, byte-identical retests, submits that changed data files only, "
-        "the first score-bearing submit (it follows none), submits that are not ok, and ok ones without a validation score.",
+        caption=(
+            "Each score-bearing submit against the one before it. Synthesis: a numeric-constant-stripped AST topology"
+            " that is new to the run. Parametric: bytes changed, topology kept. A hit raises the validation best so"
+            " far. The other columns are excluded from both rates: rollbacks to an earlier topology, byte-identical"
+            " retests, submits that changed data files only, the first score-bearing submit (it follows none), submits"
+            " that are not ok, and ok ones without a validation score."
+        ),
     )
 
 
@@ -344,8 +362,10 @@ def _structure(study: Study) -> Table:
         ),
         name="structure",
         title="Realised structure",
-        caption="AST features of the validation-selected policies (policy.py and the local modules it reaches), mean over "
-        "environments of a demand group. State counts attributes that methods assign on their instance.",
+        caption=(
+            "AST features of the validation-selected policies (policy.py and the local modules it reaches), mean over "
+            "environments of a demand group. State counts attributes that methods assign on their instance."
+        ),
     )
 
 
@@ -361,9 +381,11 @@ def _edit_sizes(study: Study) -> Table:
         ),
         name="edit_sizes",
         title="Edit size and improvement",
-        caption="Transitions between adjacent score-bearing submits by lines added and removed in the source bundle. Visible: the "
-        "train mean rose (a retest may play other cases). Validation: the validation best rose, which an unchanged policy cannot. Data "
-        "only: files outside the source bundle changed, such as weights.",
+        caption=(
+            "Transitions between adjacent score-bearing submits by lines added and removed in the source bundle."
+            " Visible: the train mean rose (a retest may play other cases). Validation: the validation best rose, which"
+            " an unchanged policy cannot. Data only: files outside the source bundle changed, such as weights."
+        ),
     )
 
 
@@ -394,7 +416,9 @@ def _tokens(study: Study) -> Table:
         ),
         name="tokens",
         title="Tokens and cost",
-        caption="Mean of a run, in millions of tokens. In: input that no cache served. Cache: cache read and creation. Out: output with "
-        "reasoning. Diagnostic only, no part of a score. A dash: nothing counted them. Counted by the relay: at the wire; by the agent: as "
-        "its program reports.",
+        caption=(
+            "Mean of a run, in millions of tokens. In: input that no cache served. Cache: cache read and creation. Out:"
+            " output with reasoning. Diagnostic only, no part of a score. A dash: nothing counted them. Counted by the"
+            " relay: at the wire; by the agent: as its program reports."
+        ),
     )

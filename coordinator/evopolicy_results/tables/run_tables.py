@@ -69,8 +69,10 @@ def _runs(study: Study, link_of: LinkOf) -> Table:
             Column(
                 "journal",
                 "Journal",
-                note="Entry with the run's result, and the journal's head there. A head that you noted earlier shows whether "
-                "the journal was rewritten.",
+                note=(
+                    "Entry with the run's result, and the journal's head there. A head that you noted earlier shows"
+                    " whether the journal was rewritten."
+                ),
                 of=_journal,
             ),
         ),
@@ -110,7 +112,10 @@ def _agents(study: Study) -> Table:
     return Table(
         name="agents",
         title="Agents",
-        caption="How each agent was set up, as its run directories tell; an agent with several rows was not the same in all of its runs.",
+        caption=(
+            "How each agent was set up, as its run directories tell; an agent with several rows was not the same in all"
+            " of its runs."
+        ),
         columns=(
             ENTRY,
             HARNESS,
@@ -233,8 +238,10 @@ def feedback_use(rows: Iterable[dict[str, Any]]) -> Table:
     return Table(
         name="feedback_use",
         title="Feedback use",
-        caption="One row a submit: what the agent had read and said since the submit before, how the policy changed, and what came of "
-        "it. Budget: train episodes consumed before and after. Validation is hidden from agents.",
+        caption=(
+            "One row a submit: what the agent had read and said since the submit before, how the policy changed, and"
+            " what came of it. Budget: train episodes consumed before and after. Validation is hidden from agents."
+        ),
         columns=(
             ENV,
             ENTRY,
@@ -275,10 +282,12 @@ def _audit(study: Study, link_of: LinkOf) -> Table:
     return Table(
         name="audit",
         title="Audit signals",
-        caption="One row a run. Invalid submits: accepted ones that are not ok, of all accepted. Repaired actions: share of the train "
-        "steps whose action was outside the action space; a dash for runs of earlier versions. Score drops: score-bearing submits "
-        "whose validation mean is below the one before. Growth: AST nodes of the selected policy over those of the first. "
-        "Wall time by phase, in seconds; phases may overlap.",
+        caption=(
+            "One row a run. Invalid submits: accepted ones that are not ok, of all accepted. Repaired actions: share of"
+            " the train steps whose action was outside the action space; a dash for runs of earlier versions. Score"
+            " drops: score-bearing submits whose validation mean is below the one before. Growth: AST nodes of the"
+            " selected policy over those of the first. Wall time by phase, in seconds; phases may overlap."
+        ),
         columns=(
             ENV,
             ENTRY,
@@ -336,8 +345,11 @@ def _simulators(study: Study, link_of: LinkOf) -> Table:
         link_of,
         name="simulator_flags",
         title="Code that looks like a simulator",
-        caption="A signal to read, never a verdict: imports and installations of a simulator, and code with a loop and several numbers of the "
-        "environment's dynamics. Simulators that an agent writes itself are seldom found. Runs whose rules allow simulation are left out.",
+        caption=(
+            "A signal to read, never a verdict: imports and installations of a simulator, and code with a loop and"
+            " several numbers of the environment's dynamics. Simulators that an agent writes itself are seldom found."
+            " Runs whose rules allow simulation are left out."
+        ),
     )
 
 
@@ -347,9 +359,11 @@ def _signals(study: Study, link_of: LinkOf) -> Table:
         link_of,
         name="signals",
         title="What deserves a look",
-        caption="Signals to read, never verdicts: commands that reach for the network, for files outside the workspace or for a simulator, "
-        "policies with tables keyed by hashes of observations or by case, and policies that hold recorded train actions. Honest agents can "
-        "raise a signal, and an agent can hide from the search.",
+        caption=(
+            "Signals to read, never verdicts: commands that reach for the network, for files outside the workspace or"
+            " for a simulator, policies with tables keyed by hashes of observations or by case, and policies that hold"
+            " recorded train actions. Honest agents can raise a signal, and an agent can hide from the search."
+        ),
     )
 
 

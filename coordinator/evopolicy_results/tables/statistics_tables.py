@@ -16,7 +16,7 @@ from evopolicy_results.studies.study import Suite
 from evopolicy_results.tables.run_tables import ENTRY, ENV
 from evopolicy_results.tables.table import Column, Table, tabulated
 
-CHECKPOINTS = "With one run a cell this compares the selected checkpoints, not the agents: how an agent's runs vary is not known."
+CHECKPOINTS = "With one run a cell this compares the selected checkpoints, not the agents: how an agent's runs vary is not known."  # noqa: E501
 _SHOWN_TAUS = (0.1, 0.25, 0.5, 0.75, 0.9)
 
 
@@ -112,14 +112,17 @@ def _pairs(suite: Suite) -> Table:
         ),
         name=f"pairs_{suite.name}",
         title=f"{suite.title} differences",
-        caption="Every two entries on every environment: first minus second, in held-out returns of the cases that both have. Interval: "
-        "95 %, for one environment and pair alone, over what the column Over names. p: of no difference, two-sided, from the "
-        "interval's own distribution; it is at most 0.05 exactly if the interval excludes 0. Corrected p: Holm, over all rows of this "
-        "table together, so a false difference in any row has a probability of at most 5 %. Significant: corrected p at most 0.05. "
-        "About how many runs (or cases) would be needed: so many that every second experiment resolves a true difference of the size "
-        "seen here, whose own size is uncertain. These cases only: permutation test that exchanges runs and takes the cases as "
-        "given; with other cases the difference may vanish, and no verdict rests on it. The tie groups of the leaderboard are a "
-        "second family of comparisons at 5 %, so both together have at most 10 %."
+        caption=(
+            "Every two entries on every environment: first minus second, in held-out returns of the cases that both"
+            " have. Interval: 95 %, for one environment and pair alone, over what the column Over names. p: of no"
+            " difference, two-sided, from the interval's own distribution; it is at most 0.05 exactly if the interval"
+            " excludes 0. Corrected p: Holm, over all rows of this table together, so a false difference in any row has"
+            " a probability of at most 5 %. Significant: corrected p at most 0.05. About how many runs (or cases) would"
+            " be needed: so many that every second experiment resolves a true difference of the size seen here, whose"
+            " own size is uncertain. These cases only: permutation test that exchanges runs and takes the cases as"
+            " given; with other cases the difference may vanish, and no verdict rests on it. The tie groups of the"
+            " leaderboard are a second family of comparisons at 5 %, so both together have at most 10 %."
+        )
         + (f" {CHECKPOINTS}" if has_single_runs(suite) else "")
         + (
             f" In {left_out} rows the entries' cases differ: only common cases pair, and the others are left out."
@@ -157,11 +160,14 @@ def _resolution(suite: Suite) -> Table:
     return Table(
         name=f"resolution_{suite.name}",
         title=f"{suite.title} resolution",
-        caption="The smallest difference between two agents that these cases and runs resolve: the half width of its 95 % interval, median "
-        "over pairs, in returns and as a share of the random-to-best scale. A true difference of that size is resolved every second "
-        "time. Repeats: runs of each agent that a difference of that share of the scale would need; `more cases` where more "
-        f"runs do not help (up to {MAX_REPEATS} were tried); a dash with one run a cell, which does not show how runs vary. "
-        "Mean of all: of the normalised scores over the environments, which are fixed."
+        caption=(
+            "The smallest difference between two agents that these cases and runs resolve: the half width of its 95 %"
+            " interval, median over pairs, in returns and as a share of the random-to-best scale. A true difference of"
+            " that size is resolved every second time. Repeats: runs of each agent that a difference of that share of"
+            f" the scale would need; `more cases` where more runs do not help (up to {MAX_REPEATS} were tried); a dash"
+            " with one run a cell, which does not show how runs vary. Mean of all: of the normalised scores over the"
+            " environments, which are fixed."
+        )
         + (
             ""
             if gap is None
@@ -221,12 +227,15 @@ def _aggregates(suite: Suite) -> Table:
     return Table(
         name=f"aggregates_{suite.name}",
         title=f"{suite.title} aggregates",
-        caption="Over the normalised scores of single runs, not clipped, on the environments that have a random-to-best scale (Agarwal et al. "
-        "2021). IQM: mean of the middle half. Above: share of the runs whose normalised score is above it (the performance "
-        "profile). Intervals: 95 %, percentiles of a bootstrap stratified by environment, over what the column Over names; the scale is "
-        "estimated again in each resample. The best agent's observed mean is the scale's end; where several agents are about as good "
-        "it is too high on average, IQMs are too low, and their intervals miss: compare such agents by their differences. "
-        f"Two runs to {LEAST_RUNS - 1} are too few for the intervals of shares."
+        caption=(
+            "Over the normalised scores of single runs, not clipped, on the environments that have a random-to-best"
+            " scale (Agarwal et al. 2021). IQM: mean of the middle half. Above: share of the runs whose normalised"
+            " score is above it (the performance profile). Intervals: 95 %, percentiles of a bootstrap stratified by"
+            " environment, over what the column Over names; the scale is estimated again in each resample. The best"
+            " agent's observed mean is the scale's end; where several agents are about as good it is too high on"
+            " average, IQMs are too low, and their intervals miss: compare such agents by their differences. Two runs"
+            f" to {LEAST_RUNS - 1} are too few for the intervals of shares."
+        )
         + (f" {CHECKPOINTS}" if has_single_runs(suite) else ""),
         columns=(
             ENTRY,
@@ -268,9 +277,12 @@ def _improvements(suite: Suite) -> Table:
         ),
         name=f"improvement_{suite.name}",
         title=f"{suite.title} probability of improvement",
-        caption="How probably a run of the first agent scores above a run of the second, ties counting half, mean over the environments that "
-        "have a scale (Agarwal et al. 2021). Interval: 95 %, stratified bootstrap over runs and their cases, or over the cases of single "
-        "runs." + (f" {CHECKPOINTS}" if has_single_runs(suite) else ""),
+        caption=(
+            "How probably a run of the first agent scores above a run of the second, ties counting half, mean over the"
+            " environments that have a scale (Agarwal et al. 2021). Interval: 95 %, stratified bootstrap over runs and"
+            " their cases, or over the cases of single runs."
+        )
+        + (f" {CHECKPOINTS}" if has_single_runs(suite) else ""),
     )
 
 
@@ -301,11 +313,14 @@ def _generalisation(suite: Suite) -> Table:
     return Table(
         name=f"generalisation_{suite.name}",
         title=f"{suite.title} generalisation",
-        caption="Mean return of the selected checkpoint on its own submit's train episodes, on validation, and on held-out cases; means over "
-        "completed runs. Optimism: validation minus held-out. Selection takes the best of many validation scores, so it is above 0 on average "
-        "even where an agent fits nothing. Normalised: as a share of the random-to-best scale; its last rows are means over environments "
-        "with a 95 % t interval whose unit is the environment. Success: share of held-out episodes that reached the goal, where the "
-        "environment reports it (Fetch, parking), or the return tells it exactly (MiniGrid, Acrobot, continuous MountainCar).",
+        caption=(
+            "Mean return of the selected checkpoint on its own submit's train episodes, on validation, and on held-out"
+            " cases; means over completed runs. Optimism: validation minus held-out. Selection takes the best of many"
+            " validation scores, so it is above 0 on average even where an agent fits nothing. Normalised: as a share"
+            " of the random-to-best scale; its last rows are means over environments with a 95 % t interval whose unit"
+            " is the environment. Success: share of held-out episodes that reached the goal, where the environment"
+            " reports it (Fetch, parking), or the return tells it exactly (MiniGrid, Acrobot, continuous MountainCar)."
+        ),
         columns=(
             ENV,
             ENTRY,

@@ -118,8 +118,9 @@ class Verifier:
         record, versions = self._run.record, self._run.record.versions
         if record.experiment_dimensions.hidden_cases == "per_run" and not state.knows_run:
             raise ConfigError(
-                f"run {record.run} had hidden cases of its own, and this cluster's coordinator does not have that run: they are in"
-                " the state folder of the coordinator that made it; use that one, with --state, or a backup of it"
+                f"run {record.run} had hidden cases of its own, and this cluster's coordinator does not have that run:"
+                " they are in the state folder of the coordinator that made it; use that one, with --state, or a"
+                " backup of it"
             )
         for split in _SPLITS:
             ours = versions.cases_hash(split).removeprefix("sha256:")
@@ -129,7 +130,8 @@ class Verifier:
             elif ours != theirs:
                 raise ConfigError(
                     f"this cluster's {split} cases of {self._run.record.env} are not the run's (SHA-256 {theirs[:12]}…"
-                    f" here, {ours[:12]}… in run.json): use the coordinator that made the run, its --state, or its --data"
+                    f" here, {ours[:12]}… in run.json): use the coordinator that made the run, its --state, or its"
+                    " --data"
                 )
         self._knows_run = state.knows_run
         self._check_numbers(state.result)

@@ -145,8 +145,8 @@ def test_a_simulator_that_prints_or_sends_out_of_turn_ends_its_slot(
     package.mkdir(parents=True)
     monkeypatch.setenv("PYTHONPATH", str(package.parent))
     (package / "__init__.py").write_text(
-        "import os\nfor fd in range(3, 64):\n    try:\n        os.write(fd, b'\\x08\\0\\0\\0nonsense')\n    except OSError:\n        pass\n"
-        "import time; time.sleep(60)"
+        "import os\nfor fd in range(3, 64):\n    try:\n        os.write(fd, b'\\x08\\0\\0\\0nonsense')\n    except"
+        " OSError:\n        pass\nimport time; time.sleep(60)"
     )
 
     async def play() -> None:

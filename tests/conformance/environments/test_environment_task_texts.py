@@ -26,7 +26,7 @@ def test_every_component_of_core16_has_exactly_one_row(env_id: str, warm: Warm) 
 
 
 TEXT = """# A\n\n## Observation\n\n| Component | Meaning | Unit | Range |\n|---|---|---|---|\n| 0 | x | m | 0 to 1 |\n| 1–2 | speeds | m/s | about ±1 |
-\n## Action\n\n| Choice | Meaning |\n|---|---|\n| 0 | left |\n| 1 | right |\n\n## Reward\n"""
+\n## Action\n\n| Choice | Meaning |\n|---|---|\n| 0 | left |\n| 1 | right |\n\n## Reward\n"""  # noqa: E501
 
 
 @pytest.mark.parametrize(

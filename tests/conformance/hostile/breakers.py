@@ -106,9 +106,11 @@ BREAKERS = (
     ),
     Breaker(
         name="memory bomb in C",
-        act="libc = ctypes.CDLL(None); libc.malloc.restype = ctypes.c_void_p\n"
-        "            p = [libc.malloc(ctypes.c_size_t(64 << 20)) for _ in range(6)]\n"
-        "            if not all(p): raise MemoryError",
+        act=(
+            "libc = ctypes.CDLL(None); libc.malloc.restype = ctypes.c_void_p\n"
+            "            p = [libc.malloc(ctypes.c_size_t(64 << 20)) for _ in range(6)]\n"
+            "            if not all(p): raise MemoryError"
+        ),
         verdict="oom",
         unsealed=True,
     ),
@@ -192,8 +194,10 @@ BREAKERS = (
     ),
     Breaker(
         name="a forged count that no encoder accepts",
-        act='b = b\'{"stage":"act","kind":"action","message":"","traceback":"","used":1\' + b"0" * 30 + b"}"\n'
-        "            os.write(4, struct.pack('<IBxxx', len(b), 6) + b); time.sleep(60)",
+        act=(
+            'b = b\'{"stage":"act","kind":"action","message":"","traceback":"","used":1\' + b"0" * 30 + b"}"\n'
+            "            os.write(4, struct.pack('<IBxxx', len(b), 6) + b); time.sleep(60)"
+        ),
         verdict="killed",
     ),
     Breaker(
@@ -287,10 +291,12 @@ BREAKERS = (
     ),
     Breaker(
         name="a timer that kills itself",
-        act="libc, which = ctypes.CDLL(None), ctypes.c_void_p()\n"
-        "            event = struct.pack('<qii48x', 0, 9, 0)\n"
-        "            if libc.timer_create(1, event, ctypes.byref(which)): raise OSError('no timer')\n"
-        "            libc.timer_settime(which, 0, struct.pack('<qqqq', 0, 0, 0, 10**7), None); time.sleep(60)",
+        act=(
+            "libc, which = ctypes.CDLL(None), ctypes.c_void_p()\n"
+            "            event = struct.pack('<qii48x', 0, 9, 0)\n"
+            "            if libc.timer_create(1, event, ctypes.byref(which)): raise OSError('no timer')\n"
+            "            libc.timer_settime(which, 0, struct.pack('<qqqq', 0, 0, 0, 10**7), None); time.sleep(60)"
+        ),
         verdict="act_error",
     ),
     Breaker(
@@ -321,11 +327,12 @@ BREAKERS = (
     ),
     Breaker(
         name="a replaced shim",
-        act="import gc\n"
-        "            for m in list(sys.modules.values()):\n"
-        "                for n in ('encoded', 'reply', 'answer', 'check', 'seal'):\n"
-        "                    if hasattr(m, n) and hasattr(m, 'REPLIES'): setattr(m, n, None)\n"
-        "            m = sys.modules['__main__']; m.player.encoded = lambda action: struct.pack('<IBxxxd', 8, 2, 9.0)",
+        act=(
+            "import gc\n            for m in list(sys.modules.values()):\n                for n in ('encoded', 'reply',"
+            " 'answer', 'check', 'seal'):\n                    if hasattr(m, n) and hasattr(m, 'REPLIES'): setattr(m,"
+            " n, None)\n            m = sys.modules['__main__']; m.player.encoded = lambda action:"
+            " struct.pack('<IBxxxd', 8, 2, 9.0)"
+        ),
         verdict=None,
     ),
     Breaker(
@@ -363,8 +370,10 @@ BREAKERS = (
     ),
     Breaker(
         name="signals in the middle of a reply",
-        act="signal.signal(signal.SIGALRM, lambda *a: os.write(4, b'zz'))\n"
-        "            signal.setitimer(signal.ITIMER_REAL, 0.001, 0.001); time.sleep(0.1)",
+        act=(
+            "signal.signal(signal.SIGALRM, lambda *a: os.write(4, b'zz'))\n"
+            "            signal.setitimer(signal.ITIMER_REAL, 0.001, 0.001); time.sleep(0.1)"
+        ),
         verdict="killed",
     ),
     Breaker(
@@ -382,10 +391,12 @@ BREAKERS = (
             ),
             Breaker(
                 name="a system call of 32-bit programs, from machine code of its own",
-                act="import mmap; m = mmap.mmap(-1, 4096, mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS, 7)\n"
-                "            m.write(bytes.fromhex('b814000000cd80c3'))  # mov eax, 20; int 0x80; ret\n"
-                "            pid = ctypes.CFUNCTYPE(ctypes.c_int)(ctypes.addressof(ctypes.c_char.from_buffer(m)))\n"
-                "            if pid() != os.getpid(): raise OSError('no such call')",
+                act=(
+                    "import mmap; m = mmap.mmap(-1, 4096, mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS, 7)\n"
+                    "            m.write(bytes.fromhex('b814000000cd80c3'))  # mov eax, 20; int 0x80; ret\n"
+                    "            pid = ctypes.CFUNCTYPE(ctypes.c_int)(ctypes.addressof(ctypes.c_char.from_buffer(m)))\n"
+                    "            if pid() != os.getpid(): raise OSError('no such call')"
+                ),
                 verdict="killed",
                 unsealed=True,
                 possible=Path("/proc/sys/abi/vsyscall32").exists(),
@@ -396,9 +407,11 @@ BREAKERS = (
     ),
     Breaker(
         name="a C function at address 0, which scipy calls",
-        act="from scipy import LowLevelCallable, integrate\n"
-        "            kind = ctypes.CFUNCTYPE(ctypes.c_double, ctypes.c_double)\n"
-        "            integrate.quad(LowLevelCallable(ctypes.cast(1, kind)), 0.0, 1.0)",
+        act=(
+            "from scipy import LowLevelCallable, integrate\n"
+            "            kind = ctypes.CFUNCTYPE(ctypes.c_double, ctypes.c_double)\n"
+            "            integrate.quad(LowLevelCallable(ctypes.cast(1, kind)), 0.0, 1.0)"
+        ),
         verdict="killed",
         packages=("scipy",),
     ),
@@ -418,7 +431,10 @@ BREAKERS = (
     ),
     Breaker(
         name="a thread that continues to reply",
-        act="threading.Thread(target=lambda: [os.write(4, 2 * struct.pack('<IBxxxq', 8, 1, 0)) or time.sleep(0.001) for _ in range(9999)]).start(); time.sleep(0.1)",
+        act=(
+            "threading.Thread(target=lambda: [os.write(4, 2 * struct.pack('<IBxxxq', 8, 1, 0)) or time.sleep(0.001) for"
+            " _ in range(9999)]).start(); time.sleep(0.1)"
+        ),
         verdict="killed",
     ),
 )

@@ -169,12 +169,15 @@ def document() -> str:
 
 PAIRS = {
     "Leaves files, shared memory, and state for the next episode, which searches for them": "with tier `none`",
-    "Two policies in parallel slots communicate by files, shared memory, sockets, locks, a page of a shared file, or the"
-    " timestamps of a device": "with tier `none`",
-    "Searches all of its memory for traces of earlier policies of the slot: their number, their durations, their exit"
-    " statuses": "-",
-    "Looks up missing names, which the kernel caches; a policy in another slot measures by timing which ones they"
-    " were": "with tier `none`",
+    "Two policies in parallel slots communicate by files, shared memory, sockets, locks, a page of a shared file, or the timestamps of a device": (  # noqa: E501
+        "with tier `none`"
+    ),
+    "Searches all of its memory for traces of earlier policies of the slot: their number, their durations, their exit statuses": (  # noqa: E501
+        "-"
+    ),
+    "Looks up missing names, which the kernel caches; a policy in another slot measures by timing which ones they were": (  # noqa: E501
+        "with tier `none`"
+    ),
     "Measures the time between its calls, to guess whether its episode is hidden": "-",
     "Searches all objects, frames and generators for the case's seed": "with tier `none`",
 }

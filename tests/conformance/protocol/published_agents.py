@@ -81,7 +81,7 @@ for number, line in enumerate(sys.stdin):
     if number == 3:
         spend_all()
     print(answers[number], flush=True)
-"""
+"""  # noqa: E501
 
 REQUESTS = """
 task = urllib.request.urlopen(os.environ["EVOPOLICYGYM_TASK_URL"]).read().decode()

@@ -42,7 +42,7 @@ good = (system / "policy.py").read_text()
 submit("0")
 (system / "policy.py").write_text("import numpy\\nraise RuntimeError('never imported')\\n")
 submit([1])
-"""
+"""  # noqa: E501
 
 
 @pytest.fixture(scope="module")

@@ -22,7 +22,7 @@ WORKER = f"{sys.executable} -m evopolicy_worker.cli"
 COORDINATOR = f"{sys.executable} -m evopolicy_coordinator.cli"
 PLAYED = f"--env toy/line --agent evolve --exp-id t {' '.join(SMALL)}"
 SUITE = 'name = "t"\nenvironments = ["toy/line"]\n[[agents]]\nname = "e"\nagent = "evolve"\n'
-POLICY = "class Policy:\n  def __init__(self, *a): pass\n  def reset(self, i): pass\n  def act(self, obs): return [0.0]\n"
+POLICY = "class Policy:\n  def __init__(self, *a): pass\n  def reset(self, i): pass\n  def act(self, obs): return [0.0]\n"  # noqa: E501
 TIMEOUT_S = 120
 COMMANDS = {
     "try": f"{EVOPOLICY} try policy --env toy/line",
@@ -49,7 +49,10 @@ def no_namespaces() -> str | None:
         text=True,
     )
     if tried.returncode:
-        return f"needs a mount and a network namespace, which cannot be made here ({tried.stderr.strip()}): run the tests as root"
+        return (
+            f"needs a mount and a network namespace, which cannot be made here ({tried.stderr.strip()}): run the tests"
+            " as root"
+        )
     return None
 
 

@@ -97,7 +97,7 @@ VIDEOS = """Promise.all([...document.querySelectorAll('video')].map((video) => n
   if (video.readyState >= 2 || video.error) { report(); return; }
   video.addEventListener('loadeddata', report); video.addEventListener('error', report);
   video.preload = 'auto'; video.load();
-})))"""
+})))"""  # noqa: E501
 
 
 @pytest.fixture(scope="module")

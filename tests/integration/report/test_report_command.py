@@ -81,7 +81,7 @@ def test_every_table_and_figure_is_written_in_every_form(report: Path) -> None:
         assert {path.stem for path in (report / "tables").glob(f"*.{suffix}")} == tables
     figures = {path.stem for path in (report / "figures").glob("*.svg")}
     assert figures >= {
-        "rank_scores_core16", "score_evolution_core16", "normalised_core16", "edit_hits", "edit_size", "structure", "tokens",
+        "rank_scores_core16", "score_evolution_core16", "normalised_core16", "edit_hits", "edit_size", "structure", "tokens",  # noqa: E501
         "wall_time", "timeline_gym_acrobot", "timeline_toy_line",
     }  # fmt: skip
     data = json.loads((report / "report.json").read_text())

@@ -60,8 +60,8 @@ def test_every_page_opens_without_console_problems_and_with_its_images(page: Pag
     for path in sorted(report.rglob("*.html")):
         page.open(path)
         broken = page.run(
-            "Promise.all([...document.images].map((image) => { image.loading = 'eager'; return image.decode().then(() => null, "
-            "() => image.src); })).then((found) => found.filter(Boolean))"
+            "Promise.all([...document.images].map((image) => { image.loading = 'eager'; return image.decode().then(()"
+            " => null, () => image.src); })).then((found) => found.filter(Boolean))"
         )
         assert broken == [], path
         assert page.run("document.querySelector('h1').textContent.length") > 3
@@ -95,8 +95,8 @@ def test_clicking_a_text_header_sorts_by_name(index: Page) -> None:
 
 def test_filter_keeps_rows_with_every_word_and_counts_them(index: Page) -> None:
     index.run(
-        "(() => { const input = document.querySelector('[data-filter=evolution-table]'); input.value = 'carracing KES'; "
-        "input.dispatchEvent(new Event('input')); })()"
+        "(() => { const input = document.querySelector('[data-filter=evolution-table]'); input.value = 'carracing KES';"
+        " input.dispatchEvent(new Event('input')); })()"
     )
     assert column(index, "evolution-table", 0) == ["CarRacing"]
     assert column(index, "evolution-table", 1) == ["Kestrel"]
@@ -104,9 +104,15 @@ def test_filter_keeps_rows_with_every_word_and_counts_them(index: Page) -> None:
 
 
 def test_timeline_picker_shows_one_environment_or_all(index: Page) -> None:
-    shown = "[...document.querySelectorAll('figure[data-timeline]')].filter((f) => !f.hidden).map((f) => f.dataset.timeline)"
+    shown = (
+        "[...document.querySelectorAll('figure[data-timeline]')].filter((f) => !f.hidden).map((f) =>"
+        " f.dataset.timeline)"
+    )
     assert index.run(shown) == ["gym/acrobot"]
-    choose = "(() => {{ const p = document.getElementById('timeline-picker'); p.value = {!r}; p.dispatchEvent(new Event('change')); }})()"
+    choose = (
+        "(() => {{ const p = document.getElementById('timeline-picker'); p.value = {!r}; p.dispatchEvent(new"
+        " Event('change')); }})()"
+    )
     index.run(choose.format("gym/ant5"))
     assert index.run(shown) == ["gym/ant5"]
     index.run(choose.format(""))
@@ -160,8 +166,9 @@ def test_page_fits_a_phone_without_sideways_scrolling(page: Page, report: Path) 
 
 def test_everything_interactive_has_a_name_and_headings_descend_in_steps(index: Page) -> None:
     nameless = index.run(
-        "[...document.querySelectorAll('button, input, select, a, figure svg, [role=region]')].filter((e) => "
-        "!(e.textContent.trim() || e.getAttribute('aria-label') || (e.labels && e.labels.length))).map((e) => e.outerHTML)"
+        "[...document.querySelectorAll('button, input, select, a, figure svg, [role=region]')].filter((e) =>"
+        " !(e.textContent.trim() || e.getAttribute('aria-label') || (e.labels && e.labels.length))).map((e) =>"
+        " e.outerHTML)"
     )
     assert nameless == []
     levels = index.run("[...document.querySelectorAll('h1, h2, h3, h4')].map((h) => Number(h.tagName[1]))")
@@ -203,7 +210,8 @@ def test_everything_can_be_reached_and_worked_by_keyboard(index: Page) -> None:
     index.run(f"{scroller}.focus()")
     assert index.run(f"{scroller}.scrollWidth > {scroller}.clientWidth")
     index.run(
-        f"void (window.scrolled = new Promise((done) => {scroller}.addEventListener('scroll', () => done(true), {{ once: true }})))"
+        f"void (window.scrolled = new Promise((done) => {scroller}.addEventListener('scroll', () => done(true), {{"
+        " once: true })))"
     )
     index.press("ArrowRight")
     assert index.run("window.scrolled")
@@ -259,7 +267,7 @@ def test_text_has_enough_contrast_in_both_themes(page: Page, report: Path) -> No
       const ratio = (a, b) => { const [x, y] = [value(a), value(b)].sort((p, q) => q - p); return (x + 0.05) / (y + 0.05); };
       return [['ink', 'bg'], ['muted', 'bg'], ['link', 'bg'], ['ink', 'panel'], ['muted', 'panel'], ['link', 'panel'],
         ['ink', 'ins'], ['ink', 'del'], ['muted', 'hunk'], ['ink', 'warn-bg']].map(([a, b]) => [a, b, ratio(a, b)]);
-    })()"""
+    })()"""  # noqa: E501
     for dark in (False, True):
         page.look(dark=dark)
         page.open(report / "index.html")

@@ -63,7 +63,8 @@ def front(page: Page, site: Path) -> str:
         page.open(path)
         assert page.run("document.querySelector('h1').textContent.length") > 3
         broken = page.run(
-            "[...document.querySelectorAll('a[href]')].map((a) => a.getAttribute('href')).filter((h) => /^https?:/.test(h))"
+            "[...document.querySelectorAll('a[href]')].map((a) => a.getAttribute('href')).filter((h) =>"
+            " /^https?:/.test(h))"
         )
         assert broken == [], path
     assert page.problems == []

@@ -143,7 +143,8 @@ def test_runs_workers_and_sweeps_are_acted_on_from_the_page(tmp_path: Path) -> N
                     act(run_page, "a.href.includes('/repin?class=')", reason="the first machine has died")
                     page.visit(f"{base}{run_page}")
                     page.until(
-                        "document.getElementById('events')?.innerText.includes('Worker w-first was lost with 1 job of this run')"
+                        "document.getElementById('events')?.innerText.includes('Worker w-first was lost with 1 job of"
+                        " this run')"
                     )
                     (folder / "go-3").touch()
                     wait_until(lambda: done(folder) == 4, lambda: sweep.text)
@@ -158,7 +159,8 @@ def test_runs_workers_and_sweeps_are_acted_on_from_the_page(tmp_path: Path) -> N
                     assert record["outcome"]["status"] == "cancelled"
                     assert "the first machine has died" in json.dumps(record)
                     reader.until(
-                        "[...document.querySelectorAll('#run-rows td')].some((cell) => cell.textContent === 'cancelled')"
+                        "[...document.querySelectorAll('#run-rows td')].some((cell) => cell.textContent ==="
+                        " 'cancelled')"
                     )
 
                     # A drained worker ends by itself.

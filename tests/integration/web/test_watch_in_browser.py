@@ -160,17 +160,20 @@ def test_a_sweep_is_watched_from_start_to_end(tmp_path: Path) -> None:
                             lambda: list((runs / "watched").glob("*/*/*/run.json")), lambda: sweep.text
                         )
                         page.until(
-                            "[...document.querySelectorAll('#run-rows tr')].some((row) => row.innerText.includes('hidden'))"
+                            "[...document.querySelectorAll('#run-rows tr')].some((row) =>"
+                            " row.innerText.includes('hidden'))"
                         )
                         for folder in workspaces():
                             (folder / "go").touch()
                         assert sweep.wait() == 0, sweep.err
                         page.until("document.querySelector('#facts b')?.textContent.startsWith('2 of 2')")
                         page.until(
-                            "![...document.querySelectorAll('#run-rows tr')].some((row) => row.innerText.includes('hidden'))"
+                            "![...document.querySelectorAll('#run-rows tr')].some((row) =>"
+                            " row.innerText.includes('hidden'))"
                         )
                         scores = page.run(
-                            "[...document.querySelectorAll('#run-rows td:nth-child(9)')].map((cell) => cell.textContent)"
+                            "[...document.querySelectorAll('#run-rows td:nth-child(9)')].map((cell) =>"
+                            " cell.textContent)"
                         )
                         assert all(float(score.replace("−", "-")) for score in scores), scores
                         page.visit(page.run("document.querySelector('#run-rows a').href"))

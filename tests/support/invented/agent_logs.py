@@ -52,7 +52,10 @@ def codex_log(versions: Sequence[Version]) -> list[dict[str, Any]]:
     lines: list[dict[str, Any]] = [{"type": "thread.started", "thread_id": "t"}]
     for index, version in enumerate(versions):
         if index:
-            command = f"cat feedback/submit_{index - 1:03d}/summary.json && head feedback/submit_{index - 1:03d}/episodes/ep_000/trajectory.jsonl"
+            command = (
+                f"cat feedback/submit_{index - 1:03d}/summary.json && head"
+                f" feedback/submit_{index - 1:03d}/episodes/ep_000/trajectory.jsonl"
+            )
             lines.append(_item({"type": "command_execution", "command": command, "aggregated_output": "{}"}))
         if version.says:
             lines.append(_item({"type": "agent_message", "text": version.says}))

@@ -51,7 +51,10 @@ def evolution(generator: random.Random, env: str, skill: float, n_submits: int, 
             integral, planner = (
                 (not integral, planner) if generator.random() < 0.5 else (integral, not planner)
             )
-            says = "The summary shows a steady error at the end of the episodes, so the controller needs another mechanism."
+            says = (
+                "The summary shows a steady error at the end of the episodes, so the controller needs another"
+                " mechanism."
+            )
         elif kind in ("parametric", "first"):
             gain, mix = round(generator.uniform(0.1, 3.0), 3), round(generator.uniform(0.5, 0.99), 3)
             bias = round(generator.gauss(0.0, 0.2), 3)

@@ -49,7 +49,10 @@ def refusal() -> str | None:
             hosts.wire(near, "10.92.0.5/30", far, "10.92.0.6/30")
     except (AssertionError, OSError, subprocess.CalledProcessError) as error:
         output = getattr(error, "stderr", None) or error
-        return f"needs network namespaces, which cannot be made here ({output}): run the tests as root, a container privileged"
+        return (
+            f"needs network namespaces, which cannot be made here ({output}): run the tests as root, a container"
+            " privileged"
+        )
     return None
 
 

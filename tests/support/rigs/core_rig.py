@@ -197,7 +197,7 @@ class Rig:
 
     def create(self, run: str = "r1", *, key: str | None = None, train: int = 64, n_valid: int = 2, n_held: int = 3,
                budget: int = 16, env: str = ENV, most: int = 16, least: int = 1, agent: str | None = "agents",
-               hidden_from: int = 1000, max_steps: int = 0, epoch: str = "e1", split_secret: bool = True, **settings: Any) -> Any:  # fmt: skip
+               hidden_from: int = 1000, max_steps: int = 0, epoch: str = "e1", split_secret: bool = True, **settings: Any) -> Any:  # fmt: skip  # noqa: E501
         """Create a run; its agent gets a permit on kernel `agent`, of its own unless told otherwise, None for none."""
         reply = self.tell(
             asked(

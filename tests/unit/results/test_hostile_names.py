@@ -24,8 +24,8 @@ from evopolicy_results.studies.study import study
 from evopolicy_results.tables.latex import to_latex
 from evopolicy_results.tables.table import Column, Table, to_csv, to_markdown
 
-PIECES = ["<script>alert(1)</script>", '"><img src=x onerror=alert(1)>', "\\input{/etc/passwd}", "$^_%&#~{", "\x1b[2J\x07\x0b",
-          "\u202egnp.exe\u2066", "\u2028", "\ufeff", "{{7*7}}", "=cmd|'/C calc'!A0", "| a [b](javascript:c) `d`", "\n\n# title"]  # fmt: skip
+PIECES = ["<script>alert(1)</script>", '"><img src=x onerror=alert(1)>', "\\input{/etc/passwd}", "$^_%&#~{", "\x1b[2J\x07\x0b",  # noqa: E501
+          "\u202egnp.exe\u2066", "\u2028", "\ufeff", "{{7*7}}", "=cmd|'/C calc'!A0", "| a [b](javascript:c) `d`", "\n\n# title"]  # fmt: skip  # noqa: E501
 hostile = st.one_of(st.text(), st.lists(st.sampled_from(PIECES), max_size=4).map("".join))
 _COMMAND = re.compile(r"\\\\[A-Za-z]+")
 

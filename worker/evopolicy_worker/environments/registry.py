@@ -191,7 +191,8 @@ def _entry(env_id: str) -> Entry:
     found = _known(env_id)
     if found is None:
         raise ConfigError(
-            f"environment {env_id!r} is not installed{catalogue.near(env_id)}; name its file, or install the package that ships it"
+            f"environment {env_id!r} is not installed{catalogue.near(env_id)}; name its file, or install the package"
+            " that ships it"
         )
     return found
 

@@ -46,8 +46,8 @@ def content(path: str) -> list[str]:
     found, whole = _content(path)
     if len(found) > _MOST and not whole:
         raise SandboxError(
-            f"{path} has {len(found):,} files and folders to show one by one, and {_MOST:,} are the limit: move hidden files,"
-            " keys, links and run directories out of it"
+            f"{path} has {len(found):,} files and folders to show one by one, and {_MOST:,} are the limit: move hidden"
+            " files, keys, links and run directories out of it"
         )
     return [path] if whole else found
 

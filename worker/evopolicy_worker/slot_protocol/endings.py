@@ -156,7 +156,10 @@ TABLE: tuple[Row, ...] = (
 BROKE_DOWN = PolicyFailure(
     category="killed",
     step_index=None,
-    message="the environment broke down on the policy's actions; the episode was played again from its first step with random actions",
+    message=(
+        "the environment broke down on the policy's actions; the episode was played again from its first step with"
+        " random actions"
+    ),
 )
 """The policy's failure when the environment's process ends on its actions."""
 

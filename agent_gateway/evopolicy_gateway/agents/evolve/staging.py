@@ -13,7 +13,7 @@ from evopolicy_gateway.agents.evolve.evolved.policy import CANDIDATES_FILE
 from evopolicy_gateway.agents.evolve.search import Candidate
 
 PACKAGE = "evolved"
-ENTRY_POINT = f'"""Plays the candidates listed in `{CANDIDATES_FILE}`."""\n\nfrom {PACKAGE}.policy import Policy as Policy\n'
+ENTRY_POINT = f'"""Plays the candidates listed in `{CANDIDATES_FILE}`."""\n\nfrom {PACKAGE}.policy import Policy as Policy\n'  # noqa: E501
 
 
 def stage_code(system: Path) -> None:

@@ -19,8 +19,8 @@ from evopolicy_gateway.agents.llm import shell
 Message = dict[str, Any]
 
 SYSTEM = (
-    "You are an autonomous engineer with a shell. Nobody answers questions: decide by yourself and keep working until the"
-    " task is done. Your turn ends when you answer without calling the tool."
+    "You are an autonomous engineer with a shell. Nobody answers questions: decide by yourself and keep working until"
+    " the task is done. Your turn ends when you answer without calling the tool."
 )
 _SKILLS = "\n\nThese files describe skills. Read one with the shell when its description fits what you do:"
 _MAX_HEADER = 2000

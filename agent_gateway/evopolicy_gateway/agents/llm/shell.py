@@ -10,8 +10,9 @@ from typing import Any, BinaryIO
 
 NAME = "bash"
 DESCRIPTION = (
-    "Runs a command with bash in the working directory and returns its exit status and output (stdout and stderr together)."
-    " Each call is a new shell: only files last. Long output is cut in the middle. Start nothing in the background."
+    "Runs a command with bash in the working directory and returns its exit status and output (stdout and stderr"
+    " together). Each call is a new shell: only files last. Long output is cut in the middle. Start nothing in the"
+    " background."
 )
 USUAL_S, MOST_S = 600.0, 7200.0
 """Time of a command unless the model sets one, and the most that it can set, seconds."""

@@ -170,7 +170,8 @@ class AcpAgent(CliAgent):
                 await self._choose(link, choice, value)
             elif not started_with_it:
                 raise AgentError(
-                    f"{name} = {value!r}: the agent offers no choice of it in a session; put the {name} into `program`, such"
+                    f"{name} = {value!r}: the agent offers no choice of it in a session; put the {name} into `program`,"
+                    " such"
                     f' as ["{self._program[0]}", "--{name}", "{value}"], or remove `{name}`'
                 )
 

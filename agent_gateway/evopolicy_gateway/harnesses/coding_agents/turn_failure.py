@@ -27,7 +27,8 @@ _MAX_SEARCHED = 20_000
 _FAULTY = re.compile(r"\d+ faulty calls in a row")
 _LOST = re.compile(r"no conversation found|no rollout found|session not found", re.IGNORECASE)
 _QUOTA = re.compile(
-    r"usage[ _]limit|insufficient_quota|exceeded your current quota|credit balance|billing|(hit|reached) your [\w ]*limit"
+    r"usage[ _]limit|insufficient_quota|exceeded your current quota|credit balance|billing|(hit|reached) your [\w"
+    r" ]*limit"
     r"|weekly limit|quota exceeded|out of credits",
     re.IGNORECASE,
 )
@@ -39,7 +40,8 @@ _FINAL = re.compile(
 )
 _STATUS = re.compile(r"(?:status:?|API Error:?|HTTP)\D{0,3}(\d{3})\b|\((\d{3})\)", re.IGNORECASE)
 _PROVIDER = re.compile(
-    r"overloaded|rate.?limit|time[d ]*.?out|stream (disconnected|error)|connect|ECONN|ENOTFOUND|reset by peer|unavailable"
+    r"overloaded|rate.?limit|time[d ]*.?out|stream (disconnected|error)|connect|ECONN|ENOTFOUND|reset by"
+    r" peer|unavailable"
     r"|high demand|server error|too many requests|at capacity|network|dns",
     re.IGNORECASE,
 )

@@ -224,7 +224,8 @@ class AgentConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
             raise ConfigError('models = "declared" needs `model`')
         if self.api is not None and not _is_reachable(self.api.url):
             raise ConfigError(
-                f"api.base_url = {self.api.url!r}: https://HOST… is needed, or http:// on this machine (localhost, 127.0.0.1)"
+                f"api.base_url = {self.api.url!r}: https://HOST… is needed, or http:// on this machine (localhost,"
+                " 127.0.0.1)"
             )
         for name in ("backoff_s", "silence_s", "pause_s"):
             if not 0.0 < getattr(self, name) < float("inf"):

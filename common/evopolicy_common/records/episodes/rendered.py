@@ -300,7 +300,8 @@ def checked_files(data: bytes, length: int, episode_return: float) -> dict[str, 
     total = functools.reduce(operator.add, rewards, 0.0)
     if (len(rewards), total) != (length, episode_return):
         raise ProtocolError(
-            f"{ROWS} has {len(rewards)} rows whose rewards come to {total!r}; {length} and {episode_return!r} were declared"
+            f"{ROWS} has {len(rewards)} rows whose rewards come to {total!r}; {length} and {episode_return!r} were"
+            " declared"
         )
     return files
 

@@ -228,7 +228,10 @@ def dispute(state: State, text: str, step: Step) -> None:
 def _name(state: State, name: str, row: AuditRow, step: Step) -> None:
     """Quarantine a worker, with its machine, whose report two others refute."""
     verb = "reported" if name == row.player else "played again"
-    text = f"forged results: what it {verb} as {row.group}, episode {row.index}, two other workers refute ({row.difference})"
+    text = (
+        f"forged results: what it {verb} as {row.group}, episode {row.index}, two other workers refute"
+        f" ({row.difference})"
+    )
     if name in state.quarantined:
         return
     workers = state.workers

@@ -63,8 +63,8 @@ def result(
     elif left := unspent(run):
         status = "error"
         error = (
-            f"the run ended ({stored.close_reason.replace('_', ' ')}) with {left} of its {row.budget} episodes left, and"
-            " must spend them (finish = budget)"
+            f"the run ended ({stored.close_reason.replace('_', ' ')}) with {left} of its {row.budget} episodes left,"
+            " and must spend them (finish = budget)"
         )
     elif not ok or (best is None and row.settings.failed_episodes == "end-submit"):
         status = "no_ok_submit"

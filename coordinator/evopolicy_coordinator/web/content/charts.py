@@ -64,16 +64,18 @@ def chart(
         )
     for tick in _ticks(x_low, x_high):
         out.append(
-            f'<text x="{x(tick):.1f}" y="{height - _BOTTOM + 14:.1f}" text-anchor="middle" class="ink">{_number(tick)}</text>'
+            f'<text x="{x(tick):.1f}" y="{height - _BOTTOM + 14:.1f}" text-anchor="middle"'
+            f' class="ink">{_number(tick)}</text>'
         )
     out.append(
-        f'<text x="{(_LEFT + _WIDTH - _RIGHT) / 2}" y="{height - 3:.1f}" text-anchor="middle" class="dim">{escape(x_title)}</text>'
+        f'<text x="{(_LEFT + _WIDTH - _RIGHT) / 2}" y="{height - 3:.1f}" text-anchor="middle"'
+        f' class="dim">{escape(x_title)}</text>'
     )
     if reference is not None:
         name, level = reference
         out.append(
-            f'<path d="M{_LEFT} {y(level):.1f}H{_WIDTH - _RIGHT}" fill="none" stroke="{REFERENCE}" stroke-dasharray="5 3">'
-            f"<title>{escape(name)}: {level:.4g}</title></path>"
+            f'<path d="M{_LEFT} {y(level):.1f}H{_WIDTH - _RIGHT}" fill="none" stroke="{REFERENCE}" stroke-dasharray="5'
+            f' 3"><title>{escape(name)}: {level:.4g}</title></path>'
         )
     for place, line in enumerate(lines):
         colour, dash = COLOURS[place % len(COLOURS)], _DASHES[place // len(COLOURS) % len(_DASHES)]
@@ -85,8 +87,8 @@ def chart(
         )
         if line.dots:
             out += [
-                f'<circle cx="{x(px):.1f}" cy="{y(py):.1f}" r="3.2" fill="{colour}"><title>{escape(line.name)} at {px:g}: {py:.4g}'
-                "</title></circle>"
+                f'<circle cx="{x(px):.1f}" cy="{y(py):.1f}" r="3.2" fill="{colour}"><title>{escape(line.name)} at'
+                f" {px:g}: {py:.4g}</title></circle>"
                 for px, py in line.points
                 if math.isfinite(py)
             ]
@@ -98,13 +100,13 @@ def chart(
 
 def _legend(lines: Sequence[Line], reference: tuple[str, float] | None) -> str:
     items = [
-        f'<li><svg class="mark" viewBox="0 0 16 16" aria-hidden="true"><path d="M1 8h14" stroke-width="3" '
+        '<li><svg class="mark" viewBox="0 0 16 16" aria-hidden="true"><path d="M1 8h14" stroke-width="3" '
         f'stroke="{COLOURS[place % len(COLOURS)]}"/></svg>{escape(line.name)}</li>'
         for place, line in enumerate(lines)
     ]
     if reference is not None:
         items.append(
-            f'<li><svg class="mark" viewBox="0 0 16 16" aria-hidden="true"><path d="M1 8h14" stroke-width="3" '
+            '<li><svg class="mark" viewBox="0 0 16 16" aria-hidden="true"><path d="M1 8h14" stroke-width="3" '
             f'stroke="{REFERENCE}" stroke-dasharray="4 2"/></svg>{escape(reference[0])}</li>'
         )
     return f'<ul class="legend">{"".join(items)}</ul>'

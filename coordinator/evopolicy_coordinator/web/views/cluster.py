@@ -47,11 +47,11 @@ def cluster_view(cluster: Cluster, words: Words, runs: Runs, roots: Sequence[Pat
         "notices": part("notices", notices=_cluster_notices(cluster, status)),
         "history": part(
             "figure", ident="history", svg=Markup(_history(cluster)), title="The last day",
-            caption="Episodes per second, and jobs that run and wait; a point a minute.", empty="The history begins now: a point a minute.",
+            caption="Episodes per second, and jobs that run and wait; a point a minute.", empty="The history begins now: a point a minute.",  # noqa: E501
         ),
         "queue": part("queue", rows=status.queue[:PAGE_ROWS], left_out=len(status.queue[PAGE_ROWS:])),
         "disks": part("disks", disks=_disks(status.disk, roots)),
-        "classes": part("classes", classes=sorted({worker.fingerprint: worker.versions for worker in status.workers}.items())),
+        "classes": part("classes", classes=sorted({worker.fingerprint: worker.versions for worker in status.workers}.items())),  # noqa: E501
     }  # fmt: skip
     lists: dict[str, list[str]] = {"worker-rows": [], "open-rows": []}
     by_run = {run.run: run for run in runs.by_key.values() if run.run}

@@ -124,7 +124,7 @@ def test_a_page_reads_no_file_of_the_machine(browser: Page, tmp_path: Path) -> N
         }};
         document.body.append(frame);
       }}
-    """
+    """  # noqa: E501
     browser.open(address(inside, script), "1")
     time.sleep(1.0)
     assert not [text for text in browser.run("window.got") if "secret" in text]
@@ -275,7 +275,7 @@ def test_keys_of_a_browser_s_own_do_nothing(browser: Page, tmp_path: Path) -> No
     browser.run("__evopolicy.clock.guarded = true")
     where = browser.run("location.href")
     for name in ("Control+t", "Control+n", "Control+Shift+n", "Control+o", "Control+s", "Control+p", "Control+u",
-                 "Control+w", "Control+r", "Control+l", "Control+Shift+i", "Alt+ArrowLeft", "F5", "F11", "F12"):  # fmt: skip
+                 "Control+w", "Control+r", "Control+l", "Control+Shift+i", "Alt+ArrowLeft", "F5", "F11", "F12"):  # fmt: skip  # noqa: E501
         found = combined(name)
         assert found is not None
         browser.press(*found)

@@ -28,7 +28,7 @@ SOLVER = """
         def act(self, obs):
             button = next(each for each in obs["dom_elements"] if each["tag"] == "button")
             return {"action_type": 8, "coords": np.zeros(2, np.float32), "ref": button["ref"], "key": 0, "text": "", "field": 0}
-"""
+"""  # noqa: E501
 
 
 @pytest.fixture

@@ -172,7 +172,7 @@ def test_a_page_times_out_within_the_limit_of_its_id(warm: Warm) -> None:
     [
         ("miniwob/click-test-v1", "...Array.from({length: 9000}, () => document.createElement('p'))", "too many"),
         ("miniwob/click-test-v1", "'word '.repeat(9000), document.createElement('br')", "cannot be listed"),
-        ("browsergym/miniwob.click-test", "...Array.from({length: 9000}, () => document.createElement('p'))", "too many"),
+        ("browsergym/miniwob.click-test", "...Array.from({length: 9000}, () => document.createElement('p'))", "too many"),  # noqa: E501
     ],
 )  # fmt: skip
 def test_an_episode_ends_when_its_page_has_grown_too_large(

@@ -11,11 +11,11 @@ from stages.model_api import CACHED, INPUT, OUTPUT, ModelApi, Step
 
 pytestmark = pytest.mark.system
 
-SUBMIT = (
-    "echo '# better' >> system/policy.py; curl -s -X POST"
-    " -d '{\"env_instances\": [0, 1]}' $EVOPOLICYGYM_SUBMIT_URL"
+SUBMIT = "echo '# better' >> system/policy.py; curl -s -X POST -d '{\"env_instances\": [0, 1]}' $EVOPOLICYGYM_SUBMIT_URL"  # noqa: E501
+PROBE = (
+    "cat /proc/[0-9]*/environ /proc/[0-9]*/cmdline | tr '\\0' '\\n'; cat /proc/$PPID/mem; curl -sS -m 5"
+    " https://example.org; curl -sS -m 5 $SIDE; python3 -c 'import gymnasium'; true"
 )
-PROBE = "cat /proc/[0-9]*/environ /proc/[0-9]*/cmdline | tr '\\0' '\\n'; cat /proc/$PPID/mem; curl -sS -m 5 https://example.org; curl -sS -m 5 $SIDE; python3 -c 'import gymnasium'; true"
 KEY = "key-of-the-test-0123456789"
 
 
@@ -33,8 +33,7 @@ def test_a_model_with_a_shell_plays_a_whole_run_in_its_jail(
     ]
     with ModelApi(script) as api, ModelApi([]) as side:
         base = f"{api.base_url}/v1" if protocol == "openai" else api.base_url
-        (tmp_path / "agent.toml").write_text(
-            f"""
+        (tmp_path / "agent.toml").write_text(f"""
 harness = "llm"
 model = "m-1"
 prices = {{ input = 1.0, output = 10.0 }}
@@ -43,8 +42,7 @@ environment = {{ SIDE = "{side.base_url}" }}
 protocol = "{protocol}"
 base_url = "{base}"
 key = "MODEL_ACCESS"
-"""
-        )
+""")
         arguments = ("--env", "toy/line", "--agent", "file:agent.toml", "--exp-id", "t", "--budget", "4")
         small = ("--validation", "1", "--heldout", "1", "--slots", "1")
         with command(tmp_path, "local", *arguments, *small) as running:

@@ -288,7 +288,10 @@ def test_a_real_agent_behind_the_protocol_plays_a_jailed_run(
     assert policy.read_text().count("# better") == 2
 
 
-LOOK = "echo '# better' >> system/policy.py; ls -d ~/.*/skills/lamps/SKILL.md; echo x >> $(ls -d ~/.*/skills/lamps/SKILL.md) || echo shut"
+LOOK = (
+    "echo '# better' >> system/policy.py; ls -d ~/.*/skills/lamps/SKILL.md; echo x >> $(ls -d"
+    " ~/.*/skills/lamps/SKILL.md) || echo shut"
+)
 
 
 @pytest.mark.parametrize(

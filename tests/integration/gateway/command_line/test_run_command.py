@@ -111,7 +111,7 @@ policy.write_text(good.replace("return self.action", "return {'no': [object]}"))
 policy.write_text(good.replace("return self.action", "while True: pass")); case("never returns")
 policy.write_text(good.replace("return self.action", "raise RuntimeError('at once')")); case("act raises")
 Path("log.json").write_text(json.dumps(log))
-"""
+"""  # noqa: E501
 
 
 def test_bad_input_gets_its_verdict_and_a_message_that_helps(operator_file: Path, tmp_path: Path) -> None:
@@ -174,7 +174,7 @@ def test_without_an_ok_submit_the_exit_code_says_so(operator_file: Path, tmp_pat
 def test_replay_submits_the_given_policies_in_order_with_even_shares(
     operator_file: Path, tmp_path: Path
 ) -> None:
-    policy = "class Policy:\n  def __init__(self, *a): pass\n  def reset(self, i): pass\n  def act(self, obs): return [{}]\n"
+    policy = "class Policy:\n  def __init__(self, *a): pass\n  def reset(self, i): pass\n  def act(self, obs): return [{}]\n"  # noqa: E501
     for name, push in (("b", 0.5), ("a", -0.5)):
         (tmp_path / "given" / name / "system").mkdir(parents=True)
         (tmp_path / "given" / name / "system" / "policy.py").write_text(policy.format(push))

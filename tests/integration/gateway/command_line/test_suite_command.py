@@ -196,9 +196,9 @@ def two_hosts(root: Path, agent: Path, flag: Path, *, budget: int) -> list[Path]
     for host in hosts:
         host.mkdir()
         (host / "t.toml").write_text(
-            f'name = "t"\nenvironments = ["toy/line"]\n[defaults]\nbudget = {budget}\nvalidation = 1\nheldout = 1\n'
-            f'[parallel]\nclaim_ttl_s = 3.0\n[[agents]]\nname = "own"\nagent = "command:{sys.executable} {agent} {flag}"\n'
-            f'[agents.jail]\nread = ["{flag.parent}"]\n'
+            f'name = "t"\nenvironments = ["toy/line"]\n[defaults]\nbudget = {budget}\nvalidation = 1\nheldout ='
+            f' 1\n[parallel]\nclaim_ttl_s = 3.0\n[[agents]]\nname = "own"\nagent = "command:{sys.executable} {agent}'
+            f' {flag}"\n[agents.jail]\nread = ["{flag.parent}"]\n'
         )
     return hosts
 

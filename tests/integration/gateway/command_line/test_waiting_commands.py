@@ -17,7 +17,7 @@ from evopolicy_common.wire.credentials import Credentials
 
 pytestmark = pytest.mark.system
 
-POLICY = "class Policy:\n  def __init__(self, *a): pass\n  def reset(self, i): pass\n  def act(self, obs): return [0.0]\n"
+POLICY = "class Policy:\n  def __init__(self, *a): pass\n  def reset(self, i): pass\n  def act(self, obs): return [0.0]\n"  # noqa: E501
 WORKER_IS_PAUSED = (
     "waiting for a worker that offers toy/line with sandbox tier bwrap: those that do are paused"
 )

@@ -17,7 +17,7 @@ from evopolicy_common.local import cluster as local_cluster
 from evopolicy_common.processes.child_process import ChildProcess
 
 SOON_S = 0.2
-STUBBORN = "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print('up', flush=True); time.sleep(1000)"
+STUBBORN = "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print('up', flush=True); time.sleep(1000)"  # noqa: E501
 SERVES = """
 import json, os, sys, time
 target = sys.argv[sys.argv.index("--ready-file") + 1]

@@ -19,7 +19,7 @@ from evopolicy_common.processes.parent_death import ending_with_parent
 child = subprocess.Popen(ending_with_parent([sys.executable, "-c", "print('up', flush=True); import time; time.sleep(1000)"]))
 print(child.pid, flush=True)
 time.sleep(1000)
-"""
+"""  # noqa: E501
     process = subprocess.Popen([sys.executable, "-c", parent], stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
     lines = sorted(process.stdout.readline().strip() for _ in range(2))

@@ -94,12 +94,11 @@ def test_a_few_hostile_bytes_take_no_memory(name: str, tmp_path: Path) -> None:
     assert len(data) < 200_000
     (tmp_path / "hostile").write_bytes(data)
     program = (
-        "import resource, sys; from evopolicy_common import errors; from evopolicy_common.records.episodes import trajectory\n"
-        "data = open(sys.argv[1], 'rb').read(); trajectory.decode(trajectory.Recorder().finish())\n"
-        "before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss\n"
-        "try: trajectory.decode(data)\n"
-        "except errors.ProtocolError as error: print(type(error.__cause__).__name__, str(error)[:200])\n"
-        "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)"
+        "import resource, sys; from evopolicy_common import errors; from evopolicy_common.records.episodes import"
+        " trajectory\ndata = open(sys.argv[1], 'rb').read(); trajectory.decode(trajectory.Recorder().finish())\nbefore"
+        " = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss\ntry: trajectory.decode(data)\nexcept"
+        " errors.ProtocolError as error: print(type(error.__cause__).__name__,"
+        " str(error)[:200])\nprint(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)"
     )
     limit = (3 << 30, 3 << 30)
     ran = subprocess.run(

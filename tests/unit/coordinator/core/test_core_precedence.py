@@ -88,7 +88,7 @@ def test_before_that_new_agents_stop_hidden_cases() -> None:
         assert held
         assert not rig.permit(run, HERE).granted
         for lease in held:
-            rig.report_results(session, wire.JobResult(lease_id=lease.id, job_id=lease.job.job_id, attempt=lease.attempt, kind="returned"))  # fmt: skip
+            rig.report_results(session, wire.JobResult(lease_id=lease.id, job_id=lease.job.job_id, attempt=lease.attempt, kind="returned"))  # fmt: skip  # noqa: E501
         assert rig.permit(run, HERE).granted
         rig.close(run)
         rig.poll(session, 8)

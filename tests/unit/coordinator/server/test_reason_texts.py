@@ -62,9 +62,10 @@ def test_a_reason_about_another_is_put_into_one_sentence() -> None:
         lacking=(),
         failed=(),
     )
-    assert words(because("no_worker_yet", waits_for=missing)) == (
-        "the run waits for a worker that offers gym/x with sandbox tier bwrap, of the versions that the run started with:"
-        " those that do are lost or out of service"
+    assert (
+        words(because("no_worker_yet", waits_for=missing))
+        == "the run waits for a worker that offers gym/x with sandbox tier bwrap, of the versions that the run started"
+        " with: those that do are lost or out of service"
     )
 
 
@@ -73,8 +74,9 @@ def test_an_installation_is_advised_only_where_a_worker_is_connected() -> None:
     missing = {"env": "gym/acrobot", "tier": "bwrap", "same_versions": False, "away": ()}
     missing |= {"lacking": (), "failed": ()}
     assert "setup gymnasium" in words(because("workers", connected=True, **missing))
-    assert words(because("workers", connected=False, **missing)) == (
-        "a worker that offers gym/acrobot with sandbox tier bwrap; no worker is connected yet"
+    assert (
+        words(because("workers", connected=False, **missing))
+        == "a worker that offers gym/acrobot with sandbox tier bwrap; no worker is connected yet"
     )
 
 
@@ -82,9 +84,10 @@ def test_a_tier_that_does_not_work_is_told_with_its_workers() -> None:
     lacking = (("lab-1", "bwrap: No permissions to create a new namespace"), ("lab-2", "no bwrap on PATH"))
     about = {"env": "gym/acrobot", "tier": "bwrap", "same_versions": False, "away": (), "connected": True}
     about["failed"] = ()
-    assert words(because("workers", lacking=lacking, **about)) == (
-        "a worker that offers gym/acrobot with sandbox tier bwrap (the tier does not work on lab-1: bwrap: No permissions to"
-        " create a new namespace; lab-2: no bwrap on PATH)"
+    assert (
+        words(because("workers", lacking=lacking, **about))
+        == "a worker that offers gym/acrobot with sandbox tier bwrap (the tier does not work on lab-1: bwrap: No"
+        " permissions to create a new namespace; lab-2: no bwrap on PATH)"
     )
 
 

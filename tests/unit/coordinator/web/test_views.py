@@ -30,7 +30,7 @@ def key(folder: Path) -> str:
 
 def worker(name: str, **more: object) -> WorkerStatus:
     fields: dict[str, object] = {
-        "worker": name, "host": "lab", "slots": 2, "state": "active", "tiers": ("bwrap",), "environments": ("gym/acrobot",),
+        "worker": name, "host": "lab", "slots": 2, "state": "active", "tiers": ("bwrap",), "environments": ("gym/acrobot",),  # noqa: E501
         "fingerprint": "f" * 12, "versions": {"python": "3.11"}, "held": 0, "running": 0, "last_seen_s": 1.0,
     }  # fmt: skip
     return WorkerStatus(**{**fields, **more})  # type: ignore[arg-type]

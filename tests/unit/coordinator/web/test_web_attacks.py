@@ -309,7 +309,7 @@ def test_an_act_is_confirmed_first_and_written_down(tmp_path: Path) -> None:
 def test_what_agents_wrote_is_text_on_every_page(tmp_path: Path) -> None:
     texts = [
         {"type": "prompt", "message": MARKUP},
-        {"type": "assistant", "message": {"content": [{"type": "text", "text": MARKUP}, {"type": "tool_use", "name": MARKUP, "input": {MARKUP: MARKUP}}]}},
+        {"type": "assistant", "message": {"content": [{"type": "text", "text": MARKUP}, {"type": "tool_use", "name": MARKUP, "input": {MARKUP: MARKUP}}]}},  # noqa: E501
         {"type": "stderr", "text": MARKUP},
     ]  # fmt: skip
     folder = open_run(
@@ -325,8 +325,8 @@ def test_what_agents_wrote_is_text_on_every_page(tmp_path: Path) -> None:
     (episode / "stdout.txt").write_text(MARKUP)
     (episode / "error.txt").write_text(MARKUP)
     worker = WorkerStatus(
-        worker=MARKUP, host=MARKUP, slots=1, state="active", tiers=("bwrap",), environments=(MARKUP,), fingerprint=MARKUP,
-        versions={MARKUP: MARKUP}, held=0, running=0, last_seen_s=0.0, refused={MARKUP: MARKUP}, hidden_bar=MARKUP, missing_tiers={MARKUP: MARKUP}, playing={MARKUP: 1},
+        worker=MARKUP, host=MARKUP, slots=1, state="active", tiers=("bwrap",), environments=(MARKUP,), fingerprint=MARKUP,  # noqa: E501
+        versions={MARKUP: MARKUP}, held=0, running=0, last_seen_s=0.0, refused={MARKUP: MARKUP}, hidden_bar=MARKUP, missing_tiers={MARKUP: MARKUP}, playing={MARKUP: 1},  # noqa: E501
     )  # fmt: skip
     reply = status(
         open_status("r-open", entry=MARKUP, waits_for=MARKUP, exp_id=MARKUP),

@@ -86,7 +86,9 @@ def test_no_key_of_a_copied_login_stays_in_the_agents_log(home: Path, tmp_path: 
     """Tokens that have the form of no known provider's."""
     files = {
         ".codex/auth.json": '{"auth_mode": "chatgpt", "tokens": {"refresh_token": "rt_0123456789abcdef"}}',
-        ".codex/config.toml": '[mcp_servers.x.env]\nX_TOKEN = "toml-0123456789abcdef"\n[tui]\ntheme = "a-very-long-theme-name"',
+        ".codex/config.toml": (
+            '[mcp_servers.x.env]\nX_TOKEN = "toml-0123456789abcdef"\n[tui]\ntheme = "a-very-long-theme-name"'
+        ),
         ".gemini/.env": "export MY_KEY='env-0123456789abcdef'\nregion=europe-west-and-more\n",
         ".local/share/opencode/auth.json": '{"anthropic": {"type": "oauth", "refresh": "oc-0123456789abcdef"}}',
         ".claude/settings.json": "no JSON",

@@ -35,7 +35,7 @@ from evopolicy_gateway.run import lifecycle
 from evopolicy_gateway.run.lifecycle import RunLifecycle
 
 SOON_S = 0.2
-STUBBORN = "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print('up', flush=True); time.sleep(1000)"
+STUBBORN = "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print('up', flush=True); time.sleep(1000)"  # noqa: E501
 
 
 @contextlib.contextmanager

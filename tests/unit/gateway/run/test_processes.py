@@ -36,7 +36,7 @@ try:
     os.waitpid(-1, os.WNOHANG)
 except ChildProcessError:
     print("nothing left")
-"""
+"""  # noqa: E501
 
 
 def test_nothing_below_survives_however_it_hides(tmp_path: Path) -> None:

@@ -283,7 +283,7 @@ returns = st.lists(
 def test_any_numbers_give_finite_intervals_or_a_reason(every: list[list[list[float]]]) -> None:
     names = [f"entry-{i}" for i in range(len(every))]
     samples = {
-        (name, "env"): entry(name, *(run(*(min(1e100, max(-1e100, v)) if math.isfinite(v) else v for v in one)) for one in runs))
+        (name, "env"): entry(name, *(run(*(min(1e100, max(-1e100, v)) if math.isfinite(v) else v for v in one)) for one in runs))  # noqa: E501
         for name, runs in zip(names, every, strict=True)
     }  # fmt: skip
     with warnings.catch_warnings():

@@ -95,7 +95,10 @@ def test_a_definition_sets_arguments_wrappers_limit_text_and_success() -> None:
         (Wrapper(wrapper="TransformReward"), "kwargs {}: it cannot be put around the environment: TypeError"),
         (
             Wrapper(wrapper="broken_on_import:Thing"),
-            "wrapper 'broken_on_import:Thing': its module 'broken_on_import' raised RuntimeError: half a build on import",
+            (
+                "wrapper 'broken_on_import:Thing': its module 'broken_on_import' raised RuntimeError: half a build on"
+                " import"
+            ),
         ),
         (
             Wrapper(wrapper="acme_envs:Grumbles"),
@@ -161,7 +164,10 @@ def test_an_environment_that_breaks_its_word_is_refused_when_it_is_described(how
         ),
         (
             {"gymnasium_id": "broken_on_import:Thing-v0"},
-            r"make: gymnasium.make\('broken_on_import:Thing-v0'\) raised RuntimeError: half a build; correct its gymnasium_id, or",
+            (
+                r"make: gymnasium.make\('broken_on_import:Thing-v0'\) raised RuntimeError: half a build; correct its"
+                r" gymnasium_id, or"
+            ),
         ),
     ],
 )

@@ -169,8 +169,12 @@ def test_an_environment_that_breaks_its_description_is_refused(
 
 WRONG = {
     "nan": "environment acme/Bad, step 0, reward: it is nan; rewards have to be finite",
-    "shape": r"environment acme/Bad, step 0, observation: an array of shape \(3,\), not \(2,\); correct the environment",
-    "raise in reset": "environment acme/Bad, reset: it raised RuntimeError: no level of that seed; correct the environment",
+    "shape": (
+        r"environment acme/Bad, step 0, observation: an array of shape \(3,\), not \(2,\); correct the environment"
+    ),
+    "raise in reset": (
+        "environment acme/Bad, reset: it raised RuntimeError: no level of that seed; correct the environment"
+    ),
     "change spaces": "environment acme/Bad, reset, observation_space: it has changed; a space has to stay",
     "error": "environment acme/Bad, step 0: it raised FileNotFoundError: levels.dat; correct the environment",
     "exit": "environment acme/Bad: its process ended while it played; the slot's process ended with status 3",
@@ -179,7 +183,9 @@ WRONG = {
     "huge": "environment acme/Bad, reward: its sum over 8 steps is [78].*e.200; rewards, .* have to be finite",
     "component": "environment acme/Bad, fuel: its sum over 8 steps is nan; rewards, their components, .* finite",
     "close files": "environment acme/Bad",
-    "object reward": r"environment acme/Bad, step 0, reward: it is <object .* \(object\); a reward has to be one number",
+    "object reward": (
+        r"environment acme/Bad, step 0, reward: it is <object .* \(object\); a reward has to be one number"
+    ),
     "hang": "environment acme/Bad, step 0: it has not returned for 4 s, the limit of one call; .*--env-timeout",
     "hang in reset": "environment acme/Bad, reset: it has not returned for 4 s",
     "hang in make": "environment acme/Bad, make: it has not returned for 4 s",
@@ -310,9 +316,10 @@ def test_memory_is_looked_at_from_outside_the_call(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(calls, "resident_bytes", lambda: 65 << 20)
     monkeypatch.setattr(calls, "current", Call())
     calls.current.begin("my/env", "reset")
-    assert guard.look(1000.0) == (
-        "environment my/env, reset: its process has 65 MiB of memory, and 64 MiB are the limit; mend what it keeps from episode"
-        " to episode, or raise the worker's --env-memory"
+    assert (
+        guard.look(1000.0)
+        == "environment my/env, reset: its process has 65 MiB of memory, and 64 MiB are the limit; mend what it keeps"
+        " from episode to episode, or raise the worker's --env-memory"
     )
 
 

@@ -235,7 +235,7 @@ class Policy:
         os.write(4, struct.pack("<IBxxx", length, tag) + payload)
         if dice.random() < 0.3:
             os._exit(dice.randrange(256))
-"""
+"""  # noqa: E501
 
 
 @pytest.mark.parametrize("scope", ["episode", "submit"])

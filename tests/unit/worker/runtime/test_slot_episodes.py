@@ -286,7 +286,8 @@ def test_with_scope_submit_a_raising_policy_stays_and_a_dead_is_rebuilt(slots: S
 
 def test_modules_and_data_of_the_bundle_are_there_and_writable(slots: Slots) -> None:
     files: dict[str, str | bytes] = {
-        "policy.py": """
+        "policy.py": (
+            """
             from pathlib import Path
             from helpers.gains import GAIN
             import player
@@ -299,7 +300,8 @@ def test_modules_and_data_of_the_bundle_are_there_and_writable(slots: Slots) -> 
                     print(GAIN, player.NAME, Path("data/weights.bin").read_bytes(), Path("/tmp/note").read_text())
                 def reset(self, episode_index): pass
                 def act(self, obs): return [0.0]
-        """,
+        """
+        ),
         "helpers/__init__.py": "",
         "helpers/gains.py": "GAIN = 3",
         "player.py": "NAME = 'a module of mine'",
@@ -413,7 +415,7 @@ def test_a_policy_computes_on_one_thread_in_a_fixed_locale(slots: Slots) -> None
                 print(ctypes.CDLL(None).fegetround(), 5e-324 * float("1") > 0)
             def reset(self, episode_index): pass
             def act(self, obs): return [0.0]
-    """
+    """  # noqa: E501
     outputs = {slots.play(policy, slot=slots.slot()).stdout.decode() for _ in range(2)}
     other = slots.new()
     with pytest.MonkeyPatch.context() as patch:

@@ -109,10 +109,12 @@ _FLAGS = (
     "--media-cache-size=1",
     "--enable-blink-features=ComputedAccessibilityInfo",
     # DeferRendererTasksAfterInput: after a click or a key, scripts would wait for the next of 60 frames a second.
-    "--disable-features=AutofillServerCommunication,BackForwardCache,CertificateTransparencyComponentUpdater,"
-    "DeferRendererTasksAfterInput,DialMediaRouteProvider,GlobalMediaControls,HttpsUpgrades,InterestFeedContentSuggestions,"
-    "IsolateOrigins,MediaRouter,OptimizationHints,OverlayScrollbar,PaintHolding,Prerender2,RenderDocument,"
-    "SpareRendererForSitePerProcess,Translate,site-per-process",
+    (
+        "--disable-features=AutofillServerCommunication,BackForwardCache,CertificateTransparencyComponentUpdater,"
+        "DeferRendererTasksAfterInput,DialMediaRouteProvider,GlobalMediaControls,HttpsUpgrades,InterestFeedContentSuggestions,"
+        "IsolateOrigins,MediaRouter,OptimizationHints,OverlayScrollbar,PaintHolding,Prerender2,RenderDocument,"
+        "SpareRendererForSitePerProcess,Translate,site-per-process"
+    ),
     "--enable-features=NetworkServiceInProcess2",
     f"--js-flags=--max-old-space-size={MAX_JS_MB} --random-seed=1 --hash-seed=1",
 )
@@ -172,7 +174,8 @@ class Chromium:
             self.close()
             why = error if isinstance(error, WorkerError) else "it does not tell its version"
             raise WorkerError(
-                f"{path} does not start as a browser: {why}; its stderr: {' | '.join(stderr)[:500] or 'empty'}; {REMEDY}"
+                f"{path} does not start as a browser: {why}; its stderr: {' | '.join(stderr)[:500] or 'empty'};"
+                f" {REMEDY}"
             ) from error
 
     def _spawn(self, path: str, theirs_in: int, theirs_out: int, folder: int) -> int:

@@ -27,8 +27,8 @@ _ROLES = {
 }
 """Calls that only elements of these roles take."""
 _TEXTS = ("a", "7", "hello", "12/24/2020", "12:30PM", "two words\nand a line", "é中😀")
-_KEYS = ("Enter", "Tab", "Shift+Tab", "Escape", "Backspace", "Delete", "Space", "a", "B", "7", "Home", "Shift+End", "PageDown",
-         "ArrowUp", "ArrowDown", "ArrowLeft", "Shift+ArrowRight", "Control+a", "Control+c", "Control+v", "Control+x")  # fmt: skip
+_KEYS = ("Enter", "Tab", "Shift+Tab", "Escape", "Backspace", "Delete", "Space", "a", "B", "7", "Home", "Shift+End", "PageDown",  # noqa: E501
+         "ArrowUp", "ArrowDown", "ArrowLeft", "Shift+ArrowRight", "Control+a", "Control+c", "Control+v", "Control+x")  # fmt: skip  # noqa: E501
 _MODIFIERS: Sequence[list[str]] = ([], [], [], ["Shift"], ["Control"])
 _TURNS = (0, 50, -50, 300)
 _ENDS = {"x": 0, "y": 1}

@@ -53,7 +53,7 @@ _MEASURE = r"""
     }
   return found;
 })()
-"""
+"""  # noqa: E501
 
 Button = Literal["left", "middle", "right"]
 

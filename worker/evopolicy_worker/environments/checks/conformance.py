@@ -313,8 +313,8 @@ class _Limit:
             return f"it hangs: it has used no processor time for {TIMEOUT_S:g} s"
         if now - self._began > LONGEST_S:
             return (
-                f"it was not done within {LONGEST_S:g} s, of which it computed for {used:.0f} s: it waits, or the machine is too"
-                " busy; correct the environment, or play it on an idle machine"
+                f"it was not done within {LONGEST_S:g} s, of which it computed for {used:.0f} s: it waits, or the"
+                " machine is too busy; correct the environment, or play it on an idle machine"
             )
         return ""
 

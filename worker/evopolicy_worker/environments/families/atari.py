@@ -16,10 +16,13 @@ if TYPE_CHECKING:
     import gymnasium
 
 _OBSERVATION = (
-    "The screen: a picture with its rows from the top and its columns from the left, red, green and blue. Score and lives can be"
-    " seen in it where the game shows them."
+    "The screen: a picture with its rows from the top and its columns from the left, red, green and blue. Score and"
+    " lives can be seen in it where the game shows them."
 )
-_REWARD = "What the game's score has gained or lost in the step. `info['lives']` tells the lives that are left, 0 where a game has none."
+_REWARD = (
+    "What the game's score has gained or lost in the step. `info['lives']` tells the lives that are left, 0 where a"
+    " game has none."
+)
 _PARTS = {"UP": "up", "DOWN": "down", "LEFT": "left", "RIGHT": "right", "FIRE": "fire button"}
 
 
@@ -61,10 +64,15 @@ class AtariFamily(GymnasiumFamily):
         return {
             "": _games()[settings["game"]],
             "Observation": _OBSERVATION,
-            "Action": f"What is done with the joystick. {duration}\n\n| choice | joystick |\n|---|---|\n"
-            + "\n".join(choices),
+            "Action": (
+                f"What is done with the joystick. {duration}\n\n| choice | joystick |\n|---|---|\n"
+                + "\n".join(choices)
+            ),
             "Reward": _REWARD,
-            "Start": "The game's beginning, the same in every episode. Where something is at random, the episode's seed decides it.",
+            "Start": (
+                "The game's beginning, the same in every episode. Where something is at random, the episode's seed"
+                " decides it."
+            ),
             "End": "An episode ends when the game is over.",
         }
 

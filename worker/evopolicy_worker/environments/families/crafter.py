@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 _SIDE_FOR_PEOPLE = 360
 """Height and width of a frame for people, pixels."""
 _ABOUT = (
-    "A survival game in a world of squares, seen from above. Collect materials, make tools, eat, drink, sleep, and fend off"
-    " zombies and skeletons. There are 22 achievements; each pays once an episode."
+    "A survival game in a world of squares, seen from above. Collect materials, make tools, eat, drink, sleep, and fend"
+    " off zombies and skeletons. There are 22 achievements; each pays once an episode."
 )
 _WHAT = {
     "noop": "nothing",
@@ -71,11 +71,16 @@ class CrafterFamily(GymnasiumFamily):
                     *_needs(constants),
                 ]
             ),
-            "Reward": f"1 at a step that unlocks achievements, each for the first time; a tenth for each point of health that is won,"
-            f" and the same less for each that is lost. `info['unlocked']` names what the step unlocked, `info['achievements']` how many have"
-            f" been unlocked so far, `info['inventory']` what is carried. The achievements: {achievements}.",
-            "Start": "The seed of the episode decides the world. The player starts in its middle, on grass, with full health, food, drink and"
-            " energy.",
+            "Reward": (
+                "1 at a step that unlocks achievements, each for the first time; a tenth for each point of health that"
+                " is won, and the same less for each that is lost. `info['unlocked']` names what the step unlocked,"
+                " `info['achievements']` how many have been unlocked so far, `info['inventory']` what is carried. The"
+                f" achievements: {achievements}."
+            ),
+            "Start": (
+                "The seed of the episode decides the world. The player starts in its middle, on grass, with full"
+                " health, food, drink and energy."
+            ),
             "End": "An episode ends with the player's death: health is used up, or the player walks into lava.",
         }
 

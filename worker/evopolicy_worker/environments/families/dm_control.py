@@ -27,7 +27,7 @@ _SYSTEM_SEED = 0
 """Draws what a task's model has at random (the springs of `lqr`): the same in every episode."""
 _UNLIMITED = 1e10
 """The suite's value for an action without a limit."""
-_UNITS = "Lengths are in metres, angles in radians, velocities by the second; x points forwards or to the right, z upwards."
+_UNITS = "Lengths are in metres, angles in radians, velocities by the second; x points forwards or to the right, z upwards."  # noqa: E501
 
 
 class DmControlFamily(MujocoFamily):

@@ -46,7 +46,10 @@ class MetaWorldFamily(MujocoFamily):
         if len(names) == 1:
             return {"": tasks[names[0]]}
         rows = [f"| `{39 + k}` | {name} | {tasks[name]} |" for k, name in enumerate(names)]
-        head = f"Each episode is one of {len(names)} tasks: the number of the observation that is 1 tells which, the others are 0."
+        head = (
+            f"Each episode is one of {len(names)} tasks: the number of the observation that is 1 tells which, the"
+            " others are 0."
+        )
         return {
             "": "\n".join([head, "", "| component | task | what is to be done |", "|---|---|---|", *rows])
         }

@@ -17,7 +17,10 @@ from evopolicy_worker.environments.tasks import template
 if TYPE_CHECKING:
     import gymnasium
 
-_PICTURE = "what a camera on the agent sees: a picture with its rows from the top and its columns from the left, red, green and blue"
+_PICTURE = (
+    "what a camera on the agent sees: a picture with its rows from the top and its columns from the left, red, green"
+    " and blue"
+)
 _PICTURE_FOR_PEOPLE = (400, 300)
 _ACTIONS = (
     "turn to the left",
@@ -29,7 +32,10 @@ _ACTIONS = (
     "nothing: no object here can be toggled",
     "nothing: no task here needs to be declared done",
 )
-_GOAL_REWARD = "0 each step. The step that reaches the goal pays between 1 and 0.8: the fewer steps it took, the more, falling evenly up to the step limit."
+_GOAL_REWARD = (
+    "0 each step. The step that reaches the goal pays between 1 and 0.8: the fewer steps it took, the more, falling"
+    " evenly up to the step limit."
+)
 _REWARDS = {
     "CollectHealth": "2 each step; -100 for the step in which health is used up.",
     "PickupObjects": "1 for each object that is picked up, otherwise 0.",

@@ -16,8 +16,8 @@ _BUTTONS = {
     "B": "shoot; for the next shot let it go first",
 }
 _OBSERVATION = (
-    "The screen: a picture with its rows from the top and its columns from the left, red, green and blue. Score and lives can be seen"
-    " in it."
+    "The screen: a picture with its rows from the top and its columns from the left, red, green and blue. Score and"
+    " lives can be seen in it."
 )
 
 
@@ -43,8 +43,10 @@ class StableRetroFamily(GymnasiumFamily):
         return {
             "": "A space ship at the lower edge of the screen. Shoot what comes from above, and do not be hit.",
             "Observation": _OBSERVATION,
-            "Action": "Which buttons are pressed for one frame, 1 for each that is. Left and right together have no"
-            " effect.\n\n| component | button | effect |\n|---|---|---|\n" + "\n".join(rows),
+            "Action": (
+                "Which buttons are pressed for one frame, 1 for each that is. Left and right together have no"
+                " effect.\n\n| component | button | effect |\n|---|---|---|\n" + "\n".join(rows)
+            ),
             "Reward": "What the game's score has gained in the step. `info['lives']` tells the lives that are left.",
             "Start": "The beginning of the first level, the same in every episode: nothing in this game is at random.",
             "End": "An episode ends when the game is over.",

@@ -162,8 +162,8 @@ def _check_shared_memory() -> None:
         tempfile.TemporaryFile(dir=_SHARED).close()
     except OSError as error:
         raise WorkerError(
-            f"ViZDoom shares memory with its game in {_SHARED}, which sandbox tier landlock hides ({error.strerror}): it is played"
-            " in tier bwrap; `evopolicy-worker doctor` tells how to get it"
+            f"ViZDoom shares memory with its game in {_SHARED}, which sandbox tier landlock hides ({error.strerror}):"
+            " it is played in tier bwrap; `evopolicy-worker doctor` tells how to get it"
         ) from error
 
 

@@ -109,8 +109,9 @@ class Guard:
             used = resident_bytes()
             if used > self._limits.memory_bytes:
                 return (
-                    f"{current}: its process has {used >> 20:,} MiB of memory, and {self._limits.memory_bytes >> 20:,} MiB are"
-                    " the limit; mend what it keeps from episode to episode, or raise the worker's --env-memory"
+                    f"{current}: its process has {used >> 20:,} MiB of memory, and {self._limits.memory_bytes >> 20:,}"
+                    " MiB are the limit; mend what it keeps from episode to episode, or raise the worker's"
+                    " --env-memory"
                 )
         return ""
 
@@ -118,8 +119,8 @@ class Guard:
 def hung(call: str, limits: Limits) -> str:
     """The text for a call that does not return."""
     return (
-        f"{call}: it has not returned for {limits.call_s:g} s, the limit of one call; correct the environment, or raise the"
-        " worker's --env-timeout"
+        f"{call}: it has not returned for {limits.call_s:g} s, the limit of one call; correct the environment, or raise"
+        " the worker's --env-timeout"
     )
 
 
@@ -185,7 +186,7 @@ def _not_shown(error: BaseException, text: str) -> str:
     for folder in own_folders if isinstance(error, OSError | ValueError) else ():
         found = re.search(rf"{re.escape(folder)}/([^'\"\n]+)", text)
         if found is not None and not os.path.exists(found[0]):
-            return f"; {found[1]} is not shown to the environment: if it exists, declare it in data of an environment file"
+            return f"; {found[1]} is not shown to the environment: if it exists, declare it in data of an environment file"  # noqa: E501
     name = getattr(error, "name", None) or getattr(error.__cause__, "name", None)
     if isinstance(error, ModuleNotFoundError) and name and own_folders:
         return f"; if {name} is a folder on PYTHONPATH, it needs an __init__.py to be shown"
@@ -199,7 +200,10 @@ def raised(error: BaseException, text: str, limits: Limits) -> str:
         return ""
     if isinstance(error, MemoryError):
         most = limits.memory_bytes >> 20
-        return f"{current}: there is no memory left for it; mend what it keeps, or raise the worker's --env-memory ({most:,} MiB)"
+        return (
+            f"{current}: there is no memory left for it; mend what it keeps, or raise the worker's --env-memory"
+            f" ({most:,} MiB)"
+        )
     if isinstance(error, EvopolicyError):
         return text
     return f"{current}: it raised {text}; correct the environment{traced(error)}"

@@ -40,7 +40,8 @@ class Scalarisation:
             return None
         if n and n != len(names):
             raise WorkerError(
-                f"environment {entry.id}, reward_vector: it names {len(names)} elements, and the environment's rewards have {n}"
+                f"environment {entry.id}, reward_vector: it names {len(names)} elements, and the environment's rewards"
+                f" have {n}"
             )
         if len(names) > _MAX_ELEMENTS:
             raise WorkerError(
@@ -61,8 +62,8 @@ class Scalarisation:
         vector = np.asarray(reward, dtype=np.float64).reshape(-1)
         if vector.size != self._values.size:
             raise WorkerError(
-                f"environment {self._env}, reward: a vector of {vector.size} elements, and {self._values.size} are declared;"
-                " name them all in reward_vector"
+                f"environment {self._env}, reward: a vector of {vector.size} elements, and {self._values.size} are"
+                " declared; name them all in reward_vector"
             )
         values = vector.tolist()
         info["reward_vector"] = values

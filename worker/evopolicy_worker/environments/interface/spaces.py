@@ -79,8 +79,8 @@ def to_schema(space: gymnasium.Space[Any]) -> SpaceSchema:
         inner = to_schema(space.feature_space)
         if space.stack and inner["type"] in ("Dict", "Tuple"):
             raise TypeError(
-                f"a stacked Sequence of {inner['type']} has no form here; give it without stack=True, or stack within the"
-                f" {inner['type']}"
+                f"a stacked Sequence of {inner['type']} has no form here; give it without stack=True, or stack within"
+                f" the {inner['type']}"
             )
         return {
             "type": "Sequence",
@@ -95,8 +95,9 @@ def to_schema(space: gymnasium.Space[Any]) -> SpaceSchema:
     if hasattr(space, "mission_func"):
         return _mission(space)
     raise TypeError(
-        f"a space of type {type(space).__name__} ({str(space)[:200]}) has no form here: known are Box, Discrete, MultiDiscrete,"
-        " MultiBinary, Text, Dict, Tuple, Sequence, Graph and OneOf; put a wrapper around the environment that encodes it"
+        f"a space of type {type(space).__name__} ({str(space)[:200]}) has no form here: known are Box, Discrete,"
+        " MultiDiscrete, MultiBinary, Text, Dict, Tuple, Sequence, Graph and OneOf; put a wrapper around the"
+        " environment that encodes it"
     )
 
 

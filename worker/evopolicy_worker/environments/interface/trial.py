@@ -53,7 +53,8 @@ class Promises:
     def after_reset(self, returned: Any) -> None:
         if not (isinstance(returned, tuple) and len(returned) == 2 and isinstance(returned[1], Mapping)):
             raise WorkerError(
-                f"{call}: it returned {_shown(returned)}; it has to return an observation and a dict, as Gymnasium 1.x has it"
+                f"{call}: it returned {_shown(returned)}; it has to return an observation and a dict, as Gymnasium 1.x"
+                " has it"
             )
         self._check_spaces()
 
@@ -143,8 +144,8 @@ def misshapen(returned: Any, error: Exception, *, vector: bool) -> str:
     `vector`: whether rewards are vectors."""
     if not isinstance(returned, tuple | list) or len(returned) != 5:
         return (
-            f"returned values: {_shown(returned)}; it has to return observation, reward, terminated, truncated and info, as"
-            " Gymnasium 1.x has it"
+            f"returned values: {_shown(returned)}; it has to return observation, reward, terminated, truncated and"
+            " info, as Gymnasium 1.x has it"
         )
     obs, reward, terminated, truncated, info = returned
     remedy = "numbers, one for each name in reward_vector" if vector else "one number"

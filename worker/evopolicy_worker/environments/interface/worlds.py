@@ -33,9 +33,15 @@ MOST_KINDS = 3
 TEXTS = {
     "the order of the actions": "An action may do what another one does in the text above.",
     "the direction of the actions": "A component of the action may act the other way round.",
-    "the order of the observation": "A component of the observation may stand at the place of another one with the same bounds.",
-    "the direction of the observation": "A component of the observation may have the opposite sign, or count from the other bound.",
-    "the scale of the observation": "A component without bounds may be multiplied by a constant, and a constant may be added.",
+    "the order of the observation": (
+        "A component of the observation may stand at the place of another one with the same bounds."
+    ),
+    "the direction of the observation": (
+        "A component of the observation may have the opposite sign, or count from the other bound."
+    ),
+    "the scale of the observation": (
+        "A component without bounds may be multiplied by a constant, and a constant may be added."
+    ),
 }
 """By kind of change, how the task text describes it."""
 
@@ -158,8 +164,8 @@ def text(possible: list[str]) -> str:
     most = min(MOST_KINDS, len(possible))
     many = "In one way" if most == 1 else f"In one to {most} of these ways"
     return (
-        f"\n\n## Altered rules\n\n{many}, the environment differs from the text above:\n\n{lines}\n\n"
-        "The stated bounds still hold. The changes are the same in every episode, train and hidden; find them out by playing."
+        f"\n\n## Altered rules\n\n{many}, the environment differs from the text above:\n\n{lines}\n\nThe stated bounds"
+        " still hold. The changes are the same in every episode, train and hidden; find them out by playing."
     )
 
 

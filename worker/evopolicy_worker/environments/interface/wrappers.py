@@ -33,6 +33,7 @@ def wrapped(env_id: str, env: gymnasium.Env[Any, Any], wrapper: Wrapper) -> gymn
         made: gymnasium.Env[Any, Any] = make(env, **wrapper.kwargs)
     except Exception as error:
         raise WorkerError(
-            f"{where}, kwargs {wrapper.kwargs}: it cannot be put around the environment: {type(error).__name__}: {error}"
+            f"{where}, kwargs {wrapper.kwargs}: it cannot be put around the environment: {type(error).__name__}:"
+            f" {error}"
         ) from error
     return made

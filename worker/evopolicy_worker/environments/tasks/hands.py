@@ -40,7 +40,8 @@ def words(gymnasium_id: str, env: Any) -> dict[str, str]:
     part = "observation[{}]" if gymnasium_id.startswith("Hand") else "{}"
     unit = {True: "m", False: "rad"}
     observed = [
-        f"| {part.format(k)} | {_JOINTS[_name(each)]} | {unit['ART' in each.name]} | {each.range[0]:.2g} to {each.range[1]:.2g} |"
+        f"| {part.format(k)} | {_JOINTS[_name(each)]} | {unit['ART' in each.name]} | {each.range[0]:.2g} to"
+        f" {each.range[1]:.2g} |"
         for k, each in enumerate(seen)
     ]
     driven = [model.jnt(model.actuator(k).trnid[0]) for k in range(model.nu)]

@@ -48,9 +48,9 @@ def _observed(env: Any) -> str:
         first = "The first index is the car that you drive. " if parts else ""
         frame = "in the same fixed frame" if of.absolute else "relative to your car"
         text = (
-            f"{first}One row for each car: row 0 is your own, in a fixed frame; rows 1 to {last} are other cars, {frame}, the nearest"
-            " along your lane first. Cars more than 10 m behind are left out, and missing rows are all 0. x is along the"
-            " road where it is straight, y points to the right."
+            f"{first}One row for each car: row 0 is your own, in a fixed frame; rows 1 to {last} are other cars,"
+            f" {frame}, the nearest along your lane first. Cars more than 10 m behind are left out, and missing rows"
+            " are all 0. x is along the road where it is straight, y points to the right."
             + (" Values beyond the range are clipped." if of.clip else "")
         )
         rows = [
@@ -63,9 +63,12 @@ def _observed(env: Any) -> str:
         steps = f"0–2, 0–{of.horizon * env.config['policy_frequency'] - 1}"
         return "\n".join(
             (
-                "Predicted collisions, if all cars keep their speeds. First index: your speed, 0 the choice below the present one, 1 the present"
-                " choice, 2 the one above (at the lowest and highest the same again). Second: the lane, 0 the one on the left, 1 your own, 2"
-                " the one on the right; a lane that does not exist is all 1. Third: after how many seconds.",
+                (
+                    "Predicted collisions, if all cars keep their speeds. First index: your speed, 0 the choice below"
+                    " the present one, 1 the present choice, 2 the one above (at the lowest and highest the same"
+                    " again). Second: the lane, 0 the one on the left, 1 your own, 2 the one on the right; a lane that"
+                    " does not exist is all 1. Third: after how many seconds."
+                ),
                 "",
                 f"| 0, {steps} | collision at a lower speed | share | 0 none, 0.5 close, 1 certain |",
                 f"| 1, {steps} | collision at the present speed | share | 0 none, 0.5 close, 1 certain |",
@@ -77,9 +80,12 @@ def _observed(env: Any) -> str:
         cells = f"0–{ahead - 1}, 0–{across - 1}"
         return "\n".join(
             (
-                f"A grid of cells of {of.grid_step[0]:g} × {of.grid_step[1]:g} m around your car, which turns with it. Second index: along your"
-                f" heading, from {-low:g} m behind to as far ahead. Third: sideways, from {-low:g} m to the left to as far to the right. Your car"
-                f" is in the cell {ahead // 2}, {across // 2}.",
+                (
+                    f"A grid of cells of {of.grid_step[0]:g} × {of.grid_step[1]:g} m around your car, which turns with"
+                    f" it. Second index: along your heading, from {-low:g} m behind to as far ahead. Third: sideways,"
+                    f" from {-low:g} m to the left to as far to the right. Your car is in the cell {ahead // 2},"
+                    f" {across // 2}."
+                ),
                 "",
                 f"| 0, {cells} | a car, your own too, has its middle in the cell | flag | 0, 1 |",
                 f"| 1, {cells} | the middle of a lane passes through the cell | flag | 0, 1 |",
@@ -107,10 +113,16 @@ def _acted(env: Any) -> str:
     each = f"Steps per second: {config['policy_frequency']}."
     if hasattr(of, "target_speeds"):
         speeds = ", ".join(f"{speed:g}" for speed in of.target_speeds)
-        told = f"A built-in driver steers along your lane and route, and approaches the speed that you choose: {speeds} m/s. {each}"
+        told = (
+            f"A built-in driver steers along your lane and route, and approaches the speed that you choose: {speeds}"
+            f" m/s. {each}"
+        )
         if parts:
             meant = "; ".join(f"{k} {_CHOICES[name]}" for k, name in of.actions.items())
-            return f"{told}\n\n| 0–{len(parts) - 1} | the choice for that car: {meant} | choice | 0 to {len(of.actions) - 1} |"
+            return (
+                f"{told}\n\n| 0–{len(parts) - 1} | the choice for that car: {meant} | choice | 0 to"
+                f" {len(of.actions) - 1} |"
+            )
         return "\n".join((told, "", *(f"| {k} | {_CHOICES[name]} |" for k, name in of.actions.items())))
     rows = ["acceleration; negative brakes, then reverses"] * of.longitudinal
     rows += ["steering angle; positive turns the heading from x towards y, to the right"] * of.lateral

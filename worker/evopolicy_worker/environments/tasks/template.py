@@ -59,8 +59,8 @@ def text(
             components, vector=bool(entry.reward_vector) or hasattr(env.unwrapped, "reward_space")
         ),
         "## Start\n\nThe start of an episode is drawn from its seed.",
-        f"## End\n\nAn episode ends when the environment ends it (`terminated`), and after {limit:,} steps at the latest"
-        " (`truncated`)." + _success(entry),
+        f"## End\n\nAn episode ends when the environment ends it (`terminated`), and after {limit:,} steps at the"
+        " latest (`truncated`)." + _success(entry),
     ]
     return "\n\n".join(parts) + "\n"
 
@@ -207,7 +207,8 @@ def _maze(env: gymnasium.Env[Any, Any]) -> str:
     drawn = ["".join("#" if cell == 1 else str(cell or ".") for cell in row) for row in rows]
     legend = (
         "The maze, seen from above: `#` wall, `.` free, `r` a place to start, `g` a place for the goal, `c` for both;"
-        " where it has no letters, any free cell is for both. x grows to the right, y upwards, and the middle is the origin."
+        " where it has no letters, any free cell is for both. x grows to the right, y upwards, and the middle is the"
+        " origin."
     )
     return "\n\n" + legend + "\n\n```\n" + "\n".join(drawn) + "\n```"
 
