@@ -143,9 +143,11 @@ class Gateway:
             self._folder.unwatched.touch(mode=0o600)
         requested_at = time.monotonic()
         permit = session.permit(self._agent_place, self._on_wait)
-        granted = await self._unless(asyncio.shield(self._orders), permit)
-        self.permit_s = time.monotonic() - requested_at
-        self._on_wait("")
+        try:
+            granted = await self._unless(asyncio.shield(self._orders), permit)
+        finally:
+            self.permit_s = time.monotonic() - requested_at
+            self._on_wait("")
         return not self._stopped.is_set() if granted is None else granted
 
     async def _watch(self, pipeline: SubmitPipeline, http: asyncio.Task[None]) -> Close | None:
