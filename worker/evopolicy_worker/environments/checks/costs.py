@@ -25,8 +25,8 @@ from evopolicy_worker.environments.interface import settings
 from evopolicy_worker.environments.interface.gymnasium_adapter import GymnasiumEnvironment
 
 CASE = Case(seed=20_011_117)
-STEPS = 1000
-"""Most steps of a stretch."""
+STEPS, PICTURES = 1000, 100
+"""Most steps of a stretch; with observations that have files of their own, whose recording has to fit a message."""
 PROCESSOR_S, WALL_S = 0.5, 5.0
 """A stretch ends sooner after so much time of this process, or so much time in all, which counts for web pages."""
 
@@ -66,7 +66,8 @@ class _Player:
         obs = self._environment.reset(CASE)
         drawn: list[Any] = []
         processor, wall = time.process_time() + PROCESSOR_S, time.monotonic() + WALL_S
-        most = min(STEPS, self._environment.description.max_episode_steps)
+        description = self._environment.description
+        most = min(STEPS if description.obs_storage == "inline" else PICTURES, description.max_episode_steps)
         while len(drawn) < most and time.process_time() < processor and time.monotonic() < wall:
             drawn.append(self._environment.draw(rng, obs))
             step = self._environment.step(drawn[-1])
