@@ -13,7 +13,8 @@ import msgspec
 from evopolicy_common.catalogue import installs
 
 FOLDER = Path(__file__).resolve().parents[1] / "families"
-N_CASES = 16
+N_DRAWN, N_CASES = 32, 16
+"""Cases of each family, and how many of them are played unless its row says otherwise."""
 
 
 class Proof(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -59,5 +60,5 @@ def drawn(family: str) -> list[int]:
     """The seeds of a family's cases: drawn by its name alone, so that nobody chose them."""
     return [
         int.from_bytes(hashlib.sha256(f"proof of life {family} {k}".encode()).digest()[:4], "big") >> 1
-        for k in range(N_CASES)
+        for k in range(N_DRAWN)
     ]

@@ -34,6 +34,7 @@ EXCLUDED_FIELDS: Mapping[str, Mapping[str, str]] = {
         "run": "the coordinator's name of the run",
         "timing": "times",
         "agent.retries": "counts what was asked again",
+        "agent.resources": "what the agent used of its machine, and how that one limits it",
         "outcome.auxiliary.infrastructure_retries": "counts what was played again",
         "rejected_submits.at": "a time",
         "committed": "the run's own place in the journal, and a random salt",
