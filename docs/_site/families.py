@@ -20,7 +20,7 @@ DOCUMENTS = (TOP / "README.md", LIST)
 END = "<!-- End of what it writes. -->"
 
 CPU = """*CPU ms a step*: processor time of a step of the library's environment alone, without accelerations, and in a worker's slot
-with its policy and recording; the median of the suite's ids."""  # noqa: E501
+with its policy and recording; the median of the ids that were measured so far, on idle cores."""  # noqa: E501
 
 
 def table() -> str:
