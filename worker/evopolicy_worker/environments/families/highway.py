@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from evopolicy_common.catalogue import Entry
+from evopolicy_worker.environments.accelerations import ACCELERATIONS
 from evopolicy_worker.environments.interface.gymnasium_adapter import GymnasiumFamily
 from evopolicy_worker.environments.interface.info import plain_info
 from evopolicy_worker.environments.tasks import highway
@@ -36,8 +37,8 @@ class HighwayFamily(GymnasiumFamily):
     solved_by = {"parking-v0": "is_success"}
 
     def rebuilds(self, entry: Entry) -> bool:
-        # All have been seen to repeat; this one keeps every state that it was in.
-        return entry.gymnasium_id == "lane-keeping-v0"
+        # Those that are accelerated have been seen to repeat.
+        return not any(each.serves(str(entry.gymnasium_id)) for each in ACCELERATIONS)
 
     def begin(self) -> None:
         """An intersection changes how the traffic of all later environments of the process drives."""
