@@ -51,7 +51,7 @@ def accelerated_ids() -> list[str]:
     """Suite ids of the environments that have accelerations, in catalogue order."""
     served = set(itertools.chain.from_iterable(one.gymnasium_ids for one in table.ACCELERATIONS))
     wanted = [entry for entry in entries().values() if entry.id in IDS or entry.adapter == "highway"]
-    return [entry.id for entry in wanted if entry.gymnasium_id in served]
+    return [entry.id for entry in wanted if entry.gymnasium_id in served and not entry.world]
 
 
 def compare(

@@ -180,7 +180,7 @@ evp.run(env="toy/line", agent=agent, budget=4, validation=1, heldout=1, exp_id="
 @pytest.mark.timeout(600)
 def test_the_page_does_what_it_says(tmp_path: Path) -> None:
     blocks = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)
-    assert len(blocks) == 4
+    assert len(blocks) == 5
     (tmp_path / "page.py").write_text("\n".join(blocks))
     output = run_here([sys.executable, "page.py"], tmp_path)
     assert "my_function gym/continuouscar completed" in output

@@ -156,9 +156,10 @@ def test_interruptions_do_not_reset_the_agents_time(operator_file: Path, tmp_pat
     arguments = [*run_arguments(operator_file, agent(tmp_path, code)), "--resume"]
     with command(tmp_path, *arguments) as running:
         wait_until(lambda: [*(tmp_path / "runs").glob("*/*/t/workspace/here")])
-        wait_until((run_dir(tmp_path) / ".gateway/times.json").exists)
+        kept = run_dir(tmp_path) / ".gateway" / "times.json"
+        wait_until(kept.exists)
+        wait_until(lambda: json.loads(kept.read_text())["agent_s"] > 0)
         running.kill()
-    kept = run_dir(tmp_path) / ".gateway" / "times.json"
     times = json.loads(kept.read_text())
     assert times["agent_s"] > 0
     assert times["open_s"] >= times["in_flight_s"]
