@@ -128,12 +128,9 @@ def secret_of(state: Path, *, unjailed: bool = False) -> tuple[bytes, str]:
         with contextlib.suppress(FileNotFoundError):
             usual.unlink()
             fsync_directory(state)
-        return (
-            data,
-            (
-                "agents of this run have no full jail and could read the cluster's state: its cases are of its own, and"
-                " later runs with jailed agents get new ones"
-            ),
+        return data, (
+            "agents of this run have no full jail and could read the cluster's state: its cases are of its own, and"
+            " later runs with jailed agents get new ones"
         )
     is_new = own.exists() and not usual.exists()
     return load_or_create_secret(usual), (

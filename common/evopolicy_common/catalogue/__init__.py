@@ -264,7 +264,11 @@ def known(env_id: str) -> Entry | None:
 def is_foreign(env_id: str) -> bool:
     """Whether an id can belong to an environment that does not ship: `module:Id`, or an id with a prefix of its own."""
     prefix, slash, _ = env_id.partition("/")
-    return valid_id(env_id) and (":" in prefix or (bool(slash) and prefix not in _load().prefixes))
+    return (
+        valid_id(env_id)
+        and "@" not in env_id
+        and (":" in prefix or (bool(slash) and prefix not in _load().prefixes))
+    )
 
 
 def entry(env_id: str) -> Entry:

@@ -232,11 +232,9 @@ def _faults(entry: Entry) -> list[tuple[bool, str]]:
     long_text = next((text for text in entry.reward_components.values() if len(text) > _MAX_REWARD_TEXT), "")
     return [
         (
-            not valid_id(entry.id),
-            (
-                f"id {entry.id[:80]!r}: letters, digits, '_', '.', '-', parts joined by '/' or ':', {_MAX_ID}"
-                " characters at most"
-            ),
+            not valid_id(entry.id) or "@" in entry.id,  # worlds ship
+            f"id {entry.id[:80]!r}: letters, digits, '_', '.', '-', parts joined by '/' or ':', {_MAX_ID}"
+            " characters at most",
         ),
         (
             not entry.gymnasium_id,

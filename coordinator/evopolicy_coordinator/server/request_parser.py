@@ -17,6 +17,7 @@ import msgspec
 from msgspec.structs import replace
 
 from evopolicy_common import catalogue
+from evopolicy_common.catalogue.worlds import OPTION, unchanged
 from evopolicy_common.errors import ConfigError, ProtocolError, RefusedError
 from evopolicy_common.messages import gateway, operator, worker
 from evopolicy_common.messages.environment import Split, StepLimit
@@ -433,6 +434,12 @@ class RequestParser:
             raise RefusedError(
                 Refusal.INVALID_SETTINGS,
                 f"the new cases are not disjoint from those of run {of.run}: {repeated[0]}",
+            )
+        worlds = {(case.options or {}).get(OPTION) for case in (*of.train, *m.cases)}
+        if unchanged(settings.env) != settings.env and len(worlds) > 1:
+            raise RefusedError(
+                Refusal.INVALID_SETTINGS,
+                f"the new cases are of another world than run {of.run}: give each the run's key in options.{OPTION}",
             )
         submit = next((each for each in result.submits if each.submit_index == m.submit_index), None)
         is_random = m.submit_index == RANDOM
