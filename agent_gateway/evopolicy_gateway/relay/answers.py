@@ -125,6 +125,8 @@ class AnswerReader:
         if len(self._held) > MAX_EVENT_BYTES:
             passed, self._unread = bytes(self._held), True
             self._held.clear()
+            # All of it may be the model's text: the estimate must not be lower than what was generated.
+            self._chars += len(passed)
             return passed
         if not self._events:
             return b""
