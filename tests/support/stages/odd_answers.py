@@ -18,6 +18,15 @@ def page(handler: Any, _: dict[str, Any]) -> None:
     handler._send(200, PAGE, "text/html")
 
 
+def garbage(body: bytes, kind: str = "text/event-stream") -> Odd:
+    """Any bytes with status 200."""
+
+    def answer(handler: Any, _: dict[str, Any]) -> None:
+        handler._send(200, body, kind)
+
+    return answer
+
+
 def busy(status: int = 429, **headers: str) -> Odd:
     """An error with further headers, such as `retry_after="2"`."""
 

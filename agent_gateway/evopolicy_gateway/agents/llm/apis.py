@@ -79,6 +79,9 @@ class ApiError(Exception):
 class Api(ABC):
     """One conversation. `messages` have the form of the protocol, without the system prompt."""
 
+    _error: type[Exception]
+    """The base of the vendor's own errors."""
+
     def __init__(self, settings: dict[str, Any], key: str, messages: list[Message]) -> None:
         self.messages = messages
         self.context_tokens = int(settings["context_tokens"])
@@ -96,9 +99,21 @@ class Api(ABC):
         """Adds a prompt."""
         self.messages.append({"role": "user", "content": text})
 
-    @abstractmethod
     def ask(self) -> Reply:
         """The model's answer, which is added to the messages. Raises ApiError."""
+        try:
+            return self._ask()
+        except self._error as error:
+            raise _failure(error) from error
+        except Exception as error:
+            # A stream that breaks off, and an answer that is none of this API, leave the libraries as errors
+            # of any kind.
+            why = f"the model's answer cannot be read: {type(error).__name__}: {error}"
+            raise ApiError(why, None, None) from error
+
+    @abstractmethod
+    def _ask(self) -> Reply:
+        """As `ask`, with the errors of the vendor's library."""
 
     @abstractmethod
     def answer(self, calls: Sequence[Call], outputs: Sequence[str]) -> None:
@@ -128,37 +143,37 @@ class OpenAi(Api):
         import openai
 
         self._client = openai.OpenAI(**self._connection)
-        self._error: type[Exception] = openai.OpenAIError
+        self._error = openai.OpenAIError
 
-    def ask(self) -> Reply:
+    def _ask(self) -> Reply:
         function = {
             "name": shell.NAME,
             "description": shell.DESCRIPTION,
             "parameters": shell.PARAMETERS,
         }
-        text, usage = "", None
+        text, usage, answered = "", None, False
         calls: dict[int, dict[str, str]] = {}
-        try:
-            stream = self._client.chat.completions.create(
-                model=self._model,
-                messages=[{"role": "system", "content": self._system}, *self.messages],
-                tools=[{"type": "function", "function": function}],
-                stream=True,
-                stream_options={"include_usage": True},
-                extra_body=self._parameters,
-            )
-            for chunk in stream:
-                usage = chunk.usage or usage
-                for choice in chunk.choices:
-                    text += choice.delta.content or ""
-                    for part in choice.delta.tool_calls or ():
-                        call = calls.setdefault(part.index, {"id": "", "name": "", "arguments": ""})
-                        call["id"] = part.id or call["id"] or f"call_{len(self.messages)}_{part.index}"
-                        if part.function is not None:
-                            call["name"] += part.function.name or ""
-                            call["arguments"] += part.function.arguments or ""
-        except self._error as error:
-            raise _failure(error) from error
+        stream = self._client.chat.completions.create(
+            model=self._model,
+            messages=[{"role": "system", "content": self._system}, *self.messages],
+            tools=[{"type": "function", "function": function}],
+            stream=True,
+            stream_options={"include_usage": True},
+            extra_body=self._parameters,
+        )
+        for chunk in stream:
+            usage = chunk.usage or usage
+            for choice in chunk.choices:
+                answered = True
+                text += choice.delta.content or ""
+                for part in choice.delta.tool_calls or ():
+                    call = calls.setdefault(part.index, {"id": "", "name": "", "arguments": ""})
+                    call["id"] = part.id or call["id"] or f"call_{len(self.messages)}_{part.index}"
+                    if part.function is not None:
+                        call["name"] += part.function.name or ""
+                        call["arguments"] += part.function.arguments or ""
+        if not answered:
+            raise ValueError("it has no choice")
         message: Message = {"role": "assistant", "content": text or None}
         if calls:
             message["tool_calls"] = [
@@ -201,26 +216,23 @@ class Anthropic(Api):
         import anthropic
 
         self._client = anthropic.Anthropic(**self._connection)
-        self._error: type[Exception] = anthropic.AnthropicError
+        self._error = anthropic.AnthropicError
 
-    def ask(self) -> Reply:
+    def _ask(self) -> Reply:
         tool = {
             "name": shell.NAME,
             "description": shell.DESCRIPTION,
             "input_schema": shell.PARAMETERS,
         }
-        try:
-            with self._client.messages.stream(
-                model=self._model,
-                max_tokens=self._max_output_tokens,
-                system=self._system,
-                messages=self._marked(),
-                tools=[tool],
-                extra_body=self._parameters,
-            ) as stream:
-                found = stream.get_final_message()
-        except self._error as error:
-            raise _failure(error) from error
+        with self._client.messages.stream(
+            model=self._model,
+            max_tokens=self._max_output_tokens,
+            system=self._system,
+            messages=self._marked(),
+            tools=[tool],
+            extra_body=self._parameters,
+        ) as stream:
+            found = stream.get_final_message()
         # With its thinking, whose signature the API checks when it comes back.
         content = [block.model_dump(mode="json", exclude_none=True) for block in found.content]
         self.messages.append({"role": "assistant", "content": content or [{"type": "text", "text": "…"}]})

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import pytest
+from stages import odd_answers
 from stages.cli_stage import Played, play, settings
 from stages.model_api import CACHED, CREATED, INPUT, OUTPUT, ModelApi, Step
 
@@ -90,6 +91,32 @@ def test_a_wrong_key_ends_the_run_with_the_providers_words(tmp_path: Path, proto
     assert "no such key" in found.ending.detail
 
 
+KNOWN = {
+    "model": "m-1",
+    "system": "",
+    "parameters": {},
+    "retries": 0,
+    "context_tokens": 1000,
+    "max_output_tokens": 9,
+    "timeout_s": 9.0,
+}
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+@pytest.mark.parametrize(
+    "body", [b"{not json", b'{"choices": null}', b"7", b'{"choices": [{}]}', b'{"choices": []}', None]
+)
+def test_an_answer_of_another_form_is_an_error_that_says_so(protocol: Protocol, body: bytes | None) -> None:
+    data = b"<html>" if body is None else b"data: " + body + b"\n\n"
+    with ModelApi([Step(odd=odd_answers.garbage(data))]) as server:
+        api = apis.open_api({"protocol": protocol, "base_url": server.base_url, **KNOWN}, "", [])
+        api.say("hello")
+        with pytest.raises(apis.ApiError, match="cannot be read"):
+            api.ask()
+    # The conversation can go on.
+    assert [message["role"] for message in api.messages] == ["user"]
+
+
 def test_a_session_that_failed_before_its_first_answer_begins_anew(tmp_path: Path) -> None:
     outage = [Step(status=503, text="overloaded")] * 5
     found, _ = played(tmp_path, "openai", [*outage, Step(command=SUBMIT), Step(command=SUBMIT)])
@@ -131,9 +158,7 @@ def test_providers_words_for_a_conversation_that_is_too_long_are_known(text: str
 
 
 def test_shortening_goes_on_until_two_outputs_are_left() -> None:
-    known = {"model": "m", "system": "", "parameters": {}, "base_url": "http://127.0.0.1:1", "retries": 0}
-    limits = {"context_tokens": 1000, "max_output_tokens": 1, "timeout_s": 1.0}
-    api = apis.open_api({"protocol": "openai", **known, **limits}, "", [])
+    api = apis.open_api({"protocol": "openai", "base_url": "http://127.0.0.1:1", **KNOWN}, "", [])
     for n in range(12):
         api.answer([apis.Call(id=str(n))], [f"output {n}"])
     left = []
