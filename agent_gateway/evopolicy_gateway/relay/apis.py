@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping
 from typing import Any, Literal
 from urllib.parse import urlencode, urlsplit
@@ -66,6 +67,28 @@ def path_of(protocol: Protocol, path: str) -> tuple[str, str] | None:
     return api, f"v1/{api}" if protocol == "anthropic" else api
 
 
+_CLIENTS_TOOLS = re.compile(
+    r"function|custom|namespace|tool_search|(local_)?shell|apply_patch|(computer|bash|text_editor|memory)(_.*)?"
+)
+"""Types of tools that the agent runs itself, in OpenAI's and Anthropic's requests."""
+
+_HOSTED = ("mcp_servers", "plugins", "prompt", "web_search_options")
+"""Other fields of a request that let the provider run tools; a stored `prompt` may have some."""
+
+
+def hosted_tools(request: Mapping[str, Any]) -> list[str]:
+    """The kinds of tools in a request that the provider runs, such as `web_search`, without the version of
+    Anthropic's; a kind that is not known counts as one of these."""
+    tools = request.get("tools")
+    kinds = [
+        str(tool.get("type") or "custom")
+        for tool in (tools if isinstance(tools, list) else ())
+        if isinstance(tool, dict)
+    ]
+    kinds += [name for name in _HOSTED if request.get(name)]
+    return sorted({re.sub(r"_\d{8}$", "", kind) for kind in kinds if not _CLIENTS_TOOLS.fullmatch(kind)})
+
+
 _PASSED_UP = ("content-type", "accept", "user-agent", "openai-beta", "session_id", "originator", "version")
 _PASSED_UP_FROM = ("anthropic-", "x-stainless-", "x-codex-")
 _PASSED_DOWN = (
@@ -126,6 +149,7 @@ SPENT = Refusal(
 NO_TOKEN = Refusal(
     status=401, openai=("invalid_request_error", "invalid_api_key"), anthropic="authentication_error"
 )
+HOSTED_TOOL = Refusal(status=400, openai=_INVALID, anthropic="invalid_request_error")
 OTHER_MODEL = Refusal(
     status=404, openai=("invalid_request_error", "model_not_found"), anthropic="not_found_error"
 )

@@ -9,7 +9,7 @@ from msgspec import Meta
 
 from evopolicy_gateway.relay.usage import Prices, Usage
 
-_SHOWN_MODELS = 20
+_MAX_NAMES = 20
 
 
 class Limits(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -36,6 +36,8 @@ class Request(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     """The model that the agent asked for."""
     answered: str = ""
     """The model that the answer names."""
+    hosted_tools: tuple[str, ...] = ()
+    """Kinds of tools in the request that the provider runs."""
     status: int
     """HTTP status; 0 where no answer came."""
     broken: bool = False
@@ -62,6 +64,8 @@ class Used(msgspec.Struct, kw_only=True):
     """Requests by model that answered."""
     other_models: dict[str, int] = {}
     """Requests by model that was asked for and is not the declared one."""
+    hosted_tools: dict[str, int] = {}
+    """Requests by kind of tool that the provider runs."""
     first_s: float = 0.0
     """Sum over the answered requests, seconds."""
     wait_s: float = 0.0
@@ -76,6 +80,8 @@ class Used(msgspec.Struct, kw_only=True):
         self.wait_s += request.wait_s
         if request.answered:
             _count(self.models, request.answered)
+        for kind in request.hosted_tools:
+            _count(self.hosted_tools, kind)
         if declared and request.asked != declared:
             _count(self.other_models, request.asked)
 
@@ -101,5 +107,5 @@ class Used(msgspec.Struct, kw_only=True):
 
 
 def _count(counts: dict[str, int], name: str) -> None:
-    if name in counts or len(counts) < _SHOWN_MODELS:
+    if name in counts or len(counts) < _MAX_NAMES:
         counts[name] = counts.get(name, 0) + 1

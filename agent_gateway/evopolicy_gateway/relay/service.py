@@ -39,6 +39,7 @@ MAX_RETRY_S = 60.0
 _FIRST_RETRY_S = 1.0
 _CHUNK = 64 << 10
 _SHOWN = 200
+_MAX_TOOLS = 20
 
 
 class Order(msgspec.Struct, frozen=True, kw_only=True):
@@ -54,6 +55,8 @@ class Order(msgspec.Struct, frozen=True, kw_only=True):
     """The declared model."""
     declared_only: bool = False
     """Whether requests for other models are refused."""
+    own_tools_only: bool = False
+    """Whether requests with tools that the provider runs are refused."""
     timeout_s: float = 600.0
     """Longest time without a byte from the provider."""
 
@@ -166,6 +169,12 @@ class Relay:
                     apis.OTHER_MODEL, f"the run's model is {order.model}; {asked!r} is not allowed"
                 )
             self._once(f"the agent asks for the model {asked!r} besides {order.model}")
+        if hosted := tuple(kind[:_SHOWN] for kind in apis.hosted_tools(document)[:_MAX_TOOLS]):
+            if order.own_tools_only:
+                return self.refused(
+                    apis.HOSTED_TOOL, f"tools of the provider are refused: {', '.join(hosted)}"
+                )
+            self._once(f"the agent offers its model tools of the provider: {', '.join(hosted)}")
         if what := used.over(order.limits, order.prices, self.in_flight):
             if not used.over(order.limits, order.prices):
                 return self.refused(
@@ -175,7 +184,7 @@ class Relay:
             return self.refused(apis.SPENT, f"the run's model budget is spent: {what}")
         if self.in_flight >= MAX_IN_FLIGHT:
             return self.refused(apis.TOO_MANY, f"{MAX_IN_FLIGHT} requests are under way", retry_after="1")
-        if order.declared_only:
+        if order.declared_only or order.own_tools_only:
             # A name that occurs twice is read in one way here, and perhaps in another there.
             body = orjson.dumps(document)
         drops_usage = False
@@ -185,7 +194,7 @@ class Relay:
             if options.get("include_usage") is not True:
                 drops_usage = True
                 body = orjson.dumps(document | {"stream_options": options | {"include_usage": True}})
-        exchange = _Exchange(self, api, asked, body, drops_usage=drops_usage)
+        exchange = _Exchange(self, api, asked, hosted, body, drops_usage=drops_usage)
         response = None
         try:
             response = await exchange.answer(request, path)
@@ -266,9 +275,12 @@ class Relay:
 class _Exchange:
     """One request that costs tokens, and its answer. Call `close` at the end of both."""
 
-    def __init__(self, relay: Relay, api: str, asked: str, body: bytes, *, drops_usage: bool) -> None:
+    def __init__(
+        self, relay: Relay, api: str, asked: str, hosted: tuple[str, ...], body: bytes, *, drops_usage: bool
+    ) -> None:
         self._relay = relay
-        self._api, self._asked, self._body, self._drops_usage = api, asked, body, drops_usage
+        self._api, self._asked, self._hosted = api, asked, hosted
+        self._body, self._drops_usage = body, drops_usage
         self._at, self._begun = relay.now(), time.monotonic()
         self._first_s: float | None = None
         self._written = False
@@ -356,6 +368,7 @@ class _Exchange:
                 at=round(self._at, 3),
                 api=self._api,
                 asked=self._asked,
+                hosted_tools=self._hosted,
                 status=self._status,
                 first_s=None if self._first_s is None else round(self._first_s, 4),
                 whole_s=round(time.monotonic() - self._begun, 4),

@@ -432,6 +432,7 @@ class RunLifecycle:
                 prices=terms.prices,
                 model=terms.model,
                 declared_only=terms.declared_only,
+                own_tools_only=terms.own_tools_only,
             ),
             self._folder.model_requests,
             self._folder.harness_log,

@@ -91,6 +91,8 @@ class ModelUse(msgspec.Struct, frozen=True, kw_only=True):
     """Requests by the model that the answer names."""
     other_models: dict[str, int] = {}
     """Requests by the model that was asked for and is not `model_string`."""
+    hosted_tools: dict[str, int] = {}
+    """Requests that offer a tool which the provider runs, by its kind, such as `web_search`."""
     first_token_s: float | None = None
     """Mean time to the first bytes of an answer."""
     rate_limit_s: float = 0.0

@@ -90,6 +90,8 @@ class TokenUse(msgspec.Struct, frozen=True, kw_only=True):
     """US dollars per run; None when any of the runs has no price."""
     metering: str = ""
     """Who counted: `relay`, `agent`, or both in different runs; empty in files of earlier versions."""
+    hosted_tools: str = ""
+    """Kinds of tools of the provider that requests offered to the model."""
     differing: int = 0
     """Runs in which the agent's own count differs from the relay's by more than `COUNTS_DIFFER`."""
 
@@ -181,5 +183,8 @@ def _token_use(env: str, entry: str, runs: list[Run]) -> TokenUse:
         output=fmean(t.output for t in counts) / 1e6 if counts else None,
         cost=fmean(costs) if counts and len(costs) == len(counts) else None,
         metering=", ".join(sorted({use.metering for use, _ in uses if use is not None})),
+        hosted_tools=", ".join(
+            sorted({kind for use, _ in uses if use is not None for kind in use.hosted_tools})
+        ),
         differing=sum(each > COUNTS_DIFFER for each in apart),
     )

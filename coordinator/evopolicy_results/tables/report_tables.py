@@ -407,6 +407,12 @@ def _tokens(study: Study) -> Table:
             Column("runs", "Runs that tell", "integer", of=lambda row: row.n_runs),
             Column("metering", "Counted by", of=lambda row: row.metering or None),
             Column(
+                "hosted_tools",
+                "Tools of the provider",
+                note="Offered to the model: the provider runs them, such as a search of the web.",
+                of=lambda row: row.hosted_tools or None,
+            ),
+            Column(
                 "differing",
                 "Runs whose agent counts otherwise",
                 "integer",

@@ -63,6 +63,7 @@ class CliAgent(Harness):
             prices=self._config.prices,
             model=self._config.model,
             declared_only=self._config.models == "declared",
+            own_tools_only=self._config.hosted_tools == "refuse",
             upstream=self._config.upstream(os.environ),
         )
         self._options = ""

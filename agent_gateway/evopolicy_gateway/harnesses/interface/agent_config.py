@@ -156,6 +156,8 @@ class AgentConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     """Model string in the CLI's form; None for its default."""
     models: Literal["any", "declared"] = "any"
     """`declared`: the relay refuses requests for other models than `model`."""
+    hosted_tools: Literal["record", "refuse"] = "record"
+    """`refuse`: the relay refuses requests with tools that the provider runs, such as a search of the web."""
     effort: str | None = None
     program: tuple[str, ...] = ()
     """Replaces the CLI on the PATH."""

@@ -122,6 +122,7 @@ class ModelTerms(msgspec.Struct, frozen=True, kw_only=True):
     model: str | None = None
     """The declared model."""
     declared_only: bool = False
+    own_tools_only: bool = False
     upstream: Upstream | None = None
     """The API behind the relay; None: the agent cannot use the relay."""
 

@@ -203,6 +203,47 @@ def test_other_models_are_told_or_refused(tmp_path: Path) -> None:
     assert served.api.n_asked == served.used.requests == 0
 
 
+@pytest.mark.parametrize(
+    ("protocol", "api", "more", "kinds"),
+    [
+        (
+            "openai",
+            "responses",
+            {"tools": [{"type": "web_search"}, {"type": "function", "name": "f"}]},
+            {"web_search": 1},
+        ),
+        (
+            "openai",
+            "chat/completions",
+            {"web_search_options": {"user_location": None}},
+            {"web_search_options": 1},
+        ),
+        ("openai", "responses", {"tools": [{"type": "custom"}, {"type": "local_shell"}, 7]}, {}),
+        (
+            "anthropic",
+            "messages",
+            {"tools": [{"type": "web_fetch_20250910"}], "mcp_servers": [{}]},
+            {"mcp_servers": 1, "web_fetch": 1},
+        ),
+        ("anthropic", "messages", {"tools": [{"name": "f"}, {"type": "bash_20250124"}]}, {}),
+    ],
+)
+def test_tools_that_the_provider_runs_are_recorded_or_refused(
+    tmp_path: Path, protocol: str, api: str, more: dict[str, Any], kinds: dict[str, int]
+) -> None:
+    async def act(served: Served) -> None:
+        assert (await served.ask(api, **more)).status_code == status
+
+    status = 200
+    served = played(tmp_path, [], act, protocol=protocol)
+    assert read(served.ledger).hosted_tools == kinds
+    assert len(served.notes) == bool(kinds)
+    status = 400 if kinds else 200
+    (tmp_path / "strict").mkdir()
+    served = played(tmp_path / "strict", [], act, protocol=protocol, own_tools_only=True)
+    assert served.api.n_asked == served.used.requests == (0 if kinds else 1)
+
+
 def test_a_model_that_is_named_twice_is_the_one_that_was_checked(tmp_path: Path) -> None:
     async def act(served: Served) -> None:
         twice = b'{"model": "dear", "model": "m", "tools": [{"name": "bash"}], "input": []}'
