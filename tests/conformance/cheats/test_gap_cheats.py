@@ -5,10 +5,13 @@ from __future__ import annotations
 import random
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 from attacks import gaps
-from slots import Slots
+from slots import Slots, make_job
+
+from evopolicy_worker.slot_protocol.slot_messages import Finished
 
 CHANCE = 0.001
 """A test like this one fails this often where there is nothing to find. It asks again before it does."""
@@ -41,6 +44,32 @@ def test_the_time_between_calls_does_not_tell_a_policy_its_split(
         for name, values in zip(gaps.FEATURES, found.features.T, strict=True)
     }
     pytest.fail(f"{share:.2f} of the guesses are right, p = {p}; medians of train and hidden: {medians}")
+
+
+def test_as_much_is_sent_between_two_hidden_episodes_as_between_train_ones(
+    slots: Slots, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sizes: dict[str, list[int]] = {}
+    policy = {"policy.py": gaps.POLICY, "given.json": '{"steps": 9, "action": 0}'}
+    slot = slots.slot()
+    for kind, options in gaps.KINDS.items():
+        received: list[Finished] = []
+        reply = slot._reply
+
+        async def noted(reply: Any = reply, received: list[Finished] = received) -> Any:
+            message = await reply()
+            received += [message] if isinstance(message, Finished) else []
+            return message
+
+        job = make_job(env="gymnasium/ALE/Pong-v5", n=3, max_steps=9, policy_scope="submit", **options)
+        with monkeypatch.context() as patch:
+            patch.setattr(slot, "_reply", noted)
+            slots.run(slot.play(job, slots.bundle(policy), lambda *_: None))
+        sizes[kind] = [len(msgspec.msgpack.encode(message)) for message in received]
+        assert all(message.outcome.failure is None for message in received)
+    assert sizes["train"][0] > 5_000
+    # A hidden episode's own actions, and the policy's, are few bytes more.
+    assert sizes["hidden"] == pytest.approx(sizes["train"], abs=600)
 
 
 def test_a_millisecond_more_in_hidden_episodes_would_be_noticed(slots: Slots) -> None:

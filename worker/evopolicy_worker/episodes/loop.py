@@ -181,11 +181,11 @@ class Player:
             environment = self._environment(job.env)
             episode = _Episode(job, k, environment, policies, progress, tell, begun)
             try:
-                outcome, log = episode.play()
+                outcome, log, unused = episode.play()
                 # In every split, as a policy of several episodes can measure the pause between them.
                 packed = begun.packed() if job.bundle is not None and len(job.episodes) > 1 else None
                 kept = packed if is_kept(job) else None
-                finished = messages.Finished(outcome=_brief(outcome, _share(job)), begun=kept)
+                finished = messages.Finished(outcome=_brief(outcome, _share(job)), begun=kept, unused=unused)
                 films = log and job.video and (not job.video_episodes or k < job.video_episodes)
                 film = [(k, job.episodes[k].case, log, outcome.length)] if films else []
                 return outcome.failure, messages.framed(finished), film
@@ -257,8 +257,8 @@ class _Episode:
     def spec(self) -> EpisodeSpec:
         return self.job.episodes[self.k]
 
-    def play(self) -> tuple[EpisodeOutcome, bytes]:
-        """The outcome, without a video, and the log of actions if it was kept."""
+    def play(self) -> tuple[EpisodeOutcome, bytes, bytes]:
+        """The outcome, without a video, the log of actions if it was kept, and feedback that nobody may read."""
         job, spec, begun = self.job, self.spec, self.begun
         start = time.monotonic()
         recorded = _recorded_actions(spec)
@@ -283,8 +283,8 @@ class _Episode:
             policy_cpu_s=ended.cpu_s,
         )
         if unplayed:
-            return outcome, b""
-        # A policy of several episodes can measure the pause between them, in which feedback files are made.
+            return outcome, b"", b""
+        # A policy of several episodes can measure the pause between them, in which feedback is made and sent.
         pauses = job.policy_scope == "submit"
         full, actions = course.full, course.actions
         rows = full.finish() if full and (pauses or job.record == "full") else b""
@@ -298,7 +298,7 @@ class _Episode:
             success=course.success if told else None,
             trajectory=feedback if job.record == "full" else kept,
         )
-        return outcome, log
+        return outcome, log, rows if job.record != "full" else b""
 
     def _begin(self) -> PolicyProcess | None:
         """The policy, told of the new episode; None, with the failure noted, when it failed before its first act."""

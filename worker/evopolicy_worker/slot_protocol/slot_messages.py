@@ -90,6 +90,9 @@ class Finished(Message, frozen=True, kw_only=True, tag="finished"):
     outcome: EpisodeOutcome
     begun: PackedBegun | None = None
     """The policy's actions in it. Only in jobs of several episodes, which are returned as a whole."""
+    unused: bytes = b""
+    """The feedback of a hidden episode, which nobody reads: with policy scope "submit" it is sent as that of a train
+    episode is, since the policy can measure the time."""
 
 
 class Filmed(Message, frozen=True, kw_only=True, tag="filmed"):
