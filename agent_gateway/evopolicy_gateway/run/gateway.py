@@ -26,6 +26,7 @@ from evopolicy_common.errors import ConfigError, RefusedError
 from evopolicy_common.logs import structlog
 from evopolicy_common.records.blobs import BlobStore
 from evopolicy_common.records.open_run import Closed, OpenedRun
+from evopolicy_common.records.trees import Recorder
 from evopolicy_common.refusals import RUN_OVER
 from evopolicy_common.wire import credentials, transport
 from evopolicy_common.wire.http import serving
@@ -117,8 +118,9 @@ class Gateway:
                 return True
             workspace.stage(self._folder, opened, address.urls(), known.agents_md)
             blobs = BlobStore(self._folder.blobs)
+            trees = Recorder(self._folder.workspace, self._folder.trees)
             pipeline = SubmitPipeline(
-                session, opened, self._folder.workspace, journal, blobs, self._changed.set
+                session, opened, self._folder.workspace, journal, blobs, self._changed.set, trees
             )
             http = await stack.enter_async_context(
                 serving(make_app(pipeline, address.token, address.bearer), sock)

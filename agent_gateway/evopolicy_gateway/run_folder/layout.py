@@ -18,6 +18,7 @@ from evopolicy_common.records import open_run
 from evopolicy_common.records.blobs import write_atomically
 from evopolicy_common.records.run_record import Artifacts
 from evopolicy_common.records.secrets import PASSED
+from evopolicy_common.records.trees import TREES
 from evopolicy_common.wire import keys
 
 T = TypeVar("T")
@@ -54,6 +55,11 @@ class RunFolder(msgspec.Struct, frozen=True):
     def checkpoints(self) -> Path:
         """The submitted policies with their metrics, written at the end."""
         return self.root / "checkpoints"
+
+    @property
+    def trees(self) -> Path:
+        """The workspace at each submit (`evopolicy_common.records.trees`)."""
+        return self.root / TREES
 
     @property
     def run_json(self) -> Path:

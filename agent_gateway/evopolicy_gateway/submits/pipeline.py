@@ -22,6 +22,7 @@ from evopolicy_common.logs import structlog
 from evopolicy_common.messages.gateway import RunOpened, RunState, SubmitAccepted, SubmitDone
 from evopolicy_common.records.blobs import BlobStore
 from evopolicy_common.records.open_run import Accepted, AnyEntry, Died, Requested, Settled
+from evopolicy_common.records.trees import Recorder
 from evopolicy_common.refusals import Refusal
 from evopolicy_gateway.run_folder.journal import Journal
 from evopolicy_gateway.submits import snapshots
@@ -47,8 +48,9 @@ class SubmitPipeline:
         journal: Journal,
         blobs: BlobStore,
         on_change: Callable[[], None] = lambda: None,
+        trees: Recorder | None = None,
     ) -> None:
-        """`on_change` is called after every change that a watcher shows."""
+        """`on_change` is called after every change that a watcher shows. `trees` records the workspace at submits."""
         self.machine = TicketMachine(run, zip(journal.entries, journal.places, strict=True))
         journal.forget()
         self.fatal: asyncio.Future[None] = asyncio.get_running_loop().create_future()
@@ -58,6 +60,7 @@ class SubmitPipeline:
         self._journal = journal
         self._blobs = blobs
         self._on_change = on_change
+        self._trees = trees
         self._news = asyncio.Event()
         """Set, and replaced, at the next change of the machine."""
         self._uploaded: str | None = None
@@ -158,7 +161,11 @@ class SubmitPipeline:
                 case "snapshot":
                     system, published = self._workspace / "system", machine.run.profile != "own"
                     take = partial(snapshots.take, system, self._blobs, published=published)
-                    return machine.took(await self._on_disk(take))
+                    taken = await self._on_disk(take)
+                    if self._trees is not None:
+                        given = (ticket.submit_id, self._trees, self._blobs, self._workspace.parent)
+                        taken = await asyncio.to_thread(snapshots.record_tree, taken, *given)
+                    return machine.took(taken)
                 case "send":
                     return machine.sent(await self._send(ticket.request))
                 case "collect":

@@ -9,10 +9,15 @@ from pathlib import Path
 import msgspec
 
 from evopolicy_common.errors import BundleError
+from evopolicy_common.logs import structlog
 from evopolicy_common.messages.episode import FailureCategory, PolicyFailure
 from evopolicy_common.records.blobs import BlobStore
 from evopolicy_common.records.code_metrics import MAX_PARSED_BYTES, parse
 from evopolicy_common.records.policies import bundles
+from evopolicy_common.records.secrets import read_passed
+from evopolicy_common.records.trees import Recorder
+
+log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
 POLICY_FILE = "policy.py"
 
@@ -24,6 +29,8 @@ class Snapshot(msgspec.Struct, frozen=True, kw_only=True):
     error: PolicyFailure | None
     kept: str | None = None
     """Digest of a bundle without a policy: stored for the run's checkpoint, and not sent."""
+    tree: str = ""
+    """Digest of the workspace's tree; empty: not recorded."""
 
 
 def take(system: Path, blobs: BlobStore, *, published: bool = False) -> Snapshot:
@@ -47,6 +54,19 @@ def take(system: Path, blobs: BlobStore, *, published: bool = False) -> Snapshot
     return Snapshot(
         digest=digest if failure is None else None, error=failure, kept=digest if failure else None
     )
+
+
+def record_tree(taken: Snapshot, submit: str, recorder: Recorder, blobs: BlobStore, folder: Path) -> Snapshot:
+    """The snapshot with the tree of the workspace, which is left out where anything keeps it from being recorded: no
+    submit fails for it. `folder`: the run's."""
+    digest = taken.digest or taken.kept
+    try:
+        bundle = None if digest is None else bundles.load(blobs.read(digest), digest)
+        tree = recorder.record(submit, bundle, read_passed(folder))
+    except Exception as error:
+        log.error("the workspace is not recorded", submit=submit, exc_info=error)
+        return taken
+    return msgspec.structs.replace(taken, tree=tree)
 
 
 def _fault_of_source(files: dict[str, bytes]) -> PolicyFailure | None:

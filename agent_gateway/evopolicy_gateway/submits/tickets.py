@@ -250,8 +250,9 @@ class TicketMachine:
         return "collect"
 
     def took(self, taken: Snapshot) -> Effect:
-        digest, error, kept = taken.digest, taken.error, taken.kept
-        return msgspec.structs.replace(self._open.request, bundle=digest, bundle_error=error, kept=kept)
+        digest, error, kept, tree = taken.digest, taken.error, taken.kept, taken.tree
+        request = self._open.request
+        return msgspec.structs.replace(request, bundle=digest, bundle_error=error, kept=kept, tree=tree)
 
     def sent(self, reply: messages.SubmitAccepted) -> Effect:
         return open_run.Accepted(

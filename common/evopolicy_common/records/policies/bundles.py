@@ -132,7 +132,7 @@ class _Reader:
             path = base / name
             if name in self._leave_out and not base.parts:
                 continue
-            _check_path(_text(path))
+            check_path(_text(path))
             mode = os.stat(name, dir_fd=fd, follow_symlinks=False).st_mode
             if stat.S_ISDIR(mode):
                 if name not in IGNORED_FOLDERS:
@@ -193,7 +193,7 @@ def _check(files: tuple[BundleFile, ...]) -> None:
     if total > MAX_BYTES:
         raise BundleError(f"bundle holds {total:,} bytes, limit {MAX_BYTES:,}")
     for file in files:
-        _check_path(file.path)
+        check_path(file.path)
         if file.path.endswith(COMPILED):
             raise BundleError(f"{file.path!a} is compiled code, which may differ from its source; remove it")
     names = [file.path for file in files]
@@ -201,7 +201,8 @@ def _check(files: tuple[BundleFile, ...]) -> None:
         raise BundleError("bundle names a path twice")
 
 
-def _check_path(path: str) -> None:
+def check_path(path: str) -> None:
+    """Raises BundleError for anything but a plain relative path of a bearable length."""
     parts = path.split("/")
     if path.startswith("/") or any(part in ("", ".", "..") for part in parts) or "\0" in path or "\\" in path:
         raise BundleError(f"{path!a} is not a plain relative path; rename it")

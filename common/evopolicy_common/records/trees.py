@@ -1,0 +1,303 @@
+"""The workspace at each submit, as a tree: a list of its files, each by the digest of its content.
+
+Rules that this module owns:
+- A tree holds regular files of the workspace only, none by a link. `LEFT_OUT` belongs to the service or to an earlier
+  run. The agent's home and logins lie elsewhere, and a file in which a key is found is left out.
+- `system/` is that of the submit's bundle if there is one, so that the tree has exactly the submitted policy.
+- Files, entries and bytes are bounded. A tree lists what it omits, with the reason; recording never fails a submit.
+- `trees/submit_NNN.json` in the run's folder is the tree (its digest: the file's SHA-256). Each content is stored once.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import os
+import re
+import stat
+import time
+from collections.abc import Collection, Iterator
+from pathlib import Path
+from typing import BinaryIO
+
+import msgspec
+
+from evopolicy_common.errors import DECODE_ERRORS, BundleError, ConfigError, StorageError
+from evopolicy_common.records.blobs import BlobStore, digest_of, sync_filesystem, write_atomically
+from evopolicy_common.records.policies.bundles import (
+    COMPILED,
+    IGNORED_FOLDERS,
+    MAX_DEPTH,
+    Bundle,
+    BundleFile,
+    check_path,
+)
+from evopolicy_common.records.secrets import Passed, found
+from evopolicy_common.regular_files import open_regular, read_regular
+
+TREES = "trees"
+"""In a run's folder."""
+HISTORY = "history"
+"""In a workspace: the feedback of the run that this one starts from, read-only."""
+LEFT_OUT = frozenset({"AGENTS.md", "feedback", HISTORY})
+MAX_FILES = 5000
+"""Of a tree. Twice as many files and folders are looked at."""
+MAX_FILE_BYTES = 64 << 20
+MAX_TREE_BYTES = 256 << 20
+MAX_STORED_BYTES = 1 << 30
+"""All contents of one run; with more, changed files are omitted."""
+MAX_LISTED = 100
+"""Omissions with their reasons; further ones are counted."""
+_MAX_MANIFEST = 8 << 20
+_SETTLED_NS = 2_000_000_000
+"""A file that changed less than this before it was read is read again: the clock of file systems is coarse."""
+_SUBMIT = re.compile(r"submit_[0-9]{1,9}")
+
+
+class TreeFile(msgspec.Struct, frozen=True, array_like=True):
+    """One file of a tree."""
+
+    path: str
+    """Relative to the workspace, with forward slashes."""
+    blob: str
+    """SHA-256 of its content, hex."""
+    size: int
+    executable: bool = False
+
+
+_Seen = tuple[tuple[int, int, int], TreeFile]
+"""Inode, time of change and size of a file, and what it was."""
+
+
+class Tree(msgspec.Struct, frozen=True, kw_only=True):
+    """The content of `trees/submit_NNN.json`."""
+
+    files: tuple[TreeFile, ...]
+    """By path."""
+    omitted: dict[str, str] = {}
+    """Path to reason, of the first `MAX_LISTED`."""
+    n_omitted: int = 0
+
+
+class Changes(msgspec.Struct, frozen=True, kw_only=True):
+    """Paths in which a tree differs from the one before."""
+
+    added: tuple[str, ...] = ()
+    changed: tuple[str, ...] = ()
+    removed: tuple[str, ...] = ()
+
+
+def changes(before: Tree | None, after: Tree) -> Changes:
+    """The differences of two trees; without `before`, all files are added."""
+    old = {} if before is None else {file.path: file for file in before.files}
+    new = {file.path: file for file in after.files}
+    return Changes(
+        added=tuple(path for path in new if path not in old),
+        changed=tuple(path for path in new if path in old and new[path] != old[path]),
+        removed=tuple(path for path in old if path not in new),
+    )
+
+
+def submit_number(name: str) -> int | None:
+    """The index in `submit_NNN`; None for another name."""
+    return int(name.partition("_")[2]) if _SUBMIT.fullmatch(name) else None
+
+
+def read(folder: Path, submit: str) -> tuple[Tree, str]:
+    """A tree of the run at `folder`, and its digest. Raises ConfigError when there is none, or it is damaged."""
+    path = folder / TREES / f"{submit}.json"
+    try:
+        data = read_regular(path, _MAX_MANIFEST)
+        tree = msgspec.json.decode(data, type=Tree)
+        names = [file.path for file in tree.files]
+        for name in names:
+            check_path(name)
+            if name.partition("/")[0] in LEFT_OUT:
+                raise BundleError(f"{name!a} is not the agent's")
+        if len(names) > MAX_FILES or len(set(names)) != len(names):
+            raise BundleError(f"{len(names)} files, some of one name, or more than {MAX_FILES}")
+        if sum(file.size for file in tree.files) > MAX_TREE_BYTES:
+            raise BundleError(f"more than {MAX_TREE_BYTES:,} bytes")
+    except (OSError, BundleError, *DECODE_ERRORS) as error:
+        why = getattr(error, "strerror", None) or str(error)
+        raise ConfigError(
+            f"{path}: {why}; name a submit whose workspace is recorded in {path.parent}"
+        ) from error
+    return tree, digest_of(data)
+
+
+def restore(folder: Path, tree: Tree, workspace: Path) -> None:
+    """Writes the files of a tree of the run at `folder` below `workspace`. Raises StorageError for a missing or wrong
+    content, and where the disk refuses."""
+    blobs = BlobStore(folder / TREES)
+    for file in tree.files:
+        try:
+            if blobs.size(file.blob) != file.size:
+                raise ValueError(f"its content has not {file.size:,} bytes")
+            data = blobs.read(file.blob)
+            _write(workspace / file.path, data, 0o755 if file.executable else 0o644)
+        except (OSError, ValueError, StorageError) as error:
+            raise StorageError(f"cannot restore {file.path}: {error}") from error
+
+
+def copy_history(
+    feedback: Path, history: Path, last: int, to: Path, most: int = MAX_STORED_BYTES
+) -> dict[str, str]:
+    """Copies the feedback of the submits up to index `last`, and the run's own `history` as `earlier/`, to the folder
+    `to`, read-only. Returns the omissions: beyond `most` bytes, what is no regular file, and links."""
+    omitted: dict[str, str] = {}
+    names = sorted(os.listdir(feedback)) if feedback.is_dir() and not feedback.is_symlink() else []
+    kept = [name for name in names if (number := submit_number(name)) is not None and number <= last]
+    sources = [(f"{name}/", feedback / name) for name in kept]
+    for prefix, source in [*sources, ("earlier/", history)]:
+        for path, file in _walk(source, (), 100 * MAX_FILES):
+            if isinstance(file, str):
+                omitted[prefix + path] = file
+                continue
+            with file:
+                data = file.read(most + 1)
+            if len(data) > most:
+                omitted[prefix + path] = "the history is too large"
+                continue
+            most -= len(data)
+            _write(to / prefix / path, data, 0o444)
+    return omitted
+
+
+def _write(path: Path, data: bytes, mode: int) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, mode)
+    with os.fdopen(fd, "wb") as out:
+        out.write(data)
+
+
+class Recorder:
+    """Records the workspace of one run. Contents of an earlier process count."""
+
+    def __init__(self, workspace: Path, folder: Path) -> None:
+        """`folder`: the run's `trees/`, outside the agent's reach."""
+        self._workspace, self._folder = workspace, folder
+        self._blobs = BlobStore(folder)
+        self._stored = sum(self._blobs.size(digest) for digest in self._blobs.digests())
+        self._seen: dict[str, _Seen] = {}
+        """By path, the files that need not be read again."""
+
+    def record(self, submit: str, bundle: Bundle | None, passed: Passed | None) -> str:
+        """Records the workspace now and returns the tree's digest. `bundle`: of this submit's `system/`; `passed`:
+        values of the run that are left out as keys are. Raises OSError and StorageError where the disk refuses."""
+        files: list[TreeFile] = []
+        omitted: dict[str, str] = {}
+        seen: dict[str, _Seen] = {}
+        stored, left = self._stored, MAX_TREE_BYTES
+        if os.path.lexists(self._workspace / HISTORY):
+            omitted[HISTORY] = "reserved for the history of a run that starts from a submit"
+        n_omitted = len(omitted)
+        whole = LEFT_OUT if bundle is None else LEFT_OUT | {"system"}
+        for path, taken in itertools.chain(_of(bundle), _walk(self._workspace, whole, 2 * MAX_FILES)):
+            one: TreeFile | str
+            if isinstance(taken, str):
+                one = taken
+            elif isinstance(taken, BundleFile):
+                one = self._keep(path, taken.executable, taken.data, left, passed)
+            else:
+                with taken:
+                    one = self._read(path, taken, left, passed, seen)
+            if isinstance(one, TreeFile) and len(files) == MAX_FILES:
+                one = f"more than {MAX_FILES} files"
+            if isinstance(one, TreeFile):
+                files.append(one)
+                left -= one.size
+                continue
+            n_omitted += 1
+            if len(omitted) < MAX_LISTED:
+                omitted[path] = one
+        self._seen = seen
+        if self._stored != stored:
+            sync_filesystem(self._folder)
+        files.sort(key=lambda file: file.path)
+        data = msgspec.json.encode(Tree(files=tuple(files), omitted=omitted, n_omitted=n_omitted))
+        write_atomically(self._folder / f"{submit}.json", data)
+        return digest_of(data)
+
+    def _read(
+        self, path: str, file: BinaryIO, left: int, passed: Passed | None, seen: dict[str, _Seen]
+    ) -> TreeFile | str:
+        info, now = os.fstat(file.fileno()), time.time_ns()
+        state, known = (info.st_ino, info.st_ctime_ns, info.st_size), self._seen.get(path)
+        if known is not None and known[0] == state and info.st_size <= left:
+            one: TreeFile | str = known[1]
+        elif info.st_size > min(left, MAX_FILE_BYTES):
+            one = f"{info.st_size:,} bytes are too many"
+        else:
+            data = file.read(info.st_size + 1)
+            one = self._keep(path, bool(info.st_mode & stat.S_IXUSR), data, left, passed)
+        if isinstance(one, TreeFile) and info.st_ctime_ns + _SETTLED_NS < now:
+            seen[path] = state, one
+        return one
+
+    def _keep(
+        self, path: str, executable: bool, data: bytes, left: int, passed: Passed | None
+    ) -> TreeFile | str:
+        """The file, stored, or why it is omitted."""
+        if len(data) > min(left, MAX_FILE_BYTES):
+            return f"{len(data):,} bytes are too many"
+        digest = digest_of(data)
+        if not self._blobs.has(digest):
+            for _, what in found(data, passed):
+                return f"holds {what}"
+            if self._stored + len(data) > MAX_STORED_BYTES:
+                return f"the run's trees hold {MAX_STORED_BYTES:,} bytes"
+            self._blobs.put(data, durable=False)
+            self._stored += len(data)
+        return TreeFile(path, digest, len(data), executable)
+
+
+def _of(bundle: Bundle | None) -> Iterator[tuple[str, BundleFile]]:
+    return ((f"system/{file.path}", file) for file in (() if bundle is None else bundle.files))
+
+
+def _walk(root: Path, leave_out: Collection[str], most: int) -> Iterator[tuple[str, BinaryIO | str]]:
+    """The regular files below `root`, open, by path; a text in place of one that is left out: why. No link is followed.
+    `most`: files and folders to look at."""
+    flags = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
+    left = most
+
+    def below(fd: int, base: str, depth: int) -> Iterator[tuple[str, BinaryIO | str]]:
+        nonlocal left
+        with os.scandir(fd) as entries:
+            names = sorted(entry.name for entry in itertools.islice(entries, left + 1))
+        if len(names) > left:
+            yield base or ".", f"more than {most} files and folders"
+            return
+        left -= len(names)
+        for name in names:
+            path = f"{base}/{name}" if base else name
+            if (not base and name in leave_out) or name in IGNORED_FOLDERS or name.endswith(COMPILED):
+                continue
+            try:
+                check_path(path)
+                path.encode()
+                if not stat.S_ISDIR(os.stat(name, dir_fd=fd, follow_symlinks=False).st_mode):
+                    file = open_regular(name, fd)
+                    if linked := os.fstat(file.fileno()).st_nlink > 1:
+                        file.close()
+                    yield path, "a hard link" if linked else file
+                    continue
+                if depth == MAX_DEPTH:
+                    yield path, f"folders nest deeper than {MAX_DEPTH}"
+                    continue
+                inner = os.open(name, flags, dir_fd=fd)
+            except (OSError, BundleError, UnicodeError) as error:
+                yield ascii(path)[1:-1][:240], str(getattr(error, "strerror", None) or error)[:240]
+                continue
+            try:
+                yield from below(inner, path, depth + 1)
+            finally:
+                os.close(inner)
+
+    with contextlib.suppress(OSError):
+        top = os.open(root, flags)
+        try:
+            yield from below(top, "", 0)
+        finally:
+            os.close(top)
