@@ -54,6 +54,7 @@ class RunOptions(TypedDict, total=False):
     limits: Mapping[str, float] | None
     video: VideoOption
     feedback: FeedbackDetail | None
+    start_from: str | None
     agents_md: AnyPath | None
     prompts: AnyPath | None
     prices: AnyPath | None

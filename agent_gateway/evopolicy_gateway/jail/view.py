@@ -102,8 +102,9 @@ class View(msgspec.Struct, frozen=True, kw_only=True):
         workspace = str(self.workspace)
         self._make_way(workspace)
         command += ["--bind", workspace, workspace]
-        for name in ("feedback", "AGENTS.md"):
-            if (self.workspace / name).exists():
+        for name in ("feedback", "AGENTS.md", "history"):
+            # An agent may have a folder of that name of its own, which it may change.
+            if (self.workspace / name / ("START.json" if name == "history" else "")).exists():
                 command += ["--ro-bind", f"{workspace}/{name}", f"{workspace}/{name}"]
         for source, target in self.inputs:
             self._make_way(target)

@@ -26,7 +26,7 @@ from evopolicy_common.errors import ConfigError, RefusedError
 from evopolicy_common.logs import structlog
 from evopolicy_common.records.blobs import BlobStore
 from evopolicy_common.records.open_run import Closed, OpenedRun
-from evopolicy_common.records.trees import Recorder
+from evopolicy_common.records.policies.trees import Recorder
 from evopolicy_common.refusals import RUN_OVER
 from evopolicy_common.wire import credentials, transport
 from evopolicy_common.wire.http import serving

@@ -53,7 +53,7 @@ from evopolicy_gateway.processes import child_messages, child_rpc
 from evopolicy_gateway.processes.child_messages import AgentEnded, Ready, StartAgent
 from evopolicy_gateway.processes.child_rpc import Child
 from evopolicy_gateway.relay.service import Order
-from evopolicy_gateway.run import record
+from evopolicy_gateway.run import record, starts
 from evopolicy_gateway.run.model_relay import ModelRelay
 from evopolicy_gateway.run.operations import Operations
 from evopolicy_gateway.run.plan import Plan
@@ -193,6 +193,8 @@ class RunLifecycle:
         async with child_process.starting():
             plan.claim()
         folder.state.mkdir(mode=0o700)
+        if plan.start_from:
+            await asyncio.to_thread(starts.stage, starts.find(plan.start_from, plan.started_in), folder)
         save(folder.intended, IntendedRun(key=key, settings=plan.settings))
         folder.asked.unlink(missing_ok=True)
         if plan.listener is not None:

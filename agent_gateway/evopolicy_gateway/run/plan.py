@@ -62,6 +62,8 @@ class Plan(msgspec.Struct, frozen=True, kw_only=True):
     """Maximum number of simultaneous runs of its entry; None: no limit of its own."""
     jail: JailSettings = JailSettings()
     limits: AgentLimits = AgentLimits()
+    start_from: str = ""
+    """`RUN@submit_NNN` with an absolute path, as `settings.start` names it; empty: the usual workspace."""
     listener: Listener | None = None
     """The address that serves a remote agent; None for an agent that is started here."""
 
@@ -159,6 +161,8 @@ class Plan(msgspec.Struct, frozen=True, kw_only=True):
         if self.texts.inputs and self.jail.mode == "none":
             raise ConfigError("skills and [mcp] servers are shown by the agent's jail; leave out --jail none")
         folder = self.folder
+        if self.start_from.rpartition("@")[0] == str(folder.root):
+            raise ConfigError(f"{folder.root} cannot start from itself; choose another --exp-id")
         if not folder.root.exists():
             return
         if not (folder.run_json.exists() or folder.state.exists() or not any(folder.root.iterdir())):

@@ -233,6 +233,8 @@ def run_record(
         versions=_versions(finished, staged),
         audit=finished.audit,
         committed=finished.committed,
+        start=settings.start,
+        trees={str(submit.submit_index): submit.tree for submit in finished.submits if submit.tree},
     )
 
 

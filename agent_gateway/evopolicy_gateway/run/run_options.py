@@ -24,7 +24,7 @@ from evopolicy_gateway import harnesses
 from evopolicy_gateway.declared import Count, Option, Several
 from evopolicy_gateway.harnesses.interface.agent_config import AgentConfig
 from evopolicy_gateway.processes.clock import SILENCE_S
-from evopolicy_gateway.run import prices, texts
+from evopolicy_gateway.run import prices, starts, texts
 from evopolicy_gateway.run.options import agent_limits, default_exp_id, limits_of, run_settings
 from evopolicy_gateway.run.plan import WALL_S, Plan
 from evopolicy_gateway.run.texts import Texts
@@ -111,6 +111,9 @@ class RunOptions(PolicyPart, frozen=True, kw_only=True):
 
     group: ClassVar[str] = "Agent"
 
+    start_from: Annotated[str | None, Option(metavar="RUN@submit_NNN")] = None
+    """Start with the workspace as it was at that submit of an earlier run of this cluster, and its feedback below
+    history/. The run has a full budget of its own."""
     agents_md: Annotated[Path | None, Option(metavar="FILE")] = None
     """Replacement for AGENTS.md; `evopolicy texts` prints the standard one."""
     prompts: Annotated[Path | None, Option(metavar="FILE.toml")] = None
@@ -156,6 +159,10 @@ class RunOptions(PolicyPart, frozen=True, kw_only=True):
         """The run with these settings. `config`: as for `texts`; `more`: further fields of the plan. Raises
         ConfigError."""
         known = config or harnesses.config_of(self.agent, started_in)
+        if self.start_from is not None:
+            found = starts.find(self.start_from, started_in)
+            settings = msgspec.structs.replace(settings, start=found.start)
+            more["start_from"] = found.text
         return Plan(
             settings=settings,
             config=config,

@@ -16,9 +16,9 @@ from evopolicy_common.catalogue import earlier_folder_name, folder_name
 from evopolicy_common.errors import DECODE_ERRORS, ConfigError
 from evopolicy_common.records import open_run
 from evopolicy_common.records.blobs import write_atomically
+from evopolicy_common.records.policies.trees import HISTORY, TREES
 from evopolicy_common.records.run_record import Artifacts
 from evopolicy_common.records.secrets import PASSED
-from evopolicy_common.records.trees import TREES
 from evopolicy_common.wire import keys
 
 T = TypeVar("T")
@@ -52,13 +52,18 @@ class RunFolder(msgspec.Struct, frozen=True):
         return self.workspace / "feedback"
 
     @property
+    def history(self) -> Path:
+        """The feedback of the run that this one starts from, read-only."""
+        return self.workspace / HISTORY
+
+    @property
     def checkpoints(self) -> Path:
         """The submitted policies with their metrics, written at the end."""
         return self.root / "checkpoints"
 
     @property
     def trees(self) -> Path:
-        """The workspace at each submit (`evopolicy_common.records.trees`)."""
+        """The workspace at each submit (`evopolicy_common.records.policies.trees`)."""
         return self.root / TREES
 
     @property
@@ -188,6 +193,11 @@ class RunFolder(msgspec.Struct, frozen=True):
     def agent(self) -> Path:
         """A jailed agent's files outside its workspace: home and /tmp."""
         return self.state / "agent"
+
+    @property
+    def start(self) -> Path:
+        """`Start` of a run whose workspace is that of an earlier submit."""
+        return self.state / "start.json"
 
     @property
     def staged(self) -> Path:

@@ -140,6 +140,7 @@ class CoordinatorClient:
             env_instances=request.env_instances,
             bundle=request.bundle,
             bundle_error=request.bundle_error,
+            tree=request.tree,
             rejected=None if request.rejected is None else request.rejected.status,
         )
         return await self._ask("submit", message, SubmitAccepted)

@@ -22,7 +22,7 @@ from evopolicy_common.logs import structlog
 from evopolicy_common.messages.gateway import RunOpened, RunState, SubmitAccepted, SubmitDone
 from evopolicy_common.records.blobs import BlobStore
 from evopolicy_common.records.open_run import Accepted, AnyEntry, Died, Requested, Settled
-from evopolicy_common.records.trees import Recorder
+from evopolicy_common.records.policies.trees import Recorder
 from evopolicy_common.refusals import Refusal
 from evopolicy_gateway.run_folder.journal import Journal
 from evopolicy_gateway.submits import snapshots

@@ -14,8 +14,8 @@ from evopolicy_common.messages.episode import FailureCategory, PolicyFailure
 from evopolicy_common.records.blobs import BlobStore
 from evopolicy_common.records.code_metrics import MAX_PARSED_BYTES, parse
 from evopolicy_common.records.policies import bundles
+from evopolicy_common.records.policies.trees import Recorder
 from evopolicy_common.records.secrets import read_passed
-from evopolicy_common.records.trees import Recorder
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
 

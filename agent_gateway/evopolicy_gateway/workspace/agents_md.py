@@ -100,7 +100,7 @@ $rule## Where things are
 |---|---|
 | `system/` | yours: `policy.py` with a top-level `class Policy`, and whatever it imports or reads |
 | `feedback/` | written by the service after each submit; read it, do not change it |
-| `AGENTS.md` | this file; do not change it |
+$history| `AGENTS.md` | this file; do not change it |
 
 Anything else you put here is your own scratch space and is never played. Your working directory is this folder. The
 $addresses
@@ -208,6 +208,10 @@ Episodes are numbered through the run. While a submit runs, its finished episode
 """)
 
 
+_HISTORY = (
+    "| `history/` | the feedback of an earlier run, up to the submit whose files you find here; read it, do not change"
+    " it |\n"
+)
 _OBSERVATIONS = {
     "arrays": "numpy arrays, ints, strings, dicts and tuples",
     "lists": "nested lists, numbers, strings and dicts",
@@ -290,8 +294,9 @@ def check_agents_md(where: str, text: str) -> None:
     check_text(where, text, PLACEHOLDERS)
 
 
-def agents_md(run: RunOpened, urls: Urls, text: str = "") -> str:
-    """The text for one run. `text`: the operator's own with `PLACEHOLDERS`; empty: the standard text."""
+def agents_md(run: RunOpened, urls: Urls, text: str = "", *, started: bool = False) -> str:
+    """The text for one run. `text`: the operator's own with `PLACEHOLDERS`; empty: the standard text. `started`: the
+    run starts from a submit of an earlier one."""
     n_example = max(run.min_episodes_per_submit, min(2, run.max_episodes_per_submit, run.episode_budget))
     example = [index % run.n_env_instances for index in range(n_example)]
     most = min(run.max_episodes_per_submit, run.episode_budget)
@@ -326,6 +331,7 @@ def agents_md(run: RunOpened, urls: Urls, text: str = "") -> str:
         "submit_url": urls.submit,
         "last_words": f"{LAST_WORDS_S:g}",
         "canary": CANARY,
+        "history": _HISTORY if started else "",
     }
     known["share"] = f"{episode_share(run.limits, run.episode_budget):,}"
     known["look"] = "" if run.feedback == "scores" else Template(_LOOK).substitute(known)

@@ -30,12 +30,15 @@ def stage(folder: RunFolder, run: RunOpened, urls: Urls, text: str = "") -> Stag
         return saved(folder.staged, Staged)
     folder.system.mkdir(parents=True, exist_ok=True)
     folder.feedback.mkdir(exist_ok=True)
-    policy = initial_policy(run.env.action_space).encode()
-    write_atomically(folder.system / "policy.py", policy)
-    rules = agents_md(run, urls, text).encode()
+    policy, started = initial_policy(run.env.action_space).encode(), folder.start.exists()
+    if started:  # its submit may have been without a policy
+        policy = (folder.system / "policy.py").read_bytes() if (folder.system / "policy.py").exists() else b""
+    else:
+        write_atomically(folder.system / "policy.py", policy)
+    rules = agents_md(run, urls, text, started=started).encode()
     write_atomically(folder.agents_md, rules, mode=0o444)
     staged = Staged(
-        agents_md_hash=digest_of(agents_md(run, NO_URLS, text).encode()),
+        agents_md_hash=digest_of(agents_md(run, NO_URLS, text, started=started).encode()),
         agents_md_file_hash=digest_of(rules),
         initial_policy_hash=digest_of(policy),
         n_train=run.n_env_instances,

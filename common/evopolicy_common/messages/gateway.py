@@ -183,6 +183,8 @@ class Submit(Message, frozen=True, kw_only=True, tag="submit"):
     rejected: RejectedStatus | None = None
     """In the published profiles: the request takes an index, plays nothing, and has this verdict. It has no cases,
     bundle or `bundle_error` then."""
+    tree: Word = ""
+    """Digest of the recorded workspace, from which other runs may start; empty: not recorded."""
 
 
 class SubmitAccepted(Message, frozen=True, kw_only=True, tag="submit_accepted"):

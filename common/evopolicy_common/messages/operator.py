@@ -126,6 +126,8 @@ class SubmitRecord(msgspec.Struct, frozen=True, kw_only=True):
     val_mean: Number | None
     started_at: Number
     completed_at: Number
+    tree: Word = ""
+    """Digest of the workspace at the submit; empty: not recorded."""
 
 
 class WaitRun(Message, frozen=True, kw_only=True, tag="wait_run"):

@@ -35,6 +35,19 @@ ELSEWHERE = "elsewhere"
 """Value of `RunSettings.agent_host`: the operator vouches that the agent is on no machine of the cluster."""
 
 
+class Start(msgspec.Struct, frozen=True, kw_only=True):
+    """The submit of an earlier run from whose workspace a run starts."""
+
+    run: Word
+    """The coordinator's name of that run."""
+    submit_index: Int
+    tree: Word
+    """SHA-256, hex, of the recorded workspace, as that run's gateway named it with the submit."""
+    parent_scored: bool = False
+    """Set by the coordinator: the agent of that run, or of one that it started from, had ended, so that a result may
+    have chosen the place."""
+
+
 class RunSettings(msgspec.Struct, frozen=True, kw_only=True):
     """Settings with which a run is opened. None means the suite's own number."""
 
@@ -78,6 +91,8 @@ class RunSettings(msgspec.Struct, frozen=True, kw_only=True):
     """First digits of the digest of the environment's definition; empty: the definition that ships or is approved."""
     agent_host: Word = ""
     """Boot id of the agent's kernel, or `ELSEWHERE`; empty: the gateway's own kernel, or unknown for a remote agent."""
+    start: Start | None = None
+    """None: the run starts with the usual workspace."""
 
     @property
     def recorded_heldout(self) -> VideoOption:
@@ -110,6 +125,8 @@ def off_profile(settings: RunSettings) -> str:
     n_validation, n_heldout = HIDDEN_COUNTS[settings.profile]
     fixed = {**PUBLISHED, "n_validation": n_validation, "n_heldout": n_heldout}
     values = {name: getattr(settings, name) for name in fixed}
+    if settings.start is not None:
+        return "a start from a submit"
     return ", ".join(
         f"{name} {values[name]} (not {value})" for name, value in fixed.items() if values[name] != value
     )

@@ -106,6 +106,8 @@ class SubmitResult(msgspec.Struct, frozen=True, kw_only=True):
     env_instances: Many[Int]
     mean_return: Number | None
     val_mean: Number | None
+    tree: Word = ""
+    """Digest of the workspace; empty where it was not recorded, and in documents of earlier versions."""
 
 
 class Result(msgspec.Struct, frozen=True, kw_only=True):
@@ -170,6 +172,7 @@ def result_of(finished: RunFinished) -> Result:
                 env_instances=submit.env_instances,
                 mean_return=submit.mean_return,
                 val_mean=submit.val_mean,
+                tree=submit.tree,
             )
             for submit in finished.submits
         ),

@@ -68,7 +68,7 @@ class Requested(Entry, frozen=True, kw_only=True, tag="requested"):
     kept: str | None = None
     """As in `Snapshot`."""
     tree: str = ""
-    """Digest of the workspace's tree (`records/trees`); empty: not recorded."""
+    """Digest of the workspace's tree (`records/policies/trees`); empty: not recorded."""
     echoed: tuple[int | bool, ...] | None = None
     """The ids as the summary shows them, where they are not `env_instances`."""
     rejected: Rejection | None = None

@@ -30,7 +30,7 @@ from evopolicy_common.messages.episode import FailureCategory, ResourceLimits, T
 from evopolicy_common.messages.gateway import FeedbackDetail, FinishRule, Profile, SimulationRule, VideoOption
 from evopolicy_common.messages.journal import Committed
 from evopolicy_common.messages.operator import RunEnd
-from evopolicy_common.messages.run_settings import HiddenCases, HiddenIsolation
+from evopolicy_common.messages.run_settings import HiddenCases, HiddenIsolation, Start
 from evopolicy_common.records.code_metrics import PUBLISHED_SCHEMA
 from evopolicy_common.records.newest import described_data
 
@@ -459,6 +459,11 @@ class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
     """Result of the audits on other workers; None without audits."""
     committed: Committed | None = None
     """The coordinator's commitment before the agent started; None for runs from before the journal."""
+    start: Start | None = None
+    """The submit of an earlier run whose workspace this one began with; None: the usual workspace."""
+    trees: dict[str, str] = {}
+    """Submit index (decimal text) to the SHA-256 of `trees/submit_NNN.json`, the workspace at that submit; empty in
+    older files."""
 
 
 class _Header(msgspec.Struct, frozen=True, kw_only=True):

@@ -32,6 +32,7 @@ from evopolicy_common.messages.operator import (
     Signed,
     SignRequest,
 )
+from evopolicy_common.messages.run_settings import Start
 from evopolicy_common.messages.status import DiskUse
 from evopolicy_common.messages.worker import BlobAck, BlobChunk, BlobGet, BlobPut, Message, Refused
 from evopolicy_common.records import journal
@@ -42,7 +43,7 @@ from evopolicy_common.wire.transport import IncomingQuery
 from evopolicy_coordinator.core.contract import records
 from evopolicy_coordinator.core.contract.effects import AuditEffect, ReadEvaluation, ReadFinished, ReadResults
 from evopolicy_coordinator.core.contract.events import AuditEvent
-from evopolicy_coordinator.core.contract.records import RunRow
+from evopolicy_coordinator.core.contract.records import RunRow, SubmitRow
 from evopolicy_coordinator.pki import identity
 from evopolicy_coordinator.server.reason_texts import env_failure, operator_words, words
 from evopolicy_coordinator.server.uploads import Uploads
@@ -168,6 +169,15 @@ class ServiceReader:
         """
         try:
             return self._reader.run(run) if run and self._reader.finished(run) is not None else None
+        except DamagedStoreError as error:
+            raise damaged(error) from error
+
+    def parent(self, start: Start) -> tuple[RunRow | None, SubmitRow | None, bool]:
+        """The run and the submit that `start` names, None for an unknown one, and whether that run's agent has ended.
+        Reads the database. Raises RefusedError when a row cannot be read."""
+        try:
+            submit = self._reader.submit(start.run, start.submit_index)
+            return self._reader.run(start.run), submit, self._reader.ended(start.run)
         except DamagedStoreError as error:
             raise damaged(error) from error
 

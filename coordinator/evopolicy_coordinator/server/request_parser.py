@@ -20,7 +20,7 @@ from evopolicy_common import catalogue
 from evopolicy_common.catalogue.worlds import OPTION, unchanged
 from evopolicy_common.errors import ConfigError, ProtocolError, RefusedError
 from evopolicy_common.messages import gateway, operator, worker
-from evopolicy_common.messages.environment import Split, StepLimit
+from evopolicy_common.messages.environment import Case, Split, StepLimit
 from evopolicy_common.messages.episode import BlobRef
 from evopolicy_common.messages.run_settings import (
     MAX_EPISODES_PER_SUBMIT,
@@ -39,7 +39,7 @@ from evopolicy_common.wire import codec, keys
 from evopolicy_common.wire.credentials import Role
 from evopolicy_coordinator.core.contract import events
 from evopolicy_coordinator.core.contract.events import AnyEvent
-from evopolicy_coordinator.core.contract.records import EvaluationRow, RunRow
+from evopolicy_coordinator.core.contract.records import EvaluationRow, RunRow, SubmitRow
 from evopolicy_coordinator.core.runs.templates import RANDOM
 from evopolicy_coordinator.pki.machines import Machines
 from evopolicy_coordinator.server.definitions import Definitions
@@ -293,7 +293,15 @@ class RequestParser:
 
     # Operators.
 
-    def _run_created(self, m: operator.CreateRun, request: int, stimulus: str) -> AnyEvent:
+    def run_created(
+        self,
+        m: operator.CreateRun,
+        request: int,
+        stimulus: str,
+        parent: tuple[RunRow | None, SubmitRow | None, bool] = (None, None, False),
+    ) -> AnyEvent:
+        """Builds the event that opens a run. `parent`: the run and submit that it starts from, and whether that run's
+        agent has ended."""
         check_idempotency_key(m.key)
         wanted = m.settings
         check_limits(wanted.limits)
@@ -301,6 +309,7 @@ class RequestParser:
             suite = catalogue.suite_of(wanted.env)
             budget, least, most = episode_counts(wanted, suite)
             self._check_profile(wanted)
+            wanted, related = _started(wanted, *parent)
             cases = self._source.splits(
                 suite.name,
                 wanted.env,
@@ -335,6 +344,9 @@ class RequestParser:
             allowed_imports=self._allowed_imports,
             denied_imports=self._denied_imports,
             max_steps=_max_steps(wanted.env, wanted.step_limit),
+            related=tuple(
+                case for case in related if case not in cases.validation and case not in cases.heldout
+            ),
         )
         return events.RunCreated(stimulus_id=stimulus, request=request, message=m, row=row)
 
@@ -597,7 +609,7 @@ REQUESTS: dict[type[Message], Request] = {
     gateway.Submit: Request("submit", RequestParser._checked_submit, creates=True),
     gateway.ResultsRequest: Request("results", RequestParser._checked_poll),
     gateway.CloseRun: Request("close", RequestParser._checked_close),
-    operator.CreateRun: Request(made=RequestParser._run_created, creates=True),
+    operator.CreateRun: Request(made=RequestParser.run_created, creates=True),
     operator.Evaluate: Request(made=RequestParser.evaluation_requested, creates=True),
     operator.Rescore: Request(creates=True),
     operator.Disclose: Request(creates=True),
@@ -626,6 +638,35 @@ def _derived(run: RunRow | None) -> RunRow | None:
     """Returns the run if its cases came from a secret; its coordinator may have another one now (see
     `splits.secret_of`)."""
     return run if run is not None and run.split_hashes.keys() == set(SPLITS) else None
+
+
+def _started(
+    wanted: RunSettings, parent: RunRow | None, submit: SubmitRow | None, ended: bool
+) -> tuple[RunSettings, tuple[Case, ...]]:
+    """The settings of a run with its start as the coordinator knows it, and the hidden cases of the runs before it.
+
+    Raises ConfigError for a start that is not as its gateway recorded it."""
+    start = wanted.start
+    if start is None:
+        return wanted, ()
+    where = f"start from submit {start.submit_index} of run {start.run}"
+    if parent is None or submit is None:
+        raise ConfigError(f"{where}: this coordinator has no such submit; name a run that it has played")
+    if not submit.tree or submit.tree != start.tree:
+        raise ConfigError(
+            f"{where}: tree {start.tree or 'none'} is not the one recorded at the submit, {submit.tree or 'none'}:"
+            " restore the run's folder, or name another submit"
+        )
+    if parent.settings.env != wanted.env:
+        raise ConfigError(
+            f"{where}: it is a run on {parent.settings.env}, not {wanted.env}; name its environment"
+        )
+    before = parent.settings.start
+    scored = ended or (before is not None and before.parent_scored)
+    return (
+        replace(wanted, start=replace(start, parent_scored=scored)),
+        (*parent.validation, *parent.heldout, *parent.related),
+    )
 
 
 def _or(value: int | None, otherwise: int) -> int:

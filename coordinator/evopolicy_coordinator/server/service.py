@@ -255,6 +255,9 @@ class Service:
         if isinstance(message, operator.Evaluate) and message.as_in is not None:
             row = self._reader.finished_run(message.as_in.run)
             return self._parser.evaluation_requested(message, request, stimulus, row)
+        if isinstance(message, operator.CreateRun) and message.settings.start is not None:
+            parent = self._reader.parent(message.settings.start)
+            return self._parser.run_created(message, request, stimulus, parent)
         if isinstance(message, operator.Rescore):
             of, result = self._reader.finished_with_result(message.run)
             return self._parser.rescore_requested(message, request, stimulus, of, result)

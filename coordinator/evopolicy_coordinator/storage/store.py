@@ -313,6 +313,11 @@ class Reader:
         """The run as it was created; None for an unknown one."""
         return self._one(RunRow, "WHERE run = ?", (run,))
 
+    def ended(self, run: str) -> bool:
+        """Whether the agent of a run has ended."""
+        row = self._one(RunStateRow, "WHERE run = ?", (run,))
+        return row is not None and row.phase != "open"
+
     def journal(self, cursor: int, max_bytes: int) -> tuple[JournalRow, ...]:
         """Entries of the journal from `cursor` on, up to `max_bytes` but at least one; empty past the last entry."""
         return self._page(JournalRow, "WHERE seq >= ? ORDER BY seq", (cursor,), max_bytes)

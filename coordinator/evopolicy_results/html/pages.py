@@ -121,6 +121,7 @@ def index_page(
             + [v for s in ranked for v in shown_tables(f"aggregates_{s}", f"improvement_{s}")]
             + [{**v, "folded": True} for s in suites for v in shown_tables(f"pairs_{s}", f"generalisation_{s}")],
         ),
+        section("starts", "Runs from one state", tables=shown_tables("starts")),
         section(
             "evolution",
             "Score evolution",

@@ -184,6 +184,8 @@ def _record(run: PublishedRun, history: History) -> Iterator[Fault]:
         ("agent.entry", record.agent.entry, settings.entry),
         ("sandbox_tier", record.sandbox_tier, settings.sandbox_tier),
         ("episode_budget", dimensions.episode_budget, opening.budget),
+        ("start", record.start, settings.start),
+        ("trees", record.trees, {str(one.submit_index): one.tree for one in result.submits if one.tree}),
         ("versions.data_secret", record.versions.data_secret, opening.cases_secret),
     ]
     for name in (

@@ -74,6 +74,16 @@ def matched(samples: Sequence[Sample]) -> Matched | None:
     )
 
 
+def returns_of(run: Run) -> RunReturns:
+    """What the statistics use of a run."""
+    shared = run.record.experiment_dimensions.hidden_cases == "shared"
+    return RunReturns(
+        score=run.score,
+        returns=run.record.outcome.heldout_returns if run.score is not None else (),
+        case_set=run.record.versions.cases_hash("heldout") if shared else "",
+    )
+
+
 def samples_of(runs: Iterable[Run], table: ScoreTable) -> dict[tuple[str, str], Sample]:
     """A sample for each cell of `table`, by (entry, env): the runs' own returns, or only scores if nothing else is
     known.
@@ -83,14 +93,9 @@ def samples_of(runs: Iterable[Run], table: ScoreTable) -> dict[tuple[str, str], 
     found: dict[tuple[str, str], list[RunReturns]] = {}
     reference: dict[str, list[RunReturns]] = {}
     for run in runs:
-        outcome = run.record.outcome
-        shared = run.record.experiment_dimensions.hidden_cases == "shared"
-        case_set = run.record.versions.cases_hash("heldout") if shared else ""
-        returns = outcome.heldout_returns if run.score is not None else ()
-        found.setdefault((run.entry, run.env), []).append(
-            RunReturns(score=run.score, returns=returns, case_set=case_set)
-        )
-        recorded = outcome.random_reference
+        played = returns_of(run)
+        found.setdefault((run.entry, run.env), []).append(played)
+        case_set, recorded = played.case_set, run.record.outcome.random_reference
         if recorded is not None and recorded.returns and recorded.seeded_by == "case" and case_set:
             reference.setdefault(run.env, []).append(
                 RunReturns(score=recorded.mean_return, returns=recorded.returns, case_set=case_set)

@@ -20,6 +20,7 @@ from evopolicy_results.scoring.evolution import Evolution, evolutions
 from evopolicy_results.scoring.normalised import Normalised, normalised
 from evopolicy_results.scoring.ranking import Leaderboard, leaderboard
 from evopolicy_results.scoring.scores import ScoreTable, score_table
+from evopolicy_results.statistics.starts import VARIED, StartGroup, grouped, start_groups
 from evopolicy_results.statistics.suite import SuiteStatistics, suite_statistics
 
 
@@ -69,6 +70,8 @@ class Study(msgspec.Struct, frozen=True, kw_only=True):
     edit_sizes: tuple[EditSizeBin, ...]
     tokens: tuple[TokenUse, ...]
     audit: tuple[AuditSignals, ...]
+    starts: tuple[StartGroup, ...] = ()
+    """Runs that start from a submit of an earlier run: all other metrics but `audit` leave them out."""
 
     @property
     def entries(self) -> list[str]:
@@ -113,17 +116,20 @@ def study_of(
     only in the leaderboard and normalised performance. Its entries must differ from those of the runs.
     """
     learn_names(run.record for run in runs)
-    mixed = mixtures(runs)
-    table = score_table(runs)
+    whole = [run for run in runs if run.record.start is None]
+    mixed = mixtures(whole)
+    for group in grouped(runs).values():
+        mixed += [one for one in mixtures(group) if one.what not in VARIED]
+    table = score_table(whole)
     if scores is not None:
         table, more = _merged(table, scores)
         mixed += more
     refused = [one for one in mixed if not (allow_unknown if one.what == UNKNOWN_ISOLATION else allow_mixed)]
     if refused:
         raise MixedRunsError(refused)
-    ordered = _in_order(runs)
+    every, ordered = _in_order(runs), _in_order(whole)
     return Study(
-        runs=tuple(ordered),
+        runs=tuple(every),
         left_out=tuple(left_out),
         mixtures=tuple(mixed),
         suites=tuple(
@@ -146,7 +152,8 @@ def study_of(
         structure=tuple(structure_means(ordered)),
         edit_sizes=tuple(edit_size_bins(ordered)),
         tokens=tuple(token_use(ordered)),
-        audit=tuple(audit_signals(ordered)),
+        audit=tuple(audit_signals(every)),
+        starts=tuple(start_groups(every, resamples=resamples)),
     )
 
 

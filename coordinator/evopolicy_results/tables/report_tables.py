@@ -33,6 +33,7 @@ from evopolicy_results.tables.statistics_tables import (
     has_single_runs,
     interval_text,
     span,
+    starts_table,
     statistics_tables,
 )
 from evopolicy_results.tables.table import Column, Table, best_marks, tabulated
@@ -48,6 +49,7 @@ def tables_of(study: Study, link_of: LinkOf = no_link) -> list[Table]:
         scored += [*statistics_tables(suite), _normalised(suite)]
         found += [_labelled(table, study.post_hoc) for table in scored]
     found += [
+        starts_table(study.starts),
         _evolution(study, link_of),
         _edit_types(study),
         _structure(study),

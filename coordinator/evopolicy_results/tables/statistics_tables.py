@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from evopolicy_common.statistics.distributions import ALPHA
@@ -12,6 +12,7 @@ from evopolicy_results.statistics.aggregates import LEAST_RUNS, TAUS, Bounded
 from evopolicy_results.statistics.pairs import Pair
 from evopolicy_results.statistics.repeats import MAX_REPEATS, Repeats
 from evopolicy_results.statistics.resolution import GAPS, Resolution
+from evopolicy_results.statistics.starts import StartGroup
 from evopolicy_results.studies.study import Suite
 from evopolicy_results.tables.run_tables import ENTRY, ENV
 from evopolicy_results.tables.table import Column, Table, tabulated
@@ -29,6 +30,58 @@ def statistics_tables(suite: Suite) -> list[Table]:
         _improvements(suite),
         _generalisation(suite),
     ]
+
+
+def starts_table(groups: Sequence[StartGroup]) -> Table:
+    """Runs from the same submit of an earlier run, compared with each other; no rows without such runs."""
+
+    def pair_row(pair: Pair) -> dict[str, Any]:
+        return {
+            "first": pair.first,
+            "second": pair.second,
+            "runs": "{} and {}".format(*pair.n_runs),
+            "gap": None if pair.gap is None else pair.gap.value,
+            "interval": interval_text(pair.gap) or pair.reason or None,
+            "p_holm": pair.p_holm,
+            "told_apart": _told_apart(pair),
+            "cases": pair.n_cases or None,
+        }
+
+    rows: list[dict[str, Any]] = []
+    for group in groups:
+        of = {
+            "env": title_of(group.env),
+            "start": f"{group.parent}, submit {group.start.submit_index}",
+            "scored": "yes" if group.parent_scored else "no",
+        }
+        found = [pair_row(pair) for pair in group.pairs]
+        lone = [{"first": label, "runs": str(n)} for label, n in group.variants.items()]
+        rows += [of | row for row in found or lone]
+    return Table(
+        name="starts",
+        title="Runs from one state",
+        caption=(
+            "Runs that start from a submit of an earlier run, compared with those from the same submit: first minus"
+            " second, in held-out returns, paired by case, with the 95 % interval and Holm's correction over all pairs"
+            " from one state. They are on no leaderboard and in no other table of scores. Place chosen: the earlier"
+            " run's agent had ended when a run started, so that its result may have chosen the submit; the differences"
+            " between runs from it stay valid, their level is not a score from scratch."
+        ),
+        columns=(
+            ENV,
+            Column("start", "From"),
+            Column("scored", "Place chosen"),
+            Column("first", "First"),
+            Column("second", "Second"),
+            Column("gap", "Difference", "number"),
+            Column("interval", "95 % interval"),
+            Column("p_holm", "Corrected p", "number", digits=4, below=True),
+            Column("told_apart", "Significantly better"),
+            Column("runs", "Runs"),
+            Column("cases", "Cases", "integer"),
+        ),
+        rows=tuple(rows),
+    )
 
 
 def span(low: float | None, high: float | None, digits: int) -> str | None:

@@ -11,6 +11,8 @@ from typing import Any, Literal
 
 import msgspec
 
+from evopolicy_common.messages.gateway import FeedbackDetail
+from evopolicy_common.messages.run_settings import Start
 from evopolicy_common.records.policies import checkpoints
 from evopolicy_common.records.policies.bundles import BundleFile, pack
 from evopolicy_common.records.policies.checkpoints import CheckpointMeta
@@ -63,6 +65,9 @@ def write_run(
     closed_reason: str | None = None,
     settings: Mapping[str, Any] | None = None,
     simulation: Literal["forbidden", "allowed"] = "forbidden",
+    feedback: FeedbackDetail = "pictures",
+    start: Start | None = None,
+    run: str = "",
 ) -> Path:
     """Writes one run directory under `runs` and returns it. `heldout` defaults to the best validation score alone."""
     folder = (
@@ -87,6 +92,8 @@ def write_run(
         env=env,
         exp_id=exp_id,
         repeat=repeat,
+        start=start,
+        run=run,
         agent=Agent(
             entry=entry,
             harness=harness,
@@ -109,6 +116,7 @@ def write_run(
             n_heldout=32,
             simulation=simulation,
             hidden_cases=hidden_cases,  # type: ignore[arg-type]
+            feedback=feedback,
         ),
         timing=Timing(
             start_time=utc_text(START),

@@ -189,7 +189,7 @@ def load(
         run = runs.get(row.run)
         if run is None or row.ended_at is not None:
             continue
-        case_set = state.case_sets.join(run.settings.env, (*run.validation, *run.heldout))
+        case_set = state.case_sets.join(run.settings.env, (*run.validation, *run.heldout, *run.related))
         restore(state, row, case_set)
         state.case_sets.leave(case_set)
         stored = states.get(row.run)

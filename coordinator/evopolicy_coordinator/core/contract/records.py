@@ -69,6 +69,8 @@ class RunRow(msgspec.Struct, frozen=True, kw_only=True, tag="run"):
     created_at: float = 0.0
     """Unix time, seconds (so are all `*_at`)."""
     stimulus_id: str = ""
+    related: tuple[Case, ...] = ()
+    """Hidden cases of the runs that it starts from, as far as they are not its own."""
 
 
 class RunStateRow(msgspec.Struct, frozen=True, kw_only=True, tag="run_state"):
@@ -128,6 +130,8 @@ class SubmitRow(msgspec.Struct, frozen=True, kw_only=True, tag="submit"):
     """Why the checkpoint cannot be selected; None if it can."""
     held_s: float = 0.0
     """Seconds for which none of its episodes ran because hidden jobs occupied the machines."""
+    tree: str = ""
+    """Digest of the workspace, as the gateway named it."""
     refunded: bool = False
     """The run was cancelled while this submit was open: it is not charged."""
 

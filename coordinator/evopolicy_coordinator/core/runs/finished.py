@@ -148,6 +148,7 @@ def _submit_record(row: SubmitRow) -> operator.SubmitRecord:
         val_mean=row.val_mean,
         started_at=row.accepted_at,
         completed_at=done.completed_at,
+        tree=row.tree,
     )
 
 

@@ -61,7 +61,7 @@ def create(state: State, event: events.RunCreated, step: Step) -> None:
 def enter(state: State, row: RunRow, stored: RunStateRow) -> Run:
     """Add a run to the core, with its whole budget available."""
     env, tier = row.settings.env, row.settings.sandbox_tier
-    case_set = state.case_sets.join(env, (*row.validation, *row.heldout))
+    case_set = state.case_sets.join(env, (*row.validation, *row.heldout, *row.related))
     closed = stored.phase != "open"
     definition = row.settings.definition
     flow = pins.add_flow(

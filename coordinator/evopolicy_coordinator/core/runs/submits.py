@@ -107,6 +107,7 @@ def _accept(state: State, run: Run, event: events.Requested[gateway.Submit], ste
         key=message.key,
         env_instances=message.env_instances[:n],
         bundle=message.bundle,
+        tree=message.tree,
         first_global_episode=first_global_episode,
         remaining_budget=run.ledger.available,
         accepted_at=step.now,

@@ -9,11 +9,10 @@ import msgspec
 import pytest
 
 from evopolicy_common.errors import ConfigError, StorageError
-from evopolicy_common.records import trees
 from evopolicy_common.records.blobs import BlobStore, digest_of
-from evopolicy_common.records.policies import bundles
+from evopolicy_common.records.policies import bundles, trees
+from evopolicy_common.records.policies.trees import Recorder, Tree, TreeFile
 from evopolicy_common.records.secrets import Passed
-from evopolicy_common.records.trees import Recorder, Tree, TreeFile
 
 KEY = "sk-live-4f8a1c9d7e2b6a3f0c5d"
 

@@ -1,0 +1,75 @@
+"""Starting a run from a submit of an earlier one: `--start-from RUN@submit_NNN`.
+
+Rules that this module owns:
+- The new workspace is the recorded tree and, read-only below `history/`, the train feedback up to that submit.
+  Nothing else of the earlier run is read: once it has ended, its `workspace/system/` shows the selected policy.
+- The coordinator accepts a start only with the digest that the earlier run's gateway sent with the submit.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import msgspec
+
+from evopolicy_common.errors import ConfigError
+from evopolicy_common.messages.run_settings import Start
+from evopolicy_common.records.open_run import OpenedRun
+from evopolicy_common.records.policies import trees
+from evopolicy_common.records.policies.trees import Tree
+from evopolicy_common.records.run_files import read_record
+from evopolicy_gateway.run_folder.layout import RunFolder, save, saved
+
+
+class Found(msgspec.Struct, frozen=True, kw_only=True):
+    """A start, and where its files are."""
+
+    text: str
+    """`RUN@submit_NNN` with an absolute path."""
+    start: Start
+    folder: Path
+    """Of the earlier run."""
+    submit: str
+    tree: Tree
+
+
+def find(text: str, started_in: Path) -> Found:
+    """The submit that `RUN@submit_NNN` names, RUN relative to `started_in`. Raises ConfigError that names the fault."""
+    place, _, submit = text.rpartition("@")
+    number = trees.submit_number(submit)
+    if not place or number is None:
+        raise ConfigError(
+            f"--start-from {text!r}: use the form RUN@submit_NNN, such as runs/evolve/gym_acrobot/first@submit_007"
+        )
+    folder = RunFolder((started_in / place).absolute())
+    try:
+        # A folder of another user's making could name any run and hold any files.
+        if folder.root.stat().st_uid != os.getuid():
+            raise ConfigError(
+                f"--start-from {text}: {folder.root} belongs to another user; name a run of your own"
+            )
+        finished = folder.run_json.exists()
+        run = read_record(folder.root).run if finished else saved(folder.opened, OpenedRun).run
+    except OSError as error:
+        raise ConfigError(
+            f"--start-from {text}: no run is there: {error.strerror}; name a run directory"
+        ) from error
+    tree, digest = trees.read(folder.root, submit)
+    if not (folder.feedback / submit).is_dir():
+        raise ConfigError(f"--start-from {text}: the submit has no feedback yet; wait until it is played")
+    start = Start(run=run, submit_index=number, tree=digest)
+    return Found(text=f"{folder.root}@{submit}", start=start, folder=folder.root, submit=submit, tree=tree)
+
+
+def stage(found: Found, folder: RunFolder) -> None:
+    """Makes the workspace of a new run. Raises StorageError for a missing content, and where the disk refuses."""
+    folder.workspace.mkdir()
+    trees.restore(found.folder, found.tree, folder.workspace)
+    source = RunFolder(found.folder)
+    history = (source.feedback, source.history)
+    omitted = trees.copy_history(*history, found.start.submit_index, folder.history)
+    folder.history.mkdir(exist_ok=True)
+    about = {"submit": found.submit, "omitted": omitted}
+    (folder.history / "START.json").write_bytes(msgspec.json.format(msgspec.json.encode(about)) + b"\n")
+    save(folder.start, found.start)

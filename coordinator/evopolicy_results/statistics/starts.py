@@ -1,0 +1,89 @@
+"""Runs that start from a submit of an earlier run: those from one state, compared with each other and no other run.
+
+Rules that this module owns:
+- Such a run is on no leaderboard and in no mean of its entry: part of its policy is another run's.
+- Runs from one state may differ in agent, model, feedback, prompts and AGENTS.md, which are in their label then. They
+  are paired by hidden case; Holm's correction is over all pairs from one state.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import msgspec
+
+from evopolicy_common.messages.run_settings import Start
+from evopolicy_common.statistics.resampling import RESAMPLES
+from evopolicy_results.reading.records import Run
+from evopolicy_results.statistics.pairs import Pair, pairs
+from evopolicy_results.statistics.samples import Sample, returns_of
+
+VARIED = ("feedback detail", "text of AGENTS.md", "prompts")
+"""Settings, by their names in `comparability`, in which runs from one state may differ."""
+
+
+class StartGroup(msgspec.Struct, frozen=True, kw_only=True):
+    """All runs from one state."""
+
+    start: Start
+    parent: str
+    """Name of the earlier run; the coordinator's name of it where it is not among the runs."""
+    env: str
+    variants: dict[str, int]
+    """Label to number of runs."""
+    parent_scored: bool
+    """Whether any of them was started when a result could have chosen the place."""
+    pairs: tuple[Pair, ...]
+
+
+def grouped(runs: Iterable[Run]) -> dict[tuple[str, int, str], list[Run]]:
+    """Runs that start from a submit, by its run, index and tree."""
+    found: dict[tuple[str, int, str], list[Run]] = {}
+    for run in runs:
+        if (start := run.record.start) is not None:
+            found.setdefault((start.run, start.submit_index, start.tree), []).append(run)
+    return found
+
+
+def start_groups(runs: Sequence[Run], *, resamples: int = RESAMPLES) -> list[StartGroup]:
+    """The groups of the started runs among `runs`."""
+    names = {run.record.run: run.name for run in runs if run.record.run}
+    out = []
+    for (parent, _, _), group in grouped(runs).items():
+        by_label: dict[str, list[Run]] = {}
+        for run, label in zip(group, _labels(group), strict=True):
+            by_label.setdefault(label, []).append(run)
+        env, start = group[0].env, group[0].record.start
+        assert start is not None
+        samples = {
+            (label, env): Sample(entry=label, env=env, runs=tuple(map(returns_of, several)))
+            for label, several in by_label.items()
+        }
+        out.append(
+            StartGroup(
+                start=start,
+                parent=names.get(parent, parent),
+                env=env,
+                variants={label: len(several) for label, several in by_label.items()},
+                parent_scored=any(run.record.start and run.record.start.parent_scored for run in group),
+                pairs=tuple(pairs(samples, list(by_label), [env], resamples=resamples)),
+            )
+        )
+    return out
+
+
+def _labels(runs: Sequence[Run]) -> list[str]:
+    """The entry of each run, with the settings in which they differ."""
+    described = [
+        {
+            "feedback": run.record.experiment_dimensions.feedback,
+            "AGENTS.md": run.record.experiment_dimensions.agents_md.removeprefix("sha256:")[:8] or "standard",
+            "prompts": run.record.agent.prompts.removeprefix("sha256:")[:8] or "standard",
+        }
+        for run in runs
+    ]
+    differing = [name for name in described[0] if len({each[name] for each in described}) > 1]
+    return [
+        ", ".join([run.entry, *(f"{name} {each[name]}" for name in differing)])
+        for run, each in zip(runs, described, strict=True)
+    ]

@@ -1,0 +1,148 @@
+"""Runs that start from a submit of another: the coordinator believes its own rows, not the operator."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+from rigs.service_world import Requested, World, play
+
+from evopolicy_common.messages import gateway, operator
+from evopolicy_common.messages.run_settings import RunSettings, Start
+from evopolicy_common.messages.worker import Refused
+from evopolicy_common.records import journal
+from evopolicy_common.wire import keys
+from evopolicy_coordinator.core.contract.records import DocumentRow
+from evopolicy_coordinator.core.tables.model import Run
+from evopolicy_coordinator.storage.store import rows
+
+TREE = "ab" * 32
+
+
+async def create(world: World, key: str, start: Start | None = None, **settings: Any) -> Any:
+    known = {"env": "toy/line", "entry": "e", "model": "m", "exp_id": "x", "budget": 100, **settings}
+    wanted = RunSettings(**known, start=start)
+    message = operator.CreateRun(token="operate", key=key, settings=wanted)
+    asked = Requested(keys.operator_key("c", "create"), message)
+    world.ask(asked)
+    return await asked.message()
+
+
+async def parent(
+    world: World, tree: str = TREE, key: str = "parent", start: Start | None = None, **settings: Any
+) -> Any:
+    """An open run with one submit, whose workspace is recorded."""
+    created = await create(world, key, start, **settings)
+    asked = world.submit(created, "submit")
+    message = gateway.Submit(
+        **{
+            **msgspec.structs.asdict(_sent(asked)),
+            "tree": tree,
+            "run": created.run,
+            "token": created.capability,
+        }
+    )
+    asked = Requested(asked.key, message)
+    world.ask(asked)
+    assert isinstance(await asked.message(), gateway.SubmitAccepted)
+    return created
+
+
+def _sent(asked: Requested) -> gateway.Submit:
+    return msgspec.msgpack.decode(asked.payload, type=gateway.Submit)
+
+
+def run_of(world: World, created: Any) -> Run:
+    core = world.service.host.core
+    assert core is not None
+    return core.state.runs[created.run]
+
+
+def start_of(world: World, created: Any) -> Start:
+    start = run_of(world, created).row.settings.start
+    assert start is not None
+    return start
+
+
+def test_a_start_from_an_open_run_is_not_scored_and_is_committed_to(tmp_path: Path) -> None:
+    async def scenario(world: World) -> None:
+        before = await parent(world)
+        wanted = Start(run=before.run, submit_index=0, tree=TREE, parent_scored=True)
+        after = await create(world, "child", wanted)
+        assert start_of(world, after) == msgspec.structs.replace(wanted, parent_scored=False)
+        assert run_of(world, after).ledger.available == 100
+        documents = [row for row in rows(world.store._db, DocumentRow) if row.run == after.run]
+        opening = msgspec.json.decode(documents[0].data, type=journal.Opening)
+        assert opening.settings.start == start_of(world, after)
+
+    play(tmp_path, scenario)
+
+
+@pytest.mark.parametrize("forged", ["tree", "submit", "run", "environment", "unrecorded", "profile"])
+def test_a_forged_start_is_refused(tmp_path: Path, forged: str) -> None:
+    async def scenario(world: World) -> None:
+        before = await parent(world, tree="" if forged == "unrecorded" else TREE)
+        start = Start(run=before.run, submit_index=0, tree=TREE)
+        settings: dict[str, Any] = {}
+        match forged:
+            case "tree":
+                start = msgspec.structs.replace(start, tree="cd" * 32)
+            case "submit":
+                start = msgspec.structs.replace(start, submit_index=1)
+            case "run":
+                start = msgspec.structs.replace(start, run="r-0123456789abcdef")
+            case "unrecorded":
+                start = msgspec.structs.replace(start, tree="")
+            case "environment":
+                settings = {"env": "gym/acrobot"}
+            case _:
+                settings = {"profile": "published"}
+        answer = await create(world, "child", start, **settings)
+        assert isinstance(answer, Refused)
+        assert answer.status == "invalid_settings"
+        core = world.service.host.core
+        assert core is not None
+        assert list(core.state.runs) == [before.run]
+
+    play(tmp_path, scenario)
+
+
+def test_a_start_from_an_ended_run_is_stamped_and_hands_the_stamp_on(tmp_path: Path) -> None:
+    async def scenario(world: World) -> None:
+        before = await parent(world)
+        message = gateway.CloseRun(run=before.run, token=before.capability, reason="agent_stopped", agent={})
+        closed = Requested(keys.gateway_key("c", before.run, "close"), message)
+        world.ask(closed)
+        assert isinstance(await closed.message(), gateway.RunClosed)
+        child = await parent(world, key="child", start=Start(run=before.run, submit_index=0, tree=TREE))
+        assert start_of(world, child).parent_scored
+        # The child is open: no result of its own chose the place, but one of its parent's did.
+        grandchild = await create(world, "grandchild", Start(run=child.run, submit_index=0, tree=TREE))
+        assert start_of(world, grandchild).parent_scored
+
+    play(tmp_path, scenario)
+
+
+def test_parent_and_start_are_related_when_each_has_its_own_hidden_cases(tmp_path: Path) -> None:
+    async def scenario(world: World) -> None:
+        before = await parent(world, hidden_cases="per_run")
+        start = Start(run=before.run, submit_index=0, tree=TREE)
+        child = await parent(world, key="child", start=start, hidden_cases="per_run")
+        again = Start(run=child.run, submit_index=0, tree=TREE)
+        grandchild = await create(world, "grandchild", again, hidden_cases="per_run")
+        stranger = await create(world, "stranger", hidden_cases="per_run")
+        assert run_of(world, child).row.heldout != run_of(world, before).row.heldout
+
+        def relatives(created: Any) -> set[Any]:
+            case_set = run_of(world, created).flow.case_set
+            assert case_set is not None
+            runs = (before, child, grandchild, stranger)
+            return {one.run for one in runs if run_of(world, one).flow.case_set in case_set.relatives}
+
+        family = {before.run, child.run, grandchild.run}
+        assert [relatives(one) for one in (before, child, grandchild)] == [family, family, family]
+        assert relatives(stranger) == {stranger.run}
+
+    play(tmp_path, scenario)
