@@ -11,6 +11,7 @@ import msgspec
 from jinja2 import DictLoader, Environment, StrictUndefined
 from markupsafe import Markup, escape
 
+from evopolicy_common.records.policies.trees import changes
 from evopolicy_common.records.words import in_words
 from evopolicy_results.behaviour.trace import Trace, TraceRow, diff, sources
 from evopolicy_results.figures.plot import Plot, inline_svg
@@ -386,6 +387,7 @@ def _trace_row(
         "video": video,
         "edit": transition.edit if transition is not None else "",
         "change": _change(row),
+        "workspace": changes(trace.run.path, submit.index),
         "outcome": _outcome(submit, row, trace),
         "hit": transition is not None and transition.hit,
     }

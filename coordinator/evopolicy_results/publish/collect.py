@@ -50,7 +50,8 @@ _LOGS = Removed(what="logs/", why="agents' and programs' logs name paths, hosts 
 _OTHER_LOGS = Removed(what="logs/, but agent.jsonl", why="programs' logs name paths, hosts and variables")
 _NEVER = (
     Removed(
-        what="trees/", why="the agent's notes are its operator's; the policies are checkpoints, and digests stay"
+        what="trees/",
+        why="the agent's notes are its operator's; the policies are checkpoints, and digests stay",
     ),
     Removed(
         what="workspace/", why="feedback follows from the recorded actions; the final policy is a checkpoint"

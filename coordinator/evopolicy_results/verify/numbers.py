@@ -14,10 +14,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from typing import Any
 
-from evopolicy_common.errors import BundleError, ProtocolError
+from evopolicy_common.errors import BundleError, ConfigError, ProtocolError
 from evopolicy_common.messages.gateway import CANCELLED
 from evopolicy_common.records.aggregates import best_validated, mean, std
 from evopolicy_common.records.journal import Result, SubmitResult
+from evopolicy_common.records.policies import trees
 from evopolicy_common.records.policies.checkpoints import bundle_of
 from evopolicy_common.records.rescores import FOLDER, RescoreRecord, read_rescore, rescore_names
 from evopolicy_common.records.run_record import Outcome
@@ -57,6 +58,16 @@ def differences(run: RunUnderTest, result: Result | None) -> Iterator[tuple[str,
         here = [submit.index for submit in run.submits if submit.status != CANCELLED]
         yield from _unlike("run.json", [("submits", here, sorted(stored))], _STORED)
         yield from _unlike("run.json", outcome_pairs(run.record.outcome, result), _STORED)
+        known_trees = {str(submit.submit_index): submit.tree for submit in result.submits if submit.tree}
+        yield from _unlike("run.json", [("trees", run.record.trees, known_trees)], _STORED)
+    for index, digest in run.record.trees.items():
+        name = trees.name_of(run.root, int(index))
+        try:
+            found = trees.read(run.root, name)[1]
+        except ConfigError as error:
+            yield "trees", str(error)
+        else:
+            yield from _unlike(f"trees/{name}.json", [("digest", found, digest)])
     for name in rescore_names(run.root):
         file = f"{FOLDER}/{name}.json"
         try:

@@ -48,6 +48,8 @@ MAX_STORED_BYTES = 1 << 30
 """All contents of one run; with more, changed files are omitted."""
 MAX_LISTED = 100
 """Omissions with their reasons; further ones are counted."""
+MAX_NAMED = 5
+"""Paths of each kind in `changes`."""
 _MAX_MANIFEST = 8 << 20
 _SETTLED_NS = 2_000_000_000
 """A file that changed less than this before it was read is read again: the clock of file systems is coarse."""
@@ -79,23 +81,36 @@ class Tree(msgspec.Struct, frozen=True, kw_only=True):
     n_omitted: int = 0
 
 
-class Changes(msgspec.Struct, frozen=True, kw_only=True):
-    """Paths in which a tree differs from the one before."""
-
-    added: tuple[str, ...] = ()
-    changed: tuple[str, ...] = ()
-    removed: tuple[str, ...] = ()
+def name_of(folder: Path, index: int) -> str:
+    """`submit_NNN`, as wide as the run's names are."""
+    names = (path.stem for path in (folder / TREES).glob(f"submit_*{index}.json"))
+    return next((name for name in names if submit_number(name) == index), f"submit_{index:03d}")
 
 
-def changes(before: Tree | None, after: Tree) -> Changes:
-    """The differences of two trees; without `before`, all files are added."""
-    old = {} if before is None else {file.path: file for file in before.files}
-    new = {file.path: file for file in after.files}
-    return Changes(
-        added=tuple(path for path in new if path not in old),
-        changed=tuple(path for path in new if path in old and new[path] != old[path]),
-        removed=tuple(path for path in old if path not in new),
-    )
+def changes(folder: Path, index: int) -> str:
+    """Files outside `system/` in which the workspace at a submit differs from the one at the submit before, in words;
+    empty where there are none, or no tree. `folder`: the run's."""
+    found: list[dict[str, str]] = []
+    omitted = 0
+    for number in (index - 1, index):
+        try:
+            tree = read(folder, name_of(folder, number))[0] if number >= 0 else Tree(files=())
+        except ConfigError:
+            return ""
+        omitted = tree.n_omitted
+        found.append({file.path: file.blob for file in tree.files if not file.path.startswith("system/")})
+    old, new = found
+    parts = {
+        "new": [path for path in new if path not in old],
+        "changed": [path for path in new if path in old and new[path] != old[path]],
+        "removed": [path for path in old if path not in new],
+    }
+    words = [
+        f"{what} {', '.join(paths[:MAX_NAMED])}{' …' * (len(paths) > MAX_NAMED)}"
+        for what, paths in parts.items()
+        if paths
+    ]
+    return "; ".join([*words, *([f"{omitted} not recorded"] if omitted else [])])
 
 
 def submit_number(name: str) -> int | None:

@@ -8,6 +8,7 @@ from typing import Any
 from markupsafe import Markup
 
 from evopolicy_common.messages.status import RetriedJobs, StatusReply
+from evopolicy_common.records.policies.trees import changes
 from evopolicy_common.records.summary import utc_text
 from evopolicy_common.terminal import duration, number
 from evopolicy_coordinator.web.content.charts import Line, chart
@@ -213,6 +214,7 @@ def submit_values(run: RunFacts, reader: Reader, index: int) -> dict[str, Any] |
         "next": index + 1 if index + 1 in submits else None,
         "diffs": _diffs(previous, code) if previous else [],
         "files": code,
+        "workspace": changes(run.path, index),
         "episodes": episodes,
         "left_out": max(0, submit.n_episodes - MAX_EPISODES),
     }

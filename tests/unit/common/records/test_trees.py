@@ -194,10 +194,15 @@ def test_the_history_has_feedback_up_to_the_submit_and_no_links(run: Path, tmp_p
     assert (to / "submit_000" / "summary.json").stat().st_mode & 0o222 == 0
 
 
-def test_changes_between_two_trees_are_named(run: Path) -> None:
-    before = recorded(run)
+def test_changes_of_the_workspace_are_named(run: Path) -> None:
+    recorder = Recorder(run / "workspace", run / "trees")
+    (run / "workspace" / "log").write_text("1")
+    recorder.record("submit_000", None, None)
+    assert trees.changes(run, 0) == "new log, notes.md"
     (run / "workspace" / "notes.md").unlink()
-    (run / "workspace" / "new.md").write_text("new")
+    (run / "workspace" / "log").write_text("2")
+    (run / "workspace" / "new.md").symlink_to("log")
     (run / "workspace" / "system" / "policy.py").write_text("class Policy: pass\n")
-    found = trees.changes(before, recorded(run))
-    assert (found.added, found.changed, found.removed) == (("new.md",), ("system/policy.py",), ("notes.md",))
+    recorder.record("submit_001", None, None)
+    assert trees.changes(run, 1) == "changed log; removed notes.md; 1 not recorded"
+    assert trees.changes(run / "elsewhere", 1) == ""
