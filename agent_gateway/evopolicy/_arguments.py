@@ -60,6 +60,7 @@ class RunOptions(TypedDict, total=False):
     prices: AnyPath | None
     simulation: SimulationRule | None
     finish: FinishRule | None
+    record_model: Literal["off", "digests", "full"]
     agent_wall_s: float
     agent_silence_s: float
     agent_cpus: float | None

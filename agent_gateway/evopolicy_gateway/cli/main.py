@@ -37,6 +37,9 @@ GROUPS = {
         "demo": Place(
             _PLAY, "Play one run on this machine: the agent evolve on gym/continuouscar, 32 episodes."
         ),
+        "replay": Place(
+            _PLAY, "Play a recorded run again: the same agent, with its model's answers from the record."
+        ),
         "try": Place(_PLAY, "Play a policy on train cases, without a run or an agent."),
         "random": Place(_PLAY, "Play uniform random actions on a split, as a reference for scores."),
         "local": Place(_PLAY, "Play runs on this machine."),

@@ -23,6 +23,7 @@ from evopolicy_gateway.cli import options
 from evopolicy_gateway.cli.option_groups import Of, Shown, spread
 from evopolicy_gateway.jail.settings import JailSettings
 from evopolicy_gateway.operator.cluster import Cluster
+from evopolicy_gateway.run import recorded_agent
 from evopolicy_gateway.run.options import cases_of, one_environment, packages_for
 from evopolicy_gateway.run.plan import Plan
 from evopolicy_gateway.run.run_options import ClusterOptions, ListenerOptions, RunOptions
@@ -260,6 +261,39 @@ def diff_runs(
     else:
         say_lines(shortened(found, left, right) or ["no difference (times and logs aside)"])
     raise typer.Exit(1 if found else 0)
+
+
+@app.command(epilog="Example: evopolicy replay runs/gpt-5.5/gym_acrobot/first")
+@spread
+def replay(
+    *,
+    run_directory: Annotated[
+        Path, typer.Argument(help="A run that was played with --record-model full.", show_default=False)
+    ],
+    runs: Annotated[Path, typer.Option(help="Folder of the replayed runs.")] = Path("replayed"),
+    connect: Connect = None,
+    credentials_file: CredentialsFile = None,
+    cluster: Annotated[
+        ClusterOptions, Shown(without=("audit", "hidden_isolation", "env_timeout", "env_memory"))
+    ],
+) -> None:
+    """Play a recorded run again: the same agent, with its model's answers from the record.
+
+    No model is asked, and no key is needed. Prints `identical`, or the first place that differs, with exit code 1.
+    Starts a local cluster unless --connect or --credentials name one.
+    """
+    with fail_on_our_errors():
+        plan = recorded_agent.plan_of(folder_of(run_directory).root, runs)
+        plan.check()
+        local = not (connect or credentials_file)
+        where = options.cluster_of(cluster, connect, credentials_file, local=local)
+        try:
+            run_to_end(plain_runs.play([plan], where, 1, terminal(stderr=True)))
+        except KeyboardInterrupt:
+            fail("interrupted", 130)
+        found = recorded_agent.outcome(run_directory, plan)
+    say_lines(found.splitlines() if found else ["identical"])
+    _exit(1 if found else 0)
 
 
 @app.command(epilog="Example: evopolicy finish runs/their-agent/gym_acrobot/20260115-093000")

@@ -52,6 +52,8 @@ class JailOrder(msgspec.Struct, frozen=True, kw_only=True):
     """Folder for the agent's home and /tmp, kept until the run ends."""
     hidden: tuple[str, ...] = ()
     """Folders that are never visible."""
+    shown: str = ""
+    """The workspace's path in the jail; empty: its own."""
 
 
 class Way:
@@ -175,6 +177,7 @@ class Jail:
         self._forwards |= {port: ("127.0.0.1", port) for name, port in self._hosts if name in _LOOPBACK_NAMES}
         self._view = View(
             workspace=workspace,
+            shown=Path(order.shown) if order.shown else workspace,
             private=Path(order.private),
             home=self._home,
             needs=needs_of(command, os.environ.get("PATH"), more_programs),

@@ -45,6 +45,8 @@ class View(msgspec.Struct, frozen=True, kw_only=True):
     """The files that one run's agent sees. Paths are absolute; files of this machine appear at their own paths."""
 
     workspace: Path
+    shown: Path | None = None
+    """The workspace's path in the jail; None: its own."""
     private: Path
     """The agent's own folder outside the workspace: its home and /tmp."""
     home: str
@@ -99,13 +101,13 @@ class View(msgspec.Struct, frozen=True, kw_only=True):
         command += self._masks(outside)
         # Paths that the operator named inside hidden folders, such as a policy of an earlier run.
         command += self._binds(inside)
-        workspace = str(self.workspace)
+        workspace = str(self.shown or self.workspace)
         self._make_way(workspace)
-        command += ["--bind", workspace, workspace]
+        command += ["--bind", str(self.workspace), workspace]
         for name in ("feedback", "AGENTS.md", "history"):
             # An agent may have a folder of that name of its own, which it may change.
             if (self.workspace / name / ("START.json" if name == "history" else "")).exists():
-                command += ["--ro-bind", f"{workspace}/{name}", f"{workspace}/{name}"]
+                command += ["--ro-bind", f"{self.workspace}/{name}", f"{workspace}/{name}"]
         for source, target in self.inputs:
             self._make_way(target)
             command += ["--ro-bind", source, target]

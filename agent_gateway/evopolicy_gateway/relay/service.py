@@ -19,12 +19,15 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.responses import Response, StreamingResponse
 from starlette.types import Receive, Scope, Send
 
+from evopolicy_common.records.model_record import Level
 from evopolicy_gateway.relay import apis, limits
 from evopolicy_gateway.relay.answers import SHAPES, AnswerReader, Cleaner
 from evopolicy_gateway.relay.apis import Refusal, Upstream
 from evopolicy_gateway.relay.ledger import Ledger
 from evopolicy_gateway.relay.limits import Limits
-from evopolicy_gateway.relay.provider import FAILED, Answer, Provider
+from evopolicy_gateway.relay.provider import FAILED, Provider
+from evopolicy_gateway.relay.recording import Answer, Cleaning, Recorder, Source
+from evopolicy_gateway.relay.replaying import Replayed
 from evopolicy_gateway.relay.usage import Prices
 
 MAX_REQUEST_BYTES = 32 << 20
@@ -59,6 +62,15 @@ class Order(msgspec.Struct, frozen=True, kw_only=True):
     """Whether requests with tools that the provider runs are refused."""
     timeout_s: float = 600.0
     """Longest time without a byte from the provider."""
+    record: Level = "off"
+    folder: str = ""
+    """Of the record."""
+    replay: str = ""
+    """Folder of the record that answers in place of the provider."""
+    tokens: tuple[str, ...] = ()
+    """The run's own, which have other texts in the record."""
+    secrets: tuple[str, ...] = ()
+    """What else the record leaves out."""
 
 
 class Relay:
@@ -89,7 +101,16 @@ class Relay:
             for value in (order.upstream.key, *order.upstream.headers.values())
             if len(value) >= 8
         )
-        self._provider = Provider(order.upstream.base_url, order.timeout_s)
+        base_url = order.upstream.base_url
+        key = order.upstream.key, *order.upstream.headers.values()
+        clean, folder = Cleaning(order.tokens, (*order.secrets, *key)), Path(order.folder)
+        self._provider: Source
+        if order.replay:
+            self._provider = Replayed(Path(order.replay), clean, base_url, folder, spent)
+        else:
+            self._provider = Provider(base_url, order.timeout_s)
+        if order.record != "off":
+            self._provider = Recorder(self._provider, folder, order.record, clean, base_url, note)
         self._authorization = order.upstream.authorization()
 
     @property

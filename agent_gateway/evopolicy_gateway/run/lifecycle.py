@@ -40,26 +40,32 @@ from evopolicy_common.messages.operator import RunFinished
 from evopolicy_common.processes import child_process, host
 from evopolicy_common.processes.left_files import keep_to_owner
 from evopolicy_common.processes.notices import Waiting
+from evopolicy_common.processes.preflight import LOOPBACK
 from evopolicy_common.processes.scratch import remove_tree
 from evopolicy_common.records.open_run import IntendedRun, OpenedRun
 from evopolicy_common.records.run_files import read_record
 from evopolicy_common.records.run_record import AgentLimits, RunRecord
-from evopolicy_common.records.secrets import without_keys
+from evopolicy_common.records.secrets import Redaction, without_keys
 from evopolicy_common.records.words import in_words
 from evopolicy_common.wire import credentials
 from evopolicy_common.wire.credentials import Credentials
+from evopolicy_gateway import harnesses
+from evopolicy_gateway.agent_supervisor.supervisor import secrets_in
+from evopolicy_gateway.http.server import Address
+from evopolicy_gateway.inputs import own_config
 from evopolicy_gateway.jail.jail import JailOrder
 from evopolicy_gateway.processes import child_messages, child_rpc
+from evopolicy_gateway.processes.agent_process import environment_of
 from evopolicy_gateway.processes.child_messages import AgentEnded, Ready, StartAgent
 from evopolicy_gateway.processes.child_rpc import Child
 from evopolicy_gateway.relay.service import Order
-from evopolicy_gateway.run import record, starts
+from evopolicy_gateway.run import record, recorded_agent, starts
 from evopolicy_gateway.run.model_relay import ModelRelay
 from evopolicy_gateway.run.operations import Operations
-from evopolicy_gateway.run.plan import Plan
+from evopolicy_gateway.run.plan import Plan, Replays
 from evopolicy_gateway.run.times import Stopwatch
 from evopolicy_gateway.run.watch import Watch
-from evopolicy_gateway.run_folder.layout import save, saved
+from evopolicy_gateway.run_folder.layout import RunFolder, save, saved
 from evopolicy_gateway.run_folder.listener import TOKEN_VARIABLE, agent_place, place_notice
 from evopolicy_gateway.run_folder.locks import alone
 from evopolicy_gateway.workspace import staging as workspace
@@ -197,6 +203,8 @@ class RunLifecycle:
             await asyncio.to_thread(starts.stage, starts.find(plan.start_from, plan.started_in), folder)
         save(folder.intended, IntendedRun(key=key, settings=plan.settings))
         folder.asked.unlink(missing_ok=True)
+        if (replays := plan.replays) is not None:
+            save(folder.service, Address(host=LOOPBACK, port=replays.port, token=replays.token))
         if plan.listener is not None:
             save(folder.listener, plan.listener)
 
@@ -338,7 +346,7 @@ class RunLifecycle:
             if not self.served.done():
                 return  # cancelled before it was served
             self._stopwatch.opened()
-            self._relay = self._new_relay()
+            self._relay = self._new_relay(self.served.result())
             relaying = [] if self._relay is None else [begin(self._relay.serve())]
             keeping = begin(self._keep_agent(self.served.result()))
             going: list[asyncio.Future[Any]] = [serving, keeping, *ends, *relaying]
@@ -408,7 +416,17 @@ class RunLifecycle:
                 self._cancelled = True
                 self._spent.set()
 
-    def _new_relay(self) -> ModelRelay | None:
+    def _secrets(self, ready: Ready) -> tuple[str, ...]:
+        """What the agent's log leaves out, and so does the record of its model."""
+        harness, config = self._plan.harness(), self._plan.agent_config
+        config = config or harnesses.config_of(self._plan.agent, self._plan.started_in)
+        variables = environment_of({**ready.variables, **workspace.variables(self._folder)})
+        on_command_line: list[str] = []
+        without_keys([self._plan.agent, msgspec.to_builtins(config)], on_command_line)
+        found = Redaction.of(secrets_in(variables, config), ready.variables).secrets
+        return (*found, *on_command_line, *own_config.secrets(harness.own_files))
+
+    def _new_relay(self, ready: Ready) -> ModelRelay | None:
         """The relay for the agent's model, or None where it has none or cannot use one. Prints the limits."""
         terms = self._plan.harness().model
         if terms is None:
@@ -418,14 +436,16 @@ class RunLifecycle:
             self._note(f"model limits: {terms.limits}; metering: agent ({how})")
             return None
         self._note(f"model limits: {terms.limits}; metering: relay")
-        upstream = terms.upstream
+        upstream, replays = terms.upstream, self._plan.replays
 
         def spent(what: str) -> None:
             if not self._model_spent.is_set():
-                self._note(f"the model budget is spent: {what}")
+                self._note(
+                    f"the model budget is spent: {what}" if replays is None else f"the replay ends: {what}"
+                )
             self._model_spent.set()
 
-        return ModelRelay(
+        made = ModelRelay(
             lambda token: Order(
                 upstream=upstream,
                 token=token,
@@ -435,13 +455,33 @@ class RunLifecycle:
                 model=terms.model,
                 declared_only=terms.declared_only,
                 own_tools_only=terms.own_tools_only,
+                record=self._plan.record_model,
+                replay="" if replays is None else str(replays.folder),
+                folder=str(self._folder.model_record),
+                tokens=(saved(self._folder.service, Address).token, token),
+                secrets=self._secrets(ready),
             ),
             self._folder.model_requests,
             self._folder.harness_log,
             jailed=self._plan.jail.mode != "none",
             doing=partial(self._watch.doing, self._name),
             spent=spent,
+            port=0 if replays is None else replays.model_port,
+            token="" if replays is None else replays.model_token,
         )
+        # A replay needs the jail, for its paths; and an agent without one could read this file.
+        if self._plan.record_model == "full" and self._plan.jail.mode != "none":
+            service = saved(self._folder.service, Address)
+            replays = Replays(
+                folder=self._folder.model_record,
+                root=self._folder.root,
+                port=service.port,
+                token=service.token,
+                model_port=made.port,
+                model_token=made.token,
+            )
+            recorded_agent.keep(self._folder, self._plan, replays)
+        return made
 
     async def _keep_gateway(self) -> None:
         """Runs the gateway, with restarts, until it has closed the run."""
@@ -518,7 +558,17 @@ class RunLifecycle:
         if self._credentials.tls is not None:
             states.append(str(Path(self._credentials.tls.private_key).parent))
         hidden = [str(self._plan.runs.absolute()), str(credentials.default_state_dir()), *states]
-        return JailOrder(settings=self._plan.jail, private=str(self._folder.agent), hidden=tuple(hidden))
+        return JailOrder(
+            settings=self._plan.jail,
+            private=str(self._folder.agent),
+            hidden=tuple(hidden),
+            shown="" if self._plan.replays is None else str(self._shown.workspace),
+        )
+
+    @property
+    def _shown(self) -> RunFolder:
+        """The run's folder, as its agent sees it."""
+        return self._folder if self._plan.replays is None else RunFolder(self._plan.replays.root)
 
     async def _keep_agent(self, ready: Ready) -> AgentEnded:
         """Runs the agent to its end. Restarts it when its supervisor dies, our failure: in its session if it
@@ -547,7 +597,7 @@ class RunLifecycle:
                 workspace=str(self._folder.workspace),
                 agent_log=str(self._folder.agent_log),
                 urls=ready.variables,
-                variables=workspace.variables(self._folder),
+                variables=workspace.variables(self._shown),
                 started_in=str(self._plan.started_in),
                 wall_limit_s=left_s,
                 silence_s=self._plan.silence_s,

@@ -43,17 +43,27 @@ class ModelRelay:
         jailed: bool,
         doing: Callable[[AgentDoing], None],
         spent: Callable[[str], None],
+        port: int = 0,
+        token: str = "",
     ) -> None:
-        """`order` makes the relay's order from the agent's token. `doing` and `spent` get its reports."""
-        self._sock = bound(LOOPBACK, 0)
+        """`order` makes the relay's order from the agent's token. `doing` and `spent` get its reports. `port`,
+        `token`: 0 and empty for new ones."""
+        self._sock = bound(LOOPBACK, port)
         # Connections queue here while a relay is started.
         self._sock.listen(64)
-        self.url = f"http://{LOOPBACK}:{self._sock.getsockname()[1]}"
-        self.token = secrets.token_hex(24)
+        self.port = self._sock.getsockname()[1]
+        self.url = f"http://{LOOPBACK}:{self.port}"
+        self.token = token or secrets.token_hex(24)
         ledger.parent.mkdir(parents=True, exist_ok=True)
         ledger.touch(mode=0o600)
-        self._order = StartRelay(order=msgspec.to_builtins(order(self.token)))
-        self._program = _program(self._sock.fileno(), ledger, jailed)
+        made = order(self.token)
+        self._order = StartRelay(order=msgspec.to_builtins(made))
+        written = [ledger]
+        if made.record != "off":
+            written.append(Path(made.folder))
+            written[1].mkdir(mode=0o700, parents=True, exist_ok=True)
+        read = [Path(made.replay)] if made.replay else []
+        self._program = _program(self._sock.fileno(), read, written, jailed)
         self._log = log
         self._doing, self._spent = doing, spent
         self._child: Child | None = None
@@ -80,12 +90,12 @@ class ModelRelay:
             await self._child.end(grace_s)
 
 
-def _program(fd: int, ledger: Path, jailed: bool) -> list[str]:
+def _program(fd: int, more: list[Path], written: list[Path], jailed: bool) -> list[str]:
     python = [sys.executable, "-P", "-m", "evopolicy_gateway.relay", str(fd)]
     if not jailed:
         return python
     ours: list[Any] = [evopolicy_common, evopolicy_gateway]
     places = [sys.base_prefix, os.path.realpath(sys.base_prefix), sys.prefix, sysconfig.get_path("platlib")]
     places += [str(Path(each.__file__).parent) for each in ours]
-    read = [Path(place) for place in dict.fromkeys(places) if not place.startswith("/usr")]
-    return [*confined(read, [ledger]), "--", *python]
+    read = [Path(place) for place in dict.fromkeys(places) if not place.startswith("/usr")] + more
+    return [*confined(read, written), "--", *python]

@@ -14,6 +14,7 @@ from evopolicy_common.messages.environment import StepLimit
 from evopolicy_common.messages.run_settings import RunSettings
 from evopolicy_common.processes.preflight import check_installed, check_loopback, check_text, check_writable
 from evopolicy_common.processes.scratch import remove_tree
+from evopolicy_common.records.model_record import Level
 from evopolicy_common.records.open_run import IntendedRun
 from evopolicy_common.records.run_record import AgentLimits
 from evopolicy_gateway import harnesses
@@ -33,6 +34,20 @@ _OPERATIONAL = frozenset(
     ("retries", "backoff_s", "silence_s", "pause_s", "max_pause_s", "pass_environment", "prices")
 )
 """Settings of a coding agent that do not affect the run's measurements."""
+
+
+class Replays(msgspec.Struct, frozen=True, kw_only=True):
+    """The run whose agent is played again: its record, and where its agent found its workspace and services."""
+
+    folder: Path
+    """Of the record of model calls."""
+    root: Path
+    """The run's folder, as its agent saw it."""
+    port: int
+    """Of the run's service."""
+    token: str
+    model_port: int
+    model_token: str
 
 
 class Plan(msgspec.Struct, frozen=True, kw_only=True):
@@ -64,6 +79,10 @@ class Plan(msgspec.Struct, frozen=True, kw_only=True):
     limits: AgentLimits = AgentLimits()
     start_from: str = ""
     """`RUN@submit_NNN` with an absolute path, as `settings.start` names it; empty: the usual workspace."""
+    record_model: Level = "digests"
+    """How much of the calls of its model is recorded."""
+    replays: Replays | None = None
+    """The recorded run whose agent is played again; None: its model answers."""
     listener: Listener | None = None
     """The address that serves a remote agent; None for an agent that is started here."""
 

@@ -28,6 +28,7 @@ from evopolicy_common.messages.gateway import CANCELLED
 from evopolicy_common.messages.operator import RunFinished, SubmitRecord
 from evopolicy_common.processes.preflight import foreseen
 from evopolicy_common.processes.scratch import remove_tree
+from evopolicy_common.records import model_record
 from evopolicy_common.records.aggregates import mean, std
 from evopolicy_common.records.blobs import BlobStore, write_atomically
 from evopolicy_common.records.code_metrics import TREND, CodeMetrics
@@ -291,6 +292,8 @@ def _complete(folder: RunFolder, plan: Plan, facts: dict[str, Any]) -> dict[str,
         hosted_tools=used.hosted_tools,
         first_token_s=round(used.first_s / answered, 4) if answered else None,
         rate_limit_s=round(used.wait_s, 3),
+        record=plan.record_model,
+        record_stopped=model_record.stopped(folder.root),
         reported=None if own is None else msgspec.convert(own, Tokens),
     )
     return found

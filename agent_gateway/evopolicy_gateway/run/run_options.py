@@ -20,6 +20,7 @@ from evopolicy_common.messages.gateway import (
     VideoOption,
 )
 from evopolicy_common.messages.run_settings import RunSettings
+from evopolicy_common.records.model_record import Level
 from evopolicy_gateway import harnesses
 from evopolicy_gateway.declared import Count, Option, Several
 from evopolicy_gateway.harnesses.interface.agent_config import AgentConfig
@@ -124,6 +125,9 @@ class RunOptions(PolicyPart, frozen=True, kw_only=True):
     """Whether AGENTS.md allows the agent to simulate the environment itself; default: forbidden."""
     finish: FinishRule | None = None
     """early: the agent may stop before it has spent its budget (default); budget: that is an error, as published."""
+    record_model: Level = "digests"
+    """Record of the calls of the agent's model, below logs/model/: off, digests, or full, which `evopolicy replay`
+    needs. For agents whose model is reached with a key."""
     agent_wall_s: Annotated[Seconds, Option(suite=Annotated[float, Meta(gt=0)])] = WALL_S
     """Time limit for the agent, in seconds."""
     agent_silence_s: Annotated[Seconds, Option(suite=Annotated[float, Meta(gt=0)])] = SILENCE_S
@@ -171,6 +175,7 @@ class RunOptions(PolicyPart, frozen=True, kw_only=True):
             agent=self.agent,
             runs=self.runs,
             started_in=started_in,
+            record_model=self.record_model,
             wall_limit_s=self.agent_wall_s,
             silence_s=self.agent_silence_s,
             overwrite=self.overwrite,

@@ -14,7 +14,7 @@ import msgspec
 
 from evopolicy_common.catalogue import earlier_folder_name, folder_name
 from evopolicy_common.errors import DECODE_ERRORS, ConfigError
-from evopolicy_common.records import open_run
+from evopolicy_common.records import model_record, open_run
 from evopolicy_common.records.blobs import write_atomically
 from evopolicy_common.records.policies.trees import HISTORY, TREES
 from evopolicy_common.records.run_record import Artifacts
@@ -87,6 +87,11 @@ class RunFolder(msgspec.Struct, frozen=True):
         return self.root / "logs" / "model_requests.jsonl"
 
     @property
+    def model_record(self) -> Path:
+        """The record of the calls of the agent's model; see `evopolicy_common/records/model_record.py`."""
+        return self.root / model_record.FOLDER
+
+    @property
     def env_log(self) -> Path:
         """Played episodes with their results, written at the end."""
         return self.root / "logs" / "env.log"
@@ -95,6 +100,11 @@ class RunFolder(msgspec.Struct, frozen=True):
     def passed(self) -> Path:
         """Digests of values that the agent got; stays when the run ends, and is never published."""
         return self.root / PASSED
+
+    @property
+    def replay(self) -> Path:
+        """`Recorded` (`run/recorded_agent.py`): what a replay of the agent needs; stays, and is never published."""
+        return self.root / ".replay.json"
 
     def artifacts(self) -> Artifacts:
         """The existing files of a finished run, under their names in `run.json`."""

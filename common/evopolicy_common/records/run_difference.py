@@ -23,6 +23,7 @@ from evopolicy_common.regular_files import MAX_BYTES, read_regular
 EXCLUDED_FILES: Mapping[str, str] = {
     "logs/*": "what happened on the way, with its times",
     ".passed.json": "digests with a key of the run's own",
+    ".replay.json": "the run's own addresses",
     "workspace/AGENTS.md": "names the gateway's port and its random token",
 }
 """Path patterns in a run directory that are not compared, with the reason."""
@@ -35,6 +36,7 @@ EXCLUDED_FIELDS: Mapping[str, Mapping[str, str]] = {
         "timing": "times",
         "agent.retries": "counts what was asked again",
         "agent.resources": "what the agent used of its machine, and how that one limits it",
+        "agent.model_use.first_token_s": "a time",
         "outcome.auxiliary.infrastructure_retries": "counts what was played again",
         "rejected_submits.at": "a time",
         "committed": "the run's own place in the journal, and a random salt",

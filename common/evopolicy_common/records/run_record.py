@@ -32,6 +32,7 @@ from evopolicy_common.messages.journal import Committed
 from evopolicy_common.messages.operator import RunEnd
 from evopolicy_common.messages.run_settings import HiddenCases, HiddenIsolation, Start
 from evopolicy_common.records.code_metrics import PUBLISHED_SCHEMA
+from evopolicy_common.records.model_record import Level
 from evopolicy_common.records.newest import described_data
 
 RECORD_VERSION = 3
@@ -97,6 +98,10 @@ class ModelUse(msgspec.Struct, frozen=True, kw_only=True):
     """Mean time to the first bytes of an answer."""
     rate_limit_s: float = 0.0
     """Sum of the times for which the provider asked to wait."""
+    record: Level | None = None
+    """How much of its calls is in `logs/model/`; None in older files, and where the relay did not count."""
+    record_stopped: str = ""
+    """Why the record ends before the run; empty where it does not."""
     reported: Tokens | None = None
     """The agent's own count, beside that of the relay."""
 

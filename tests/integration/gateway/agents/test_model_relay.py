@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
@@ -15,6 +16,7 @@ from stages import odd_answers
 from stages.model_api import CACHED, INPUT, OUTPUT, ModelApi, Step
 from waiting import wait_until
 
+from evopolicy_common.records import model_record
 from evopolicy_common.records.run_record import RunRecord
 from evopolicy_gateway.relay.ledger import read
 
@@ -119,7 +121,7 @@ def test_the_key_is_nowhere_in_the_jail(tmp_path: Path, operator: Path, protocol
     # Its commands have the relay's token as little as the key.
     assert "_API_KEY=" not in found
     assert KEY not in "".join(
-        path.read_text(errors="replace") for path in (run_dir(tmp_path) / "logs").iterdir()
+        path.read_text(errors="replace") for path in (run_dir(tmp_path) / "logs").rglob("*") if path.is_file()
     )
 
 
@@ -242,3 +244,55 @@ def is_below(pid: int, running: Command) -> bool:
             return True
         pid = int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1])
     return False
+
+
+def test_a_run_is_recorded_whole_and_stamped(tmp_path: Path, operator: Path) -> None:
+    arguments = ["--record-model", "full"]
+    read = Step(command="cat AGENTS.md; env; echo sk-0123456789abcdefghij")
+    with ModelApi([read, *ENDS]) as api:
+        given = [*run_arguments(operator, agent(tmp_path, api)), *arguments]
+        with command(tmp_path, *given) as running:
+            assert running.wait() == 0, running.text
+    root = run_dir(tmp_path)
+    use = record_in(root).agent.model_use
+    calls = model_record.read_calls(root / model_record.FOLDER)
+    assert use is not None
+    assert (use.record, use.record_stopped, use.requests) == ("full", "", len(calls))
+    with contextlib.closing(model_record.Pack(root / model_record.FOLDER)) as pack:
+        held = b"\n".join(map(pack.get, pack.keys()))
+    assert b"[token-0]/submit" in held
+    assert b"sk-0123456789abcdefghij" not in held
+
+
+EDIT = Step(
+    command="sed -i 's/pass/pass  # it waits/' system/policy.py; pwd; date; ls -l; cat AGENTS.md feedback/*/*"
+)
+
+
+@pytest.mark.parametrize("protocol", ["openai", "anthropic"])
+def test_a_recorded_agent_replays_to_the_byte_without_its_model(
+    tmp_path: Path, operator: Path, protocol: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    script = [EDIT, SUBMIT, EDIT, Step(odd=odd_answers.busy(429, retry_after="0")), *ENDS[1:]]
+    with ModelApi(script) as api:
+        arguments = run_arguments(operator, agent(tmp_path, api, protocol))
+        with command(tmp_path, *arguments, "--record-model", "full") as running:
+            assert running.wait() == 0, running.text
+    monkeypatch.delenv("MODEL_ACCESS")
+    (tmp_path / "agent.toml").unlink()
+    again = ["replay", str(run_dir(tmp_path)), "--credentials", str(operator)]
+    with command(tmp_path, *again) as running:
+        assert running.finish()[:2] == (0, "identical\n"), running.text
+    (other,) = (tmp_path / "replayed").glob("*/toy_line/t")
+    assert record_in(other).outcome == record_in(run_dir(tmp_path)).outcome
+    # The same agent with another system prompt: its first request is another one.
+    kept = run_dir(tmp_path) / ".replay.json"
+    document = json.loads(kept.read_bytes())
+    document["plan"]["config"]["api"]["system"] = "You are somebody else."
+    kept.write_text(json.dumps(document))
+    with command(tmp_path, *again) as running:
+        code, out, _ = running.finish()
+    assert code == 1
+    assert out.startswith("request 0 to ")
+    assert "+" in out
+    assert "You are somebody else." in out

@@ -1,0 +1,93 @@
+"""The canonical form of a request, by which a replay recognises it. No I/O.
+
+`LEFT_OUT` names fields that differ between equal requests, by API; `TEXTS` replaces times and random names in all
+texts. docs/how-to/replay-an-agent.md lists both.
+"""
+
+from __future__ import annotations
+
+import difflib
+import json
+import re
+from typing import Any
+
+import orjson
+
+LEFT_OUT: dict[str, tuple[str, ...]] = {
+    "chat/completions": ("user", "metadata", "prompt_cache_key", "safety_identifier"),
+    "responses": (
+        *("user", "metadata", "client_metadata", "prompt_cache_key", "safety_identifier"),
+        *("input.*.id", "input.*.internal_chat_message_metadata_passthrough"),
+    ),
+    "messages": (
+        *("metadata", "system.*.cache_control", "tools.*.cache_control"),
+        *("messages.*.content.*.cache_control", "messages.*.cache_control"),
+    ),
+}
+"""Dotted paths of fields that are left out; `*` stands for each element of a list."""
+_MONTHS = rb"(?:Jan|Feb|Mar|Apr|May|Jun|Jul|Aug|Sep|Oct|Nov|Dec)"
+_CLOCK = rb"\d\d:\d\d(?::\d\d(?:\.\d+)?)?"
+TEXTS: tuple[tuple[str, re.Pattern[bytes], bytes], ...] = (
+    ("random ids", re.compile(rb"[0-9a-f]{8}-[0-9a-f]{4}-[0-9a-f]{4}-[0-9a-f]{4}-[0-9a-f]{12}"), b"[id]"),
+    (
+        "dates and times of ISO 8601",
+        re.compile(rb"\b20\d\d-[01]\d-[0-3]\d(?:[T ]" + _CLOCK + rb"(?: ?(?:Z|[+-]\d\d:?\d\d))?)?"),
+        b"[time]",
+    ),
+    (
+        "dates and times of `ls` and `date`",
+        re.compile(
+            rb"\b(?:(?:Mon|Tue|Wed|Thu|Fri|Sat|Sun) )?"
+            + _MONTHS
+            + rb" {1,2}\d{1,2} {1,2}(?:"
+            + _CLOCK
+            + rb"(?: [A-Z]{3,4})?(?: 20\d\d)?|20\d\d)\b"
+        ),
+        b"[time]",
+    ),
+    ("durations of a submit", re.compile(rb'(wall_time_seconds\\*":\s*)[0-9.eE+-]+'), rb"\1[seconds]"),
+    (
+        "what Codex tells of a command",
+        re.compile(rb"(Wall time: |Chunk ID: |\\*\"duration_seconds\\*\":\s*)[0-9a-f.]+"),
+        rb"\1[once]",
+    ),
+)
+"""Patterns in the request's JSON, with what takes their place."""
+MAX_LINES = 60
+
+
+def canonical(api: str, body: bytes) -> bytes:
+    """The bytes whose digest a replay compares: JSON with sorted keys; a body that is none as it is."""
+    try:
+        document = orjson.loads(body)
+        for path in LEFT_OUT.get(api, ()):
+            _remove(document, path.split("."))
+        body = orjson.dumps(document, option=orjson.OPT_SORT_KEYS)
+    except (orjson.JSONDecodeError, TypeError):
+        pass  # no JSON, or nested more deeply than can be written
+    for _, pattern, by in TEXTS:
+        body = pattern.sub(by, body)
+    return body
+
+
+def _remove(value: Any, path: list[str]) -> None:
+    head, *rest = path
+    if head == "*":
+        for each in value if isinstance(value, list) else ():
+            _remove(each, rest)
+    elif isinstance(value, dict):
+        if rest:
+            _remove(value.get(head), rest)
+        else:
+            value.pop(head, None)
+
+
+def difference(recorded: Any, now: Any) -> str:
+    """How two canonical requests differ, in lines of a unified diff, at most `MAX_LINES`."""
+    ours, theirs = (
+        json.dumps(each, indent=1, ensure_ascii=False).replace("\\n", "\n").split("\n")
+        for each in (recorded, now)
+    )
+    lines = list(difflib.unified_diff(ours, theirs, "recorded", "now", n=2, lineterm=""))
+    cut = [f"… {len(lines) - MAX_LINES:,} more lines"] if len(lines) > MAX_LINES else []
+    return "\n".join([line[:400] for line in lines[:MAX_LINES]] + cut)

@@ -1,0 +1,203 @@
+"""Records the calls that go to a provider (`evopolicy_common/records/model_record.py` has the form).
+
+The run has precedence: at a limit, or when the disk refuses, recording stops with a note.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any, Protocol
+
+import msgspec
+import orjson
+
+from evopolicy_common.errors import ConfigError
+from evopolicy_common.records import model_record
+from evopolicy_common.records.model_record import Call, Kept, Level, Pack, key_of
+from evopolicy_common.records.secrets import Redaction
+from evopolicy_gateway.relay import apis
+from evopolicy_gateway.relay.canonical import canonical
+
+_MAX_ANSWER_BYTES = 8 << 20
+"""Limit of an answer whose content is kept."""
+_MAX_HEADERS, _MAX_HEADER = 30, 200
+
+
+class Answer(Protocol):
+    """A provider's answer, whose body is still to come."""
+
+    status: int
+    headers: dict[str, str]
+
+    def pieces(self) -> AsyncIterator[bytes]: ...
+
+
+class Source(Protocol):
+    """Where answers come from."""
+
+    def sent(
+        self, method: str, url: str, headers: Mapping[str, str], body: bytes
+    ) -> contextlib.AbstractAsyncContextManager[Any]: ...
+
+    async def close(self) -> None: ...
+
+
+class Cleaning:
+    """Takes secrets out of what is recorded, by the rules of logs."""
+
+    def __init__(self, tokens: tuple[str, ...], secrets: tuple[str, ...]) -> None:
+        """`tokens`: those that only this run's own services accept. Each has a text in its place, which a replay
+        replaces by the token."""
+        self._tokens = [(token.encode(), f"[token-{n}]".encode()) for n, token in enumerate(tokens)]
+        self._redact = Redaction(secrets)
+
+    def __call__(self, data: bytes) -> bytes:
+        for token, text in self._tokens:
+            data = data.replace(token, text)
+        return self._redact(data)
+
+    def restored(self, data: bytes) -> bytes:
+        """The data with the run's tokens in their places."""
+        for token, text in self._tokens:
+            data = data.replace(text, token)
+        return data
+
+
+class Recorder:
+    """A provider whose calls are recorded. `url` and what is sent stay as they are."""
+
+    def __init__(
+        self,
+        source: Source,
+        folder: Path,
+        level: Level,
+        clean: Cleaning,
+        base_url: str,
+        note: Callable[[str], None],
+    ) -> None:
+        self._source, self._clean, self._note = source, clean, note
+        self._base = base_url
+        self._stopped = folder / model_record.STOPPED
+        self._on = not self._stopped.exists()
+        self._n = self._begun = 0
+        self._pack: Pack | None = None
+        self._opened = contextlib.ExitStack()
+        with self._stopping():
+            if self._on:
+                self._open(folder, level)
+
+    async def close(self) -> None:
+        self._opened.close()
+        await self._source.close()
+
+    def _open(self, folder: Path, level: Level) -> None:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        self._calls = self._opened.enter_context((folder / model_record.CALLS).open("ab", buffering=0))
+        if self._calls.tell():
+            self._calls.write(b"\n")  # a kill may have left half a line
+            known = model_record.read_calls(folder)
+            self._n, self._begun = len(known), max((call.n for call in known), default=-1) + 1
+        if level == "full":
+            self._pack = self._opened.enter_context(contextlib.closing(Pack(folder, writes=True)))
+
+    @contextlib.asynccontextmanager
+    async def sent(
+        self, method: str, url: str, headers: Mapping[str, str], body: bytes
+    ) -> AsyncIterator[Answer]:
+        n, self._begun = self._begun, self._begun + 1
+        api = api_of(url, self._base)
+        answer: _Heard | None = None
+        try:
+            async with self._source.sent(method, url, headers, body) as got:
+                answer = _Heard(got)
+                yield answer
+        finally:
+            if self._on:
+                with self._stopping():
+                    self._keep(n, api, method, body, answer)
+
+    @contextlib.contextmanager
+    def _stopping(self) -> Iterator[None]:
+        """What fails within ends the record, and not the run."""
+        try:
+            yield
+        except (OSError, ValueError, ConfigError) as error:
+            self._on = False
+            self._note(f"the record of model calls stops here, and the run goes on: {error}")
+            with contextlib.suppress(OSError):
+                # `run.json` has this text, which is published: no paths.
+                why = str(error) if isinstance(error, ValueError) else getattr(error, "strerror", None)
+                self._stopped.write_text(f"{why or 'its files cannot be read'}\n")
+
+    def _keep(self, n: int, api: str, method: str, body: bytes, answer: _Heard | None) -> None:
+        if self._n >= model_record.MAX_CALLS:
+            raise ValueError(f"its limit of {model_record.MAX_CALLS:,} calls is reached")
+        request = canonical(api, self._clean(body))
+        call = Call(n=n, api=api, method=method, digest=key_of(request), status=0, broken=True)
+        if answer is not None:
+            data = self._clean(bytes(answer.heard))
+            passed = list(apis.passed_down(answer.headers).items())[:_MAX_HEADERS]
+            headers = {
+                name: self._clean(value.encode()).decode("utf-8", "replace")[:_MAX_HEADER]
+                for name, value in passed
+            }
+            call = msgspec.structs.replace(
+                call,
+                status=answer.status,
+                headers=headers,
+                broken=not answer.ended,
+                answer="" if answer.left_out else key_of(data),
+                left_out=answer.left_out,
+            )
+            if self._pack is not None and not answer.left_out:
+                self._pack.put(data)
+        if self._pack is not None:
+            call = msgspec.structs.replace(call, request=_put_request(self._pack, request))
+        self._calls.write(msgspec.json.encode(call) + b"\n")
+        self._n += 1
+
+
+class _Heard:
+    """An answer whose bytes are kept as they pass."""
+
+    def __init__(self, got: Answer) -> None:
+        self._got = got
+        self.status, self.headers = got.status, got.headers
+        self.heard = bytearray()
+        self.ended = False
+        coding = got.headers.get("content-encoding", "identity").strip().lower()
+        self.left_out = "" if coding == "identity" else f"it came compressed as {coding[:20]}"
+
+    async def pieces(self) -> AsyncIterator[bytes]:
+        async for data in self._got.pieces():
+            if len(self.heard) + len(data) > _MAX_ANSWER_BYTES:
+                self.left_out = "it is too long"
+                self.heard.clear()
+            if not self.left_out:
+                self.heard += data
+            yield data
+        self.ended = True
+
+
+def api_of(url: str, base_url: str) -> str:
+    """The API of a request's address, below the base URL and without its query."""
+    return url.removeprefix(base_url.rstrip("/")).partition("?")[0].strip("/").removeprefix("v1/")
+
+
+def _put_request(pack: Pack, request: bytes) -> str:
+    """Keeps a request as `Kept`."""
+    try:
+        document = orjson.loads(request)
+    except orjson.JSONDecodeError:
+        document = None
+    if not isinstance(document, dict):
+        document = {"body": request.decode("utf-8", "replace")}
+    lists = {
+        name: [pack.put(orjson.dumps(each)) for each in value]
+        for name, value in document.items()
+        if isinstance(value, list)
+    }
+    plain = {name: value for name, value in document.items() if name not in lists}
+    return pack.put(msgspec.json.encode(Kept(plain=plain, lists=lists)))

@@ -1,0 +1,87 @@
+"""Answers calls from a run's record in place of a provider, which is not asked.
+
+A call takes the first unused one of the record whose canonical request has the same digest. One that has none ends
+the replay: `DIFFERENCE` in the new record's folder then has the recorded request beside the new one.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from collections.abc import AsyncIterator, Callable, Mapping
+from pathlib import Path
+
+import httpcore
+import orjson
+
+from evopolicy_common.records.model_record import Call, Pack, key_of, read_calls, request_of
+from evopolicy_gateway.relay.canonical import canonical, difference
+from evopolicy_gateway.relay.recording import Answer, Cleaning, api_of
+
+DIFFERENCE = "difference.txt"
+_PIECE = 64 << 10
+
+
+class Replayed:
+    """The record of a run as a source of answers."""
+
+    def __init__(
+        self, folder: Path, clean: Cleaning, base_url: str, out: Path, differs: Callable[[str], None]
+    ) -> None:
+        """`out`: where `DIFFERENCE` is written. `differs` is called with the first line of it. Raises ConfigError."""
+        self._left = read_calls(folder)
+        self._pack = Pack(folder)
+        self._clean, self._base, self._out, self._differs = clean, base_url, out, differs
+
+    async def close(self) -> None:
+        self._pack.close()
+
+    @contextlib.asynccontextmanager
+    async def sent(
+        self, method: str, url: str, headers: Mapping[str, str], body: bytes
+    ) -> AsyncIterator[Answer]:
+        api = api_of(url, self._base)
+        request = canonical(api, self._clean(body))
+        digest = key_of(request)
+        call = next((each for each in self._left if each.digest == digest and each.api == api), None)
+        if call is None or call.left_out:
+            why = (
+                self._unmatched(api, request)
+                if call is None
+                else f"answer {call.n} was not kept: {call.left_out}"
+            )
+            if not (path := self._out / DIFFERENCE).exists():
+                path.write_text(why + "\n")
+            self._differs(why.partition("\n")[0])
+            refusal = {"error": {"message": "the replay has ended", "type": "invalid_request_error"}}
+            ended = {"content-type": "application/json", "x-should-retry": "false"}
+            yield _Given(400, ended, json.dumps(refusal).encode(), broken=False)
+            return
+        self._left.remove(call)
+        if not call.status:
+            raise httpcore.NetworkError("no answer came when this was recorded")
+        data = self._clean.restored(self._pack.get(call.answer))
+        yield _Given(call.status, call.headers, data, broken=call.broken)
+
+    def _unmatched(self, api: str, request: bytes) -> str:
+        expected = next((call for call in self._left if call.api == api), None)
+        if expected is None:
+            return f"a request to {api} comes after all that were recorded"
+        return f"request {expected.n} to {api} differs:\n{difference(self._request(expected), orjson.loads(request))}"
+
+    def _request(self, call: Call) -> object:
+        return request_of(self._pack, call)
+
+
+class _Given:
+    """A recorded answer."""
+
+    def __init__(self, status: int, headers: dict[str, str], data: bytes, *, broken: bool) -> None:
+        self.status, self.headers = status, headers
+        self._data, self._broken = data, broken
+
+    async def pieces(self) -> AsyncIterator[bytes]:
+        for at in range(0, len(self._data), _PIECE):
+            yield self._data[at : at + _PIECE]
+        if self._broken:
+            raise httpcore.ReadError("the answer broke off when this was recorded")

@@ -1,0 +1,99 @@
+"""What `evopolicy replay` needs of a recorded run besides its record of model calls: its plan and its addresses.
+
+`.replay.json` in the run's folder (mode 0600) has both. It is never published: it names paths, and tokens that were
+valid while the run was open.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from evopolicy_common.errors import DECODE_ERRORS, ConfigError
+from evopolicy_common.records import model_record
+from evopolicy_common.records.blobs import write_atomically
+from evopolicy_common.records.run_difference import differences
+from evopolicy_common.records.secrets import without_keys
+from evopolicy_common.regular_files import read_regular
+from evopolicy_gateway import harnesses
+from evopolicy_gateway.relay.replaying import DIFFERENCE
+from evopolicy_gateway.run.plan import Plan, Replays
+from evopolicy_gateway.run_folder.layout import RunFolder
+
+_MAX_BYTES = 4 << 20
+_NO_KEY = "no-key-is-needed-to-replay"
+_OWN = ("run.json: agent.model_use.", "run.json: agent.settings.agent: ")
+"""Values of a replay's own."""
+
+
+class Recorded(msgspec.Struct, frozen=True, kw_only=True):
+    """The content of `.replay.json`."""
+
+    plan: dict[str, Any]
+    replays: dict[str, Any]
+
+
+def keep(folder: RunFolder, plan: Plan, replays: Replays) -> None:
+    """Writes `.replay.json`. Raises StorageError."""
+    config = plan.agent_config or harnesses.config_of(plan.agent, plan.started_in)
+    whole = msgspec.structs.replace(plan, config=config, prices=None)
+    kept = Recorded(plan=without_keys(_plain(whole)), replays=_plain(replays))
+    write_atomically(folder.replay, msgspec.json.encode(kept), mode=0o600)
+
+
+def plan_of(run: Path, runs: Path) -> Plan:
+    """The plan that plays the agent of the run directory again, below `runs`. Raises ConfigError."""
+    folder = RunFolder(run.absolute())
+    try:
+        kept = msgspec.json.decode(read_regular(folder.replay, _MAX_BYTES), type=Recorded)
+        plan = msgspec.convert(kept.plan, Plan, dec_hook=_path, strict=False)
+        replays = msgspec.convert(kept.replays, Replays, dec_hook=_path)
+    except FileNotFoundError as error:
+        raise ConfigError(
+            f"{run} has no record to replay; play runs in the jail, with --record-model full"
+        ) from error
+    except (OSError, *DECODE_ERRORS) as error:
+        raise ConfigError(f"{folder.replay} cannot be read: {error}") from error
+    if why := model_record.stopped(folder.root):
+        raise ConfigError(f"the record of {run} is not whole, and cannot be replayed: {why}")
+    for name in _keys(plan):
+        os.environ.setdefault(name, _NO_KEY)
+    replays = msgspec.structs.replace(replays, folder=folder.model_record)
+    return msgspec.structs.replace(
+        plan, runs=runs, overwrite=True, resume=False, record_model="digests", replays=replays
+    )
+
+
+def outcome(run: Path, plan: Plan) -> str:
+    """The first place in which the replay differs from the run; empty where they are identical."""
+    again = plan.folder
+    try:
+        return (again.model_record / DIFFERENCE).read_text().strip()
+    except FileNotFoundError:
+        pass
+    left = [call.digest for call in model_record.read_calls(again.model_record)]
+    for call in model_record.read_calls(RunFolder(run.absolute()).model_record):
+        if call.digest not in left:
+            return f"request {call.n} to {call.api} did not come again"
+        left.remove(call.digest)
+    return next((line for line in differences(run, again.root) if not line.startswith(_OWN)), "")
+
+
+def _keys(plan: Plan) -> tuple[str, ...]:
+    """The variables in which the agent's settings look for a key."""
+    config = plan.config
+    if config is None:
+        return ()
+    own = {"codex": ("OPENAI_API_KEY",), "claude-code": ("ANTHROPIC_API_KEY",)}
+    return (*config.secret, *(() if config.api else own.get(config.harness, ())))
+
+
+def _plain(value: Any) -> Any:
+    return msgspec.to_builtins(value, enc_hook=str)
+
+
+def _path(kind: type, value: Any) -> Any:
+    return Path(value)
