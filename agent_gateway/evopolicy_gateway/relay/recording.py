@@ -186,14 +186,18 @@ def api_of(url: str, base_url: str) -> str:
     return url.removeprefix(base_url.rstrip("/")).partition("?")[0].strip("/").removeprefix("v1/")
 
 
-def _put_request(pack: Pack, request: bytes) -> str:
-    """Keeps a request as `Kept`."""
+def document_of(request: bytes) -> dict[str, Any]:
+    """A canonical request as a JSON object; one that is none, as the text in `body`."""
     try:
         document = orjson.loads(request)
     except orjson.JSONDecodeError:
         document = None
-    if not isinstance(document, dict):
-        document = {"body": request.decode("utf-8", "replace")}
+    return document if isinstance(document, dict) else {"body": request.decode("utf-8", "replace")}
+
+
+def _put_request(pack: Pack, request: bytes) -> str:
+    """Keeps a request as `Kept`."""
+    document = document_of(request)
     lists = {
         name: [pack.put(orjson.dumps(each)) for each in value]
         for name, value in document.items()

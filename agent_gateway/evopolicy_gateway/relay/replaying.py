@@ -12,11 +12,10 @@ from collections.abc import AsyncIterator, Callable, Mapping
 from pathlib import Path
 
 import httpcore
-import orjson
 
-from evopolicy_common.records.model_record import Call, Pack, key_of, read_calls, request_of
+from evopolicy_common.records.model_record import Pack, key_of, read_calls, request_of
 from evopolicy_gateway.relay.canonical import canonical, difference
-from evopolicy_gateway.relay.recording import Answer, Cleaning, api_of
+from evopolicy_gateway.relay.recording import Answer, Cleaning, api_of, document_of
 
 DIFFERENCE = "difference.txt"
 _PIECE = 64 << 10
@@ -67,10 +66,8 @@ class Replayed:
         expected = next((call for call in self._left if call.api == api), None)
         if expected is None:
             return f"a request to {api} comes after all that were recorded"
-        return f"request {expected.n} to {api} differs:\n{difference(self._request(expected), orjson.loads(request))}"
-
-    def _request(self, call: Call) -> object:
-        return request_of(self._pack, call)
+        recorded = request_of(self._pack, expected)
+        return f"request {expected.n} to {api} differs:\n{difference(recorded, document_of(request))}"
 
 
 class _Given:

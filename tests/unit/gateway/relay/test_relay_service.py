@@ -597,3 +597,26 @@ def test_digests_keep_no_content_and_off_keeps_nothing(tmp_path: Path) -> None:
     (call,) = read_calls(tmp_path / "model")
     assert call.digest
     assert not call.request
+
+
+def test_a_replay_answers_from_the_record_until_a_request_differs(tmp_path: Path) -> None:
+    async def act(served: Served) -> None:
+        answers.append([(await served.ask(n=n)).content for n in (1, 2, 1)])
+        answers.append([(await served.client.get("/v1/models")).content])
+
+    async def again(served: Served) -> None:
+        await act(served)
+        assert (await served.client.post("/v1/models", json={})).status_code == 400
+        assert (await served.ask(n=1)).status_code == 400
+        assert (await served.ask(n=3)).headers["x-should-retry"] == "false"
+
+    answers: list[list[bytes]] = []
+    script = [Step(text="one"), Step(text="a" * 32), Step(text=SECRET)]
+    asked = recorded(tmp_path, script, act).api.n_asked
+    folder, out = str(tmp_path / "model"), tmp_path / "again"
+    served = recorded(tmp_path, [], again, folder=str(out), record="digests", replay=folder)
+    assert (asked, served.api.n_asked) == (3, 0)
+    whole = [answer.replace(SECRET.encode(), b"[redacted]") for answer in answers[0]]
+    assert (answers[2], answers[3]) == (whole, answers[1])
+    assert "comes after all that were recorded" in served.spent[0]
+    assert served.spent[0] in (out / "difference.txt").read_text()
