@@ -2,11 +2,33 @@
 
 from __future__ import annotations
 
-from evopolicy_worker.environments.interface.gymnasium_adapter import GymnasiumFamily
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from evopolicy_worker.environments.interface.gymnasium_adapter import GymnasiumFamily, Quantity
+
+if TYPE_CHECKING:
+    import gymnasium
+
+_PARAMETERS = {
+    "AcrobotEnv": {
+        "length of the links": ("LINK_LENGTH_1", "LINK_LENGTH_2", "LINK_COM_POS_1", "LINK_COM_POS_2"),
+        "mass of the links": ("LINK_MASS_1", "LINK_MASS_2", "LINK_MOI"),
+        "torque of the motor": ("AVAIL_TORQUE",),
+    },
+    "Continuous_MountainCarEnv": {"force of the motor": ("power",)},
+}
+"""Attributes by class and parameter. The libraries' other constants are no attributes."""
 
 
 class ClassicFamily(GymnasiumFamily):
     """Small worlds of a few numbers."""
+
+    def parameters(self, env: gymnasium.Env[Any, Any]) -> Mapping[str, Sequence[Quantity]]:
+        bare = env.unwrapped
+        # An acceleration's class is derived from the library's.
+        found = next((known for each in type(bare).__mro__ if (known := _PARAMETERS.get(each.__name__))), {})
+        return {name: [(bare, each) for each in attributes] for name, attributes in found.items()}
 
 
 FAMILY = ClassicFamily()

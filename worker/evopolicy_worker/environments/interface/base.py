@@ -51,6 +51,14 @@ class Environment(ABC):
     """Key of `info` that reports at the last step whether the task was solved, where the definition names none. Not
     part of the definition, so that runs of earlier versions stay comparable."""
 
+    parameters: tuple[str, ...] = ()
+    """Names of the simulator's parameters that `alter` knows."""
+
+    def alter(self, factors: dict[str, float]) -> None:
+        """Multiply parameters from the next `reset` on; those without a factor are as they were made."""
+        if factors:
+            raise WorkerError(f"{self.description.env}: its simulator has no parameters to alter")
+
     @abstractmethod
     def reset(self, case: Case) -> Observation:
         """Start the episode of `case`; its first observation."""

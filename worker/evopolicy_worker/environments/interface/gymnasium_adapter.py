@@ -11,7 +11,7 @@ import contextlib
 import importlib
 import io
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from importlib.metadata import version
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
@@ -42,6 +42,10 @@ _MISSHAPEN = (TypeError, ValueError, OverflowError, AttributeError, LookupError)
 """Exceptions that values of a wrong form raise when they are read."""
 _PLAIN_WRAPPERS = {"OrderEnforcing", "PassiveEnvChecker", "TimeLimit"}
 """Wrappers that change no value; the adapter counts the steps itself, and calls in order."""
+
+
+Quantity = tuple[Any, str]
+"""An object, and the name of its attribute: a number, a list of numbers, or an array."""
 
 
 class GymnasiumFamily:
@@ -121,6 +125,13 @@ class GymnasiumFamily:
         """
         return True
 
+    def parameters(self, env: gymnasium.Env[Any, Any]) -> Mapping[str, Sequence[Quantity]]:
+        """The quantities of a new environment's simulator that worlds alter, by name of a parameter."""
+        return {}
+
+    def altered(self, env: gymnasium.Env[Any, Any]) -> None:
+        """Called after quantities were multiplied: computes again what follows from them."""
+
     def info(self, info: Mapping[str, Any]) -> dict[str, Any]:
         """The plain part of a step's `info`."""
         return plain_info(info) if info else {}
@@ -160,6 +171,7 @@ class GymnasiumEnvironment(Environment):
         self._accelerate = accelerations
         self.accelerations: tuple[str, ...] = ()
         """Names of those in use."""
+        self._factors: dict[str, float] = {}
         settings.apply(render=render)
         with quiet():
             family.load()
@@ -169,6 +181,7 @@ class GymnasiumEnvironment(Environment):
         self._options_used = False
         self._steps = 0
         self._build()
+        self.parameters = tuple(sorted(family.parameters(self._env)))
         obs_schema = self._schema("observation_space")
         action_schema = self._schema("action_space")
         self._observe = compile_observation(obs_schema)
@@ -223,6 +236,12 @@ class GymnasiumEnvironment(Environment):
     def rebuilds(self) -> bool:
         """Whether each episode gets an environment made anew."""
         return self._rebuilds
+
+    def alter(self, factors: dict[str, float]) -> None:
+        if factors != self._factors:
+            self._factors = factors
+            self._env.close()
+            self._build()
 
     @property
     def bare(self) -> gymnasium.Env[Any, Any]:
@@ -321,11 +340,25 @@ class GymnasiumEnvironment(Environment):
             limits.append(getattr(env, "_max_episode_steps", None) or 0)
             env = env.env  # type: ignore[attr-defined]
         self._limit = min(filter(None, limits), default=USUAL_STEPS)
-        if self._accelerate and not entry.kwargs:
+        self.accelerations = ()
+        if self._factors:  # No acceleration is proved for other parameters.
+            self._multiply(env)
+        elif self._accelerate and not entry.kwargs:
             self.accelerations = tuple(accelerate(str(entry.gymnasium_id), env))
         for wrapper in entry.wrappers:
             env = wrapped(entry.id, env, wrapper)
         self._env = env
+
+    def _multiply(self, env: gymnasium.Env[Any, Any]) -> None:
+        for name, quantities in self._family.parameters(env).items():
+            for owner, attribute in quantities:
+                value, factor = getattr(owner, attribute), self._factors.get(name, 1.0)
+                if isinstance(value, np.ndarray):
+                    value *= factor  # MuJoCo's arrays are views of its model.
+                else:
+                    many = isinstance(value, list)
+                    setattr(owner, attribute, [each * factor for each in value] if many else value * factor)
+        self._family.altered(env)
 
     def _schema(self, name: str) -> SpaceSchema:
         try:

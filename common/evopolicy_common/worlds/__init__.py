@@ -1,0 +1,1 @@
+"""Altered rules of an environment, and policies that undo them."""
