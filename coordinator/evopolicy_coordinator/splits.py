@@ -37,6 +37,7 @@ from evopolicy_common.records.splits import (
     overlaps,
     read_split_file,
 )
+from evopolicy_coordinator import worlds
 
 SECRET_BYTES = 32
 SECRET, UNJAILED_SECRET = "secret", "secret-unjailed"
@@ -87,12 +88,11 @@ def derive(
     return {split: tuple(drawn[split][: counts.get(split, 0)]) for split in SPLITS}
 
 
-def in_world(secret: bytes, env: str, cases: dict[Split, tuple[Case, ...]]) -> dict[Split, tuple[Case, ...]]:
-    """The cases with the key of their world, HMAC-SHA256(secret, world | environment) cut to 128 bits; of an
-    environment that is no world, as they are."""
+def in_world(env: str, key: str, cases: dict[Split, tuple[Case, ...]]) -> dict[Split, tuple[Case, ...]]:
+    """The cases with the key of their world; of an environment that is no world, as they are."""
     if unchanged(env) == env:
         return cases
-    options = {OPTION: hmac.digest(secret, f"world|{env}".encode(), "sha256").hex()[:32]}
+    options = {OPTION: key}
     return {
         split: tuple(Case(seed=each.seed, options=options) for each in some) for split, some in cases.items()
     }
@@ -222,12 +222,14 @@ def _file_findings(folder: Path, split: Split, content: SplitFile, env: str) -> 
 class SplitSource:
     """A coordinator's source of splits: a data folder, or its secret."""
 
-    def __init__(self, *, data: Path | None, secret: bytes) -> None:
-        """`data` None: derive all splits from `secret`. Raises ConfigError when `data` is not a folder."""
+    def __init__(self, *, data: Path | None, secret: bytes, journal: Path | None = None) -> None:
+        """`data` None: derive all splits from `secret`. `journal`: of worlds. Raises ConfigError when `data` is not a
+        folder."""
         if data is not None and not data.is_dir():
             raise ConfigError(f"--data {data} is not a folder")
         self._data = data
         self._secret = secret
+        self._journal = journal
 
     @property
     def from_files(self) -> bool:
@@ -248,7 +250,7 @@ class SplitSource:
                 key = hmac.digest(self._secret, f"hidden cases of run {own}".encode(), "sha256")
                 shared = {case.seed for members in cases.values() for case in members}
                 cases = {**derive(key, suite, env, counts, shared), "train": cases["train"]}
-            cases = in_world(self._secret, env, cases)
+            cases = in_world(env, self._key(env), cases)
             return EnvironmentSplits(env=env, secret=True, epoch=epoch_of(self._secret), files={}, **cases)
         if own:
             raise ConfigError(
@@ -267,7 +269,7 @@ class SplitSource:
             raise ConfigError(
                 f"splits of {env} in {folder} cannot be used: all cases of a world have the same key; give each the"
                 " options"
-                f' {{"{OPTION}": "32 hexadecimal digits"}}, as `evopolicy data create` does'
+                f' {{"{OPTION}": "32 hexadecimal digits"}}, as `evopolicy data make` does'
             )
         if splits.env != env:
             raise ConfigError(f"{folder} holds the splits of {splits.env!r}, not of {env!r}")
@@ -288,8 +290,13 @@ class SplitSource:
             )
         key = hmac.digest(self._secret, f"further hidden cases {name}".encode(), "sha256")
         cases = derive(key, suite, env, {"heldout": n}, (case.seed for case in taken))
-        cases = in_world(self._secret, env, cases)
+        cases = in_world(env, self._key(env), cases)
         return FurtherSplit(cases=cases["heldout"], epoch=epoch_of(self._secret))
+
+    def _key(self, env: str) -> str:
+        if unchanged(env) == env:
+            return ""
+        return worlds.key_of(self._secret, env, worlds.number_of(env, self._secret, self._journal))
 
 
 def _cut(folder: Path, split: Split, cases: Sequence[Case], count: int | None) -> tuple[Case, ...]:

@@ -13,7 +13,6 @@ from proofs import Proof
 from slots import Slots, make_job
 
 from evopolicy_common import catalogue
-from evopolicy_common.catalogue.worlds import ids
 from evopolicy_common.messages.episode import ResourceLimits
 from evopolicy_common.statistics.intervals import over_cases
 from evopolicy_worker import check_env
@@ -79,13 +78,3 @@ def test_a_policy_beats_random_on_the_cases_that_were_fixed_beforehand(slots: Sl
 def test_check_env_finds_nothing_in_a_few_environments_of_the_family(proof: Proof) -> None:
     verdicts = {each.here.env: each.verdict for each in check_env.check(proof.check, proof.check_steps, ())}
     assert verdicts == dict.fromkeys(proof.check, "ok")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("env", catalogue.suites()["core16"].environments)
-def test_check_env_finds_nothing_in_the_worlds_of_core16(env: str) -> None:
-    if lacking := missing(env):
-        pytest.skip(f"{env} needs {lacking}")
-    worlds = ids(env)
-    verdicts = {each.here.env: each.verdict for each in check_env.check(worlds, 40, ())}
-    assert verdicts == dict.fromkeys(worlds, "ok")

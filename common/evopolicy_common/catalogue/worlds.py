@@ -11,7 +11,8 @@ N_WORLDS = 3
 """Worlds of each environment that has some."""
 OPTION = "world"
 """The key's name in a case's options."""
-KEY = re.compile("[0-9a-f]{32}")
+KEY = re.compile("[0-9a-f]{32}(-[0-9]{1,4})?")
+"""The root of an environment's candidates, and which of them; files may have a key without number."""
 _ID = re.compile(r"(.+)@w([1-9][0-9]*)")
 
 

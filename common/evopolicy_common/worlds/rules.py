@@ -46,7 +46,7 @@ TEXTS = {
 """By kind of change, how the task text describes it."""
 
 
-class _Draws:
+class Draws:
     """Whole numbers from a key."""
 
     def __init__(self, key: str) -> None:
@@ -91,13 +91,13 @@ class Rules:
         self, key: str, obs_space: Space, action_space: Space, parameters: Sequence[str] = ()
     ) -> None:
         """`key`: as `KEY` of the catalogue's worlds. `parameters`: the names of the simulator's."""
-        draws = _Draws(key)
+        draws = Draws(key)
         possible = kinds(obs_space, action_space, parameters)
         n = min(1 + draws.below(MOST_KINDS), len(possible))
         self.kinds = tuple(possible[i] for i in sorted(draws.order(len(possible))[:n]))
         """The kinds of change in use, keys of `TEXTS`."""
-        self._action = self._change(draws, action_space, "the actions")
-        self._obs = self._change(draws, obs_space, "the observation")
+        self.action_change = self._change(draws, action_space, "the actions")
+        self.obs_change = self._change(draws, obs_space, "the observation")
         self.factors = {
             name: FACTORS[draws.below(len(FACTORS))]
             for name in sorted(parameters)
@@ -107,21 +107,21 @@ class Rules:
 
     def observe(self, obs: Any) -> Any:
         """What the policy sees of an observation."""
-        return _apply(self._obs, obs)
+        return _apply(self.obs_change, obs)
 
     def act(self, action: Any) -> Any:
         """What an action of the policy does: an action of the unchanged environment."""
-        return _apply(self._action, action)
+        return _apply(self.action_change, action)
 
     def undo(self, obs: Any) -> Any:
         """The observation of the unchanged environment that the policy sees as `obs`."""
-        return _undo(self._obs, obs)
+        return _undo(self.obs_change, obs)
 
     def redo(self, action: Any) -> Any:
         """The action that does what `action` does in the unchanged environment."""
-        return _undo(self._action, action)
+        return _undo(self.action_change, action)
 
-    def _change(self, draws: _Draws, space: Space, what: str) -> list[int] | _Vector | None:
+    def _change(self, draws: Draws, space: Space, what: str) -> list[int] | _Vector | None:
         ordered, turned, scaled = (
             f"the {kind} of {what}" in self.kinds for kind in ("order", "direction", "scale")
         )
@@ -186,7 +186,7 @@ def _groups(low: NDArray[np.float64], high: NDArray[np.float64]) -> list[list[in
     return list(found.values())
 
 
-def _within_groups(draws: _Draws, groups: list[list[int]], n: int) -> list[int]:
+def _within_groups(draws: Draws, groups: list[list[int]], n: int) -> list[int]:
     order = list(range(n))
     for group in groups:
         for place, other in zip(group, draws.order(len(group)), strict=True):

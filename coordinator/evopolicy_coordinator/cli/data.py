@@ -14,6 +14,7 @@ import msgspec
 import typer
 
 from evopolicy_common import catalogue
+from evopolicy_common.catalogue.worlds import unchanged
 from evopolicy_common.cli.conventions import fail, fail_on_our_errors
 from evopolicy_common.cli.frame import App
 from evopolicy_common.console import table, terminal
@@ -23,7 +24,7 @@ from evopolicy_common.messages.run_settings import MAX_HIDDEN
 from evopolicy_common.records import splits as split_files
 from evopolicy_common.records.blobs import write_atomically
 from evopolicy_common.terminal import say, say_json
-from evopolicy_coordinator import splits
+from evopolicy_coordinator import splits, worlds
 
 MAX_TRAIN = 1_000_000
 """As many as `--cases` can name."""
@@ -93,7 +94,10 @@ def _plan(
             "validation": valid or suite.n_validation,
             "heldout": heldout or suite.n_heldout,
         }
-        cases_of = splits.in_world(secret, env, splits.derive(secret, suite.name, env, counts))
+        derived = splits.derive(secret, suite.name, env, counts)
+        is_world = unchanged(env) != env
+        key = worlds.key_of(secret, env, worlds.number_of(env, secret, None)) if is_world else ""
+        cases_of = splits.in_world(env, key, derived)
         for split, cases in cases_of.items():
             stem = split_files.FILE_STEMS[split]
             content = split_files.SplitFile(env=env, split=stem, cases=cases, secret=seed is None)

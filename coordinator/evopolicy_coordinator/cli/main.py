@@ -21,6 +21,7 @@ from evopolicy_common.wire.ready import Ready
 from evopolicy_coordinator.cli import certs as certs_cli
 from evopolicy_coordinator.cli import epochs as epochs_cli
 from evopolicy_coordinator.cli import router_config
+from evopolicy_coordinator.cli import worlds as worlds_cli
 from evopolicy_coordinator.core.contract.settings import CoreSettings
 from evopolicy_coordinator.server import process
 from evopolicy_coordinator.server.process import Options
@@ -33,6 +34,9 @@ app.command(epilog="Example: evopolicy-coordinator identity --state /var/lib/evo
 app.command(
     epilog="Example: evopolicy-coordinator countersign HEAD --out head.json --state /var/lib/evopolicy"
 )(epochs_cli.countersign)
+app.command(
+    "accept-worlds", epilog="Example: evopolicy-coordinator accept-worlds --state /var/lib/evopolicy"
+)(worlds_cli.accept_worlds)
 app.command(
     "router-config",
     epilog=(

@@ -32,6 +32,7 @@ from evopolicy_coordinator.server.uploads import Uploads
 from evopolicy_coordinator.splits import SplitSource, secret_of
 from evopolicy_coordinator.storage.state_folder import ROLES, StateFolder, reachable, resolve_listen
 from evopolicy_coordinator.storage.store import Store
+from evopolicy_coordinator.worlds import JOURNAL
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
@@ -71,7 +72,7 @@ async def run(options: Options, stop: asyncio.Event, on_ready: Callable[[Ready],
         secret, note = secret_of(state.root, unjailed=options.unjailed)
         if note and options.data is None:
             log.warning(note)
-        source = SplitSource(data=options.data, secret=secret)
+        source = SplitSource(data=options.data, secret=secret, journal=state.root / JOURNAL)
         machines = Machines(state.root)
         listen, remote = _listen(state, options, machines)
         store = Store(state.database)

@@ -201,7 +201,7 @@ def world_of(found: splits.EnvironmentSplits) -> set[str]:
 def test_all_cases_of_a_world_have_one_key_for_each_secret() -> None:
     source = SplitSource(data=None, secret=b"s" * 32)
     (key,) = world_of(source.splits("core16-worlds", WORLD, COUNTS))
-    assert re.fullmatch("[0-9a-f]{32}", key)
+    assert re.fullmatch("[0-9a-f]{32}-0", key)
     assert world_of(source.splits("core16-worlds", WORLD, COUNTS, own="run-7")) == {key}
     further = source.further("core16-worlds", WORLD, "more", 3, ())
     assert {case.options["world"] for case in further.cases if case.options} == {key}

@@ -1,0 +1,193 @@
+"""`evopolicy-coordinator accept-worlds`: tries candidates of worlds, in their order, and writes the journal of them.
+
+It plays on a cluster of its own, whose cases come from a temporary folder: `ENV@w1` has the rules of the candidate that
+is tried. A repeated command continues with the first candidate that the journal does not have.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import time
+import uuid
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+import typer
+
+from evopolicy_common import catalogue
+from evopolicy_common.catalogue.worlds import N_WORLDS, ids, unchanged
+from evopolicy_common.cli.conventions import State, end_on_sigterm, fail_on_our_errors, run_to_end
+from evopolicy_common.errors import ConfigError
+from evopolicy_common.local.cluster import local_cluster, unless_failed
+from evopolicy_common.messages.environment import EnvironmentDescription, Split
+from evopolicy_common.messages.operator import DescribeEnvironment, Evaluate
+from evopolicy_common.processes.scratch import scratch_folder
+from evopolicy_common.records import splits as split_files
+from evopolicy_common.records.blobs import write_atomically
+from evopolicy_common.records.journal import epoch_of
+from evopolicy_common.records.policies.bundles import Bundle, snapshot
+from evopolicy_common.terminal import number, say
+from evopolicy_common.wire import credentials, transport
+from evopolicy_common.worlds.rules import PARAMETERS, Rules
+from evopolicy_common.worlds.transformed import transformed, varied
+from evopolicy_coordinator import splits, worlds
+from evopolicy_results.evaluations import Evaluations
+
+_COUNTS: dict[Split, int] = {"train": worlds.CASES, "validation": 1, "heldout": 1}
+
+
+def accept_worlds(
+    env: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="[ENV]...", help="Environments of Core16, or globs. Default: all of them."),
+    ] = None,
+    policies: Annotated[
+        Path, typer.Option(help="Folder of the canonical policies, each in the folder of its environment.")
+    ] = Path("examples/policies"),
+    state: State = None,
+    slots: Annotated[int, typer.Option(min=1, max=1024, help="Episodes played at the same time.")] = 2,
+) -> None:
+    """Choose the rules of an epoch's worlds: play candidates in a fixed order, and accept by a fixed rule.
+
+    Writes STATE/worlds.jsonl, which the coordinator of this state folder reads. Run it before the epoch's first run;
+    repeat an interrupted command to continue it.
+    """
+    root = state or credentials.default_state_dir()
+    core16 = catalogue.suites()["core16"].environments
+    with fail_on_our_errors():
+        env_ids = catalogue.resolve(env or ["core16"])
+        if others := [each for each in env_ids if each not in core16]:
+            raise ConfigError(f"{others[0]} has no worlds; those of Core16 have some: {', '.join(core16)}")
+        root.mkdir(mode=0o700, parents=True, exist_ok=True)
+        secret = splits.load_or_create_secret(root / splits.SECRET)
+        run_to_end(_accept(env_ids, policies, _Journal(root / worlds.JOURNAL, secret), slots))
+    say(f"next: evopolicy-coordinator --state {root}")
+
+
+class _Journal:
+    """The journal, as one epoch sees it."""
+
+    def __init__(self, path: Path, secret: bytes) -> None:
+        self.path, self.secret, self.epoch = path, secret, epoch_of(secret)
+
+    def of(self, env: str) -> list[worlds.Entry]:
+        return worlds.of_environment(worlds.read(self.path), self.epoch, env)
+
+    def add(self, entry: worlds.Entry) -> None:
+        worlds.append(self.path, entry)
+        if isinstance(entry, worlds.Base):
+            scores = f"random {number(entry.random)}, policy {number(entry.canonical)}"
+            say(f"{entry.env}: {scores if entry.policy else 'no policy is known, so no world is accepted'}")
+        else:
+            verdict = "accepted" if entry.accepted else "rejected"
+            scores = f"policy {number(entry.canonical)}, ceiling {number(entry.ceiling)}"
+            say(f"{entry.env}, candidate {entry.number}: {verdict} ({scores})")
+
+
+async def _accept(env_ids: list[str], policies: Path, journal: _Journal, slots: int) -> None:
+    end_on_sigterm()
+    began = time.monotonic()
+    with scratch_folder("worlds") as data:
+        async with local_cluster("accept-worlds", data=data) as cluster:
+            offered = [each for env in env_ids for each in (env, ids(env)[0])]
+            await cluster.start_workers(offered, slots=slots, tiers={"bwrap"})
+            found = credentials.find("operator", (), cluster.operator_file)
+            async with transport.connect(found) as link:
+                player = _Player(Evaluations(link, lambda _, __: None, own=True), data, journal.secret)
+
+                async def work() -> None:
+                    for env in env_ids:
+                        await _environment(env, policies / catalogue.folder_name(env), journal, player)
+
+                await unless_failed(asyncio.create_task(work()), cluster.failed)
+    say(f"{len(env_ids)} environments in {time.monotonic() - began:.0f} s")
+
+
+async def _environment(env: str, folder: Path, journal: _Journal, player: _Player) -> None:
+    policy = snapshot(folder) if (folder / "policy.py").is_file() else None
+    digest = policy.digest if policy else ""
+    entries = journal.of(env)
+    if not entries:
+        base = worlds.Base(epoch=journal.epoch, env=env, policy=digest)
+        if policy is not None:
+            scores = [await player.mean(env, each, "") for each in (None, policy)]
+            base = msgspec.structs.replace(base, random=scores[0], canonical=scores[1])
+        journal.add(base)
+        entries = [base]
+    base, tried = entries[0], [each for each in entries if isinstance(each, worlds.Candidate)]
+    assert isinstance(base, worlds.Base)
+    if base.policy != digest:
+        raise ConfigError(
+            f"{folder} is not the policy with which this epoch's candidates of {env} are tried"
+            f" ({base.policy[:16] or 'none'}): restore it"
+        )
+    while policy and len(tried) < worlds.CANDIDATES and sum(each.accepted for each in tried) < N_WORLDS:
+        tried.append(await _candidate(base, policy, len(tried), journal, player))
+        journal.add(tried[-1])
+
+
+async def _candidate(
+    base: worlds.Base, policy: Bundle, n: int, journal: _Journal, player: _Player
+) -> worlds.Candidate:
+    world, key = ids(base.env)[0], worlds.key_of(journal.secret, base.env, n)
+    canonical = await player.mean(world, policy, key)
+    ceiling, variants = None, 0
+    if worlds.loses(base, canonical):
+        described = await player.description(world)
+        names = tuple(described.definition.get("parameters", ()))
+        rules = Rules(key, described.obs_space, described.action_space, names)
+        for variants in range(1, 2 + (worlds.VARIANTS if PARAMETERS in rules.kinds else 0)):
+            variant = transformed(varied(policy, variants - 1), rules)
+            ceiling = max(await player.mean(world, variant, key), -math.inf if ceiling is None else ceiling)
+            if worlds.reaches(base, ceiling):
+                break
+    return worlds.Candidate(
+        epoch=base.epoch,
+        env=base.env,
+        number=n,
+        canonical=canonical,
+        ceiling=ceiling,
+        variants=variants,
+        accepted=ceiling is not None and worlds.reaches(base, ceiling),
+    )
+
+
+class _Player:
+    """Evaluations on the command's own cluster, all on the same cases of an environment."""
+
+    def __init__(self, evaluations: Evaluations, data: Path, secret: bytes) -> None:
+        self._evaluations, self._data, self._secret = evaluations, data, secret
+
+    async def mean(self, env: str, bundle: Bundle | None, key: str) -> float:
+        """Mean return of a policy, or of random actions, in an environment or in a world with a key."""
+        self._write(env, key)
+        if bundle is not None:
+            await self._evaluations.ask.upload(bundle.digest, bundle.packed)
+        message = Evaluate(
+            token="",
+            key=uuid.uuid4().hex,
+            env=env,
+            bundle=None if bundle is None else bundle.digest,
+            split="train",
+            cases=None,
+            record="actions",
+        )
+        returns = [float(each.episode_return) async for each in self._evaluations.outcomes(message)]
+        return math.fsum(returns) / len(returns)
+
+    async def description(self, world: str) -> EnvironmentDescription:
+        await self._evaluations.versions(DescribeEnvironment(token="", env=world), wait=True)
+        offered, *_ = await self._evaluations.ask.environments()
+        return next(each.description for each in offered if each.description.env == world)
+
+    def _write(self, env: str, key: str) -> None:
+        """The files of the cases, which the coordinator reads at each request."""
+        derived = splits.derive(self._secret, "acceptance", unchanged(env), _COUNTS)
+        folder = self._data / catalogue.folder_name(env)
+        folder.mkdir(exist_ok=True)
+        for split, cases in splits.in_world(env, key, derived).items():
+            stem = split_files.FILE_STEMS[split]
+            content = split_files.SplitFile(env=env, split=stem, cases=cases, secret=True)
+            write_atomically(folder / f"{stem}.json", msgspec.json.encode(content), mode=0o600)
