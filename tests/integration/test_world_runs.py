@@ -23,7 +23,7 @@ CLUSTER = ("--state", "state")
 
 
 @pytest.mark.timeout(600)
-def test_key_and_parameters_of_a_world_are_in_no_file_of_a_run(tmp_path: Path) -> None:
+def test_secrets_of_a_world_are_in_no_file_of_a_run(tmp_path: Path) -> None:
     described = environments.make(WORLD).description
     given = described.obs_space, described.action_space, tuple(described.definition["parameters"])
     secrets = (hashlib.sha256(str(n).encode()).digest() for n in range(1000))

@@ -23,12 +23,14 @@ from evopolicy_common.errors import ConfigError, StorageError
 from evopolicy_common.records.blobs import BlobStore, fsync_directory, write_atomically
 from evopolicy_common.wire.credentials import no_state
 from evopolicy_coordinator.pki.identity import SIGNING_KEY
+from evopolicy_coordinator.worlds import JOURNAL
 
 KEPT_FILES = (
     "secret",
     "secret-unjailed",
     "identity.json",
     SIGNING_KEY,
+    JOURNAL,
     *(
         f"certs/{name}"
         for name in ("ca.pem", "ca-key.pem", "coordinator.pem", "coordinator-key.pem", "machines.json")

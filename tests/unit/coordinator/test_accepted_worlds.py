@@ -46,12 +46,12 @@ def test_half_of_the_distance_is_lost_and_four_fifths_are_reached(
     assert worlds.reaches(BASE, ceiling) is reaches
 
 
-def test_no_candidate_is_accepted_where_the_policy_is_no_better_than_random() -> None:
+def test_nothing_is_accepted_where_the_policy_equals_random() -> None:
     base = worlds.Base(epoch="e", env="gym/acrobot", policy="d" * 64, random=5.0, canonical=5.0)
     assert not worlds.loses(base, -100.0)
 
 
-def test_the_worlds_of_a_coordinator_are_the_accepted_candidates_in_order(tmp_path: Path) -> None:
+def test_a_coordinator_plays_the_accepted_candidates_in_order(tmp_path: Path) -> None:
     journal = tmp_path / worlds.JOURNAL
     source = SplitSource(data=None, secret=SECRET, journal=journal)
 
@@ -81,7 +81,7 @@ def test_an_environment_without_a_known_policy_has_no_world(tmp_path: Path) -> N
         worlds.number_of("gym/acrobot@w1", SECRET, journal)
 
 
-def test_candidates_of_an_environment_share_a_root_and_others_have_their_own() -> None:
+def test_candidates_of_one_environment_share_a_root() -> None:
     first, second = (worlds.key_of(SECRET, "gym/acrobot@w1", n) for n in (0, 1))
     assert first.partition("-")[0] == second.partition("-")[0]
     assert first.partition("-")[2] == "0"
