@@ -223,8 +223,10 @@ class SplitSource:
     """A coordinator's source of splits: a data folder, or its secret."""
 
     def __init__(self, *, data: Path | None, secret: bytes, journal: Path | None = None) -> None:
-        """`data` None: derive all splits from `secret`. `journal`: of worlds. Raises ConfigError when `data` is not a
-        folder."""
+        """`data` None: derive all splits from `secret`. `journal`: of worlds.
+
+        Raises ConfigError when `data` is not a folder.
+        """
         if data is not None and not data.is_dir():
             raise ConfigError(f"--data {data} is not a folder")
         self._data = data

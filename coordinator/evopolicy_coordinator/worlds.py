@@ -1,12 +1,14 @@
-"""Which rules the worlds of an epoch have: candidates from its secret, and the journal of those that were tried.
+"""Which rules the worlds of an epoch have: candidates from its secret, and the journal of those that were
+tried.
 
 Rules that this module owns:
-- The candidates of an environment are numbered from 0. The key of a candidate is its environment's root, HMAC-SHA256(
-  secret, worlds | environment) cut to 128 bits, a hyphen, and its number. So the key of one case shows its number and
-  all other candidates. It is committed to when a run is opened, and revealed with the epoch.
-- A candidate is accepted if the canonical policy loses at least half of its distance from random, and the ceiling
-  reaches at least 80 % of that distance (`accepts`). Candidates are tried in the order of their numbers. World n of the
-  environment has the n-th accepted one.
+- The candidates of an environment are numbered from 0. The key of a candidate is its environment's root,
+  HMAC-SHA256(secret, worlds | environment) cut to 128 bits, a hyphen, and its number. So the key of one
+  case shows its number and all other candidates. It is committed to when a run is opened, and revealed with
+  the epoch.
+- A candidate is accepted if the canonical policy loses at least half of its distance from random, and the
+  ceiling reaches at least 80 % of that distance. Candidates are tried in the order of their
+  numbers. World n of the environment has the n-th accepted one.
 - Without entries of the epoch and environment in the journal, world n has candidate n - 1, accepted or not.
 - The journal has neither root nor rules.
 """
@@ -52,7 +54,8 @@ class Candidate(msgspec.Struct, frozen=True, kw_only=True, tag="candidate", tag_
     canonical: float
     """Score of the canonical policy in this world."""
     ceiling: float | None
-    """Score of the best of the transformed policy and its variants; None: not played, as the policy lost too little."""
+    """Score of the best of the transformed policy and its variants; None: not played, as the policy lost
+    too little."""
     variants: int
     """Policies played for the ceiling, the transformed one included."""
     accepted: bool
@@ -85,8 +88,8 @@ def key_of(secret: bytes, env: str, number: int) -> str:
 
 
 def number_of(env: str, secret: bytes, journal: Path | None) -> int:
-    """The candidate that a world of this epoch has. Raises ConfigError if its environment's candidates were tried and
-    too few were accepted."""
+    """The candidate that a world of this epoch has. Raises ConfigError if its environment's candidates were
+    tried and too few were accepted."""
     place = ids(unchanged(env)).index(env)
     tried = [] if journal is None else of_environment(read(journal), epoch_of(secret), unchanged(env))
     if not tried:
@@ -94,8 +97,9 @@ def number_of(env: str, secret: bytes, journal: Path | None) -> int:
     accepted = [each.number for each in tried if isinstance(each, Candidate) and each.accepted]
     if place >= len(accepted):
         raise ConfigError(
-            f"{env} has no accepted rules in this epoch: {len(tried) - 1} candidates were tried and {len(accepted)}"
-            " accepted; repeat `evopolicy-coordinator accept-worlds` if it was interrupted, or leave this world out"
+            f"{env} has no accepted rules in this epoch: {len(tried) - 1} candidates were tried and"
+            f" {len(accepted)} accepted; repeat `evopolicy-coordinator accept-worlds` if it was interrupted, or"
+            " leave this world out"
         )
     return accepted[place]
 

@@ -1,5 +1,5 @@
-"""A whole run in a world: neither its key nor a parameter reaches anything that the agent or the operator can read, and
-the run can be verified."""
+"""A whole run in a world: neither its key nor a parameter reaches anything that the agent or the operator
+can read, and the run can be verified."""
 
 from __future__ import annotations
 

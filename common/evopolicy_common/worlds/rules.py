@@ -1,14 +1,14 @@
-"""An environment under altered rules: the order, direction, and scale of what its policy sees and does, and the
-parameters of its simulator.
+"""An environment under altered rules: the order, direction, and scale of what its policy sees and does, and
+the parameters of its simulator.
 
 Rules that this module owns:
-- The altered rules follow from a case's key, the environment's spaces, and the names of its parameters alone: one to
-  three kinds of change, drawn from the SHA-256 of the key. Without a key they are those of the key of zeros, which is
-  public: for descriptions and checks.
-- No change alters a space: a component moves only to a place with the same bounds, turns only about the middle of its
-  bounds, and is scaled only if it has none.
-- Each change but that of the parameters can be undone. So a policy for the unchanged environment scores in such a world
-  as it does there, once it knows the rules (`Rules.undo`, `Rules.redo`).
+- The altered rules follow from a case's key, the environment's spaces, and the names of its parameters
+  alone: one to three kinds of change, drawn from the SHA-256 of the key. Without a key they are those of
+  the key of zeros, which is public: for descriptions and checks.
+- No change alters a space: a component moves only to a place with the same bounds, turns only about the
+  middle of its bounds, and is scaled only if it has none.
+- Each change but that of the parameters can be undone. So a policy for the unchanged environment scores in
+  such a world as it does there, once it knows the rules (`Rules.undo`, `Rules.redo`).
 - Scales are powers of two and shifts multiples of 1/8: only a shift rounds.
 """
 

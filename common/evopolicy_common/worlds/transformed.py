@@ -1,4 +1,5 @@
-"""A policy for the unchanged environment, transformed for a world: code around it that undoes the altered rules."""
+"""A policy for the unchanged environment, transformed for a world: code around it that undoes the altered
+rules."""
 
 from __future__ import annotations
 
@@ -41,8 +42,8 @@ class Policy(Unchanged):
 
 
 def transformed(bundle: Bundle, rules: Rules) -> Bundle:
-    """The bundle that plays in a world as `bundle` does in the unchanged environment. It tells the world's rules:
-    keep it as secret as they are."""
+    """The bundle that plays in a world as `bundle` does in the unchanged environment. It tells the world's
+    rules: keep it as secret as they are."""
     around = _AROUND.format(
         inner=_INNER, observation=_literal(rules.obs_change), action=_literal(rules.action_change)
     )
@@ -54,8 +55,8 @@ def transformed(bundle: Bundle, rules: Rules) -> Bundle:
 
 
 def varied(bundle: Bundle, n: int) -> Bundle:
-    """Variant `n` of a policy: each constant at the top of policy.py has its floating-point numbers multiplied by one
-    factor, drawn for this variant. Variant 0 is the policy itself."""
+    """Variant `n` of a policy: each constant at the top of policy.py has its floating-point numbers
+    multiplied by one factor, drawn for this variant. Variant 0 is the policy itself."""
     draws = Draws(f"variant {n}")
     found = []
     for each in bundle.files if n else ():

@@ -1,7 +1,9 @@
-"""`evopolicy-coordinator accept-worlds`: tries candidates of worlds, in their order, and writes the journal of them.
+"""`evopolicy-coordinator accept-worlds`: tries candidates of worlds, in their order, and writes the journal
+of them.
 
-It plays on a cluster of its own, whose cases come from a temporary folder: `ENV@w1` has the rules of the candidate that
-is tried. A repeated command continues with the first candidate that the journal does not have.
+It plays on a cluster of its own, whose cases come from a temporary folder: `ENV@w1` has the rules of the
+candidate that is tried. A repeated command continues with the first candidate that the journal does not
+have.
 """
 
 from __future__ import annotations
@@ -51,8 +53,8 @@ def accept_worlds(
 ) -> None:
     """Choose the rules of an epoch's worlds: play candidates in a fixed order, and accept by a fixed rule.
 
-    Writes STATE/worlds.jsonl, which the coordinator of this state folder reads. Run it before the epoch's first run;
-    repeat an interrupted command to continue it.
+    Writes STATE/worlds.jsonl, which the coordinator of this state folder reads. Run it before the epoch's
+    first run; repeat an interrupted command to continue it.
     """
     root = state or credentials.default_state_dir()
     core16 = catalogue.suites()["core16"].environments

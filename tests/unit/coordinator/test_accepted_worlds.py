@@ -1,4 +1,5 @@
-"""Worlds that were accepted: the order and the rule are fixed, and the journal decides which ones are played."""
+"""Worlds that were accepted: the order and the rule are fixed, and the journal decides which ones are
+played."""
 
 from __future__ import annotations
 
