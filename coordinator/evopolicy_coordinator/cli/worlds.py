@@ -112,12 +112,12 @@ async def _environment(env: str, folder: Path, journal: _Journal, player: _Playe
     digest = policy.digest if policy else ""
     entries = journal.of(env)
     if not entries:
-        base = worlds.Base(epoch=journal.epoch, env=env, policy=digest)
+        new = worlds.Base(epoch=journal.epoch, env=env, policy=digest)
         if policy is not None:
             scores = [await player.mean(env, each, "") for each in (None, policy)]
-            base = msgspec.structs.replace(base, random=scores[0], canonical=scores[1])
-        journal.add(base)
-        entries = [base]
+            new = msgspec.structs.replace(new, random=scores[0], canonical=scores[1])
+        journal.add(new)
+        entries = [new]
     base, tried = entries[0], [each for each in entries if isinstance(each, worlds.Candidate)]
     assert isinstance(base, worlds.Base)
     if base.policy != digest:

@@ -10,7 +10,7 @@ from evopolicy_worker.environments.interface.gymnasium_adapter import GymnasiumF
 if TYPE_CHECKING:
     import gymnasium
 
-_PARAMETERS = {
+_PARAMETERS: dict[str, dict[str, tuple[str, ...]]] = {
     "AcrobotEnv": {
         "length of the links": ("LINK_LENGTH_1", "LINK_LENGTH_2", "LINK_COM_POS_1", "LINK_COM_POS_2"),
         "mass of the links": ("LINK_MASS_1", "LINK_MASS_2", "LINK_MOI"),
@@ -27,7 +27,8 @@ class ClassicFamily(GymnasiumFamily):
     def parameters(self, env: gymnasium.Env[Any, Any]) -> Mapping[str, Sequence[Quantity]]:
         bare = env.unwrapped
         # An acceleration's class is derived from the library's.
-        found = next((known for each in type(bare).__mro__ if (known := _PARAMETERS.get(each.__name__))), {})
+        known = [_PARAMETERS[each.__name__] for each in type(bare).__mro__ if each.__name__ in _PARAMETERS]
+        found = known[0] if known else {}
         return {name: [(bare, each) for each in attributes] for name, attributes in found.items()}
 
 
