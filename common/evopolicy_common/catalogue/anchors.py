@@ -1,5 +1,5 @@
-"""Floor and ceiling of returns: random actions and the best policy of this repository, for Core16 and an environment
-of every family.
+"""Floor and ceiling of returns: random actions and the best policy of this repository, for Core16 and an
+environment of every family.
 
 `docs/_site/anchors.py` measures both on the same drawn cases and writes `anchors.json`.
 """
@@ -51,5 +51,5 @@ def anchors() -> dict[str, Anchor]:
 
 
 def anchor(env_id: str) -> Anchor | None:
-    """The anchor of an environment; None where it is not known. A world has that of the environment that it alters."""
+    """The anchor of an environment, None if unknown; a world has that of the environment that it alters."""
     return anchors().get(unchanged(env_id))

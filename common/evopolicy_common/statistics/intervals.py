@@ -11,13 +11,14 @@ The method depends on the data, as chosen by measured coverage:
   analysis of variance). Degrees of freedom are Satterthwaite's, and those of unequal numbers of runs at most twice the
   smaller number's: otherwise a small variance of few runs counts as known.
 - Several runs without common cases: Welch's t interval over run means.
+- A mean over environments: a t interval from the sum of their variances, with Satterthwaite's degrees of freedom.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import msgspec
 import numpy as np
@@ -38,11 +39,12 @@ LEAST_CASES = 5
 _RELATIVE_ZERO = 1e-9
 """Relative bound: a smaller spread is rounding error."""
 
-Method = Literal["bootstrap-t", "adjusted Wald", "score", "crossed t", "Welch t", "none"]
-Over = Literal["cases", "runs and cases", "runs", "nothing"]
+Method = Literal["bootstrap-t", "adjusted Wald", "score", "crossed t", "Welch t", "stratified t", "none"]
+Over = Literal["cases", "runs and cases", "runs", "worlds, runs, and cases", "nothing"]
 
 TOO_FEW_CASES = "too few cases"
 TOO_FEW_RUNS = "too few runs"
+TOO_FEW_UNITS = "too few worlds or runs"
 
 
 class Estimate(msgspec.Struct, frozen=True, kw_only=True):
@@ -131,6 +133,45 @@ def of_runs(first: Sequence[float], second: Sequence[float] = ()) -> Estimate:
     if _is_zero(total, groups):
         return Estimate(value=value, reason=no_spread(min(map(len, groups))))
     return _t_interval(value, total, _runs_df(variances, [len(one) for one in groups]), "Welch t", "runs")
+
+
+class Stratum(NamedTuple):
+    """A mean, such as that of one environment, with the variance of this mean and its degrees of freedom."""
+
+    value: float
+    variance: float
+    """NaN if it cannot be estimated."""
+    df: float
+
+
+def stratum(returns: Floats) -> Stratum:
+    """The mean of a matrix runs × cases: over runs and cases, or over the cases of a single run."""
+    n_runs, n_cases = returns.shape
+    parts, value = components(returns), float(returns.mean())
+    if n_cases < 2:
+        return Stratum(value, math.nan, 1.0)
+    if n_runs < 2:
+        return Stratum(value, parts.cases, n_cases - 1.0)
+    return Stratum(value, *_variance([parts], parts.cases, n_cases))
+
+
+def stratum_of(values: Sequence[float]) -> Stratum:
+    """The mean of units of one kind, such as worlds."""
+    n = len(values)
+    return Stratum(float(np.mean(values)), float(np.var(values, ddof=1)) / n if n > 1 else math.nan, n - 1.0)
+
+
+def stratified(strata: Sequence[Stratum], weights: Sequence[float], over: Over) -> Estimate:
+    """The weighted sum of independent means."""
+    value = float(sum(w * each.value for w, each in zip(weights, strata, strict=True)))
+    variances = [w * w * each.variance for w, each in zip(weights, strata, strict=True)]
+    total = sum(variances)
+    if not math.isfinite(total):
+        return Estimate(value=value, over=over, reason=TOO_FEW_UNITS)
+    if total <= (_RELATIVE_ZERO * max(1e-300, *(abs(each.value) for each in strata))) ** 2:
+        return Estimate(value=value, over=over, reason=no_spread(len(strata), "means"))
+    shares = [(v / total) ** 2 / each.df for v, each in zip(variances, strata, strict=True) if v > 0.0]
+    return _t_interval(value, total, 1.0 / sum(shares), "stratified t", over)
 
 
 def over_cases(values: Floats, returns: Sequence[Floats] = (), *, resamples: int = RESAMPLES) -> Estimate:

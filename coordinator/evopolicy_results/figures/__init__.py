@@ -22,7 +22,14 @@ _OF_SUITE = (
     "scores.normalised_performance",
 )
 """All but the second average over environments."""
-_OF_STUDY = ("edits.hit_rates", "edits.edit_size", "cost.structure", "cost.tokens", "cost.wall_time")
+_OF_STUDY = (
+    "worlds.worlds",
+    "edits.hit_rates",
+    "edits.edit_size",
+    "cost.structure",
+    "cost.tokens",
+    "cost.wall_time",
+)
 
 Drawing = partial[Plot | None]
 """Draws one figure; None if it has no data. Can be sent to another process."""

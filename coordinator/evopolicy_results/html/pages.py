@@ -124,6 +124,15 @@ def index_page(
         ),
         section("starts", "Runs from one state", tables=shown_tables("starts")),
         section(
+            "worlds",
+            "Worlds",
+            title="Environments and their worlds",
+            texts=["A world is the environment with altered rules. A lower score there shows knowledge that these rules do not confirm, or too "
+                   "little exploration: compare with agents that know nothing of the environments."],
+            figures=shown_figures("worlds"),
+            tables=shown_tables("worlds"),
+        ),
+        section(
             "evolution",
             "Score evolution",
             figures=shown_figures(*(f"score_evolution_{s}" for s in suites)),
@@ -175,7 +184,7 @@ def index_page(
         ),
     ]  # fmt: skip
     if n_envs < _RANKS_FROM:
-        evolution = sections.pop(2)
+        evolution = sections.pop(3)
         sections[:0] = [section("returns", "Returns", title="Held-out returns", tables=returns), evolution]
     kept = [
         s for s in sections if s["figures"] or s["tables"] or s["links"] or s["id"] in ("replays", "left-out")

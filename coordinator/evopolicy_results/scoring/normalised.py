@@ -11,6 +11,7 @@ from statistics import fmean
 
 import msgspec
 
+from evopolicy_common.catalogue.anchors import anchor
 from evopolicy_results.behaviour.edits import demand_of
 from evopolicy_results.scoring.scores import ScoreTable
 
@@ -69,6 +70,13 @@ def normalise(score: float | None, random: float | None, best: float | None) -> 
     if score is None or random is None or best is None or best <= random:
         return None
     return min(1.0, max(0.0, (score - random) / (best - random)))
+
+
+def on_known_scale(score: float | None, env: str) -> float | None:
+    """The score with random actions at 0 and the best known policy at 1, not clipped: a scale of the catalogue, the
+    same in all reports. None without a score or a scale."""
+    known = anchor(env)
+    return None if score is None or known is None else known.normalised(score)
 
 
 def normalised(table: ScoreTable) -> Normalised:

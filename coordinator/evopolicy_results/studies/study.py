@@ -22,6 +22,7 @@ from evopolicy_results.scoring.ranking import Leaderboard, leaderboard
 from evopolicy_results.scoring.scores import ScoreTable, score_table
 from evopolicy_results.statistics.starts import VARIED, StartGroup, grouped, start_groups
 from evopolicy_results.statistics.suite import SuiteStatistics, suite_statistics
+from evopolicy_results.statistics.worlds import Worlds, worlds_of
 
 
 class Suite(msgspec.Struct, frozen=True, kw_only=True):
@@ -72,6 +73,8 @@ class Study(msgspec.Struct, frozen=True, kw_only=True):
     audit: tuple[AuditSignals, ...]
     starts: tuple[StartGroup, ...] = ()
     """Runs that start from a submit of an earlier run: all other metrics but `audit` leave them out."""
+    worlds: Worlds | None = None
+    """Environments beside their worlds; None if no entry has played both."""
 
     @property
     def entries(self) -> list[str]:
@@ -128,6 +131,7 @@ def study_of(
     if refused:
         raise MixedRunsError(refused)
     every, ordered = _in_order(runs), _in_order(whole)
+    found = tuple(evolutions(ordered, _reference_of(table)))
     return Study(
         runs=tuple(every),
         left_out=tuple(left_out),
@@ -136,7 +140,7 @@ def study_of(
             _suite(name, table.restricted(envs), ordered, resamples)
             for name, envs in suites_of(table.environments).items()
         ),
-        evolutions=tuple(evolutions(ordered, _reference_of(table))),
+        evolutions=found,
         edit_rates=tuple(edit_rates(ordered)),
         timelines=tuple(
             Timeline(
@@ -154,6 +158,7 @@ def study_of(
         tokens=tuple(token_use(ordered)),
         audit=tuple(audit_signals(every)),
         starts=tuple(start_groups(every, resamples=resamples)),
+        worlds=worlds_of(ordered, table, found),
     )
 
 

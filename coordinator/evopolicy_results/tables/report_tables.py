@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from statistics import fmean
 from typing import Any
 
 import msgspec
@@ -13,7 +14,7 @@ from evopolicy_results.behaviour import structure
 from evopolicy_results.behaviour.audit import TokenUse
 from evopolicy_results.behaviour.edits import demand_of
 from evopolicy_results.reading.environments import family_of, family_title, suite_size, title_of
-from evopolicy_results.scoring.normalised import DEMANDS
+from evopolicy_results.scoring.normalised import DEMANDS, on_known_scale
 from evopolicy_results.scoring.ranking import CellResult
 from evopolicy_results.statistics.standings import RankEstimate
 from evopolicy_results.studies.study import Study, Suite
@@ -39,6 +40,13 @@ from evopolicy_results.tables.statistics_tables import (
 from evopolicy_results.tables.table import Column, Table, best_marks, tabulated
 
 _DEMAND = Column("demand", "Demand")
+_KNOWN = Column(
+    "known",
+    "Normalised",
+    "number",
+    digits=2,
+    note="0: random actions, 1: the best known policy, as measured in the catalogue. May exceed 1.",
+)
 
 
 def tables_of(study: Study, link_of: LinkOf = no_link) -> list[Table]:
@@ -50,6 +58,7 @@ def tables_of(study: Study, link_of: LinkOf = no_link) -> list[Table]:
         found += [_labelled(table, study.post_hoc) for table in scored]
     found += [
         starts_table(study.starts),
+        _labelled(_worlds(study), study.post_hoc),
         _evolution(study, link_of),
         _edit_types(study),
         _structure(study),
@@ -76,6 +85,7 @@ def _aggregate(suite: Suite, study: Study) -> Table:
             **{_key(family): row.families.get(family) for family in families},
             "score": row.score,
             **_sure(suite.statistics.standings.of(row.entry)),
+            "known": _known_mean(suite, row.entry),
             "rank": row.rank,
             "budget": None if row.is_reference else budgets.get(row.entry),
             "wins": row.wins,
@@ -95,6 +105,8 @@ def _aggregate(suite: Suite, study: Study) -> Table:
         columns.append(
             Column("ties", "Tie group", note="Entries that share a letter do not differ significantly.")
         )
+    if any(row["known"] is not None for row in rows):
+        columns.append(_KNOWN)
     if budgets:
         columns.append(Column("budget", "Budget", "integer", note="Train episodes of a run."))
     columns += [
@@ -231,6 +243,7 @@ def _cells(suite: Suite) -> Table:
                 of=over,
             ),
             RUNS,
+            msgspec.structs.replace(_KNOWN, of=lambda cell: on_known_scale(cell.mean, cell.env)),
             Column("rank", "Rank", "integer"),
             Column("score", "Rank score", "number"),
         ),
@@ -242,7 +255,10 @@ def _cells(suite: Suite) -> Table:
             " of these intervals may overlap where the difference is sure: compare by the table of differences."
         ),
     )
-    return table if suite.is_ranked else msgspec.structs.replace(table, columns=table.columns[:-1])
+    left_out: tuple[str, ...] = () if suite.is_ranked else ("score",)
+    left_out += () if any(row["known"] is not None for row in table.rows) else ("known",)
+    columns = tuple(column for column in table.columns if column.key not in left_out)
+    return msgspec.structs.replace(table, columns=columns)
 
 
 def _normalised(suite: Suite) -> Table:
@@ -276,6 +292,49 @@ def _normalised(suite: Suite) -> Table:
         ),
         rows=tuple(rows),
         marks=bold,
+    )
+
+
+def _known_mean(suite: Suite, entry: str) -> float | None:
+    """Mean over the suite's environments; None unless all have a scale and a score."""
+    cells = [suite.board.cells.get((entry, env)) for env in suite.board.environments]
+    values = [None if cell is None else on_known_scale(cell.mean, cell.env) for cell in cells]
+    known = [value for value in values if value is not None]
+    return fmean(known) if known and len(known) == len(values) else None
+
+
+def _worlds(study: Study) -> Table:
+    def where(scope: str) -> str:
+        return title_of(scope) if scope in catalogue.entries() else family_title(scope) if scope else "All"
+
+    def estimates(key: str, title: str) -> tuple[Column, Column]:
+        return (
+            Column(key, title, "number", digits=2, of=lambda row: getattr(row, key).value),
+            Column(
+                f"{key}_interval", "95 % interval", of=lambda row: interval_text(getattr(row, key), digits=2)
+            ),
+        )
+
+    return tabulated(
+        study.worlds.paired if study.worlds is not None else (),
+        (
+            ENTRY,
+            Column("scope", "Environments", of=lambda row: where(row.scope)),
+            *estimates("unchanged", "Unchanged"),
+            *estimates("worlds", "Worlds"),
+            *estimates("difference", "Difference"),
+            Column("n_environments", "n", "integer", note="Environments."),
+            Column("n_worlds", "Worlds n", "integer"),
+        ),
+        name="worlds",
+        title="Environments and their worlds",
+        caption=(
+            "Held-out return with random actions at 0 and the best known policy at 1, not clipped: in the unchanged"
+            " environments, the mean over their worlds, and the difference. Intervals: over new worlds, runs, and cases"
+            " in the same environments (unchanged: over runs and cases, or the cases of single runs). An entry counts"
+            " on environments where it has a score in all worlds of the report; compare entries with equal n only. The"
+            " difference grows with knowledge that the worlds do not confirm, and with too little exploration."
+        ),
     )
 
 
