@@ -200,6 +200,8 @@ def bare_loop(definitions: tuple[Entry, ...]) -> Iterator[Callable[[str], Stretc
             yield play
         finally:
             process.kill()
+            with contextlib.suppress(BrokenPipeError):  # what was not read is still held
+                asked.close()
 
 
 async def in_a_slot(env_id: str, definitions: tuple[Entry, ...], bare: Callable[[str], Stretch]) -> InASlot:

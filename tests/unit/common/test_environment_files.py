@@ -119,6 +119,7 @@ def test_a_file_may_define_several(tmp_path: Path) -> None:
         ),
         ('id = "acme/x"', "gymnasium_id is missing"),
         ('id = "../x"\ngymnasium_id = "a:B-v0"', "id '../x': letters, digits"),
+        ('id = "acme/x@w1"\ngymnasium_id = "a:B-v0"', "id 'acme/x@w1': letters, digits"),
         ('id = "gym/acrobot"\ngymnasium_id = "a:B-v0"', "ids that begin with gym/ ship with evopolicy"),
     ],
 )
@@ -169,7 +170,9 @@ def test_foreign_environments_are_named_by_module_or_own_prefix(name: str) -> No
     assert catalogue.suite_of(name).name == "other"
 
 
-@pytest.mark.parametrize("name", ["gym/acrobat", "acme", "acme/../x", "a b/c", "x" * 200 + "/y"])
+@pytest.mark.parametrize(
+    "name", ["gym/acrobat", "acme", "acme/../x", "a b/c", "acme/x@w1", "a:B-v0@w1", "x" * 200 + "/y"]
+)
 def test_other_names_are_refused_here(name: str) -> None:
     with pytest.raises(ConfigError):
         catalogue.resolve([name])

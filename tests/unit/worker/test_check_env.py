@@ -12,11 +12,25 @@ import msgspec
 import pytest
 
 from evopolicy_common import catalogue
+from evopolicy_common.catalogue import Entry
 from evopolicy_worker.check_env import COLUMNS, MOST_MEMORY_MB, Checked, InASlot, bare_loop, page
 from evopolicy_worker.environments.checks import conformance
 from evopolicy_worker.environments.checks.conformance import CheckResult
 
 CARTPOLE, PENDULUM = "gymnasium/CartPole-v1", "gymnasium/Pendulum-v1"
+
+ENDS_ITS_PROCESS = """
+import os
+import gymnasium
+
+class Ends(gymnasium.Env):
+    observation_space = action_space = gymnasium.spaces.Box(-1, 1, (1,))
+
+    def reset(self, *, seed=None, options=None):
+        os._exit(1)
+
+gymnasium.register("Ends-v0", Ends)
+"""
 
 
 def checked(env: str, *, memory_mb: int = 100, steps: int = 7, fault: str = "") -> Checked:
@@ -55,6 +69,16 @@ def test_the_bare_loop_plays_the_same_stretch_at_each_turn() -> None:
     assert set(first.actions) == {0, 1}
     assert first.cpu_s > 0
     assert other.fault == "TypeError: it is not a Gymnasium environment, and has no bare loop"
+
+
+def test_a_lost_bare_loop_costs_later_environments_their_times_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "ends_it.py").write_text(ENDS_ITS_PROCESS)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    ends = Entry(id="acme/ends", gymnasium_id="ends_it:Ends-v0", family="acme")
+    with bare_loop((ends,)) as bare:
+        assert [bare(env).fault for env in ("acme/ends", CARTPOLE, PENDULUM)] == ["its process ended"] * 3
 
 
 def test_a_time_says_whether_the_machine_was_busy() -> None:

@@ -14,6 +14,7 @@ from rigs.core_rig import describe, fingerprint
 from rigs.finished_run import finished
 from rigs.store_rows import blob
 
+from evopolicy_common.catalogue import worlds
 from evopolicy_common.errors import ProtocolError, RefusedError
 from evopolicy_common.messages import gateway, operator, worker
 from evopolicy_common.messages.environment import Case
@@ -472,6 +473,25 @@ def test_a_rescore_takes_all_but_its_cases_from_the_run(blobs: BlobStore, parser
     assert "positions" in refused_for(indexes=())
     assert "no ok submit 1" in refused_for(submit_index=1)
     assert "no ok submit 9" in refused_for(submit_index=9)
+
+
+@pytest.mark.parametrize("wrong", ["ab", "bb", "a-", "--"])
+def test_a_rescore_of_a_world_keeps_the_runs_key(blobs: BlobStore, parser: RequestParser, wrong: str) -> None:
+    """A letter stands for a case with that key, `-` for one without."""
+    blobs.put(b"policy")
+    row, result = finished_pair(parser, env="gym/acrobot@w1")
+
+    def cases(letters: str, first_seed: int) -> tuple[Case, ...]:
+        given = [None if letter == "-" else {worlds.OPTION: letter * 32} for letter in letters]
+        return tuple(Case(seed=first_seed + n, options=each) for n, each in enumerate(given))
+
+    row = msgspec.structs.replace(row, train=cases("aa", 0), validation=(), heldout=())
+    message = operator.Rescore(
+        token="operate", key="k", run=row.run, submit_index=0, cases=cases("aa", 7), indexes=(0, 1)
+    )
+    parser.rescore_requested(message, 7, "s", row, result)
+    with pytest.raises(RefusedError, match=f"another world than run {row.run}"):
+        parser.rescore_requested(msgspec.structs.replace(message, cases=cases(wrong, 7)), 7, "s", row, result)
 
 
 def test_a_rescore_by_policies_of_whole_submits_plays_all_cases_at_once(
