@@ -114,6 +114,7 @@ def edit_size(study: Study, looks: Mapping[str, Look]) -> Plot | None:
                     s=[14 + 130 * n / largest for _, _, n in points],
                     color=look.colour, marker=look.marker, alpha=0.8, linewidths=0,
                 )  # fmt: skip
+            panel.set_xlim(-0.6, len(labels) - 0.4)
             panel.set_xticks(range(len(labels)), [label.replace(" ", "\n") for label in labels])
             panel.set_ylim(-0.04, 1.04)
             panel.set_yticks([0.0, 0.25, 0.5, 0.75, 1.0], ["0", "25", "50", "75", "100"])
