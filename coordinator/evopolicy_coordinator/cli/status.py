@@ -110,21 +110,8 @@ def list_workers(connect: Connect = None, file: CredentialsFile = None, as_json:
     if as_json:
         say_json(reply.workers)
         return
-    shown = listing(
-        reply.workers,
-        {
-            "worker": lambda one: one.worker,
-            "host": lambda one: one.host,
-            "state": lambda one: one.state,
-            "slots": lambda one: str(one.slots),
-            "running": lambda one: str(one.running),
-            "tiers": _tiers,
-            "environments": lambda one: _names(one.environments),
-        },
-        right=("slots", "running"),
-        whole=("worker",),
-    )
-    terminal().print(shown if reply.workers else "no worker is connected")
+    shown = ("worker", "host", "state", "slots", "running", "tiers", "environments")
+    terminal().print(_workers(reply, *shown) if reply.workers else "no worker is connected")
     say_lines(line for worker in reply.workers for line in _lacks(worker))
 
 
@@ -148,6 +135,28 @@ def _names(env_ids: Sequence[str]) -> str:
             left -= members
             names.append(suite)
     return " ".join([*names, *(env_id for env_id in env_ids if env_id in left)])
+
+
+_WORKER_COLUMNS: dict[str, Callable[[WorkerStatus], str]] = {
+    "worker": lambda one: one.worker,
+    "host": lambda one: one.host,
+    "state": lambda one: one.state,
+    "slots": lambda one: str(one.slots),
+    "running": lambda one: str(one.running),
+    "held": lambda one: str(one.held),
+    "envs": lambda one: str(len(one.environments)),
+    "tiers": _tiers,
+    "environments": lambda one: _names(one.environments),
+    "class": lambda one: one.fingerprint,
+    "seen": lambda one: f"{duration(one.last_seen_s)} ago",
+}
+
+
+def _workers(reply: StatusReply, *columns: str) -> Table:
+    shown = {name: _WORKER_COLUMNS[name] for name in columns}
+    return listing(
+        reply.workers, shown, right=("slots", "running", "held", "envs"), whole=("worker", "class")
+    )
 
 
 def _set_worker(
@@ -273,7 +282,14 @@ def render(reply: StatusReply) -> RenderableType:
         f" {sum(run.queued for run in reply.runs)} queued, {sum(run.running for run in reply.runs)} running,"
         f" {reply.episodes_done} episodes done, {reply.episodes_per_s:.1f}/s over the last minute"
     )
-    parts: list[RenderableType] = [Text(head), _workers(reply), *_classes(reply), _runs(reply)]
+    parts: list[RenderableType] = [
+        Text(head),
+        _workers(
+            reply, "worker", "host", "state", "slots", "running", "held", "envs", "tiers", "class", "seen"
+        ),
+        *_classes(reply),
+        _runs(reply),
+    ]
     if reply.audit_share or reply.audits:
         stand = ", ".join(f"{n} {state.replace('_', ' ')}" for state, n in sorted(reply.audits.items()))
         parts.append(
@@ -281,25 +297,6 @@ def render(reply: StatusReply) -> RenderableType:
         )
     parts += [Text(line, style="yellow") for line in _remarks(reply)]
     return Group(*parts)
-
-
-def _workers(reply: StatusReply) -> Table:
-    return listing(
-        reply.workers,
-        {
-            "worker": lambda one: one.worker,
-            "host": lambda one: one.host,
-            "state": lambda one: one.state,
-            "slots": lambda one: str(one.slots),
-            "running": lambda one: str(one.running),
-            "held": lambda one: str(one.held),
-            "envs": lambda one: str(len(one.environments)),
-            "tiers": _tiers,
-            "class": lambda one: one.fingerprint,
-            "seen": lambda one: f"{duration(one.last_seen_s)} ago",
-        },
-        whole=("worker", "class"),
-    )
 
 
 def _classes(reply: StatusReply) -> Iterator[Text]:

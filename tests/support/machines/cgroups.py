@@ -1,6 +1,6 @@
 """Cgroups of a test's own, of version 1 or 2: they keep processor or memory from a process, or freeze it.
 
-Only root can make cgroups. A test is skipped, with the reason, where its cgroup cannot be made.
+Only root can make cgroups. Where a cgroup cannot be made, `NoCgroupError` says why; in a test it is a skip.
 """
 
 from __future__ import annotations
@@ -13,14 +13,21 @@ import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NoReturn
-
-import pytest
+from unittest import SkipTest
 
 from evopolicy_common.processes.cgroups import ROOT, hierarchies
 
 TIMEOUT_S = 10.0
 _numbers = itertools.count()
+
+
+class NoCgroupError(SkipTest):
+    """A cgroup cannot be made here."""
+
+    def __init__(self, why: str) -> None:
+        super().__init__(
+            f"needs a cgroup of its own, which cannot be made here ({why}): run the tests as root"
+        )
 
 
 class Cgroup:
@@ -118,14 +125,14 @@ def _group(controller: str, first: dict[str, str], second: dict[str, str]) -> It
     """A cgroup with the settings of version 1 (`first`) or 2 (`second`), whichever this machine has."""
     found = hierarchies().get(controller)
     if found is None:
-        _skip(f"no {controller} controller")
+        raise NoCgroupError(f"no {controller} controller")
     group = Cgroup(_folder(found.folder))
     try:
         try:
             for name, value in (first if found.version == 1 else second).items():
                 group.set(name, value)
         except OSError as error:
-            _skip(f"the {controller} controller is not available: {error}")
+            raise NoCgroupError(f"the {controller} controller is not available: {error}") from error
         yield group
     finally:
         group.remove()
@@ -136,7 +143,7 @@ def _folder(root: Path) -> Path:
     try:
         folder.mkdir()
     except OSError as error:
-        _skip(str(error))
+        raise NoCgroupError(str(error)) from error
     return folder
 
 
@@ -147,12 +154,8 @@ def _mounted(controller: str) -> Iterator[Path]:
             ["mount", "-t", "cgroup", "-o", controller, "none", folder], capture_output=True, text=True
         )
         if done.returncode:
-            _skip(done.stderr.strip())
+            raise NoCgroupError(done.stderr.strip())
         try:
             yield Path(folder)
         finally:
             subprocess.run(["umount", folder], check=True)
-
-
-def _skip(why: str) -> NoReturn:
-    pytest.skip(f"needs a cgroup of its own, which cannot be made here ({why}): run the tests as root")
