@@ -37,8 +37,8 @@ def program(name: str) -> str:
     path = os.path.join(os.path.dirname(beside), name)
     if not os.path.exists(path):
         return name
-    found = shutil.which(name)
-    if found is not None and os.path.samefile(found, path):
+    on_path = shutil.which(name)
+    if on_path is not None and os.path.samefile(on_path, path):
         return name
     return shlex.quote(_near(path))
 

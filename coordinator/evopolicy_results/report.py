@@ -182,9 +182,9 @@ def _page(
     run: Run, out: Path, look: Look | None, beside: Sequence[tuple[str, Look | None, str]]
 ) -> list[dict[str, Any]]:
     try:
-        found = trace(run)
-        _write_trace(found, out, look, beside)
-        return submits_of(found)
+        traced = trace(run)
+        _write_trace(traced, out, look, beside)
+        return submits_of(traced)
     except Exception as error:
         # A bad log or source that an agent wrote must spoil at most its own page.
         _write_failed(run, out, f"{type(error).__name__}: {error}")
@@ -198,13 +198,13 @@ def _write_failed(run: Run, out: Path, why: str) -> None:
 
 def _beside(run: Run, runs: Sequence[Run]) -> list[Run]:
     """One run of each other agent on the same environment, with the same repeat number if there is one."""
-    found: dict[str, Run] = {}
+    chosen: dict[str, Run] = {}
     for other in runs:
         if other.entry != run.entry:
-            chosen = found.setdefault(other.entry, other)
-            if chosen.record.repeat != run.record.repeat == other.record.repeat:
-                found[other.entry] = other
-    return list(found.values())
+            first = chosen.setdefault(other.entry, other)
+            if first.record.repeat != run.record.repeat == other.record.repeat:
+                chosen[other.entry] = other
+    return list(chosen.values())
 
 
 def _write_trace(

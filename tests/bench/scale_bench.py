@@ -232,7 +232,7 @@ class Run:
         self.log = root / "gateway.log"
         found = msgspec.structs.replace(coordinator.credentials("gateway"), token=capability)
         credentials.write(found, self.folder.credentials)
-        save(self.folder.opened, OpenedRun(run=run))
+        save(self.folder.opened_run, OpenedRun(run=run))
         self.process = stack.enter_context(
             child(
                 "-m", "evopolicy_gateway.cli.serve", str(root), "--json", log=self.log, stdout=subprocess.PIPE

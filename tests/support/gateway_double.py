@@ -477,7 +477,7 @@ def prepare(root: Path, found: Credentials, double: Double) -> RunFolder:
     folder = RunFolder(root)
     folder.state.mkdir(parents=True, mode=0o700, exist_ok=True)
     credentials.write(found, folder.credentials)
-    save(folder.opened, OpenedRun(run=double.run_id))
+    save(folder.opened_run, OpenedRun(run=double.run_id))
     return folder
 
 

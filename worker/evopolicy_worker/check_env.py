@@ -342,15 +342,15 @@ def command(
 
 def read(results: Path) -> dict[str, Checked]:
     """Results in the file, by environment id. Skips truncated lines, so that those environments are played again."""
-    found: dict[str, Checked] = {}
+    by_env: dict[str, Checked] = {}
     data = read_given(results, f"--results {results}") if results.exists() else b""
     for line in data.splitlines():
         try:
             checked = msgspec.json.decode(line, type=Checked)
         except msgspec.MsgspecError:
             continue
-        found[checked.here.env] = checked
-    return found
+        by_env[checked.here.env] = checked
+    return by_env
 
 
 def page(results: Path, earlier: str = "", ids: Sequence[str] | None = None) -> str:

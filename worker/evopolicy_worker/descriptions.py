@@ -110,9 +110,9 @@ def sorted_out(
     shipped: list[str] = []
     others: list[str] = []
     for env_id in env_ids:
-        found = cache.get(env_id)
-        if found is not None:
-            known.append(found)
+        cached = cache.get(env_id)
+        if cached is not None:
+            known.append(cached)
         else:
             (shipped if catalogue.is_shipped(env_id) else others).append(env_id)
     if len(shipped) <= AT_ONCE:
@@ -129,7 +129,7 @@ async def describe_all(
     Starts the slot again when its processes are killed meanwhile; at most `TRIES` attempts for each. Raises WorkerError
     when the slot does not start.
     """
-    found: list[EnvironmentDescription] = []
+    descriptions: list[EnvironmentDescription] = []
     failed: dict[str, str] = {}
     await _started(slot)
     for env_id in env_ids:
@@ -140,10 +140,10 @@ async def describe_all(
             failed[env_id] = str(error)
             await _started(slot)
             continue
-        found.append(description)
+        descriptions.append(description)
         if cache is not None:
             cache.put(description)
-    return tuple(found), failed
+    return tuple(descriptions), failed
 
 
 async def _described(env_id: str, slot: Describes) -> EnvironmentDescription:

@@ -237,20 +237,20 @@ def _usual() -> Path:
         package.parent / "evopolicy_gateway" / "constraints.txt",
         package.parents[1] / "constraints.txt",
     )
-    found = next((each for each in places if each.is_file()), None)
-    if found is None:
+    place = next((each for each in places if each.is_file()), None)
+    if place is None:
         raise ConfigError("constraints.txt is missing from this installation: install evopolicy again")
-    return found
+    return place
 
 
 def _ourselves(scratch: Path, extras: str) -> list[str]:
     """pip's arguments for this very version of evopolicy: the checkout that is installed, or a wheel of the installed
     files."""
-    found = metadata.distribution(DISTRIBUTION)
-    origin = json.loads(found.read_text("direct_url.json") or "{}")
+    installed = metadata.distribution(DISTRIBUTION)
+    origin = json.loads(installed.read_text("direct_url.json") or "{}")
     if origin.get("dir_info", {}).get("editable"):
         return ["--editable", f"{unquote(urlsplit(origin['url']).path)}[{extras}]"]
-    return [f"{wheel(found, scratch)}[{extras}]"]
+    return [f"{wheel(installed, scratch)}[{extras}]"]
 
 
 def wheel(found: metadata.Distribution, folder: Path) -> Path:
@@ -291,9 +291,9 @@ def failure(what: str, output: str) -> ConfigError:
         )
     if "No space left" in output or "Errno 28" in output:
         return MachineError(f"{what}: no space is left; make room, or name another folder with --into")
-    if found := _NO_VERSION.search(output):
+    if match := _NO_VERSION.search(output):
         return ConfigError(
-            f"{what}: the package index has no {found[1]} for this Python and platform; name another interpreter with"
+            f"{what}: the package index has no {match[1]} for this Python and platform; name another interpreter with"
             " --python"
         )
     return ConfigError(f"{what} cannot be installed: {last_line(output)}")

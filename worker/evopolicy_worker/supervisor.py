@@ -320,16 +320,16 @@ class Supervisor:
         assert self._describe is not None
         log.info("describing", environments=wanted)
         try:
-            found, failed = await self._describe(wanted)
+            descriptions, failed = await self._describe(wanted)
         except (EvopolicyError, OSError) as error:
             log.error("environments are not described", environments=wanted, why=str(error))
             return
         before = self._failed_environments
         self._failed_environments = {env: why for env, why in before.items() if env not in wanted} | failed
-        self._described |= {each.env: each for each in found}
+        self._described |= {each.env: each for each in descriptions}
         for env_id in wanted:
             self._undescribed.pop(env_id, None)
-        if found or self._failed_environments != before:
+        if descriptions or self._failed_environments != before:
             with contextlib.suppress(RefusedError):  # the lease loop meets the same refusal
                 await self._register()
 
@@ -646,10 +646,10 @@ def tell_missing(tiers: Mapping[Tier, str]) -> None:
 
 def _told(failed: Mapping[str, str]) -> dict[str, str]:
     """The reasons as they are announced: all environments, and of the reasons as much as the coordinator takes."""
-    left, told = MAX_FAILURES, {}
+    remaining, told = MAX_FAILURES, {}
     for env, why in failed.items():
-        told[env] = why[: min(MAX_FAILURE, left)]
-        left -= len(told[env])
+        told[env] = why[: min(MAX_FAILURE, remaining)]
+        remaining -= len(told[env])
     return told
 
 

@@ -99,12 +99,12 @@ def _write(runs: list[Path], to: Format, out: Path) -> None:
         Format.ATIF: transcripts.write_atif,
         Format.INSPECT: transcripts.write_inspect,
     }
-    found = load_runs(*runs)
-    for folder, why in found.left_out:
+    runs_read = load_runs(*runs)
+    for folder, why in runs_read.left_out:
         say(f"{folder}: left out: {why}", err=True)
     check_writable(out, "--out")
     out.mkdir(parents=True, exist_ok=True)
-    say_lines(map(str, writers[to](found, out)))
+    say_lines(map(str, writers[to](runs_read, out)))
 
 
 def _track(runs: list[Path], to: Format, out: str, follow: bool) -> None:

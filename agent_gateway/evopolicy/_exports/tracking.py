@@ -299,8 +299,10 @@ class MLflow:
 
         self._client = MlflowClient(tracking_uri=out)
         name = os.environ.get("MLFLOW_EXPERIMENT_NAME", "evopolicy")
-        found = self._client.get_experiment_by_name(name)
-        self._experiment = self._client.create_experiment(name) if found is None else found.experiment_id
+        experiment = self._client.get_experiment_by_name(name)
+        self._experiment = (
+            self._client.create_experiment(name) if experiment is None else experiment.experiment_id
+        )
         self._runs: dict[str, Any] = {}
 
     def _find(self, curve: Curve) -> Any:

@@ -263,9 +263,9 @@ def list_files() -> Tool:
     async def execute() -> str:
         """Lists the files of the workspace with their sizes in bytes."""
         root = _of_sample().folder.workspace
-        found = sorted(path for path in root.rglob("*") if path.is_file())
-        lines = [f"{path.relative_to(root)} {path.stat().st_size}" for path in found[:_MAX_LISTED]]
-        more = [f"… {len(found) - _MAX_LISTED} more"] if len(found) > _MAX_LISTED else []
+        files = sorted(path for path in root.rglob("*") if path.is_file())
+        lines = [f"{path.relative_to(root)} {path.stat().st_size}" for path in files[:_MAX_LISTED]]
+        more = [f"… {len(files) - _MAX_LISTED} more"] if len(files) > _MAX_LISTED else []
         return "\n".join(lines + more)
 
     return execute
@@ -287,11 +287,11 @@ def read_file() -> Tool:
                 begin = min(max(0, offset), size)
                 file.seek(begin)
                 data = file.read(_MAX_READ)
-                left = size - begin - len(data)
+                rest = size - begin - len(data)
         except OSError as error:
             raise ToolError(f"{path}: {error.strerror}") from error
         text = data.decode("utf-8", "replace")
-        return f"{text}\n[{left} more bytes]" if left > 0 else text
+        return f"{text}\n[{rest} more bytes]" if rest > 0 else text
 
     return execute
 
@@ -347,10 +347,10 @@ def submit_episodes() -> Tool:
 
 def _of_sample() -> _Live:
     """The run of the sample that the caller belongs to."""
-    found = _live.get(store().get(_KEY, ""))
-    if found is None:
+    live = _live.get(store().get(_KEY, ""))
+    if live is None:
         raise RuntimeError("this sample has no open run: its task's setup opens one")
-    return found
+    return live
 
 
 def _count(live: _Live) -> None:

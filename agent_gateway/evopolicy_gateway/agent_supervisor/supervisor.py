@@ -229,11 +229,11 @@ async def _until_gone(started: Collection[int]) -> None:
     gone.
     """
     reported: list[int] = []
-    while left := await asyncio.to_thread(processes.end_descendants, END_GRACE_S, waited=started):
-        if left != reported:
-            log.error("processes of the agent survive", pids=left)
-            child_messages.emit(AgentSurvives(pids=tuple(left)))
-            reported = left
+    while survivors := await asyncio.to_thread(processes.end_descendants, END_GRACE_S, waited=started):
+        if survivors != reported:
+            log.error("processes of the agent survive", pids=survivors)
+            child_messages.emit(AgentSurvives(pids=tuple(survivors)))
+            reported = survivors
         await asyncio.sleep(_SURVIVORS_PAUSE_S)
 
 

@@ -62,5 +62,5 @@ def cluster_of(
         raise ConfigError(f"--fresh and --state {given.state}: give only one of them")
     state = None if given.fresh else given.state or local_state_dir()
     browser = None if given.browser is None else given.browser.absolute()
-    found = msgspec.structs.replace(given, state=state, browser=browser, policy_package=packages)
-    return Cluster(local=found)
+    options = msgspec.structs.replace(given, state=state, browser=browser, policy_package=packages)
+    return Cluster(local=options)

@@ -255,12 +255,12 @@ def diff_runs(
             root = folder_of(each).root  # for typer a pipe is no file
             if not ((root / "run.json").exists() or (root / "workspace").is_dir()):
                 raise ConfigError(f"{each} is no run directory: it has neither run.json nor workspace/")
-        found = differences(left, right)
+        lines = differences(left, right)
     if as_json:
-        say_json(found, indent=False)
+        say_json(lines, indent=False)
     else:
-        say_lines(shortened(found, left, right) or ["no difference (times and logs aside)"])
-    raise typer.Exit(1 if found else 0)
+        say_lines(shortened(lines, left, right) or ["no difference (times and logs aside)"])
+    raise typer.Exit(1 if lines else 0)
 
 
 @app.command(epilog="Example: evopolicy replay runs/gpt-5.5/gym_acrobot/first")

@@ -160,7 +160,7 @@ def _below(field: str, path: str, started_in: Path) -> Path:
 def _files(field: str, root: Path, prefix: str) -> Iterator[tuple[str, File]]:
     """A file, or all files of a folder, by path from `prefix` on. ConfigError for links, devices, and too many or too
     large ones."""
-    left, n, pending = MAX_BYTES, 0, [(root, prefix)]
+    remaining, n, pending = MAX_BYTES, 0, [(root, prefix)]
     while pending:
         path, name = pending.pop()
         try:
@@ -176,13 +176,13 @@ def _files(field: str, root: Path, prefix: str) -> Iterator[tuple[str, File]]:
                 kind = "a symbolic link; put a copy in its place" if stat.S_ISLNK(mode) else "no regular file"
                 raise ConfigError(f"{field}: {path} is {kind}")
             with open_regular(path) as file:
-                data = file.read(left + 1)
+                data = file.read(remaining + 1)
         except OSError as error:
             raise ConfigError(f"{field}: {path}: {error.strerror}") from error
         if any("\ud800" <= character <= "\udfff" for character in name):
             raise ConfigError(f"{field}: the name {str(path)!r} is not UTF-8; rename the file")
-        left, n = left - len(data), n + 1
-        if left < 0 or n > MAX_FILES:
+        remaining, n = remaining - len(data), n + 1
+        if remaining < 0 or n > MAX_FILES:
             raise ConfigError(
                 f"{field}: more than {MAX_BYTES >> 20} MiB or {MAX_FILES} files; leave out what the agent does not need"
             )

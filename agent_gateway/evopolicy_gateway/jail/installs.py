@@ -55,9 +55,9 @@ def needs_of(command: Sequence[str], search: str | None, more: Sequence[Sequence
     needs = Needs()
     _our_python(needs)
     for words in (command, *more):
-        found = shutil.which(words[0], path=search) if words else None
-        if found is not None:
-            _program(needs, os.path.abspath(found), search)
+        program = shutil.which(words[0], path=search) if words else None
+        if program is not None:
+            _program(needs, os.path.abspath(program), search)
     for word in command[1:]:
         if os.path.isabs(word) and word != "/" and os.path.exists(word) and not _is_ours(word):
             needs.path(word)
@@ -162,8 +162,8 @@ def _interpreter(path: str, search: str | None) -> str | None:
         return None
     if words and os.path.basename(words[0]) == "env":
         words = [word for word in words[1:] if not word.startswith("-") and "=" not in word]
-    found = shutil.which(words[0], path=search) if words else None
-    return None if found is None else os.path.abspath(found)
+    program = shutil.which(words[0], path=search) if words else None
+    return None if program is None else os.path.abspath(program)
 
 
 def _in_system(path: str) -> bool:

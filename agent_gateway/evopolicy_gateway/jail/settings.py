@@ -94,11 +94,11 @@ class JailSettings(msgspec.Struct, frozen=True, kw_only=True):
 def host(text: str, option: str = "--allow-host") -> Host:
     """Parses `HOST` or `HOST:PORT` into lower-case name and port. Raises ConfigError for anything else, and
     patterns."""
-    found = _HOST.fullmatch(text)
-    port = HTTPS if found is None or found["port"] is None else int(found["port"])
-    if found is None or not 0 < port < 1 << 16:
+    match = _HOST.fullmatch(text)
+    port = HTTPS if match is None or match["port"] is None else int(match["port"])
+    if match is None or not 0 < port < 1 << 16:
         raise ConfigError(f"{option} {text!r}: use the form HOST or HOST:PORT, without patterns")
-    return found["name"].lower(), port
+    return match["name"].lower(), port
 
 
 def check_bubblewrap() -> None:

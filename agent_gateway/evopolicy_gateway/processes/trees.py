@@ -62,9 +62,9 @@ def end_descendants(
         _reap(kept)
         time.sleep(_PAUSE_S)
     deadline = time.monotonic() + KILL_TIMEOUT_S
-    while (left := _left(spare, kept)) and time.monotonic() < deadline:
+    while (survivors := _left(spare, kept)) and time.monotonic() < deadline:
         # Stopped first: a process that forks faster than it is found must not outrun the killing.
-        _signal_all(left, signal.SIGSTOP)
+        _signal_all(survivors, signal.SIGSTOP)
         _signal_all(_left(spare, kept), signal.SIGKILL)
         _kill_children(kept)
         _reap(kept)

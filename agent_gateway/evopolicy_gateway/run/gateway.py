@@ -213,13 +213,13 @@ class Gateway:
 def _load(
     folder: RunFolder, connect: tuple[str, ...], file: Path | None
 ) -> tuple[credentials.Credentials, OpenedRun]:
-    if not folder.opened.exists():
+    if not folder.opened_run.exists():
         raise ConfigError(
-            f"{folder.root} holds no open run ({folder.state.name}/{folder.opened.name} is missing);"
+            f"{folder.root} holds no open run ({folder.state.name}/{folder.opened_run.name} is missing);"
             " runs are opened by `evopolicy run`"
         )
     found = credentials.read(folder.credentials)
-    run = saved(folder.opened, OpenedRun)
+    run = saved(folder.opened_run, OpenedRun)
     if file is not None:
         found = msgspec.structs.replace(credentials.find("gateway", connect, file), token=found.token)
     return credentials.at(found, connect), run

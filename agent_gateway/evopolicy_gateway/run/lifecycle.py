@@ -64,7 +64,7 @@ from evopolicy_gateway.run.model_relay import ModelRelay
 from evopolicy_gateway.run.operations import Operations
 from evopolicy_gateway.run.plan import Plan, Replays
 from evopolicy_gateway.run.times import Stopwatch
-from evopolicy_gateway.run.watch import Watch
+from evopolicy_gateway.run.watch import RunObserver
 from evopolicy_gateway.run_folder.layout import RunFolder, save, saved
 from evopolicy_gateway.run_folder.listener import TOKEN_VARIABLE, agent_place, place_notice
 from evopolicy_gateway.run_folder.locks import alone
@@ -96,7 +96,7 @@ class RunLifecycle:
         plan: Plan,
         operations: Operations,
         gateway: Credentials,
-        watch: Watch,
+        watch: RunObserver,
         *,
         stays_open: bool = False,
         on_agent_gone: Callable[[], None] = lambda: None,
@@ -186,7 +186,7 @@ class RunLifecycle:
 
     async def _claim(self) -> None:
         plan, folder = self._plan, self._folder
-        if not self._new and (folder.intended.exists() or folder.opened.exists()):
+        if not self._new and (folder.intended.exists() or folder.opened_run.exists()):
             return
         self._new = True
         # Checking starts programs that try the jail, which another run's search would take for orphans.
@@ -240,8 +240,11 @@ class RunLifecycle:
 
     async def _open(self) -> None:
         folder = self._folder
-        if resumed := folder.opened.exists():
-            self.run, token = saved(folder.opened, OpenedRun).run, credentials.read(folder.credentials).token
+        if resumed := folder.opened_run.exists():
+            self.run, token = (
+                saved(folder.opened_run, OpenedRun).run,
+                credentials.read(folder.credentials).token,
+            )
         else:
             key = saved(folder.intended, IntendedRun).key
             created = await self._operations.create(self._plan.settings, key)
@@ -255,7 +258,7 @@ class RunLifecycle:
                 self._closed.set()
             self._note(f"goes on with run {self.run} in {folder.root}")
         else:
-            save(folder.opened, OpenedRun(run=self.run, agents_md=self._plan.texts.agents_md))
+            save(folder.opened_run, OpenedRun(run=self.run, agents_md=self._plan.texts.agents_md))
             self._note(f"run {self.run} in {folder.root}")
         self._operations.watched_by(self.run, (folder.lock, folder.supervisor_lock))
         self._stopwatch = Stopwatch(folder.times)

@@ -122,8 +122,8 @@ class Operations(OperatorClient):
         Waits for the agent of a killed command, which may still be ending. Does nothing without such a run, or when the
         cluster does not know it.
         """
-        if folder.opened.exists():
-            run = saved(folder.opened, OpenedRun).run
+        if folder.opened_run.exists():
+            run = saved(folder.opened_run, OpenedRun).run
         elif folder.intended.exists():
             # The coordinator may have opened it, and the command was killed before it had the answer.
             intended = saved(folder.intended, IntendedRun)

@@ -50,7 +50,7 @@ def find(text: str, started_in: Path) -> Found:
                 f"--start-from {text}: {folder.root} belongs to another user; name a run of your own"
             )
         finished = folder.run_json.exists()
-        run = read_record(folder.root).run if finished else saved(folder.opened, OpenedRun).run
+        run = read_record(folder.root).run if finished else saved(folder.opened_run, OpenedRun).run
     except OSError as error:
         raise ConfigError(
             f"--start-from {text}: no run is there: {error.strerror}; name a run directory"

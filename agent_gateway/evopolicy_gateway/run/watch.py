@@ -31,7 +31,7 @@ PHASES = {
 }
 
 
-class Watch(Protocol):
+class RunObserver(Protocol):
     """Receives the reports of runs; `run` is a run's short name."""
 
     def held(self, run: str, what: str) -> None:
@@ -69,7 +69,7 @@ R = TypeVar("R", bound=Row)
 
 
 class View(ABC, Generic[R]):
-    """A `Watch` with one row per run."""
+    """A `RunObserver` with one row per run."""
 
     new_row: Callable[[], R]
     no_news: tuple[str, ...] = ("",)

@@ -165,8 +165,8 @@ class RunFolder(msgspec.Struct, frozen=True):
         return self.root / open_run.BUNDLES
 
     @property
-    def opened(self) -> Path:
-        """The id of this run: `OpenedRun`."""
+    def opened_run(self) -> Path:
+        """The id of the run that the folder belongs to: `OpenedRun`."""
         return self.root / open_run.OPENED
 
     @property

@@ -73,10 +73,10 @@ def _fault_of_source(files: dict[str, bytes]) -> PolicyFailure | None:
     """The verdict of the published software on sources that it does not run: `import_error` for a Python file that
     cannot be parsed, `missing_policy` for a `policy.py` without a class statement `Policy` at its top level."""
     category: FailureCategory = "import_error"
-    left = MAX_PARSED_BYTES
+    remaining = MAX_PARSED_BYTES
     for path in sorted(path for path in files if path.endswith(".py")):
-        left -= len(files[path])
-        if left < 0:
+        remaining -= len(files[path])
+        if remaining < 0:
             break
         tree = parse(files[path])
         if tree is None:

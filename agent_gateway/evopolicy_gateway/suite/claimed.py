@@ -306,8 +306,8 @@ class ClaimedSweep(Sweep):
 def _opened(run: Plan) -> str:
     """The cluster's id of the run in the run's folder; empty for none."""
     with contextlib.suppress(OSError, EvopolicyError):
-        if run.folder.opened.exists():
-            return saved(run.folder.opened, OpenedRun).run
+        if run.folder.opened_run.exists():
+            return saved(run.folder.opened_run, OpenedRun).run
         return read_record(run.folder.root).run
     return ""
 
@@ -318,11 +318,11 @@ async def look(run: Plan, index: Index, operations: Operations) -> Found:
     status: str | None = None
     with contextlib.suppress(OSError, EvopolicyError):
         status = suite_index.state_of(read_record(folder.root))
-    opened = status is None and folder.opened.exists() and folder.credentials.exists()
+    opened = status is None and folder.opened_run.exists() and folder.credentials.exists()
     phase: str | None = None
     has_session = False
     if opened:
-        identity = saved(folder.opened, OpenedRun).run
+        identity = saved(folder.opened_run, OpenedRun).run
         phase = await operations.phase(identity)
         resumable = run.harness().resumable
         has_session = resumable and session.load(folder.session).session is not None

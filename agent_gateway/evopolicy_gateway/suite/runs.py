@@ -20,7 +20,7 @@ from evopolicy_common.wire.credentials import Credentials
 from evopolicy_gateway.operator.cluster import Cluster, connected
 from evopolicy_gateway.run.operations import Operations
 from evopolicy_gateway.run.plan import Plan
-from evopolicy_gateway.run.watch import RunView, Watch
+from evopolicy_gateway.run.watch import RunObserver, RunView
 from evopolicy_gateway.suite.decisions import Decision
 from evopolicy_gateway.suite.ends import next_step
 from evopolicy_gateway.suite.suite_file import Parallel
@@ -47,7 +47,12 @@ class _Runs(Sweep):
     stays_open = False
 
     def __init__(
-        self, played: PlayedRuns, parallel: int, operations: Operations, gateway: Credentials, watch: Watch
+        self,
+        played: PlayedRuns,
+        parallel: int,
+        operations: Operations,
+        gateway: Credentials,
+        watch: RunObserver,
     ) -> None:
         super().__init__(Parallel(machine=parallel), played.index, operations, gateway, watch)
         self._results = played

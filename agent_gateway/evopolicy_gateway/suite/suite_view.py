@@ -137,10 +137,10 @@ class SuiteView(View[SuiteRow]):
             for row in rows
             if row.entry is not None and row.entry.state in FINISHED and row.entry.wall_s
         ]
-        left = sum(row.state not in FINISHED and row.state not in ("error", "cancelled") for row in rows)
-        if not walls or not left:
+        n_open = sum(row.state not in FINISHED and row.state not in ("error", "cancelled") for row in rows)
+        if not walls or not n_open:
             return None
-        return sum(walls) / len(walls) * left / min(self._parallel, left)
+        return sum(walls) / len(walls) * n_open / min(self._parallel, n_open)
 
     def words(self, kind: str, run: str, details: dict[str, Any]) -> str:
         if kind == "started":
@@ -226,24 +226,24 @@ def _columns(width: int, longest: int) -> dict[str, int]:
     Names are whole if the terminal has room for them beside a state; otherwise they fold. A narrow terminal gets only
     the first columns of `_ORDER` that fit, and states get their full width before less important columns are added.
     """
-    found = {"run": min(longest, max(_LEAST_NAME, width - _LEAST_STATE - _GAP))}
-    room = width - found["run"]
+    widths = {"run": min(longest, max(_LEAST_NAME, width - _LEAST_STATE - _GAP))}
+    room = width - widths["run"]
     for title in _ORDER:
         if title == "last action":
-            more = max(0, min(room, _WIDTHS["state"] - found["state"]))
-            found["state"] += more
+            more = max(0, min(room, _WIDTHS["state"] - widths["state"]))
+            widths["state"] += more
             room -= more
         least = min(_WIDTHS[title], _LEAST_STATE)
         if least + _GAP > room:
             break
-        found[title] = least
+        widths[title] = least
         room -= least + _GAP
     for title, most in (("state", _WIDTHS["state"]), ("last action", width)):
-        if title in found:
-            more = max(0, min(room, most - found[title]))
-            found[title] += more
+        if title in widths:
+            more = max(0, min(room, most - widths[title]))
+            widths[title] += more
             room -= more
-    return {title: found[title] for title in _TITLES if title in found}
+    return {title: widths[title] for title in _TITLES if title in widths}
 
 
 def _order(row: SuiteRow) -> int:

@@ -21,7 +21,7 @@ from evopolicy_gateway.run.lifecycle import RunLifecycle
 from evopolicy_gateway.run.operations import Operations
 from evopolicy_gateway.run.plan import Plan
 from evopolicy_gateway.run.record import why_failed
-from evopolicy_gateway.run.watch import Watch
+from evopolicy_gateway.run.watch import RunObserver
 from evopolicy_gateway.suite.decisions import Decision, side_by_side
 from evopolicy_gateway.suite.suite_file import Parallel
 from evopolicy_gateway.suite.suite_index import directory_of
@@ -43,7 +43,7 @@ class Sweep(ABC):
     """Whether cancelling this leaves its runs open, to be resumed."""
 
     def __init__(
-        self, limits: Parallel, index: Index, operations: Operations, gateway: Credentials, watch: Watch
+        self, limits: Parallel, index: Index, operations: Operations, gateway: Credentials, watch: RunObserver
     ) -> None:
         self._limits = limits
         self._index = index
@@ -147,18 +147,18 @@ class Sweep(ABC):
         if len(self._scored) >= MAX_SCORED:
             return []
         # A run that is only finished has no agent and needs no place.
-        found = [one for one in self._todo if one.kind == "finish" and self._may_begin(one.run)]
-        left = [one for one in self._todo if one.kind != "finish" and self._may_begin(one.run)]
+        finishes = [one for one in self._todo if one.kind == "finish" and self._may_begin(one.run)]
+        waiting = [one for one in self._todo if one.kind != "finish" and self._may_begin(one.run)]
         while len(placed) < self._limits.machine:
-            fitting = (one for one in side_by_side(left, under_way) if self._fits(one.run, placed))
+            fitting = (one for one in side_by_side(waiting, under_way) if self._fits(one.run, placed))
             decision = next(fitting, None)
             if decision is None:
                 break
-            left.remove(decision)
-            found.append(decision)
+            waiting.remove(decision)
+            finishes.append(decision)
             placed.append(decision.run)
             under_way.append(decision.run)
-        return found
+        return finishes
 
     def _fits(self, run: Plan, placed: list[Plan]) -> bool:
         """Whether the limits allow a run beside those that have a place."""

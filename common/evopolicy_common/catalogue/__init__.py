@@ -251,14 +251,14 @@ def source_of(env_id: str) -> str:
 
 def known(env_id: str) -> Entry | None:
     """The entry of an environment, without asking a worker; None if it is unknown here."""
-    found = _load().entries.get(env_id)
-    if found is None and env_id in _added:
-        found = _added[env_id][0]
-    if found is None and is_foreign(env_id):
+    entry = _load().entries.get(env_id)
+    if entry is None and env_id in _added:
+        entry = _added[env_id][0]
+    if entry is None and is_foreign(env_id):
         if ":" in env_id and "/" not in env_id:
             return Entry(id=env_id, gymnasium_id=env_id)
-        found = plugins().get(env_id, (None, ""))[0]
-    return found
+        entry = plugins().get(env_id, (None, ""))[0]
+    return entry
 
 
 def is_foreign(env_id: str) -> bool:
@@ -274,9 +274,9 @@ def is_foreign(env_id: str) -> bool:
 def entry(env_id: str) -> Entry:
     """The entry of `env_id`, perhaps with only its id if foreign. Raises ConfigError with similar names for a wrong
     id."""
-    found = known(env_id)
-    if found is not None:
-        return found
+    entry = known(env_id)
+    if entry is not None:
+        return entry
     if is_foreign(env_id):
         return Entry(id=env_id)
     raise ConfigError(f"no environment {env_id!r} in the catalogue{near(env_id)}")

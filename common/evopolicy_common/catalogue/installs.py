@@ -84,8 +84,8 @@ def installs() -> dict[str, Install]:
 
 def family_of(env_id: str) -> str:
     """The family, a key of `installs()`, that must be installed to play an environment; empty when nothing must."""
-    found = catalogue.known(env_id)
-    adapter = "" if found is None else found.adapter
+    entry = catalogue.known(env_id)
+    adapter = "" if entry is None else entry.adapter
     return next(
         (name for name, each in installs().items() if adapter in (each.adapters or (name,))),
         "",

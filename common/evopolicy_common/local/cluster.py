@@ -148,9 +148,9 @@ async def local_cluster(
         root.mkdir(mode=0o700, parents=True, exist_ok=True)
         # Named after this process: the folder may be in use, and another command's file in it.
         ready_file = root / f"{kind}-{os.getpid()}.json"
-        for left in root.glob(f"{kind}-[0-9]*.*"):
-            if not Path("/proc", left.stem.rpartition("-")[2]).exists():
-                left.unlink(missing_ok=True)
+        for stale in root.glob(f"{kind}-[0-9]*.*"):
+            if not Path("/proc", stale.stem.rpartition("-")[2]).exists():
+                stale.unlink(missing_ok=True)
         ready_file.unlink(missing_ok=True)
         folders.callback(ready_file.unlink, missing_ok=True)
         if (root / PROCESSES).exists() and not _is_held(root / PROCESSES):

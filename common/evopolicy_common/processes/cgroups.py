@@ -199,10 +199,10 @@ def _move_away(folder: Path) -> None:
 
 def _made(below: Path) -> Path:
     """A new group. Removes those that killed processes left."""
-    for left in below.glob(f"{_NAME}*"):
-        if not Path("/proc", left.name.removeprefix(_NAME)).exists():
+    for stale in below.glob(f"{_NAME}*"):
+        if not Path("/proc", stale.name.removeprefix(_NAME)).exists():
             with contextlib.suppress(OSError):
-                left.rmdir()
+                stale.rmdir()
     folder = below / f"{_NAME}{os.getpid()}"
     folder.mkdir(exist_ok=True)
     return folder

@@ -76,9 +76,9 @@ def _family(os_release: Path | None) -> str | None:
 
 def permit_namespaces(settings: Path = Path("/proc/sys")) -> str:
     """How to permit user namespaces: the settings that forbid them now, or else all settings that could."""
-    found = [remedy for name, forbids, remedy in _SETTINGS if _value(settings / name) == forbids]
-    if found:
-        return "; ".join(found)
+    remedies = [remedy for name, forbids, remedy in _SETTINGS if _value(settings / name) == forbids]
+    if remedies:
+        return "; ".join(remedies)
     if any(Path(mark).exists() for mark in _CONTAINER_MARKS):
         return "this is a container: start it with --security-opt seccomp=unconfined --security-opt systempaths=unconfined"  # noqa: E501
     names = ", ".join(name.replace("/", ".") for name, _, _ in _SETTINGS)

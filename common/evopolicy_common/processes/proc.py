@@ -60,8 +60,8 @@ def stat(pid: int | str) -> Stat | None:
 
 def table() -> list[Stat]:
     """All processes, zombies included."""
-    found = [stat(name) for name in os.listdir("/proc") if name.isdecimal()]
-    return [each for each in found if each is not None]
+    processes = [stat(name) for name in os.listdir("/proc") if name.isdecimal()]
+    return [each for each in processes if each is not None]
 
 
 def family(root: int, *, spare: Collection[int] = ()) -> list[Stat]:
@@ -76,12 +76,12 @@ def family(root: int, *, spare: Collection[int] = ()) -> list[Stat]:
         children.setdefault(each.parent, []).append(each)
         if each.pid == root:
             stack.append(each)
-    found: list[Stat] = []
+    processes: list[Stat] = []
     while stack:
         each = stack.pop()
-        found.append(each)
+        processes.append(each)
         stack += [child for child in reversed(children.get(each.pid, [])) if child.pid not in spare]
-    return found
+    return processes
 
 
 def descendants(root: int, *, spare: Collection[int] = ()) -> list[int]:

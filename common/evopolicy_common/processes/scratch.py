@@ -98,9 +98,9 @@ def _flatten_away(folder: Path) -> None:
     root = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
     try:
         names = (f"{secrets.token_hex(8)}-{n}" for n in itertools.count())
-        left = os.listdir(root)
-        while left:
-            name = left.pop()
+        names = os.listdir(root)
+        while names:
+            name = names.pop()
             if not _is_folder(name, root):
                 os.unlink(name, dir_fd=root)
                 continue
@@ -112,7 +112,7 @@ def _flatten_away(folder: Path) -> None:
                         # Moving a folder to another parent needs write permission on the folder.
                         os.chmod(child, 0o700, dir_fd=inner)
                     os.rename(child, here := next(names), src_dir_fd=inner, dst_dir_fd=root)
-                    left.append(here)
+                    names.append(here)
             finally:
                 os.close(inner)
             os.rmdir(name, dir_fd=root)

@@ -213,13 +213,13 @@ class BlobStore:
         was in the state `unless_changed`."""
         path = self.path(digest)
         try:
-            found = path.stat()
-            if unless_changed not in (None, _state(found)):
+            status = path.stat()
+            if unless_changed not in (None, _state(status)):
                 return 0
             path.unlink()
         except FileNotFoundError:
             return 0
-        return found.st_size
+        return status.st_size
 
     def digests(self) -> Iterator[str]:
         """The digests of all blobs, in no particular order."""
@@ -245,8 +245,8 @@ class BlobStore:
 
     def _finish(self, part: Path, digest: str) -> None:
         with part.open("rb") as file:
-            found = hashlib.file_digest(file, "sha256").hexdigest()
-        if found != digest:
+            actual = hashlib.file_digest(file, "sha256").hexdigest()
+        if actual != digest:
             part.unlink()
             raise StorageError(f"uploaded bytes are not blob {digest}; upload it again")
         path = self.path(digest)

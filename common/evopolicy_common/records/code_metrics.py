@@ -82,10 +82,10 @@ def code_metrics(files: Mapping[str, bytes]) -> CodeMetrics:
     lines = [line.strip() for text in sources.values() for line in text.splitlines()]
     shapes: list[_Shape] = []
     errors: list[str] = []
-    left = MAX_PARSED_BYTES
+    remaining = MAX_PARSED_BYTES
     for path, text in sources.items():
-        left -= len(counted[path])
-        tree = parse(text) if left >= 0 else None
+        remaining -= len(counted[path])
+        tree = parse(text) if remaining >= 0 else None
         if tree is None:
             errors.append(path)
         else:

@@ -45,11 +45,11 @@ _decoder = msgspec.json.Decoder(_Header)
 def described_data(data: bytes) -> str:
     """The description of such a file by its bytes; empty for any other."""
     try:
-        found = _decoder.decode(data)
+        record = _decoder.decode(data)
     except DECODE_ERRORS:
         return ""
-    version = f" {found.library_version[:20]}" if found.library_version.isprintable() else ""
-    texts = (text for start, text in _NAMES.items() if found.schema.startswith(start))
+    version = f" {record.library_version[:20]}" if record.library_version.isprintable() else ""
+    texts = (text for start, text in _NAMES.items() if record.schema.startswith(start))
     return next(texts, "").format(version=version.rstrip())
 
 

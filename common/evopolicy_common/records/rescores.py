@@ -101,23 +101,23 @@ def read_rescore(run: Path, name: str) -> RescoreRecord | None:
     try:
         if path.stat().st_size > _MAX_BYTES:
             raise ProtocolError(f"{path} is larger than {_MAX_BYTES >> 20} MiB")
-        found = _decoder.decode(read_regular(path))
+        record = _decoder.decode(read_regular(path))
     except FileNotFoundError:
         return None
     except OSError as error:
         raise ProtocolError(f"{path} cannot be read: {error.strerror}") from error
     except (*DECODE_ERRORS, ValueError) as error:
         raise ProtocolError(f"{path} is not a re-score: {error}") from error
-    if found.format != FORMAT:
-        raise ProtocolError(f"{path} has format {found.format!r}; this version reads {FORMAT!r}")
-    whole = [found.random_returns, *(each.returns for each in found.checkpoints)]
-    if found.n_cases < 1 or any(len(returns) != found.n_cases for returns in whole):
-        raise ProtocolError(f"{path} does not have {found.n_cases} returns for each checkpoint")
+    if record.format != FORMAT:
+        raise ProtocolError(f"{path} has format {record.format!r}; this version reads {FORMAT!r}")
+    whole = [record.random_returns, *(each.returns for each in record.checkpoints)]
+    if record.n_cases < 1 or any(len(returns) != record.n_cases for returns in whole):
+        raise ProtocolError(f"{path} does not have {record.n_cases} returns for each checkpoint")
     if any(abs(value) > LARGEST for returns in whole for value in returns):
         raise ProtocolError(f"{path} has a return beyond {LARGEST:g}, which is not plausible")
-    places = {place for each in found.checkpoints for place in each.failures}
+    places = {place for each in record.checkpoints for place in each.failures}
     if odd := sorted(
         place for place in places if not (place.isascii() and place.isdecimal() and len(place) < 10)
     ):
         raise ProtocolError(f"{path} has a failure of episode {odd[0][:20]!r}, which is no position")
-    return found
+    return record

@@ -83,11 +83,11 @@ def differences(left: Path, right: Path) -> list[str]:
     """One line per file or field in which two run directories differ; empty when they are the same run."""
     old = _is_old(left) != _is_old(right)
     ours, theirs = _files(left, old), _files(right, old)
-    found = [f"{name}: only in {left}" for name in sorted(ours.keys() - theirs.keys())]
-    found += [f"{name}: only in {right}" for name in sorted(theirs.keys() - ours.keys())]
+    lines = [f"{name}: only in {left}" for name in sorted(ours.keys() - theirs.keys())]
+    lines += [f"{name}: only in {right}" for name in sorted(theirs.keys() - ours.keys())]
     for name in sorted(ours.keys() & theirs.keys()):
-        found += _file_differences(name, ours[name], theirs[name], old)
-    return found
+        lines += _file_differences(name, ours[name], theirs[name], old)
+    return lines
 
 
 def shortened(found: Sequence[str], left: Path, right: Path) -> list[str]:

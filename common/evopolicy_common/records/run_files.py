@@ -79,7 +79,7 @@ def submit_folders(folder: Path) -> dict[int, Path]:
     """
     if not folder.is_dir() or folder.is_symlink():
         return {}
-    found = [(match, child) for child in folder.iterdir() if (match := _SUBMIT.fullmatch(child.name))]
+    submits = [(match, child) for child in folder.iterdir() if (match := _SUBMIT.fullmatch(child.name))]
     # Of several spellings of one index, the shortest. Links are left out.
-    found.sort(key=lambda each: (int(each[0][1]), -len(each[1].name)))
-    return {int(match[1]): child for match, child in found if not child.is_symlink()}
+    submits.sort(key=lambda each: (int(each[0][1]), -len(each[1].name)))
+    return {int(match[1]): child for match, child in submits if not child.is_symlink()}

@@ -66,7 +66,7 @@ def _incomplete_beta(a: float, b: float, x: float) -> float:
     log_front = math.lgamma(a + b) - math.lgamma(a) - math.lgamma(b) + a * math.log(x) + b * math.log1p(-x)
     tiny = 1e-300
     c, d = 1.0, 1.0 / _away(1.0 - (a + b) * x / (a + 1.0), tiny)
-    found = d
+    value = d
     for m in range(1, 500):
         for numerator in (
             m * (b - m) * x / ((a + 2 * m - 1.0) * (a + 2 * m)),
@@ -74,10 +74,10 @@ def _incomplete_beta(a: float, b: float, x: float) -> float:
         ):
             d = 1.0 / _away(1.0 + numerator * d, tiny)
             c = _away(1.0 + numerator / c, tiny)
-            found *= d * c
+            value *= d * c
         if abs(d * c - 1.0) < 1e-15:
             break
-    return math.exp(log_front) * found / a
+    return math.exp(log_front) * value / a
 
 
 def _away(value: float, tiny: float) -> float:

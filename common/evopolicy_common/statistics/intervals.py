@@ -311,8 +311,8 @@ def _two_levels(returns: Sequence[Floats]) -> tuple[float, float] | None:
     """The two values that all returns take; None if they take one, or more than two."""
     if not returns:
         return None
-    found: NDArray[np.float64] = np.unique(np.concatenate([one.ravel() for one in returns]))
-    return (float(found[0]), float(found[1])) if len(found) == 2 else None
+    values: NDArray[np.float64] = np.unique(np.concatenate([one.ravel() for one in returns]))
+    return (float(values[0]), float(values[1])) if len(values) == 2 else None
 
 
 def _constant(values: Floats) -> bool:

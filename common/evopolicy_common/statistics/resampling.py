@@ -48,13 +48,13 @@ def label_patterns(n_first: int, n_second: int, n_random: int) -> tuple[Floats, 
     for i in range(n_first):
         n_all = n_all * (n - i) // (i + 1)
     if n_all <= EXACT_UP_TO:
-        found = np.zeros((n_all, n))
-        for row, chosen in zip(found, itertools.combinations(range(n), n_first), strict=True):
+        counts = np.zeros((n_all, n))
+        for row, chosen in zip(counts, itertools.combinations(range(n), n_first), strict=True):
             row[list(chosen)] = 1.0
         exact = True
     else:
         order = np.random.default_rng([12, n_first, n_second]).random((n_random, n)).argsort(axis=1)
-        found = (order < n_first).astype(np.float64)
+        counts = (order < n_first).astype(np.float64)
         exact = False
-    found.setflags(write=False)
-    return found, exact
+    counts.setflags(write=False)
+    return counts, exact

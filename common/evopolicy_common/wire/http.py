@@ -33,8 +33,8 @@ MAX_CONNECTIONS = 256
 
 def bound(host: str, port: int) -> socket.socket:
     """A bound socket, of IPv4 where the host has both. Raises OSError when the address is not available."""
-    found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
-    family, kind, _, _, where = min(found, key=lambda each: each[0] != socket.AF_INET)
+    addresses = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
+    family, kind, _, _, where = min(addresses, key=lambda each: each[0] != socket.AF_INET)
     sock = socket.socket(family, kind)
     # Allows binding while old connections to the address are in TIME_WAIT.
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)

@@ -77,15 +77,15 @@ class OperatorClient:
     ) -> tuple[list[OfferedEnvironment], dict[str, tuple[str, ...]], dict[str, dict[str, str]]]:
         """The environments that connected workers offer; those that they describe on first use, with the workers; and
         those that failed, with the reasons by worker."""
-        found: list[OfferedEnvironment] = []
+        offered: list[OfferedEnvironment] = []
         while True:
-            message = EnvironmentsRequest(token=self._token, cursor=len(found))
+            message = EnvironmentsRequest(token=self._token, cursor=len(offered))
             page = await self._requests.until_answered(
                 "environments", message, EnvironmentsReply, timeout_s=TIMEOUT_S
             )
-            found += page.environments
+            offered += page.environments
             if page.finished:
-                return found, page.undescribed, page.failed
+                return offered, page.undescribed, page.failed
 
     async def approve(self, env: str, digest: str) -> None:
         """Lets runs use this definition of an environment that does not ship."""
@@ -99,11 +99,11 @@ class OperatorClient:
         request = replace(message, token=self._token)
         until = time.monotonic() + DESCRIPTION_S
         while True:
-            found = await self._requests.until_answered(
+            reply = await self._requests.until_answered(
                 "describe", request, EnvironmentState, timeout_s=TIMEOUT_S
             )
-            if not found.awaited or time.monotonic() > until:
-                return found
+            if not reply.awaited or time.monotonic() > until:
+                return reply
             await asyncio.sleep(DESCRIPTION_PAUSE_S)
 
     # Runs.

@@ -224,10 +224,10 @@ class Link:
         on disk."""
         while self.credentials.token == token:
             try:
-                found = None if self._read_again is None else await asyncio.to_thread(self._read_again)
+                fresh = None if self._read_again is None else await asyncio.to_thread(self._read_again)
             except (ConfigError, OSError):
-                found = None
-            if found is None or found.token == token:
+                fresh = None
+            if fresh is None or fresh.token == token:
                 return False
             await asyncio.sleep(_RENEWED_PAUSE_S)
         return True
@@ -284,18 +284,18 @@ async def _take_renewed(link: Link, read_again: Callable[[], Credentials]) -> No
     while True:
         await asyncio.sleep(RENEWED_LOOK_S)
         try:
-            found = await asyncio.to_thread(read_again)
-            content = await asyncio.to_thread(_content, found)
+            fresh = await asyncio.to_thread(read_again)
+            content = await asyncio.to_thread(_content, fresh)
             if content == used:
                 continue
-            session = await asyncio.to_thread(zenoh.open, client_config(found))
-            await asyncio.to_thread(link.replace, session, found)
+            session = await asyncio.to_thread(zenoh.open, client_config(fresh))
+            await asyncio.to_thread(link.replace, session, fresh)
         except (ConfigError, OSError, zenoh.ZError) as error:
             # The folder is being copied, or the coordinator does not admit them yet.
             log.debug("renewed credentials cannot be used yet", why=str(error))
             continue
         used = content
-        log.info("renewed credentials are in use", user=found.user)
+        log.info("renewed credentials are in use", user=fresh.user)
 
 
 def _content(credentials: Credentials) -> tuple[object, ...]:

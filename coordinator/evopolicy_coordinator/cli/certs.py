@@ -190,8 +190,8 @@ def list_(state: State = None, as_json: Json = False) -> None:
 def _validity(expires: dt.datetime, revoked: dt.datetime | None, now: dt.datetime) -> tuple[str, str]:
     if revoked is not None:
         return f"{expires:%Y-%m-%d}", f"revoked {revoked:%Y-%m-%d}"
-    left = (expires - now).days
-    return f"{expires:%Y-%m-%d}", "expired" if expires <= now else f"{left} days left"
+    days = (expires - now).days
+    return f"{expires:%Y-%m-%d}", "expired" if expires <= now else f"{days} days left"
 
 
 def _facts(machine: Machine) -> dict[str, object]:

@@ -128,13 +128,13 @@ def _lacks(worker: WorkerStatus) -> Iterator[str]:
 
 def _names(env_ids: Sequence[str]) -> str:
     """Environments in short form: a suite's name for all of a suite."""
-    left, names = set(env_ids), []
+    remaining, names = set(env_ids), []
     for suite in catalogue.suites():
         members = set(catalogue.resolve([suite]))
-        if members <= left:
-            left -= members
+        if members <= remaining:
+            remaining -= members
             names.append(suite)
-    return " ".join([*names, *(env_id for env_id in env_ids if env_id in left)])
+    return " ".join([*names, *(env_id for env_id in env_ids if env_id in remaining)])
 
 
 _WORKER_COLUMNS: dict[str, Callable[[WorkerStatus], str]] = {
@@ -234,9 +234,9 @@ def cancel(
     """End a run without a score, and stop its episodes."""
 
     async def cancelled(operator: OperatorClient) -> bool:
-        found = await operator.status()
+        reply = await operator.status()
         await operator.cancel(run)
-        return any(one.run == run for one in found.runs)
+        return any(one.run == run for one in reply.runs)
 
     was_open = asking(connect, file, cancelled)
     say(f"{run} is cancelled" if was_open else f"{run} had ended before; its result stays as it is")

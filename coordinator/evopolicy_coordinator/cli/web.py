@@ -125,13 +125,13 @@ def web(
         roots = _roots(runs)
         tokens = Tokens.drawn() if token_file is None else kept_tokens(token_file)
         names = [host, *(name or ())]
-        found = _credentials(tuple(connect or ()), file)
+        given = _credentials(tuple(connect or ()), file)
         book = (action_log or credentials.state_home() / "web-actions.jsonl") if act else None
         if book is not None:
             check_writable(book.parent, "--action-log")
         with announcing(url_file) as announce:
             asyncio.run(
-                _serve(address, roots, tokens, names, found, bool(connect or file), report, book, announce)
+                _serve(address, roots, tokens, names, given, bool(connect or file), report, book, announce)
             )
 
 

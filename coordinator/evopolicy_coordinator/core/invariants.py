@@ -118,8 +118,8 @@ def _jobs(state: State) -> None:
     ends = not state.adopting or ("adopt", "") in state.timers
     want("", ends, "a job that waits for adoption has a deadline")
     for group in state.groups.values():
-        left = sum(job.n for job in group.jobs.values())
-        want(group.id, left + group.done == group.n, "each episode is open or done")
+        n_open = sum(job.n for job in group.jobs.values())
+        want(group.id, n_open + group.done == group.n, "each episode is open or done")
         leased = sum(job.lease is not None for job in group.jobs.values())
         want(group.id, leased == group.n_leased, "leased jobs are counted")
         live += leased

@@ -104,15 +104,15 @@ class Machines:
 
     def holder(self, role: Role, token: str) -> Machine | None:
         """The admitted machine of this role with this token; compared in constant time."""
-        found = None
+        newest = None
         for machine in self.admitted():
             if (
                 machine.role == role
                 and machine.token
                 and hmac.compare_digest(machine.token.encode(), token.encode())
             ):
-                found = machine
-        return found
+                newest = machine
+        return newest
 
     def session_for(self, token: str) -> str:
         """A new session for a worker that registers; it names the machine's certificate if the token is a machine's."""
@@ -333,7 +333,7 @@ def _write(path: Path, data: bytes) -> None:
 
 def _stat(path: Path) -> tuple[int, ...]:
     try:
-        found = path.stat()
+        status = path.stat()
     except FileNotFoundError:
         return (0, 0, 0)
-    return (found.st_mtime_ns, found.st_ino, found.st_size)
+    return (status.st_mtime_ns, status.st_ino, status.st_size)

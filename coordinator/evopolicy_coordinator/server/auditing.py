@@ -92,11 +92,11 @@ def outcome_difference(ours: EpisodeOutcome, theirs: EpisodeOutcome, blobs: Blob
     if (left.record, left.observations) != (right.record, right.observations):
         return f"records of {left.record}, {left.observations} and of {right.record}, {right.observations}"
     try:
-        found = compare.episode_difference(ours, left, theirs, right)
+        difference = compare.episode_difference(ours, left, theirs, right)
     except Exception as error:
         # Their content may be anything that a worker makes up.
-        found = f"the recordings cannot be compared: {type(error).__name__}: {error}"
-    return None if found is None else found[:MAX_TEXT]
+        difference = f"the recordings cannot be compared: {type(error).__name__}: {error}"
+    return None if difference is None else difference[:MAX_TEXT]
 
 
 def _actions(recorded: Trajectory) -> bytes:

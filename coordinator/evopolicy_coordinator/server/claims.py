@@ -87,8 +87,8 @@ class Claims:
 
     async def _loaded(self, now: float) -> dict[tuple[str, str], ClaimRow]:
         if self._rows is None:
-            found = await self._writer.call(Store.claims)
-            self._rows = {(suite, name): _decoded(suite, name, data) for suite, name, data in found}
+            claims = await self._writer.call(Store.claims)
+            self._rows = {(suite, name): _decoded(suite, name, data) for suite, name, data in claims}
             self._until = {key: now + row.ttl_s for key, row in self._rows.items()}
         return self._rows
 

@@ -416,19 +416,19 @@ class RequestParser:
             )
         try:
             suite = catalogue.suite_of(of.settings.env)
-            found = self._source.further(
+            cases = self._source.further(
                 suite.name, of.settings.env, m.name, m.n, (*of.train, *of.validation, *of.heldout)
             )
         except ConfigError as error:
             raise RefusedError(Refusal.INVALID_SETTINGS, str(error)) from error
-        if found.epoch in revealed:
+        if cases.epoch in revealed:
             raise RefusedError(
                 Refusal.BAD_REQUEST,
-                f"the cases of epoch {found.epoch} are public, as runs on them were published: stop the coordinator,"
+                f"the cases of epoch {cases.epoch} are public, as runs on them were published: stop the coordinator,"
                 " say `evopolicy-coordinator epoch new` with its --state, and start it again, or name other cases with"
                 " --data",
             )
-        return found
+        return cases
 
     def rescore_requested(
         self, m: operator.Rescore, request: int, stimulus: str, of: RunRow, result: operator.RunFinished

@@ -315,8 +315,8 @@ class Service:
     def _further_cases(self, message: operator.FurtherCasesRequest) -> operator.FurtherCases:
         """Derives further hidden cases for a finished run."""
         row, _ = self._reader.finished_with_result(message.run)
-        found = self._parser.further_cases(message, row, self._reader.revealed())
-        return operator.FurtherCases(cases=found.cases, epoch=found.epoch)
+        cases = self._parser.further_cases(message, row, self._reader.revealed())
+        return operator.FurtherCases(cases=cases.cases, epoch=cases.epoch)
 
     def _serve_claim(self, core: Core, query: IncomingQuery, parsed: Parsed) -> None:
         self._spawn(self._claim(query, parsed.message))

@@ -72,13 +72,13 @@ class Uploads:
         """Records that the run's gateway has sent the whole blob. `stored`: its file, if nobody had stored it
         before."""
         with self._lock:
-            found = self._of(run)
-            found.sent[digest] = None
-            found.sent.move_to_end(digest)
+            uploads = self._of(run)
+            uploads.sent[digest] = None
+            uploads.sent.move_to_end(digest)
             if stored is not None:
-                found.stored[digest] = stored
-            while len(found.sent) > MAX_OF_A_RUN:
-                found.stored.pop(found.sent.popitem(last=False)[0], None)
+                uploads.stored[digest] = stored
+            while len(uploads.sent) > MAX_OF_A_RUN:
+                uploads.stored.pop(uploads.sent.popitem(last=False)[0], None)
 
     def forget(self, over: Callable[[str], bool]) -> dict[str, dict[str, FileState]]:
         """Forgets the runs that are over. Returns the files that their uploads made, by run and digest."""
@@ -90,8 +90,8 @@ class Uploads:
             return run in self._runs and digest in self._runs[run].sent
 
     def _of(self, run: str) -> _OfRun:
-        found = self._runs.setdefault(run, _OfRun())
+        uploads = self._runs.setdefault(run, _OfRun())
         self._runs.move_to_end(run)
         while len(self._runs) > MAX_RUNS:
             self._runs.popitem(last=False)
-        return found
+        return uploads

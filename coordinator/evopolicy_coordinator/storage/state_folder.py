@@ -212,11 +212,15 @@ def _linked(root: Path) -> Path:
         with contextlib.suppress(OSError):
             if _fits(link):
                 folder.mkdir(parents=True, mode=0o700, exist_ok=True)
-                found = folder.lstat()
-                if stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid() and not found.st_mode & 0o022:
-                    for left in folder.iterdir():  # of deleted state folders
-                        if left.is_symlink() and not left.exists():
-                            left.unlink(missing_ok=True)
+                status = folder.lstat()
+                if (
+                    stat.S_ISDIR(status.st_mode)
+                    and status.st_uid == os.getuid()
+                    and not status.st_mode & 0o022
+                ):
+                    for link in folder.iterdir():  # of deleted state folders
+                        if link.is_symlink() and not link.exists():
+                            link.unlink(missing_ok=True)
                     new = folder / f"{name}.{os.getpid()}"
                     new.unlink(missing_ok=True)
                     new.symlink_to(root)

@@ -73,17 +73,17 @@ def kept_tokens(path: Path) -> Tokens:
     try:
         if path.stat().st_mode & 0o077:
             raise ConfigError(f"--token-file {path} may be read by others: chmod 600 it")
-        found = msgspec.json.decode(read_given(path, f"--token-file {path}"), type=Tokens)
+        tokens = msgspec.json.decode(read_given(path, f"--token-file {path}"), type=Tokens)
     except FileNotFoundError:
-        found = Tokens.drawn()
-        write_atomically(path, msgspec.json.encode(found), mode=0o600)
+        tokens = Tokens.drawn()
+        write_atomically(path, msgspec.json.encode(tokens), mode=0o600)
     except OSError as error:
         raise ConfigError(f"--token-file {path} cannot be read: {error.strerror or error}") from error
     except DECODE_ERRORS as error:
         raise ConfigError(f"--token-file {path}: {error}; remove it, and it is created again") from error
-    if min(len(found.read), len(found.act)) < 32 or found.read == found.act:
+    if min(len(tokens.read), len(tokens.act)) < 32 or tokens.read == tokens.act:
         raise ConfigError(f"--token-file {path}: two different tokens of 32 characters or more are needed")
-    return found
+    return tokens
 
 
 class Access:
@@ -129,13 +129,13 @@ class Access:
 
     def is_own_host(self, host: str) -> bool:
         """Whether `Host` names this server: an address, which cannot be rebound, or one of its names."""
-        found = _HOST.fullmatch(host)
-        if found is None:
+        match = _HOST.fullmatch(host)
+        if match is None:
             return False
         try:
-            ipaddress.IPv6Address(found["six"]) if found["six"] else ipaddress.IPv4Address(found["name"])
+            ipaddress.IPv6Address(match["six"]) if match["six"] else ipaddress.IPv4Address(match["name"])
         except ValueError:
-            return not found["six"] and found["name"].lower().rstrip(".") in self._names
+            return not match["six"] and match["name"].lower().rstrip(".") in self._names
         return True
 
     def objection(self, scheme: str, method: str, headers: Headers) -> tuple[int, str] | None:

@@ -331,10 +331,10 @@ class Site:
         return answer
 
     async def static(self, request: Request) -> Response:
-        found = rendering.static_files().get(request.path_params["name"])
-        if found is None:
+        file = rendering.static_files().get(request.path_params["name"])
+        if file is None:
             return PlainTextResponse("There is no such file.\n", 404)
-        return Response(found[0], media_type=found[1], headers={"cache-control": "max-age=300"})
+        return Response(file[0], media_type=file[1], headers={"cache-control": "max-age=300"})
 
     async def health(self, request: Request) -> Response:
         """For service managers: the process serves. It tells nothing else, as it needs no token."""
@@ -507,8 +507,8 @@ def _file(request: Request, files: Confined, path: str, kind: str, policy: str) 
     size = os.fstat(fd).st_size
     first, last, status = 0, size - 1, 200
     headers = {"accept-ranges": "bytes", "content-security-policy": policy}
-    if (found := _RANGE.fullmatch(request.headers.get("range", ""))) and size:
-        start, end = found.groups()
+    if (match := _RANGE.fullmatch(request.headers.get("range", ""))) and size:
+        start, end = match.groups()
         if start:
             first, last = int(start), min(size - 1, int(end) if end else size - 1)
         elif end:
@@ -525,12 +525,12 @@ def _file(request: Request, files: Confined, path: str, kind: str, policy: str) 
 async def _chunks(fd: int, first: int, last: int) -> AsyncIterator[bytes]:
     with os.fdopen(fd, "rb") as file:
         file.seek(first)
-        left = last - first + 1
-        while left > 0:
-            data = await asyncio.to_thread(file.read, min(_CHUNK, left))
+        remaining = last - first + 1
+        while remaining > 0:
+            data = await asyncio.to_thread(file.read, min(_CHUNK, remaining))
             if not data:
                 return
-            left -= len(data)
+            remaining -= len(data)
             yield data
 
 

@@ -171,8 +171,8 @@ def _count(row: dict[str, int], key: str) -> None:
 
 def demand_of(env: str) -> str | None:
     """The environment's demand group in the catalogue; None if it has none or is unknown."""
-    found = catalogue.entries().get(env)
-    return found.demand if found is not None else None
+    entry = catalogue.entries().get(env)
+    return entry.demand if entry is not None else None
 
 
 def phases(transitions: Sequence[Transition]) -> list[tuple[int, int, str]]:

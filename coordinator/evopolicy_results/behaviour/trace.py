@@ -90,13 +90,13 @@ def sources(run: Run, submit: Submit) -> dict[str, str]:
     system = policy_folder(run.checkpoint(submit.index))
     try:
         if submit.source is not None:
-            found = {path: read_regular(system / path) for path in submit.source.files}
+            files = {path: read_regular(system / path) for path in submit.source.files}
         else:
-            found = read_python_files(system)
+            files = read_python_files(system)
     except OSError:
         return {}
-    ordered = sorted(found, key=lambda path: (path != "policy.py", path))
-    return {path: found[path].decode("utf-8", "replace") for path in ordered}
+    ordered = sorted(files, key=lambda path: (path != "policy.py", path))
+    return {path: files[path].decode("utf-8", "replace") for path in ordered}
 
 
 def diff(before: Mapping[str, str], after: Mapping[str, str]) -> list[FileDiff]:

@@ -58,15 +58,15 @@ def write_site(
 
 
 def _write_pages(bundles: Sequence[LabBundle], out: Path, title: str, tell: Tell) -> None:
-    found = boards(bundles)
+    all_boards = boards(bundles)
     for bundle in bundles:
         _write(out / bundle.page, _bundle_page(bundle))
     sections: list[dict[str, Any]] = []
     entries: set[str] = set()
     reference: str | None = None
     run_rows: list[list[Cell]] = []
-    for number, board in enumerate(found, start=1):
-        tell(f"board {number} of {len(found)}: {len(board.runs)} runs")
+    for number, board in enumerate(all_boards, start=1):
+        tell(f"board {number} of {len(all_boards)}: {len(board.runs)} runs")
         study = study_of(board.runs, allow_mixed=True, allow_unknown=True)
         folder = f"board-{number}"
         write_report(study, out / folder, title=f"{title}, board {number}")

@@ -208,15 +208,15 @@ def _cell(env: str, entry: str, sources: Sequence[Source]) -> Cell:
         cases, score = record.versions.cases_hash("heldout") if is_shared else "", record.outcome.score
         returns = result.heldout_returns if score is not None else ()
         runs.append(RunReturns(score=score, returns=returns, case_set=cases))
-    found = cell_mean(Sample(entry=entry, env=env, runs=tuple(runs)))
+    estimate = cell_mean(Sample(entry=entry, env=env, runs=tuple(runs)))
     outcomes = [each.record.outcome for each in sources]
     random = [each.random_score for each in outcomes if each.random_score is not None]
     cell = Cell(entry=entry, env=env, runs=len(sources), mean=None, random=mean(random) if random else None)
-    if found is None:
+    if estimate is None:
         return msgspec.structs.replace(cell, over="a run has no score")
     score = mean([each.score for each in outcomes if each.score is not None])
-    over = found.reason or found.over
-    return msgspec.structs.replace(cell, mean=score, low=found.low, high=found.high, over=over)
+    over = estimate.reason or estimate.over
+    return msgspec.structs.replace(cell, mean=score, low=estimate.low, high=estimate.high, over=over)
 
 
 def _agent(entry: str, sources: Sequence[Source]) -> AgentCost:

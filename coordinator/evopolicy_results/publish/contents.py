@@ -248,8 +248,8 @@ def listing(entries: Iterable[journal.Entry], published: Iterable[str]) -> tuple
 
 def completeness(listed: Sequence[Listed]) -> str:
     """How many of the runs that were opened are left out, in words."""
-    left = [each.state for each in listed if each.state != "published"]
-    if not left:
+    omitted = [each.state for each in listed if each.state != "published"]
+    if not omitted:
         return f"all {len(listed)} runs that the journal has of these entries are here"
-    states = ", ".join(f"{left.count(state)} {state}" for state in sorted(set(left)))
-    return f"{len(left)} of {len(listed)} runs of these entries are left out ({states}): these runs were selected"
+    states = ", ".join(f"{omitted.count(state)} {state}" for state in sorted(set(omitted)))
+    return f"{len(omitted)} of {len(listed)} runs of these entries are left out ({states}): these runs were selected"

@@ -136,12 +136,12 @@ def _digests(files: Files, manifest: Manifest, checked: Checked) -> tuple[set[st
     damaged: set[str] = set()
     for name in sorted(wanted.keys() & files.names):
         try:
-            found = contents.digest(files.read(name, contents.MAX_RECORDING_BYTES))
+            actual = contents.digest(files.read(name, contents.MAX_RECORDING_BYTES))
         except ProtocolError as error:
             bad.append(str(error))
             damaged.add(name)
             continue
-        if found != wanted[name]:
+        if actual != wanted[name]:
             bad.append(f"{name} was changed")
             damaged.add(name)
     bad += [f"{name} is missing" for name in sorted(expected - files.names)]
@@ -228,9 +228,11 @@ def _history_fault(entries: Sequence[journal.Entry]) -> str | None:
             ended.add(entry.run)
         else:
             revealed.add(entry.epoch)
-            left = next((run for run, of in opened.items() if of == entry.epoch and run not in ended), None)
-            if left is not None:
-                return f"epoch {entry.epoch} is revealed while run {left} is open"
+            open_run = next(
+                (run for run, of in opened.items() if of == entry.epoch and run not in ended), None
+            )
+            if open_run is not None:
+                return f"epoch {entry.epoch} is revealed while run {open_run} is open"
     return None
 
 
@@ -249,13 +251,13 @@ def _descriptions(files: Files, manifest: Manifest, digests: Mapping[str, str], 
         return
     try:
         data = {name: files.read(name, contents.MAX_DOCUMENT_BYTES) for name in contents.DESCRIPTIONS}
-        found = decoded(contents.CARD, data[contents.CARD], cards.Card)
+        card = decoded(contents.CARD, data[contents.CARD], cards.Card)
         refuse_unknown(contents.CARD, fields.parsed(contents.CARD, data[contents.CARD]), {}, checked)
     except ProtocolError as error:
         checked.add("card", "failed", str(error))
         return
-    if found.version != cards.VERSION:
-        text = f"it has version {found.version}, this program makes version {cards.VERSION}: not compared"
+    if card.version != cards.VERSION:
+        text = f"it has version {card.version}, this program makes version {cards.VERSION}: not compared"
         checked.add("card", "open", text)
         for name in contents.DESCRIPTIONS:
             checked.claim(name, ["**"])
@@ -265,12 +267,12 @@ def _descriptions(files: Files, manifest: Manifest, digests: Mapping[str, str], 
         contents.journal_entries(files.read(contents.JOURNAL, contents.MAX_RECORDING_BYTES)),
         signer=checked.signer,
         software=manifest.software,
-        licence=found.licence,
-        claimed=found.licences,
+        licence=card.licence,
+        claimed=card.licences,
     )
     wrong = [
         name
-        for name, made in descriptions.files(cards.matching(own, found), digests).items()
+        for name, made in descriptions.files(cards.matching(own, card), digests).items()
         if made != data[name]
     ]
     for name in wrong:

@@ -118,11 +118,11 @@ def _entry(history: History, kind: type[T], run: str) -> tuple[int, T] | None:
 
 def _commitment(run: PublishedRun, history: History) -> Iterator[Fault]:
     opening, settings = run.opening, run.opening.settings
-    found = _entry(history, Opened, opening.run)
-    if found is None:
+    numbered = _entry(history, Opened, opening.run)
+    if numbered is None:
         yield Fault("journal", "the journal has no entry of this run")
         return
-    number, entry = found
+    number, entry = numbered
     if len(run.salt) != journal.SALT_BYTES:
         yield Fault("commitment", f"its salt has {len(run.salt)} bytes instead of {journal.SALT_BYTES}")
     if journal.commitment(run.salt, run.opening_bytes) != entry.commitment:
@@ -153,11 +153,11 @@ def _disclosure(run: PublishedRun, history: History) -> Iterator[Fault]:
 
 
 def _result(run: PublishedRun, history: History) -> Iterator[Fault]:
-    found = _entry(history, Ended, run.opening.run)
-    if found is None:
+    numbered = _entry(history, Ended, run.opening.run)
+    if numbered is None:
         yield Fault("result", "the journal has no end of this run")
         return
-    number, entry = found
+    number, entry = numbered
     if journal.digest(run.result_bytes) != entry.result or run.result.run != run.opening.run:
         yield Fault("result", "result.json is not the result that the journal fixed when the run ended")
     if run.result.status != entry.status:

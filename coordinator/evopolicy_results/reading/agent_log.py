@@ -165,13 +165,13 @@ def _evidence(events: Iterable[LogEvent]) -> Evidence:
 
 
 def _lines(path: Path) -> Iterator[bytes]:
-    left = MAX_LOG_BYTES
+    remaining = MAX_LOG_BYTES
     with open_regular(path) as stream:
-        while left > 0:
-            line = stream.readline(left)
+        while remaining > 0:
+            line = stream.readline(remaining)
             if not line:
                 return
-            left -= len(line)
+            remaining -= len(line)
             yield line
 
 
@@ -239,7 +239,7 @@ def _call(texts: Sequence[str], at: float | None) -> LogEvent:
 def _images(text: str) -> Iterator[str]:
     """Every run of path characters that holds an image suffix, cut after its last one."""
     for run in _PATH.findall(text):
-        ends = [found.end() for found in _IMAGE_SUFFIX.finditer(run)]
+        ends = [match.end() for match in _IMAGE_SUFFIX.finditer(run)]
         if ends:
             yield run[: ends[-1]]
 

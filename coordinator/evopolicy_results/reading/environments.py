@@ -37,9 +37,9 @@ def learn_names(records: Iterable[RunRecord]) -> None:
 
 def _name(env: str) -> tuple[str, str]:
     """Title and family; empty where they are unknown."""
-    found = catalogue.entries().get(env)
-    if found is not None:
-        return found.title, found.family
+    entry = catalogue.entries().get(env)
+    if entry is not None:
+        return entry.title, entry.family
     names = names_in_runs.get(env, set())
     return next(iter(names)) if len(names) == 1 else ("", "")
 

@@ -203,8 +203,8 @@ def _read_submits(folder: Path, record: RunRecord) -> tuple[Submit, ...]:
         if summary is not None:
             status: str = summary.status
             n_episodes, mean = summary.n_episodes, summary.mean_return
-            left = summary.remaining_budget
-            after = budget - consumed - n_episodes if left is None else left
+            remaining = summary.remaining_budget
+            after = budget - consumed - n_episodes if remaining is None else remaining
         elif meta is not None:
             status, n_episodes, mean = meta.validation_status, meta.n_episodes_requested, meta.mean_return
             after = meta.remaining_budget_after

@@ -44,9 +44,9 @@ def suite_statistics(
     samples = samples_of(runs, table)
     environments = table.environments
     scales = scales_of(table)
-    found = pairs(samples, table.entries, environments, resamples=resamples)
+    compared = pairs(samples, table.entries, environments, resamples=resamples)
     means = {key: mean for key, sample in samples.items() if (mean := cell_mean(sample, resamples=resamples))}
-    resolved = resolutions(samples, found, table.agents, scales, environments)
+    resolved = resolutions(samples, compared, table.agents, scales, environments)
     shares, against = aggregates(samples, board.agents, scales, resamples=resamples)
     wanted = set(environments)
     general = generalisation((run for run in runs if run.env in wanted), scales)
@@ -54,8 +54,8 @@ def suite_statistics(
     scores = {row.entry: row.score for row in board.standings}
     return SuiteStatistics(
         means=means,
-        pairs=tuple(found),
-        standings=standings(samples, scores, environments, found=found, resamples=resamples),
+        pairs=tuple(compared),
+        standings=standings(samples, scores, environments, found=compared, resamples=resamples),
         resolutions=tuple(resolved),
         overall=overall(resolved),
         aggregates=tuple(shares),

@@ -221,8 +221,8 @@ def _cells(suite: Suite) -> Table:
         return suite.statistics.means.get((cell.entry, cell.env))
 
     def over(cell: CellResult) -> str | None:
-        found = mean(cell)
-        return None if found is None or found.low is None else found.over
+        average = mean(cell)
+        return None if average is None or average.low is None else average.over
 
     place = {env: i for i, env in enumerate(suite.board.environments)}
     table = tabulated(

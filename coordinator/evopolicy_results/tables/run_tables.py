@@ -265,14 +265,14 @@ def feedback_use(rows: Iterable[dict[str, Any]]) -> Table:
 
 def _audit(study: Study, link_of: LinkOf) -> Table:
     rows: list[dict[str, Any]] = []
-    for found in study.audit:
-        row = {key: getattr(found, key) for key in found.__struct_fields__}
-        selected = found.selected_index
+    for audited in study.audit:
+        row = {key: getattr(audited, key) for key in audited.__struct_fields__}
+        selected = audited.selected_index
         row |= {
-            "env": title_of(found.env),
-            "run": _short(found.run),
+            "env": title_of(audited.env),
+            "run": _short(audited.run),
             "selected": None if selected is None else f"s{selected:03d}",
-            "splits": "secret" if found.secret_splits else "public",
+            "splits": "secret" if audited.secret_splits else "public",
         }
         rows.append(row)
 
@@ -335,7 +335,7 @@ def _audit(study: Study, link_of: LinkOf) -> Table:
             seconds("finalise_s", "Finalise"),
         ),
         rows=tuple(rows),
-        links={i: link for i, found in enumerate(study.audit) if (link := link_of(found.run))},
+        links={i: link for i, audited in enumerate(study.audit) if (link := link_of(audited.run))},
     )
 
 

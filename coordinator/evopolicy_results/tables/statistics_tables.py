@@ -111,14 +111,14 @@ def has_single_runs(suite: Suite) -> bool:
 
 
 def _pairs(suite: Suite) -> Table:
-    found = suite.statistics.pairs
-    left_out = sum(pair.n_left_out > 0 for pair in found)
+    pairs = suite.statistics.pairs
+    left_out = sum(pair.n_left_out > 0 for pair in pairs)
 
     def with_interval(field: str) -> Callable[[Pair], str | None]:
         return lambda pair: None if pair.gap is None or pair.gap.low is None else getattr(pair.gap, field)
 
     return tabulated(
-        found,
+        pairs,
         (
             ENV,
             Column("first", "First"),
@@ -205,8 +205,8 @@ def _not_told(pair: Pair) -> str:
 
 
 def _resolution(suite: Suite) -> Table:
-    found = suite.statistics.resolutions
-    rows = [_resolved(title_of(one.env), one) for one in found]
+    resolutions = suite.statistics.resolutions
+    rows = [_resolved(title_of(one.env), one) for one in resolutions]
     if rows and suite.statistics.overall is not None:
         rows.append({**_resolved("Mean of all", suite.statistics.overall), "gap": None})
     gap = suite.statistics.standings.gap

@@ -240,10 +240,10 @@ def _checkpoint(submit: SubmitFiles, known: SubmitResult | None) -> str | None:
     if not wanted:
         return None
     try:
-        found = bundle_of(submit.checkpoint).digest
+        digest = bundle_of(submit.checkpoint).digest
     except BundleError as error:
         return f"its checkpoint cannot be read: {error}"
-    if found != wanted:
+    if digest != wanted:
         names = "that _meta.json names" if submitted is None else "that was submitted"
         return f"its checkpoint does not hold the policy {names}"
     return (

@@ -273,10 +273,10 @@ class Verifier:
 
     async def _stored(self, played: EpisodeList) -> dict[int, EpisodeOutcome]:
         """Outcomes that the coordinator stored, by index."""
-        found = self._evaluations.ask.recorded(
+        recorded = self._evaluations.ask.recorded(
             self._run.record.run, played.split, played.submit_index, timeout_s=TIMEOUT_S
         )
-        return {outcome.index: outcome async for outcome in found}
+        return {outcome.index: outcome async for outcome in recorded}
 
     # Comparison.
 

@@ -50,8 +50,8 @@ def defined() -> tuple[Entry, ...]:
 def definition(env_id: str) -> list[str]:
     """The definition of an environment that does not ship, as a command-line argument; an empty list for a shipped
     one."""
-    found = _defined.get(env_id)
-    return [] if found is None else [msgspec.json.encode(found).decode()]
+    environment = _defined.get(env_id)
+    return [] if environment is None else [msgspec.json.encode(environment).decode()]
 
 
 def make(env_id: str, *, render: bool = False, accelerations: bool | None = None) -> Environment:
@@ -60,26 +60,26 @@ def make(env_id: str, *, render: bool = False, accelerations: bool | None = None
     `accelerations`: faster code for the same episodes; None takes the process environment's setting, which defaults to
     on. Raises ConfigError for an unknown id, and WorkerError when packages are missing.
     """
-    found = _entry(env_id)
-    if found.world:
+    entry = _entry(env_id)
+    if entry.world:
         base = make(unchanged(env_id), render=render, accelerations=accelerations)
-        return World(env_id, found.title, base)
-    if found.adapter == "toy":
+        return World(env_id, entry.title, base)
+    if entry.adapter == "toy":
         from evopolicy_worker.environments.families import toy
 
-        return toy.make(found, render=render)
-    family = family_of(found)
+        return toy.make(entry, render=render)
+    family = family_of(entry)
     if not family.installed():
         raise WorkerError(f"{env_id} needs {family.needs()}")
     if accelerations is None:
         accelerations = settings.accelerations_on()
-    return GymnasiumEnvironment(found, family, render=render, accelerations=accelerations)
+    return GymnasiumEnvironment(entry, family, render=render, accelerations=accelerations)
 
 
 def load(env_id: str) -> None:
     """Imports an environment's simulator, if installed, so that processes forked afterwards have it already."""
-    found = _entry(env_id)
-    if found.adapter != "toy" and (family := family_of(found)).installed():
+    entry = _entry(env_id)
+    if entry.adapter != "toy" and (family := family_of(entry)).installed():
         settings.apply()
         with quiet():
             family.load()
@@ -96,12 +96,12 @@ def describe(env_id: str) -> EnvironmentDescription:
         description = measured(environment)
     except WorkerError as error:
         raise type(error)(f"{error}{traced(error.__cause__)}") from error.__cause__
-    left_out, found = tuple(foreign.left_out.get(env_id, ())), _entry(env_id)
-    if found.success in left_out:
+    left_out, entry = tuple(foreign.left_out.get(env_id, ())), _entry(env_id)
+    if entry.success in left_out:
         raise WorkerError(
-            f"environment {env_id}, step, info[{found.success!r}]: it is a text; success is true or false"
+            f"environment {env_id}, step, info[{entry.success!r}]: it is a text; success is true or false"
         )
-    told = {"info_strings": list(found.info_strings)} if found.info_strings else {}
+    told = {"info_strings": list(entry.info_strings)} if entry.info_strings else {}
     description = msgspec.structs.replace(
         description, definition=description.definition | told, info_left_out=left_out
     )
@@ -129,11 +129,11 @@ def measured(environment: Environment) -> EnvironmentDescription:
 def packages(env_id: str) -> dict[str, str] | None:
     """Versions of the distributions that decide this environment's numbers; None where they are measured in an
     environment that has been made. Imports no simulator."""
-    found = _entry(env_id)
-    if found.adapter == "toy":
+    entry = _entry(env_id)
+    if entry.adapter == "toy":
         return versions(("numpy",))
-    family = family_of(found)
-    return None if family.measures else family.packages(found)
+    family = family_of(entry)
+    return None if family.measures else family.packages(entry)
 
 
 def remembers(env_id: str) -> bool:
@@ -141,13 +141,13 @@ def remembers(env_id: str) -> bool:
     environment that does not ship."""
     if not catalogue.is_shipped(env_id):
         return True
-    found = _entry(env_id)
-    return found.adapter != "toy" and family_of(found).remembers
+    entry = _entry(env_id)
+    return entry.adapter != "toy" and family_of(entry).remembers
 
 
 def offered() -> list[str]:
     """Suite ids of shipped environments that this installation can play, in catalogue order. Imports no simulator."""
-    return [found.id for found in catalogue.entries().values() if offers(found.id)]
+    return [entry.id for entry in catalogue.entries().values() if offers(entry.id)]
 
 
 def offers(env_id: str) -> bool:
@@ -159,12 +159,12 @@ def missing(env_id: str) -> str:
     """The packages to install for an environment here, or the reason why its id is unknown; empty when it can be
     played."""
     try:
-        found = _entry(env_id)
+        entry = _entry(env_id)
     except ConfigError as error:
         return str(error)
-    if found.adapter == "toy":
+    if entry.adapter == "toy":
         return ""
-    family = family_of(found)
+    family = family_of(entry)
     if family.installed():
         return ""
     advice = installs.advice(env_id)
@@ -188,13 +188,13 @@ def _known(env_id: str) -> Entry | None:
 
 
 def _entry(env_id: str) -> Entry:
-    found = _known(env_id)
-    if found is None:
+    entry = _known(env_id)
+    if entry is None:
         raise ConfigError(
             f"environment {env_id!r} is not installed{catalogue.near(env_id)}; name its file, or install the package"
             " that ships it"
         )
-    return found
+    return entry
 
 
 def family_of(found: Entry) -> GymnasiumFamily:

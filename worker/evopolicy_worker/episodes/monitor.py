@@ -203,8 +203,8 @@ class Watch:
             self._excused_s += now - looked
             self._answer_excused_s += owed_s
         elif owed_s and now - since > _SLOW_S:
-            cpu_s, found = self.cpu_s(), proc.stat(self.child.host_pid)
-            state = "" if found is None else found.state
+            cpu_s, stat = self.cpu_s(), proc.stat(self.child.host_pid)
+            state = "" if stat is None else stat.state
             if self._held and state in STOPPED:
                 self._stood_s += owed_s
                 self._excused_s += owed_s
@@ -308,8 +308,8 @@ class Monitor(threading.Thread):
 
 def is_stopped(pid: int) -> bool:
     """Whether the process is stopped, or held by a debugger."""
-    found = proc.stat(pid)
-    return found is not None and found.state in STOPPED
+    stat = proc.stat(pid)
+    return stat is not None and stat.state in STOPPED
 
 
 def _threads(pid: int) -> int:

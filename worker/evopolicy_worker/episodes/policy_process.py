@@ -351,11 +351,11 @@ class PolicyProcess:
         return tag, data[8:]
 
     def _write_rest(self, parts: list[Any], n: int) -> None:
-        left = memoryview(
+        unsent = memoryview(
             b"".join([bytes(part) if type(part) is bytes else part.tobytes() for part in parts])
         )[n:]
-        while left:
-            left = left[os.write(self._requests, left) :]
+        while unsent:
+            unsent = unsent[os.write(self._requests, unsent) :]
 
     def _read_more(self, data: bytes, wanted: int) -> bytes:
         pieces = [data]
@@ -449,11 +449,11 @@ class PolicyProcess:
         if alive and _exiting(self._child.host_pid):
             alive = not wait_dead(self._child.pidfd, _EXIT_S)
         self._bury()
-        exit_, found = self._exit, watch.verdict
-        if found is None and exit_ is not None and not alive and not watch.stopped:
-            found = self._limit_of(exit_)
-        if found is not None:
-            ending, text = Ending("policy", "SIGKILL", found.category), found.message
+        exit_, verdict = self._exit, watch.verdict
+        if verdict is None and exit_ is not None and not alive and not watch.stopped:
+            verdict = self._limit_of(exit_)
+        if verdict is not None:
+            ending, text = Ending("policy", "SIGKILL", verdict.category), verdict.message
         elif watch.stopped:
             ending, text = Ending("policy", "stop"), f"the policy's process was stopped for {STOPPED_S:g} s"
         elif alive:
@@ -474,9 +474,9 @@ class PolicyProcess:
             if watch.what == "seal":
                 raise EndedFromOutsideError(f"a policy's process could not seal itself: {text}")
             raise EndedFromOutsideError(f"{text}, and neither the policy nor a limit can have done that")
-        if found is None:
+        if verdict is None:
             return self._failed(self._fatal(category), text)
-        return self._failed(self._fatal(category), text, limit=found.limit, used=found.used)
+        return self._failed(self._fatal(category), text, limit=verdict.limit, used=verdict.used)
 
     def _limit_of(self, exit_: Exit) -> Verdict | None:
         """The limit for which the system ended it."""
@@ -573,5 +573,5 @@ def _memory(pid: int) -> tuple[int, int]:
 
 def _exiting(pid: int) -> bool:
     """Whether the process is on its way out."""
-    found = proc.stat(pid)
-    return found is None or found.exiting
+    stat = proc.stat(pid)
+    return stat is None or stat.exiting

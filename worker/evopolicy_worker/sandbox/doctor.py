@@ -84,9 +84,9 @@ def _kernel() -> Check:
 
 
 def _boot_id() -> Check:
-    found = host.boot_id()
-    if found:
-        return Check(name="boot id", verdict="ok", found=found)
+    boot_id = host.boot_id()
+    if boot_id:
+        return Check(name="boot id", verdict="ok", found=boot_id)
     return Check(
         name="boot id",
         verdict="missing",
@@ -168,12 +168,12 @@ def _landlock() -> Check:
 def _cgroups() -> Check:
     root = Path("/sys/fs/cgroup")
     if (root / "cgroup.controllers").is_file():
-        found = f"version 2: {(root / 'cgroup.controllers').read_text().strip() or 'no controllers'}"
+        version = f"version 2: {(root / 'cgroup.controllers').read_text().strip() or 'no controllers'}"
     elif root.is_dir() and any(root.iterdir()):
-        found = "version 1"
+        version = "version 1"
     else:
-        found = "none"
-    return Check(name="cgroups", verdict="note", found=f"{found} (limits do not need them)")
+        version = "none"
+    return Check(name="cgroups", verdict="note", found=f"{version} (limits do not need them)")
 
 
 def _pinning() -> Check:
@@ -216,12 +216,12 @@ def _clock() -> Check:
 
 
 def _fingerprint() -> list[Check]:
-    found = fingerprint()
-    packages = ", ".join(f"{name} {version}" for name, version in found.packages.items())
+    own = fingerprint()
+    packages = ", ".join(f"{name} {version}" for name, version in own.packages.items())
     return [
-        Check(name="worker", verdict="note", found=f"{found.code_version}, Python {found.python}"),
+        Check(name="worker", verdict="note", found=f"{own.code_version}, Python {own.python}"),
         Check(name="packages", verdict="note", found=packages),
-        Check(name="CPU", verdict="note", found=found.cpu),
+        Check(name="CPU", verdict="note", found=own.cpu),
     ]
 
 

@@ -122,10 +122,10 @@ def some_user() -> int:
 
 def bubblewrap() -> str:
     """Path of bubblewrap. Raises SandboxError, with how to install it, when it is missing."""
-    found = shutil.which("bwrap")
-    if found is None:
+    bwrap = shutil.which("bwrap")
+    if bwrap is None:
         raise SandboxError(f"bubblewrap is not installed: {distribution.install('bubblewrap')}")
-    return found
+    return bwrap
 
 
 def landlock_version() -> int:

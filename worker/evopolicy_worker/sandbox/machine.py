@@ -65,13 +65,13 @@ def _extras() -> list[Check]:
 
 
 def _graphics() -> Check:
-    found = find_library("EGL")
+    library = find_library("EGL")
     return Check(
         name="drawing (EGL)",
-        verdict="missing" if found is None else "ok",
-        found=found or "no libEGL",
+        verdict="missing" if library is None else "ok",
+        found=library or "no libEGL",
         without="everything but videos and replays of MuJoCo's environments",
-        advice="" if found else distribution.install("egl"),
+        advice="" if library else distribution.install("egl"),
     )
 
 
@@ -104,13 +104,13 @@ def _disk() -> Check:
     folder = local_state_dir()
     there = next(path for path in (folder, *folder.parents) if path.exists())
     free = shutil.disk_usage(there).free
-    found = f"{free / 2**30:.1f} GiB free for {folder}"
+    free_space = f"{free / 2**30:.1f} GiB free for {folder}"
     if free >= _ROOMY_BYTES:
-        return Check(name="disk", verdict="ok", found=found)
+        return Check(name="disk", verdict="ok", found=free_space)
     return Check(
         name="disk",
         verdict="note",
-        found=found,
+        found=free_space,
         without="single runs; a sweep may fill it (`evopolicy disk` says how much it takes)",
         advice="make room, or name other folders with --state and --runs",
     )

@@ -222,8 +222,8 @@ def wait_dead(pidfd: int, timeout_s: float) -> bool:
     poller = select.poll()
     poller.register(pidfd, select.POLLIN)
     end = time.monotonic() + timeout_s
-    while (left := end - time.monotonic()) > 0:
-        if poller.poll(left * 1000):
+    while (remaining_s := end - time.monotonic()) > 0:
+        if poller.poll(remaining_s * 1000):
             return True
     return False
 

@@ -261,7 +261,7 @@ class Slot:
         if self._process is None:
             raise WorkerError("the slot is not started")
         limits = self._start.limits
-        found: list[EnvironmentDescription] = []
+        descriptions: list[EnvironmentDescription] = []
         for env_id in env_ids:
             try:
                 async with asyncio.timeout(DESCRIBED_CALLS * limits.call_s + SILENT_S):
@@ -278,8 +278,8 @@ class Slot:
                 ) from error
             if not isinstance(reply, messages.Described):
                 raise _error(reply)
-            found += reply.environments
-        return tuple(found)
+            descriptions += reply.environments
+        return tuple(descriptions)
 
     def memory_bytes(self) -> int:
         """Resident memory of all of the slot's processes; each has its part of what several share, as a browser's

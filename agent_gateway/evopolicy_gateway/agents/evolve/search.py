@@ -94,10 +94,10 @@ def make_plan(budget: int, min_per_submit: int, max_per_submit: int) -> Plan:
         return Plan(opening=0, rounds=(), finals=max(1, budget // per_final), episodes_per_final=per_final)
     first = searching if searching <= 16 else max(searching // 3, min(2 * searching // 3, most))
     opening = min(max(first, min_per_submit), max_per_submit)
-    left = searching - opening
+    fresh = searching - opening
     least = max(4, min_per_submit)
-    n_rounds = min(-(-left // max(most, least)), left // least)
-    rounds = tuple(min(left // n_rounds + (i < left % n_rounds), max_per_submit) for i in range(n_rounds))
+    n_rounds = min(-(-fresh // max(most, least)), fresh // least)
+    rounds = tuple(min(fresh // n_rounds + (i < fresh % n_rounds), max_per_submit) for i in range(n_rounds))
     return Plan(
         opening=opening,
         rounds=tuple(size for size in rounds if size >= min_per_submit),
@@ -168,16 +168,16 @@ class Search:
         more cases than the search did, so a hedge against a lucky leader costs little.
         """
         taken = [c for c in self.candidates if c.is_final]
-        left = [c for c in _distinct(taken, self.ranking()) if not c.is_final]
-        if not left:
-            left = self.opening(1) or self.ranking() or self.candidates
-        chosen = left[0]
+        candidates = [c for c in _distinct(taken, self.ranking()) if not c.is_final]
+        if not candidates:
+            candidates = self.opening(1) or self.ranking() or self.candidates
+        chosen = candidates[0]
         if len(taken) == MEAN_AFTER:
             chosen = self._mean_of_best() or chosen
         elif len(taken) % 2:
             worth = self.worth()
             bar = self._hedge_bar(worth)
-            able = [c for c in left if worth.get(id(c), bar) >= bar] or left[:1]
+            able = [c for c in candidates if worth.get(id(c), bar) >= bar] or candidates[:1]
             finals = [c.family.name for c in taken]
             chosen = min(able, key=lambda c: finals.count(c.family.name))
         chosen.is_final = True

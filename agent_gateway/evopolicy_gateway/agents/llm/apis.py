@@ -232,11 +232,11 @@ class Anthropic(Api):
             tools=[tool],
             extra_body=self._parameters,
         ) as stream:
-            found = stream.get_final_message()
+            message = stream.get_final_message()
         # With its thinking, whose signature the API checks when it comes back.
-        content = [block.model_dump(mode="json", exclude_none=True) for block in found.content]
+        content = [block.model_dump(mode="json", exclude_none=True) for block in message.content]
         self.messages.append({"role": "assistant", "content": content or [{"type": "text", "text": "…"}]})
-        usage = found.usage
+        usage = message.usage
         return Reply(
             text="\n".join(block["text"] for block in content if block["type"] == "text"),
             calls=tuple(

@@ -160,17 +160,17 @@ class CliAgent(Harness):
         stage.on_turn(state.turns, stage.log.redact.text(reader.text))
         if (why := self._capped(state.usage)) is not None:
             return self._ending("agent_stopped", why)
-        left = await left_of(stage)
-        if left == 0 or stage.over.is_set():
+        n_left = await left_of(stage)
+        if n_left == 0 or stage.over.is_set():
             return self._ending()
         if state.reprompts >= self._config.reprompts:
-            remaining = "budget" if left is None else f"{left} episodes"
+            remaining = "budget" if n_left is None else f"{n_left} episodes"
             return self._ending(
                 "agent_stopped", f"stopped with {remaining} left after {state.reprompts} reminders"
             )
         state.reprompts += 1
         self._keep(stage)
-        return stage.prompts.stopped(left) if self._dialect.resumes else stage.prompts.begin()
+        return stage.prompts.stopped(n_left) if self._dialect.resumes else stage.prompts.begin()
 
     async def _failed(self, stage: Stage, reader: TurnReader) -> AgentEnded | str:
         """Waits as the failure requires and returns the prompt of the retry, or the end."""
@@ -226,12 +226,12 @@ class CliAgent(Harness):
     async def _prompt_after_failure(self, stage: Stage) -> AgentEnded | str:
         """The first prompt of a session, or the prompt that resumes an interrupted one; the end if the budget is
         spent."""
-        left = await left_of(stage)
-        if left == 0:
+        n_left = await left_of(stage)
+        if n_left == 0:
             return self._ending()
         if self._state.session is None or not self._dialect.resumes:
             return stage.prompts.begin()
-        return stage.prompts.resumed(left)
+        return stage.prompts.resumed(n_left)
 
     def _keep(self, stage: Stage) -> None:
         self._state.cli_version = self._version
@@ -277,9 +277,9 @@ class CliAgent(Harness):
                 f" its help begins: {first_line(self._options) or '(empty)'}"
             )
         if self._version != dialect.tested_version:
-            found = self._version or "of an unknown version"
-            note = f"{name} {found} is used; held against was {dialect.tested_version}"
-            log.warning("another version than the tested one", version=found, tested=dialect.tested_version)
+            version = self._version or "of an unknown version"
+            note = f"{name} {version} is used; held against was {dialect.tested_version}"
+            log.warning("another version than the tested one", version=version, tested=dialect.tested_version)
             stage.on_doing(AgentDoing(note=note))
 
     async def _ask(self, stage: Stage, arguments: tuple[str, ...]) -> str:

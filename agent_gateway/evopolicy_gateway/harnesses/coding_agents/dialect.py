@@ -108,8 +108,8 @@ class Dialect(ABC):
 
     def version_in(self, text: str) -> str | None:
         """The version in its `--version` output; None if there is none."""
-        found = _VERSION.search(text[:_MAX_VERSION_CHARS])
-        return None if found is None else found.group(0)
+        match = _VERSION.search(text[:_MAX_VERSION_CHARS])
+        return None if match is None else match.group(0)
 
 
 def mapping(value: Any) -> Mapping[str, Any]:

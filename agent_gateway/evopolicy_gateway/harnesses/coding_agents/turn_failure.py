@@ -68,8 +68,8 @@ class TurnFailure(msgspec.Struct, frozen=True, kw_only=True):
 def turn_failure_of(message: str, status: int | None = None, now: float | None = None) -> TurnFailure:
     """Classifies an error by its text, and by its HTTP status if known separately. `now`: Unix time, seconds."""
     text = " ".join(message.split())[:_MAX_MESSAGE] or "no message"
-    found = _STATUS.search(text)
-    code = status if status is not None else int(found.group(1) or found.group(2)) if found else None
+    match = _STATUS.search(text)
+    code = status if status is not None else int(match.group(1) or match.group(2)) if match else None
     if _FAULTY.match(text):
         return TurnFailure(kind="faulty", message=text)
     if _LOST.search(text):
@@ -104,10 +104,10 @@ def _stated_wait(text: str, now: float) -> float | None:
         return float(seconds.group(1))
     if (epoch := _EPOCH.search(text)) is not None:
         return max(0.0, float(epoch.group(1)) - now)
-    if (found := _IN.search(text)) is None:
+    if (match := _IN.search(text)) is None:
         return None
     total = 0.0
-    for number, unit in _PART.findall(found.group(1)):
+    for number, unit in _PART.findall(match.group(1)):
         name = unit.lower()
         total += float(number) * _UNITS.get("ms" if name.startswith("ms") else name[0], 0.0)
     return total or None

@@ -289,16 +289,16 @@ def _pictures_difference(folder: Path, rows: Rows, episode: Trajectory) -> str |
     )
     if path is None:
         return "there is no file of observations"
-    found = read_arrays(read_regular(path, MAX_OBSERVATIONS_BYTES), MAX_BYTES)
-    if list(columns) == [""] and list(found) == [SINGLE]:
-        found = {"": found[SINGLE]}
-    if found.keys() != columns.keys():
+    arrays = read_arrays(read_regular(path, MAX_OBSERVATIONS_BYTES), MAX_BYTES)
+    if list(columns) == [""] and list(arrays) == [SINGLE]:
+        arrays = {"": arrays[SINGLE]}
+    if arrays.keys() != columns.keys():
         return f"{path.name}: holds other columns"
     for name, leaf in columns.items():
-        column = leaf if isinstance(leaf, np.ndarray) else np.array(leaf, dtype=found[name].dtype)
+        column = leaf if isinstance(leaf, np.ndarray) else np.array(leaf, dtype=arrays[name].dtype)
         # The published profiles stack numbers of other sizes.
-        common = np.result_type(column, found[name])
-        one, other = (np.ascontiguousarray(each, dtype=common) for each in (column, found[name]))
+        common = np.result_type(column, arrays[name])
+        one, other = (np.ascontiguousarray(each, dtype=common) for each in (column, arrays[name]))
         if not same(one, other):
             return f"{path.name}: column {name or 'of observations'} differs"
     return None

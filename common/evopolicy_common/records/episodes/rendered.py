@@ -314,15 +314,15 @@ def _rewards(rows: bytes) -> list[float]:
     while at < len(rows):
         end = rows.rfind(b"\n", at, at + _ROWS_AT_ONCE) + 1 or rows.find(b"\n", at) + 1 or len(rows)
         try:
-            found = _rows_decoder.decode_lines(view[at:end])
+            some = _rows_decoder.decode_lines(view[at:end])
         except (msgspec.DecodeError, RecursionError) as error:
             raise ProtocolError(f"{ROWS} cannot be read after step {len(rewards)}: {error}") from error
-        if [row.t for row in found] != list(range(len(rewards), len(rewards) + len(found))):
-            wrong = next(n for n, row in enumerate(found, len(rewards)) if row.t != n)
+        if [row.t for row in some] != list(range(len(rewards), len(rewards) + len(some))):
+            wrong = next(n for n, row in enumerate(some, len(rewards)) if row.t != n)
             raise ProtocolError(
-                f"row {wrong} of {ROWS} says that it is of step {found[wrong - len(rewards)].t}"
+                f"row {wrong} of {ROWS} says that it is of step {some[wrong - len(rewards)].t}"
             )
-        rewards += [row.reward for row in found]
+        rewards += [row.reward for row in some]
         at = end
     return rewards
 
@@ -345,14 +345,14 @@ def files_of(episode: Trajectory, storage: ObsStorage | None) -> dict[str, bytes
     if episode.files:
         return episode.files
     outside = storage != "inline" if storage is not None else _holds_pictures(episode.obs)
-    found = list(episode.rows())
+    steps = list(episode.rows())
     rows = _Rows(
-        None if outside else [row.obs for row in found],
-        [row.action for row in found],
-        [row.reward for row in found],
-        [row.terminated for row in found],
-        [row.truncated for row in found],
-        [row.info for row in found],
+        None if outside else [row.obs for row in steps],
+        [row.action for row in steps],
+        [row.reward for row in steps],
+        [row.terminated for row in steps],
+        [row.truncated for row in steps],
+        [row.info for row in steps],
     )
     files = {ROWS: b"".join(rows.texts(0, 0))}
     if outside and episode.obs is not None:
@@ -372,8 +372,8 @@ def is_picture(shape: tuple[int, ...], dtype: str) -> bool:
 
 
 def _holds_pictures(obs: Any) -> bool:
-    found = [leaf for _, leaf in columns.leaves(obs) if isinstance(leaf, np.ndarray)]
-    return any(is_picture(leaf.shape[1:], leaf.dtype.name) for leaf in found)
+    arrays = [leaf for _, leaf in columns.leaves(obs) if isinstance(leaf, np.ndarray)]
+    return any(is_picture(leaf.shape[1:], leaf.dtype.name) for leaf in arrays)
 
 
 def _parts(data: bytes) -> list[memoryview]:

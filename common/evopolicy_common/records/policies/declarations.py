@@ -19,11 +19,11 @@ def declares_deterministic(files: Mapping[str, bytes]) -> bool:
     if len(source) > _MAX_BYTES:
         return False
     module = parse(source)
-    found = False
+    declared = False
     for node in () if module is None else module.body:
         if isinstance(node, ast.ClassDef) and node.name == "Policy":
-            found = any(_declares(inner) for inner in node.body)
-    return found
+            declared = any(_declares(inner) for inner in node.body)
+    return declared
 
 
 def _declares(node: ast.stmt) -> bool:

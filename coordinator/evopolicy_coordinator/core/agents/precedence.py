@@ -172,14 +172,14 @@ def _train(state: State, lane: Lane, there: dict[Kernel, None], step: Step) -> N
     for name in waiting:
         run = state.runs.get(name)
         open_group = "" if run is None or run.open is None else train_group(run.id, run.open)
-        found = state.groups.get(open_group)
+        group = state.groups.get(open_group)
         if (
-            found is None
-            or found.n_leased
-            or found.flow.lane is not lane
-            or found.flow.case_set not in barred
+            group is None
+            or group.n_leased
+            or group.flow.lane is not lane
+            or group.flow.case_set not in barred
         ):
             continue
-        if found.held_since is None:
-            found.held_since = step.now
-            state.held[found] = None
+        if group.held_since is None:
+            group.held_since = step.now
+            state.held[group] = None

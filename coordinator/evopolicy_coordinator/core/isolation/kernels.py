@@ -19,10 +19,10 @@ T = TypeVar("T")
 
 def kernel(state: State, boot_id: str) -> Kernel:
     """Returns the kernel with that boot id; creates it if it is new."""
-    found = state.kernels.get(boot_id)
-    if found is None:
-        found = state.kernels[boot_id] = Kernel(boot_id)
-    return found
+    kernel = state.kernels.get(boot_id)
+    if kernel is None:
+        kernel = state.kernels[boot_id] = Kernel(boot_id)
+    return kernel
 
 
 def tidy(state: State, kernel: Kernel) -> None:

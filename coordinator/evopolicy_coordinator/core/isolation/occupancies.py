@@ -58,7 +58,7 @@ def _enter(occupancy: Occupancy) -> None:
     )
 
 
-def left(state: State, lease: Lease, worker: Worker, step: Step, *, sure: bool) -> None:
+def vacate(state: State, lease: Lease, worker: Worker, step: Step, *, sure: bool) -> None:
     """A worker no longer holds a lease: surely, or only by the coordinator's decision."""
     occupancy, lease.occupancy = lease.occupancy, None
     if occupancy is None:
@@ -78,9 +78,9 @@ def _gone(state: State, occupancy: Occupancy, step: Step) -> None:
     case_set = occupancy.case_set
     take(index, case_set, occupancy.key)
     if occupancy.hidden and case_set is not None:
-        left = case_set.hidden_on[occupancy.kernel] - 1
-        if left:
-            case_set.hidden_on[occupancy.kernel] = left
+        n_hidden = case_set.hidden_on[occupancy.kernel] - 1
+        if n_hidden:
+            case_set.hidden_on[occupancy.kernel] = n_hidden
         else:
             del case_set.hidden_on[occupancy.kernel]
     if not related(index, case_set):

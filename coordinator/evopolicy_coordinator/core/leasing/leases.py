@@ -231,7 +231,7 @@ def release(state: State, worker: Worker, lease: Lease, step: Step, *, sure: boo
 
 def _leave(state: State, worker: Worker, lease: Lease, step: Step, *, sure: bool) -> None:
     worker.leases.pop(lease.id, None)
-    occupancies.left(state, lease, worker, step, sure=sure)
+    occupancies.vacate(state, lease, worker, step, sure=sure)
     if lease.stopped_for is not None:
         lease.stopped_for.stopping -= 1
         lease.stopped_for = None

@@ -187,11 +187,11 @@ def take(state: State, worker: Worker, warm: Collection[str], now: float) -> Job
         barred = 0
         job: JobState | None = None
         while job is None and len(passed) - barred < PASSES_MAX and barred < BARRED_MAX:
-            found = _best(state, worker, rank, warm)
-            if found is None or found[0].lane is None:
+            best = _best(state, worker, rank, warm)
+            if best is None or best[0].lane is None:
                 break
-            flow, priority = found
-            lane = found[0].lane
+            flow, priority = best
+            lane = best[0].lane
             if conflicts.conflict(state, priority, flow.case_set, worker):
                 barred += 1
             else:
@@ -199,7 +199,7 @@ def take(state: State, worker: Worker, warm: Collection[str], now: float) -> Job
             if job is None:
                 heapq.heappop(lane.heaps[priority])
                 flow.in_heap[priority] = False
-                passed.append(found)
+                passed.append(best)
         for flow, priority in passed:
             if flow.lane is not None:
                 _enter(flow, flow.lane, priority)
@@ -212,9 +212,9 @@ def take(state: State, worker: Worker, warm: Collection[str], now: float) -> Job
 def leading(state: State, worker: Worker) -> tuple[Flow, int] | None:
     """The flow that goes first among those that the worker may be leased, and its priority; None when none waits."""
     for rank in _ranks(worker):
-        found = _best(state, worker, rank, ())
-        if found is not None:
-            return found
+        best = _best(state, worker, rank, ())
+        if best is not None:
+            return best
     return None
 
 
@@ -278,7 +278,7 @@ def _first(flow: Flow, priority: int, worker: Worker, now: float, *, sole: bool)
     """The flow's first job that may go to `worker` and does not avoid it; drops void entries on the way."""
     ready = flow.ready[priority]
     skipped: list[tuple[int, JobState]] = []
-    found: JobState | None = None
+    best: JobState | None = None
     while ready and len(skipped) < SKIPS_MAX:
         ticket, job = ready[0]
         if job.ticket != ticket:
@@ -286,10 +286,10 @@ def _first(flow: Flow, priority: int, worker: Worker, now: float, *, sole: bool)
         elif (job.avoid == worker.name and now < job.avoid_until and not sole) or job.group.excludes(worker):
             skipped.append(ready.popleft())
         else:
-            found = job
+            best = job
             break
     ready.extendleft(reversed(skipped))
-    return found
+    return best
 
 
 def head(lane: Lane, priority: int) -> JobState | None:

@@ -27,8 +27,12 @@ from evopolicy_coordinator.core.tables.step import Step
 def unspent(run: Run) -> int:
     """Unspent episodes of a run that must spend its budget; 0 for other runs, or if fewer are left
     than a submit's minimum."""
-    left = run.ledger.available
-    return left if run.row.settings.finish == "budget" and left >= run.row.min_episodes_per_submit else 0
+    available = run.ledger.available
+    return (
+        available
+        if run.row.settings.finish == "budget" and available >= run.row.min_episodes_per_submit
+        else 0
+    )
 
 
 def ok_submits(run: Run) -> list[SubmitRow]:
@@ -60,11 +64,11 @@ def result(
     status: operator.RunEnd = "completed"
     if cancelled:
         status = "error" if error else "cancelled"
-    elif left := unspent(run):
+    elif n_unspent := unspent(run):
         status = "error"
         error = (
-            f"the run ended ({stored.close_reason.replace('_', ' ')}) with {left} of its {row.budget} episodes left,"
-            " and must spend them (finish = budget)"
+            f"the run ended ({stored.close_reason.replace('_', ' ')}) with {n_unspent} of its {row.budget}"
+            " episodes left, and must spend them (finish = budget)"
         )
     elif not ok or (best is None and row.settings.failed_episodes == "end-submit"):
         status = "no_ok_submit"

@@ -479,9 +479,9 @@ def _of(there: dict[CaseSet | None, int], case_set: CaseSet | None) -> bool:
 
 
 def add(counts: dict[T, int], key: T, n: int) -> None:
-    left = counts.get(key, 0) + n
-    if left:
-        counts[key] = left
+    total = counts.get(key, 0) + n
+    if total:
+        counts[key] = total
     else:
         counts.pop(key, None)
 

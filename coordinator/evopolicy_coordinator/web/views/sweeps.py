@@ -35,11 +35,11 @@ def sweeps_view(
         "notices": part("notices", notices=_run_notices(runs, every, cluster, roots)),
     }
     lists: dict[str, list[str]] = {"matrices": []}
-    left = MAX_CELLS
+    cells = MAX_CELLS
     for sweep in runs.sweeps:
         name = ident("sweep", str(sweep.root))
         lists["matrices"].append(name)
-        matrix, left = _matrix(sweep, runs, agents, left)
+        matrix, cells = _matrix(sweep, runs, agents, cells)
         parts[name] = part("matrix", ident=name, key=name, acting=acting, **matrix)
     kept = [
         run
@@ -80,8 +80,8 @@ def _sweep_facts(every: Sequence[RunFacts]) -> list[tuple[str, str]]:
     open_runs = [run for run in every if not run.finished and run.state not in ("pending", "interrupted")]
     walls = [run.wall_s for run in done if run.wall_s]
     waiting = sum(run.state in ("pending", "interrupted") for run in every)
-    left = [run.left_s for run in open_runs if run.left_s is not None]
-    rest = max(left, default=0.0)
+    remaining_s = [run.left_s for run in open_runs if run.left_s is not None]
+    rest = max(remaining_s, default=0.0)
     if walls and waiting:
         rest += sum(walls) / len(walls) * waiting / max(1, len(open_runs))
     facts = [
@@ -136,9 +136,9 @@ def _run_notices(
     return notices
 
 
-def _matrix(sweep: Sweep, runs: Runs, agents: Mapping[str, Look], left: int) -> tuple[dict[str, Any], int]:
+def _matrix(sweep: Sweep, runs: Runs, agents: Mapping[str, Look], most: int) -> tuple[dict[str, Any], int]:
     cells: dict[tuple[str, str], list[RunFacts]] = {}
-    shown = sorted(sweep.runs, key=lambda run: (_order(run)[0], run.repeat))[:left]
+    shown = sorted(sweep.runs, key=lambda run: (_order(run)[0], run.repeat))[:most]
     for run in shown:
         cells.setdefault((run.entry, run.env), []).append(run)
     entries = sorted({run.entry for run in shown}, key=str.casefold)
@@ -172,7 +172,7 @@ def _matrix(sweep: Sweep, runs: Runs, agents: Mapping[str, Look], left: int) -> 
         "is_suite": sweep.is_suite,
         "paused": sweep.paused,
     }
-    return view, left - len(shown)
+    return view, most - len(shown)
 
 
 def _chip(run: RunFacts, may_show: bool) -> dict[str, Any]:

@@ -116,7 +116,7 @@ def test_run_of_a_killed_command_is_dropped_when_its_agent_is_gone(
     async def main() -> None:
         await cluster.drop(folder)
         assert cluster.asked == []
-        save(folder.opened, OpenedRun(run="r-1"))
+        save(folder.opened_run, OpenedRun(run="r-1"))
         with folder.supervisor_lock.open("w") as held:
             fcntl.flock(held, fcntl.LOCK_EX)
             dropping = asyncio.create_task(cluster.drop(folder))

@@ -45,7 +45,7 @@ def machines_folder(folder: Path) -> Path:
 def run(tmp_path: Path) -> RunFolder:
     folder = RunFolder(tmp_path / "run")
     folder.state.mkdir(parents=True)
-    write_atomically(folder.opened, msgspec.json.encode(OpenedRun(run="r-1")))
+    write_atomically(folder.opened_run, msgspec.json.encode(OpenedRun(run="r-1")))
     credentials.write(RUNS_OWN, folder.credentials)
     return folder
 

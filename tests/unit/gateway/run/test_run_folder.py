@@ -14,9 +14,9 @@ from evopolicy_gateway.run_folder.layout import RunFolder, save, saved
 def test_a_file_that_a_disk_has_damaged_is_reported(tmp_path: Path) -> None:
     folder = RunFolder(tmp_path)
     folder.state.mkdir()
-    save(folder.opened, OpenedRun(run="r-1"))
-    assert saved(folder.opened, OpenedRun).run == "r-1"
+    save(folder.opened_run, OpenedRun(run="r-1"))
+    assert saved(folder.opened_run, OpenedRun).run == "r-1"
     for damaged in (b"", b"{", b"\xff", b"[" * 100_000, b'{"run": 1}'):
-        folder.opened.write_bytes(damaged)
-        with pytest.raises(ConfigError, match=f"{folder.opened} is damaged.*--overwrite"):
-            saved(folder.opened, OpenedRun)
+        folder.opened_run.write_bytes(damaged)
+        with pytest.raises(ConfigError, match=f"{folder.opened_run} is damaged.*--overwrite"):
+            saved(folder.opened_run, OpenedRun)

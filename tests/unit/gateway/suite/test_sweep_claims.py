@@ -141,7 +141,7 @@ def test_a_claim_that_was_given_back_ends_the_earlier_hosts_run(
     if ours:
         folder = stage.runs[0].folder
         folder.state.mkdir(parents=True)
-        save(folder.opened, OpenedRun(run="r-7", agents_md=""))
+        save(folder.opened_run, OpenedRun(run="r-7", agents_md=""))
     stage.cluster.answer = lambda _: ClaimState(granted=True, holder="me", run="r-7")
     stage.play()
     assert stage.cluster.cancelled == ([] if ours else ["r-7"])

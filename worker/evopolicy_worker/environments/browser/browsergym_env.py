@@ -77,9 +77,9 @@ class BrowserGymEnv(PageEnv):
         except ValueError as wrong:
             error = f"{type(wrong).__name__}: {wrong}"[:MAX_TEXT]
         self._last = action, error
-        found = self._pass()
-        reward, done, info = self._scored(found)
-        observed = self._observation(found)
+        outcome = self._pass()
+        reward, done, info = self._scored(outcome)
+        observed = self._observation(outcome)
         if self._over and not done:
             done, reward = True, 0.0
             info |= {"raw_reward": 0.0, "reason": "the agent reported the task infeasible", "success": False}

@@ -209,8 +209,8 @@ class Chromium:
         atexit.unregister(self.close)
         # More than once: a process may start another meanwhile, and writes into the profile until it has ended.
         deadline = time.monotonic() + _END_S
-        while (left := _session(self.pid)) and time.monotonic() < deadline:
-            for pid in left:
+        while (processes := _session(self.pid)) and time.monotonic() < deadline:
+            for pid in processes:
                 with contextlib.suppress(ProcessLookupError):
                     os.kill(pid, signal.SIGKILL)
             with contextlib.suppress(ChildProcessError):

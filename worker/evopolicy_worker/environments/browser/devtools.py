@@ -97,8 +97,8 @@ class DevTools:
 
     def _receive(self, deadline: float) -> None:
         """Reads once, and takes every whole message."""
-        left = deadline - time.monotonic()
-        if left <= 0 or not select.select([self._replies], [], [], left)[0]:
+        remaining_s = deadline - time.monotonic()
+        if remaining_s <= 0 or not select.select([self._replies], [], [], remaining_s)[0]:
             raise BrowserLostError("the browser or its page does not answer: it hangs")
         data = os.read(self._replies, _READ)
         if not data:

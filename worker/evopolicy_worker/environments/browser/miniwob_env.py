@@ -88,9 +88,9 @@ class MiniWoBEnv(PageEnv):
 
     def _step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         self._act(action)
-        found = self._pass()
-        reward, done, info = self._scored(found)
-        return self._observation({} if done else found), reward, done, False, info
+        outcome = self._pass()
+        reward, done, info = self._scored(outcome)
+        return self._observation({} if done else outcome), reward, done, False, info
 
     def _act(self, action: dict[str, Any]) -> None:
         kind = ACTIONS[action["action_type"]]

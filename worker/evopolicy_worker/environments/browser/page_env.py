@@ -124,11 +124,11 @@ class PageEnv(gymnasium.Env[Any, Any]):
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         try:
-            found = self._step(action)
+            outcome = self._step(action)
         except BrowserLostError:
-            found = self._play_again(action)
+            outcome = self._play_again(action)
         self._actions.append(action)
-        return found
+        return outcome
 
     def render(self) -> Any:
         """The window as it is."""

@@ -172,11 +172,11 @@ def _set_birthday(library: str) -> None:
 
 def _name(entry: Entry) -> tuple[str, str]:
     """Which package's task an environment is, and its name without what all have in common."""
-    found = str(entry.gymnasium_id)
+    gymnasium_id = str(entry.gymnasium_id)
     return (
-        ("minihack", found.removeprefix("MiniHack-"))
+        ("minihack", gymnasium_id.removeprefix("MiniHack-"))
         if _is_minihack(entry)
-        else ("nethack", found.removeprefix("NetHack"))
+        else ("nethack", gymnasium_id.removeprefix("NetHack"))
     )
 
 

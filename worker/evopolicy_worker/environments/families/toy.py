@@ -201,11 +201,11 @@ class Maze(_Toy):
             self._row += down
             self._column += right
         self._steps += 1
-        found = (self._row, self._column) == self._exit
+        reached = (self._row, self._column) == self._exit
         return Step(
             self._observe(),
             -1.0,
-            found,
+            reached,
             self._steps >= self._limit,
             {"bumped": bool(bumped), "steps": self._steps},
         )

@@ -161,8 +161,8 @@ def last_words(stderr: Iterable[str]) -> str:
     said: list[str] = []
     stack: list[tuple[str, str]] = []
     for line in stderr:
-        if found := _STACK_LINE.match(line):
-            stack.insert(0, (found[1], line.strip()))
+        if match := _STACK_LINE.match(line):
+            stack.insert(0, (match[1], line.strip()))
         elif line and not line.startswith(("Stack (most recent", "Extension modules")):
             said.append(line)
     return " | ".join([*said, *_own(stack)])
@@ -184,9 +184,9 @@ def _not_shown(error: BaseException, text: str) -> str:
     if isinstance(error, PermissionError) and isinstance(error.filename, str):
         return "" if os.access(error.filename, os.R_OK) else unreadable(error.filename)
     for folder in own_folders if isinstance(error, OSError | ValueError) else ():
-        found = re.search(rf"{re.escape(folder)}/([^'\"\n]+)", text)
-        if found is not None and not os.path.exists(found[0]):
-            return f"; {found[1]} is not shown to the environment: if it exists, declare it in data of an environment file"  # noqa: E501
+        match = re.search(rf"{re.escape(folder)}/([^'\"\n]+)", text)
+        if match is not None and not os.path.exists(match[0]):
+            return f"; {match[1]} is not shown to the environment: if it exists, declare it in data of an environment file"  # noqa: E501
     name = getattr(error, "name", None) or getattr(error.__cause__, "name", None)
     if isinstance(error, ModuleNotFoundError) and name and own_folders:
         return f"; if {name} is a folder on PYTHONPATH, it needs an __init__.py to be shown"

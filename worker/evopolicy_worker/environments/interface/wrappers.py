@@ -19,10 +19,10 @@ def wrapped(env_id: str, env: gymnasium.Env[Any, Any], wrapper: Wrapper) -> gymn
     where = f"environment {env_id}, wrapper {wrapper.wrapper!r}"
     module, colon, name = wrapper.wrapper.rpartition(":")
     try:
-        found = importlib.import_module(module if colon else "gymnasium.wrappers")
-        make = getattr(found, name)
+        module_found = importlib.import_module(module if colon else "gymnasium.wrappers")
+        make = getattr(module_found, name)
     except (ImportError, AttributeError, ValueError) as error:
-        near = [] if colon else difflib.get_close_matches(name, dir(found), n=3)
+        near = [] if colon else difflib.get_close_matches(name, dir(module_found), n=3)
         hint = f"near: {', '.join(near)}" if near else "say a class of gymnasium.wrappers, or module:Class"
         raise WorkerError(f"{where}: no wrapper has this name; {hint}") from error
     except Exception as error:

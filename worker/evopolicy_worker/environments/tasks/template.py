@@ -215,8 +215,8 @@ def _maze(env: gymnasium.Env[Any, Any]) -> str:
 
 def _sections(text: str) -> dict[str, str]:
     """A text's sections by heading, those above the first heading under ""."""
-    found = re.split(r"^## (.+)\n", f"\n{text}", flags=re.MULTILINE)
-    return {name: part.strip() for name, part in zip(("", *found[1::2]), found[::2], strict=True)}
+    parts = re.split(r"^## (.+)\n", f"\n{text}", flags=re.MULTILINE)
+    return {name: part.strip() for name, part in zip(("", *parts[1::2]), parts[::2], strict=True)}
 
 
 def clean(given: str) -> str:
@@ -227,10 +227,10 @@ def clean(given: str) -> str:
 def _documentation(env: gymnasium.Env[Any, Any]) -> str:
     """The docstring of the environment's class, with headings two levels down; empty when the class has none of its
     own."""
-    found = clean(inspect.getdoc(type(env.unwrapped)) or "") if "__doc__" in vars(type(env.unwrapped)) else ""
-    if len(found) > MAX_DOCUMENTATION:
-        found = found[:MAX_DOCUMENTATION].rpartition("\n")[0] + "\n\n(The documentation goes on.)"
-    return re.sub(r"^(#+) ", r"##\1 ", found.strip(), flags=re.MULTILINE)
+    text = clean(inspect.getdoc(type(env.unwrapped)) or "") if "__doc__" in vars(type(env.unwrapped)) else ""
+    if len(text) > MAX_DOCUMENTATION:
+        text = text[:MAX_DOCUMENTATION].rpartition("\n")[0] + "\n\n(The documentation goes on.)"
+    return re.sub(r"^(#+) ", r"##\1 ", text.strip(), flags=re.MULTILINE)
 
 
 def _space(space: SpaceSchema) -> str:

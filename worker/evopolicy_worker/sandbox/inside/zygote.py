@@ -144,9 +144,9 @@ def module(name: str) -> Any:
     spec = importlib.util.spec_from_file_location(f"_{name}", path)
     assert spec is not None
     assert spec.loader is not None
-    found = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(found)
-    return found
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
 
 
 def warm(modules: list[str]) -> None:
