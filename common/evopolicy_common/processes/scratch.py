@@ -97,7 +97,7 @@ def _flatten_away(folder: Path) -> None:
     folder.chmod(0o700)
     root = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
     try:
-        names = (f"{secrets.token_hex(8)}-{n}" for n in itertools.count())
+        fresh = (f"{secrets.token_hex(8)}-{n}" for n in itertools.count())
         names = os.listdir(root)
         while names:
             name = names.pop()
@@ -111,7 +111,7 @@ def _flatten_away(folder: Path) -> None:
                     if _is_folder(child, inner):
                         # Moving a folder to another parent needs write permission on the folder.
                         os.chmod(child, 0o700, dir_fd=inner)
-                    os.rename(child, here := next(names), src_dir_fd=inner, dst_dir_fd=root)
+                    os.rename(child, here := next(fresh), src_dir_fd=inner, dst_dir_fd=root)
                     names.append(here)
             finally:
                 os.close(inner)

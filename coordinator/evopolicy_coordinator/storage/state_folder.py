@@ -218,9 +218,9 @@ def _linked(root: Path) -> Path:
                     and status.st_uid == os.getuid()
                     and not status.st_mode & 0o022
                 ):
-                    for link in folder.iterdir():  # of deleted state folders
-                        if link.is_symlink() and not link.exists():
-                            link.unlink(missing_ok=True)
+                    for other in folder.iterdir():  # of deleted state folders
+                        if other.is_symlink() and not other.exists():
+                            other.unlink(missing_ok=True)
                     new = folder / f"{name}.{os.getpid()}"
                     new.unlink(missing_ok=True)
                     new.symlink_to(root)
