@@ -271,6 +271,12 @@ def replay(
         Path, typer.Argument(help="A run that was played with --record-model full.", show_default=False)
     ],
     runs: Annotated[Path, typer.Option(help="Folder of the replayed runs.")] = Path("replayed"),
+    trust: Annotated[
+        bool,
+        typer.Option(
+            "--trust", help="Also replay a run that was recorded by others: it runs their programs."
+        ),
+    ] = False,
     connect: Connect = None,
     credentials_file: CredentialsFile = None,
     cluster: Annotated[
@@ -283,7 +289,7 @@ def replay(
     Starts a local cluster unless --connect or --credentials name one.
     """
     with fail_on_our_errors():
-        plan = recorded_agent.plan_of(folder_of(run_directory).root, runs)
+        plan = recorded_agent.plan_of(folder_of(run_directory).root, runs, trusted=trust)
         plan.check()
         local = not (connect or credentials_file)
         where = options.cluster_of(cluster, connect, credentials_file, local=local)

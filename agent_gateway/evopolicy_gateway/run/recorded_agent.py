@@ -1,12 +1,16 @@
 """What `evopolicy replay` needs of a recorded run besides its record of model calls: its plan and its addresses.
 
 `.replay.json` in the run's folder (mode 0600) has both. It is never published: it names paths, and tokens that were
-valid while the run was open.
+valid while the run was open. A replay runs the programs that the plan names, some of them without a jail. So a file
+that was not written by this user on this machine is refused: its authentication code needs this user's key.
 """
 
 from __future__ import annotations
 
+import contextlib
+import hmac
 import os
+import secrets
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +22,7 @@ from evopolicy_common.records.blobs import write_atomically
 from evopolicy_common.records.run_difference import differences
 from evopolicy_common.records.secrets import without_keys
 from evopolicy_common.regular_files import read_regular
+from evopolicy_common.wire.credentials import state_home
 from evopolicy_gateway import harnesses
 from evopolicy_gateway.relay.replaying import DIFFERENCE
 from evopolicy_gateway.run.plan import Plan, Replays
@@ -34,6 +39,8 @@ class Recorded(msgspec.Struct, frozen=True, kw_only=True):
 
     plan: dict[str, Any]
     replays: dict[str, Any]
+    code: str = ""
+    """HMAC-SHA256 of plan and replays, hex."""
 
 
 def keep(folder: RunFolder, plan: Plan, replays: Replays) -> None:
@@ -41,11 +48,13 @@ def keep(folder: RunFolder, plan: Plan, replays: Replays) -> None:
     config = plan.agent_config or harnesses.config_of(plan.agent, plan.started_in)
     whole = msgspec.structs.replace(plan, config=config, prices=None)
     kept = Recorded(plan=without_keys(_plain(whole)), replays=_plain(replays))
+    kept = msgspec.structs.replace(kept, code=_code(kept))
     write_atomically(folder.replay, msgspec.json.encode(kept), mode=0o600)
 
 
-def plan_of(run: Path, runs: Path) -> Plan:
-    """The plan that plays the agent of the run directory again, below `runs`. Raises ConfigError."""
+def plan_of(run: Path, runs: Path, *, trusted: bool = False) -> Plan:
+    """The plan that plays the agent of the run directory again, below `runs`. `trusted`: also one that was written
+    elsewhere. Raises ConfigError."""
     folder = RunFolder(run.absolute())
     try:
         kept = msgspec.json.decode(read_regular(folder.replay, _MAX_BYTES), type=Recorded)
@@ -57,6 +66,11 @@ def plan_of(run: Path, runs: Path) -> Plan:
         ) from error
     except (OSError, *DECODE_ERRORS) as error:
         raise ConfigError(f"{folder.replay} cannot be read: {error}") from error
+    if not trusted and not (kept.code and hmac.compare_digest(kept.code, _code(kept))):
+        raise ConfigError(
+            f"{run} was not recorded by you on this machine, and a replay runs the programs that it names: read"
+            f" {folder.replay}, then repeat with --trust"
+        )
     if why := model_record.stopped(folder.root):
         raise ConfigError(f"the record of {run} is not whole, and cannot be replayed: {why}")
     for name in _keys(plan):
@@ -89,6 +103,22 @@ def _keys(plan: Plan) -> tuple[str, ...]:
         return ()
     own = {"codex": ("OPENAI_API_KEY",), "claude-code": ("ANTHROPIC_API_KEY",)}
     return (*config.secret, *(() if config.api else own.get(config.harness, ())))
+
+
+def _code(kept: Recorded) -> str:
+    """The code with this user's key; empty where no key can be kept."""
+    path = state_home() / "replay.key"
+    try:
+        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        with contextlib.suppress(FileExistsError):
+            file = os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600)
+            os.write(file, secrets.token_bytes(32))
+            os.close(file)
+        key = path.read_bytes()
+    except OSError:
+        return ""
+    data = msgspec.json.encode((kept.plan, kept.replays), order="sorted")
+    return hmac.new(key, data, "sha256").hexdigest() if len(key) == 32 else ""
 
 
 def _plain(value: Any) -> Any:

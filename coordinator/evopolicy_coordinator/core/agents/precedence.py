@@ -172,14 +172,14 @@ def _train(state: State, lane: Lane, there: dict[Kernel, None], step: Step) -> N
     for name in waiting:
         run = state.runs.get(name)
         open_group = "" if run is None or run.open is None else train_group(run.id, run.open)
-        group = state.groups.get(open_group)
+        submitted = state.groups.get(open_group)
         if (
-            group is None
-            or group.n_leased
-            or group.flow.lane is not lane
-            or group.flow.case_set not in barred
+            submitted is None
+            or submitted.n_leased
+            or submitted.flow.lane is not lane
+            or submitted.flow.case_set not in barred
         ):
             continue
-        if group.held_since is None:
-            group.held_since = step.now
-            state.held[group] = None
+        if submitted.held_since is None:
+            submitted.held_since = step.now
+            state.held[submitted] = None

@@ -290,7 +290,11 @@ def test_a_recorded_agent_replays_to_the_byte_without_its_model(
     document = json.loads(kept.read_bytes())
     document["plan"]["config"]["api"]["system"] = "You are somebody else."
     kept.write_text(json.dumps(document))
+    # The file names programs that a replay runs: one that was changed, or made by others, is not trusted.
     with command(tmp_path, *again) as running:
+        assert running.finish()[0] == 2
+        assert "was not recorded by you on this machine" in running.text
+    with command(tmp_path, *again, "--trust") as running:
         code, out, _ = running.finish()
     assert code == 1
     assert out.startswith("request 0 to ")
