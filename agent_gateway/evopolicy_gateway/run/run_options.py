@@ -112,7 +112,7 @@ class RunOptions(PolicyPart, frozen=True, kw_only=True):
 
     group: ClassVar[str] = "Agent"
 
-    start_from: Annotated[str | None, Option(metavar="RUN@submit_NNN")] = None
+    start_from: Annotated[str | None, Option(metavar="RUN@submit_NNN", suite=str)] = None
     """Start with the workspace as it was at that submit of an earlier run of this cluster, and its feedback below
     history/. The run has a full budget of its own."""
     agents_md: Annotated[Path | None, Option(metavar="FILE")] = None

@@ -1,8 +1,8 @@
 """Starting a run from a submit of an earlier one: `--start-from RUN@submit_NNN`.
 
 Rules that this module owns:
-- The new workspace is the recorded tree and, read-only below `history/`, the train feedback up to that submit.
-  Nothing else of the earlier run is read: once it has ended, its `workspace/system/` shows the selected policy.
+- The new workspace is the recorded tree and, read-only below `history/`, the train feedback up to that
+  submit. Nothing else of the earlier run is read: its final `workspace/system/` shows the selected policy.
 - The coordinator accepts a start only with the digest that the earlier run's gateway sent with the submit.
 """
 
@@ -35,12 +35,13 @@ class Found(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def find(text: str, started_in: Path) -> Found:
-    """The submit that `RUN@submit_NNN` names, RUN relative to `started_in`. Raises ConfigError that names the fault."""
+    """The submit that `RUN@submit_NNN` names, RUN relative to `started_in`. ConfigError that names the fault."""
     place, _, submit = text.rpartition("@")
     number = trees.submit_number(submit)
     if not place or number is None:
         raise ConfigError(
-            f"--start-from {text!r}: use the form RUN@submit_NNN, such as runs/evolve/gym_acrobot/first@submit_007"
+            f"--start-from {text!r}: use the form RUN@submit_NNN, such as"
+            " runs/evolve/gym_acrobot/first@submit_007"
         )
     folder = RunFolder((started_in / place).absolute())
     try:
@@ -63,7 +64,7 @@ def find(text: str, started_in: Path) -> Found:
 
 
 def stage(found: Found, folder: RunFolder) -> None:
-    """Makes the workspace of a new run. Raises StorageError for a missing content, and where the disk refuses."""
+    """Makes the workspace of a new run. StorageError for a missing content, and where the disk refuses."""
     folder.workspace.mkdir()
     trees.restore(found.folder, found.tree, folder.workspace)
     source = RunFolder(found.folder)

@@ -1,11 +1,12 @@
 """The workspace at each submit, as a tree: a list of its files, each by the digest of its content.
 
 Rules that this module owns:
-- A tree holds regular files of the workspace only, none by a link. `LEFT_OUT` belongs to the service or to an earlier
-  run. The agent's home and logins lie elsewhere, and a file in which a key is found is left out.
+- A tree holds regular files of the workspace only, none by a link. `LEFT_OUT` belongs to the service or to an
+  earlier run. The agent's home and logins lie elsewhere, and a file in which a key is found is left out.
 - `system/` is that of the submit's bundle if there is one, so that the tree has exactly the submitted policy.
-- Files, entries and bytes are bounded. A tree lists what it omits, with the reason; recording never fails a submit.
-- `trees/submit_NNN.json` in the run's folder is the tree (its digest: the file's SHA-256). Each content is stored once.
+- Files, entries and bytes are bounded. A tree lists its omissions with the reasons. Recording fails no submit.
+- `trees/submit_NNN.json` in the run's folder is the tree, and its SHA-256 the tree's digest. Each content is stored
+  once.
 """
 
 from __future__ import annotations
@@ -88,8 +89,8 @@ def name_of(folder: Path, index: int) -> str:
 
 
 def changes(folder: Path, index: int) -> str:
-    """Files outside `system/` in which the workspace at a submit differs from the one at the submit before, in words;
-    empty where there are none, or no tree. `folder`: the run's."""
+    """Files outside `system/` in which the workspace differs from that at the submit before, in words; empty where
+    there are none, or no tree. `folder`: the run's."""
     found: list[dict[str, str]] = []
     omitted = 0
     for number in (index - 1, index):
@@ -119,7 +120,7 @@ def submit_number(name: str) -> int | None:
 
 
 def read(folder: Path, submit: str) -> tuple[Tree, str]:
-    """A tree of the run at `folder`, and its digest. Raises ConfigError when there is none, or it is damaged."""
+    """A tree of the run at `folder`, and its digest. Raises ConfigError for a missing or damaged one."""
     path = folder / TREES / f"{submit}.json"
     try:
         data = read_regular(path, _MAX_MANIFEST)
@@ -142,8 +143,8 @@ def read(folder: Path, submit: str) -> tuple[Tree, str]:
 
 
 def restore(folder: Path, tree: Tree, workspace: Path) -> None:
-    """Writes the files of a tree of the run at `folder` below `workspace`. Raises StorageError for a missing or wrong
-    content, and where the disk refuses."""
+    """Writes the files of a tree of the run at `folder` below `workspace`. Raises StorageError for a missing or
+    wrong content, and where the disk refuses."""
     blobs = BlobStore(folder / TREES)
     for file in tree.files:
         try:
@@ -158,8 +159,9 @@ def restore(folder: Path, tree: Tree, workspace: Path) -> None:
 def copy_history(
     feedback: Path, history: Path, last: int, to: Path, most: int = MAX_STORED_BYTES
 ) -> dict[str, str]:
-    """Copies the feedback of the submits up to index `last`, and the run's own `history` as `earlier/`, to the folder
-    `to`, read-only. Returns the omissions: beyond `most` bytes, what is no regular file, and links."""
+    """Copies the feedback of the submits up to index `last`, and the run's own `history` as `earlier/`, to the
+    folder `to`, read-only. Returns the omissions, with reasons: links, special files, and files beyond `most` bytes.
+    """
     omitted: dict[str, str] = {}
     names = sorted(os.listdir(feedback)) if feedback.is_dir() and not feedback.is_symlink() else []
     kept = [name for name in names if (number := submit_number(name)) is not None and number <= last]
@@ -198,8 +200,8 @@ class Recorder:
         """By path, the files that need not be read again."""
 
     def record(self, submit: str, bundle: Bundle | None, passed: Passed | None) -> str:
-        """Records the workspace now and returns the tree's digest. `bundle`: of this submit's `system/`; `passed`:
-        values of the run that are left out as keys are. Raises OSError and StorageError where the disk refuses."""
+        """Records the workspace now and returns the tree's digest. `bundle`: of this submit's `system/`. `passed`:
+        values of the run, left out as keys are. Raises OSError and StorageError where the disk refuses."""
         files: list[TreeFile] = []
         omitted: dict[str, str] = {}
         seen: dict[str, _Seen] = {}
@@ -272,8 +274,8 @@ def _of(bundle: Bundle | None) -> Iterator[tuple[str, BundleFile]]:
 
 
 def _walk(root: Path, leave_out: Collection[str], most: int) -> Iterator[tuple[str, BinaryIO | str]]:
-    """The regular files below `root`, open, by path; a text in place of one that is left out: why. No link is followed.
-    `most`: files and folders to look at."""
+    """The regular files below `root`, open, by path; the reason in place of one that is left out. No link is
+    followed. `most`: files and folders to look at."""
     flags = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
     left = most
 

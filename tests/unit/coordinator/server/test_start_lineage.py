@@ -66,7 +66,7 @@ def start_of(world: World, created: Any) -> Start:
     return start
 
 
-def test_a_start_from_an_open_run_is_not_scored_and_is_committed_to(tmp_path: Path) -> None:
+def test_a_start_from_an_open_run_is_committed_to_as_unscored(tmp_path: Path) -> None:
     async def scenario(world: World) -> None:
         before = await parent(world)
         wanted = Start(run=before.run, submit_index=0, tree=TREE, parent_scored=True)
@@ -109,7 +109,7 @@ def test_a_forged_start_is_refused(tmp_path: Path, forged: str) -> None:
     play(tmp_path, scenario)
 
 
-def test_a_start_from_an_ended_run_is_stamped_and_hands_the_stamp_on(tmp_path: Path) -> None:
+def test_a_start_from_an_ended_run_hands_its_stamp_on(tmp_path: Path) -> None:
     async def scenario(world: World) -> None:
         before = await parent(world)
         message = gateway.CloseRun(run=before.run, token=before.capability, reason="agent_stopped", agent={})
