@@ -234,7 +234,7 @@ def run_record(
         versions=_versions(finished, staged),
         audit=finished.audit,
         committed=finished.committed,
-        start=settings.start,
+        start=settings.start or plan.settings.start,  # an older coordinator keeps none
         trees={str(submit.submit_index): submit.tree for submit in finished.submits if submit.tree},
     )
 
