@@ -1,8 +1,8 @@
-"""Measures random actions and the policy of this repository in Core16 and an environment of every family, and writes
-both into the catalogue: `python docs/_site/anchors.py [ID…]`.
+"""Measures random actions and the policy of this repository in Core16 and an environment of every family, and
+writes both into the catalogue: `python docs/_site/anchors.py [ID…]`.
 
-The cases are drawn by the environment's name, so that nobody chose them. Episodes are whole, played in this process,
-without sandbox or limits. Without ids it measures those that have no anchor yet. It also writes the table of
+The cases are drawn by the environment's name, so that nobody chose them. Episodes are whole, played in this
+process, without sandbox or limits. Without ids it measures those that have no anchor yet. It also writes the table of
 docs/reference/environments.md.
 """
 

@@ -62,3 +62,10 @@ def test_a_folder_without_the_environment_is_played_itself(tmp_path: Path) -> No
     for name in ("my_env:Glider-v0", "my_env_Glider-v0"):  # the second is preferred
         (tmp_path / name).mkdir()
         assert folder_for(tmp_path, "my_env:Glider-v0") == tmp_path / name
+
+
+def test_a_world_is_played_by_the_policies_of_the_unchanged_environment(tmp_path: Path) -> None:
+    (tmp_path / "gym_acrobot").mkdir()
+    assert folder_for(tmp_path, "gym/acrobot@w2") == tmp_path / "gym_acrobot"
+    (tmp_path / "gym_acrobot@w2").mkdir()
+    assert folder_for(tmp_path, "gym/acrobot@w2") == tmp_path / "gym_acrobot@w2"

@@ -68,8 +68,8 @@ def suite(
         str,
         typer.Argument(
             help=(
-                "TOML file, or one of smoke.toml, breadth.toml, core16.toml, core16-paper.toml, core16-published.toml,"
-                " which come with evopolicy."
+                "TOML file, or one of smoke.toml, breadth.toml, world-controls.toml, core16.toml, core16-paper.toml,"
+                " core16-published.toml, which come with evopolicy."
             )
         ),
     ],

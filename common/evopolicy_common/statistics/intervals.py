@@ -169,7 +169,7 @@ def stratified(strata: Sequence[Stratum], weights: Sequence[float], over: Over) 
     if not math.isfinite(total):
         return Estimate(value=value, over=over, reason=TOO_FEW_UNITS)
     if total <= (_RELATIVE_ZERO * max(1e-300, *(abs(each.value) for each in strata))) ** 2:
-        return Estimate(value=value, over=over, reason=no_spread(len(strata), "means"))
+        return Estimate(value=value, over=over, reason="no spread")
     shares = [(v / total) ** 2 / each.df for v, each in zip(variances, strata, strict=True) if v > 0.0]
     return _t_interval(value, total, 1.0 / sum(shares), "stratified t", over)
 
