@@ -12,7 +12,7 @@ import errno
 import json
 import os
 import re
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -95,16 +95,8 @@ async def serving(tmp_path: Path, listener: Listener | None = None) -> AsyncIter
             yield Wire(service, tmp_path)
 
 
-def play(tmp_path: Path, script: Callable[[Wire], Awaitable[None]]) -> None:
-    async def main() -> None:
-        async with serving(tmp_path) as wire:
-            await script(wire)
-
-    asyncio.run(main())
-
-
-def test_no_trick_with_a_path_reaches_a_file_or_another_answer(tmp_path: Path) -> None:
-    async def script(w: Wire) -> None:
+async def test_no_trick_with_a_path_reaches_a_file_or_another_answer(tmp_path: Path) -> None:
+    async with serving(tmp_path) as w:
         nothing = await w.ask(f"{w.path}/nothing")
         assert status(nothing) == 404
         tricks = [
@@ -136,11 +128,9 @@ def test_no_trick_with_a_path_reaches_a_file_or_another_answer(tmp_path: Path) -
         assert status(await w.ask(f"{w.path}/info")) == 200
         await w.submit_honestly(0)
 
-    play(tmp_path, script)
 
-
-def test_a_submit_that_is_guessed_is_one_of_its_own_or_none(tmp_path: Path) -> None:
-    async def script(w: Wire) -> None:
+async def test_a_submit_that_is_guessed_is_one_of_its_own_or_none(tmp_path: Path) -> None:
+    async with serving(tmp_path) as w:
         await w.submit_honestly(0)
         own = await w.ask(f"{w.path}/submit/submit_000")
         assert status(own) == 200
@@ -169,11 +159,9 @@ def test_a_submit_that_is_guessed_is_one_of_its_own_or_none(tmp_path: Path) -> N
             assert await w.ask(f"{w.path}/submit/{guess}") == nothing, guess
         await w.submit_honestly(1)
 
-    play(tmp_path, script)
 
-
-def test_a_request_inside_another_body_is_served_only_with_the_token(tmp_path: Path) -> None:
-    async def script(w: Wire) -> None:
+async def test_a_request_inside_another_body_is_served_only_with_the_token(tmp_path: Path) -> None:
+    async with serving(tmp_path) as w:
         head = f"POST {w.path}/submit HTTP/1.1\r\nHost: {w.host}\r\n"
         inner = f"{head}Content-Length: {len(BODY)}\r\nConnection: close\r\n\r\n".encode() + BODY
         chunk = b"%x\r\n%s\r\n0\r\n\r\n" % (len(BODY), BODY)
@@ -208,25 +196,20 @@ def test_a_request_inside_another_body_is_served_only_with_the_token(tmp_path: P
         assert answer.count(b"HTTP/1.1 200") == 1
         await w.submit_honestly(n + 1)
 
-    play(tmp_path, script)
+
+async def test_a_smuggled_request_needs_the_bearer_token_again(tmp_path: Path) -> None:
+    async with serving(tmp_path, Listener(host="127.0.0.2", port=0)) as w:
+        bearer = w.served.folder.bearer.read_text().strip()
+        request = f"GET {w.path}/info HTTP/1.1\r\nHost: {w.host}\r\n"
+        mine = f"{request}Authorization: Bearer {bearer}\r\n\r\n".encode()
+        stranger = f"{request}Connection: close\r\n\r\n".encode()
+        answer = await w.send(mine + stranger)
+        assert [status(one) for one in re.findall(rb"HTTP/1\.1 \d+", answer)] == [200, 401]
+        assert bearer.encode() not in answer
 
 
-def test_a_smuggled_request_needs_the_bearer_token_again(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with serving(tmp_path, Listener(host="127.0.0.2", port=0)) as w:
-            bearer = w.served.folder.bearer.read_text().strip()
-            request = f"GET {w.path}/info HTTP/1.1\r\nHost: {w.host}\r\n"
-            mine = f"{request}Authorization: Bearer {bearer}\r\n\r\n".encode()
-            stranger = f"{request}Connection: close\r\n\r\n".encode()
-            answer = await w.send(mine + stranger)
-            assert [status(one) for one in re.findall(rb"HTTP/1\.1 \d+", answer)] == [200, 401]
-            assert bearer.encode() not in answer
-
-    asyncio.run(main())
-
-
-def test_a_huge_query_and_odd_headers_change_nothing(tmp_path: Path) -> None:
-    async def script(w: Wire) -> None:
+async def test_a_huge_query_and_odd_headers_change_nothing(tmp_path: Path) -> None:
+    async with serving(tmp_path) as w:
         assert status(await w.ask(f"{w.path}/info?{'a=b&' * 7000}")) == 200
         for size in (200_000, 1 << 20):
             assert status(await w.ask(f"{w.path}/info?{'a' * size}")) in (0, 400)
@@ -249,21 +232,19 @@ def test_a_huge_query_and_odd_headers_change_nothing(tmp_path: Path) -> None:
         assert b"101 " not in await w.ask(f"{w.path}/info", head=upgrade)
         await w.submit_honestly(0)
 
-    play(tmp_path, script)
 
-
-def test_requests_that_cannot_be_read_fill_no_log(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    async def script(w: Wire) -> None:
+async def test_requests_that_cannot_be_read_fill_no_log(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    async with serving(tmp_path) as w:
         for _ in range(20):
             assert status(await w.send(b"\x1b[2J\r\n\r\n")) == 400
         assert caplog.records == []
         await w.submit_honestly(0)
 
-    play(tmp_path, script)
 
-
-def test_one_request_with_two_keys_is_one_submit(tmp_path: Path) -> None:
-    async def script(w: Wire) -> None:
+async def test_one_request_with_two_keys_is_one_submit(tmp_path: Path) -> None:
+    async with serving(tmp_path) as w:
         head = f"Idempotency-Key: one\r\nIdempotency-Key: two\r\nContent-Length: {len(BODY)}\r\n"
         first = await w.ask(f"{w.path}/submit", "POST", head, BODY)
         again = await w.ask(f"{w.path}/submit", "POST", head, BODY)
@@ -271,13 +252,12 @@ def test_one_request_with_two_keys_is_one_submit(tmp_path: Path) -> None:
         assert status(first) == 200
         await w.submit_honestly(1)
 
-    play(tmp_path, script)
 
-
-def test_a_fault_of_ours_is_reported_without_a_word_of_it(
+async def test_a_fault_of_ours_is_reported_without_a_word_of_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    async def script(w: Wire) -> None:
+    async with serving(tmp_path) as w:
+
         async def fail() -> None:
             raise RuntimeError(f"{tmp_path} {w.served.double.capability}")
 
@@ -290,10 +270,8 @@ def test_a_fault_of_ours_is_reported_without_a_word_of_it(
         )
         await w.submit_honestly(0)
 
-    play(tmp_path, script)
 
-
-def test_feedback_that_cannot_be_written_is_reported_without_the_machines_paths(
+async def test_feedback_that_cannot_be_written_is_reported_without_the_machines_paths(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(submits, "DISK_PAUSE_S", 0.1)
@@ -301,7 +279,7 @@ def test_feedback_that_cannot_be_written_is_reported_without_the_machines_paths(
     def refuse(tree: SubmitTree) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(tree.final))
 
-    async def script(w: Wire) -> None:
+    async with serving(tmp_path) as w:
         length = f"Content-Length: {len(BODY)}\r\n"
         with monkeypatch.context() as patched:
             patched.setattr(SubmitTree, "begin", refuse)
@@ -313,5 +291,3 @@ def test_feedback_that_cannot_be_written_is_reported_without_the_machines_paths(
         assert waits_for == "the gateway cannot write feedback: No space left on device"
         await w.served.pipeline.idle()
         await w.submit_honestly(1)
-
-    play(tmp_path, script)

@@ -32,7 +32,7 @@ async def output(program: list[str], cwd: Path) -> str:
     return out.decode()
 
 
-def test_every_command_in_the_rules_runs_as_it_stands(tmp_path: Path) -> None:
+async def test_every_command_in_the_rules_runs_as_it_stands(tmp_path: Path) -> None:
     async def script(s: Served) -> None:
         workspace = s.folder.workspace
         text = (workspace / "AGENTS.md").read_text()
@@ -55,23 +55,17 @@ def test_every_command_in_the_rules_runs_as_it_stands(tmp_path: Path) -> None:
         exec(interface, scope)
         assert {"__init__", "reset", "act"} <= set(vars(scope["Policy"]))
 
-    async def main() -> None:
-        async with served(tmp_path) as service:
-            await script(service)
-
-    asyncio.run(main())
+    async with served(tmp_path) as service:
+        await script(service)
 
 
-def test_every_path_in_the_rules_exists_after_a_submit(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with served(tmp_path) as s:
-            await s.http.post(s.urls.submit, json={"env_instances": [0]})
-            text = (s.folder.workspace / "AGENTS.md").read_text()
-            for path in ("system/", "feedback/", "AGENTS.md"):
-                assert f"`{path}`" in text
-                assert (s.folder.workspace / path).exists()
-
-    asyncio.run(main())
+async def test_every_path_in_the_rules_exists_after_a_submit(tmp_path: Path) -> None:
+    async with served(tmp_path) as s:
+        await s.http.post(s.urls.submit, json={"env_instances": [0]})
+        text = (s.folder.workspace / "AGENTS.md").read_text()
+        for path in ("system/", "feedback/", "AGENTS.md"):
+            assert f"`{path}`" in text
+            assert (s.folder.workspace / path).exists()
 
 
 def test_rules_forbid_every_rollout_outside_a_submit_unless_the_run_allows_it() -> None:

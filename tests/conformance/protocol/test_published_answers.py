@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import asyncio
 import json
-from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Any
 
@@ -21,14 +19,6 @@ FAILURES: dict[str, Any] = json.loads((GOLDEN / "published_failures.json").read_
 
 def double() -> Double:
     return Double(opened(profile="published", policy_scope="submit", n_env_instances=1024))
-
-
-def play(tmp_path: Path, script: Callable[[Served], Awaitable[None]], of: Double | None = None) -> None:
-    async def main() -> None:
-        async with served(tmp_path, of or double()) as service:
-            await script(service)
-
-    asyncio.run(main())
 
 
 async def n_submits(s: Served) -> int:
@@ -80,28 +70,24 @@ def expanded(value: Any) -> list[Any]:
     return [number for part in parts for number in range(int(part[0]), int(part[-1]) + 1)]
 
 
-def test_odd_requests_have_the_published_answers_counts_and_folders(tmp_path: Path) -> None:
-    async def script(s: Served) -> None:
+async def test_odd_requests_have_the_published_answers_counts_and_folders(tmp_path: Path) -> None:
+    async with served(tmp_path, double()) as s:
         for row in REQUESTS["before"]:
             await check_row(s, row)
         assert (await s.http.get(s.urls.info)).json()["state"]["is_finalized"]
         for row in REQUESTS["after"]:
             await check_row(s, row)
 
-    play(tmp_path, script)
 
-
-def test_a_body_that_is_not_utf8_is_a_clear_bad_request(tmp_path: Path) -> None:
-    async def script(s: Served) -> None:
+async def test_a_body_that_is_not_utf8_is_a_clear_bad_request(tmp_path: Path) -> None:
+    async with served(tmp_path, double()) as s:
         answer = await s.http.post(s.urls.submit, content=b'{"env_instances": "\xff"}')
         assert (answer.status_code, answer.json()["status"]) == (400, "bad_request")
         assert await n_submits(s) == 0
 
-    play(tmp_path, script)
 
-
-def test_echoed_true_is_played_as_the_train_id_one(tmp_path: Path) -> None:
-    async def script(s: Served) -> None:
+async def test_echoed_true_is_played_as_the_train_id_one(tmp_path: Path) -> None:
+    async with served(tmp_path, double()) as s:
         document = (await s.http.post(s.urls.submit, json={"env_instances": [True]})).json()
         assert document["summary"]["env_instances"] == [True]
         assert document["summary"]["env_instances"][0] is True
@@ -109,14 +95,12 @@ def test_echoed_true_is_played_as_the_train_id_one(tmp_path: Path) -> None:
         data = (s.folder.feedback / "submit_000/summary.json").read_bytes()
         assert decode_summary(data).env_instances == (True,)
 
-    play(tmp_path, script)
-
 
 @pytest.mark.parametrize("row", REQUESTS["urls"], ids=lambda row: f"{row[0]} {row[1]}")
-def test_odd_urls_and_methods_have_the_published_answers(tmp_path: Path, row: list[Any]) -> None:
+async def test_odd_urls_and_methods_have_the_published_answers(tmp_path: Path, row: list[Any]) -> None:
     method, path, code, wanted = row
 
-    async def script(s: Served) -> None:
+    async with served(tmp_path, double()) as s:
         answer = await s.http.request(method, s.urls.api + path)
         assert answer.status_code == code
         if isinstance(wanted, dict):
@@ -128,14 +112,12 @@ def test_odd_urls_and_methods_have_the_published_answers(tmp_path: Path, row: li
             assert answer.headers["content-type"] == "text/html;charset=utf-8"
             assert bool(answer.content) is (wanted is not None)
 
-    play(tmp_path, script)
 
-
-def test_a_failed_episode_has_the_published_summary(tmp_path: Path) -> None:
+async def test_a_failed_episode_has_the_published_summary(tmp_path: Path) -> None:
     failing = double()
     failing.failures[1] = PolicyFailure(category="act_error", step_index=2, message="no", traceback="T")
 
-    async def script(s: Served) -> None:
+    async with served(tmp_path, failing) as s:
         answer = await s.http.post(s.urls.submit, json={"env_instances": [0, 1, 2]})
         document = answer.json()
         assert answer.status_code == 200
@@ -148,8 +130,6 @@ def test_a_failed_episode_has_the_published_summary(tmp_path: Path) -> None:
         wanted = FAILURES["errors_txt"]
         assert {name: json.loads(line)[name] for name in wanted} == wanted
         assert (await s.http.get(s.urls.info)).json()["state"]["remaining_budget"] == 9
-
-    play(tmp_path, script, failing)
 
 
 POLICIES = {
@@ -164,8 +144,10 @@ POLICIES = {
 
 
 @pytest.mark.parametrize(("source", "status"), POLICIES.items())
-def test_a_policy_is_missing_without_a_class_statement(tmp_path: Path, source: str, status: str) -> None:
-    async def script(s: Served) -> None:
+async def test_a_policy_is_missing_without_a_class_statement(
+    tmp_path: Path, source: str, status: str
+) -> None:
+    async with served(tmp_path, double()) as s:
         system = s.folder.system
         system.mkdir(exist_ok=True)
         (system / "policy.py").write_text(source)
@@ -173,30 +155,23 @@ def test_a_policy_is_missing_without_a_class_statement(tmp_path: Path, source: s
         assert (answer.status_code, answer.json()["status"]) == (200, status)
         assert (await s.http.get(s.urls.info)).json()["state"]["remaining_budget"] == 11
 
-    play(tmp_path, script)
 
-
-def test_a_syntax_error_in_any_file_is_an_import_error(tmp_path: Path) -> None:
-    async def script(s: Served) -> None:
+async def test_a_syntax_error_in_any_file_is_an_import_error(tmp_path: Path) -> None:
+    async with served(tmp_path, double()) as s:
         (s.folder.system / "unused.py").write_text("def (\n")
         answer = await s.http.post(s.urls.submit, json={"env_instances": [0]})
         assert answer.json()["status"] == "import_error"
         assert "system/unused.py" in (s.folder.feedback / "submit_000/errors.txt").read_text()
 
-    play(tmp_path, script)
 
-
-def test_counted_requests_keep_their_indices_after_a_restart_of_the_gateway(tmp_path: Path) -> None:
-    async def main() -> None:
-        coordinator = double()
-        async with answering(tmp_path, coordinator) as found:
-            folder = prepare(tmp_path / "run", found, coordinator)
-            async with gateway_on(folder, coordinator) as s:
-                for body in ({"env_instances": "a"}, {"env_instances": [5000]}):
-                    assert (await s.http.post(s.urls.submit, json=body)).status_code == 400
-            async with gateway_on(folder, coordinator) as s:
-                assert await n_submits(s) == 2
-                answer = await s.http.post(s.urls.submit, json={"env_instances": [0]})
-                assert (answer.status_code, answer.json()["submit_id"]) == (200, 2)
-
-    asyncio.run(main())
+async def test_counted_requests_keep_their_indices_after_a_restart_of_the_gateway(tmp_path: Path) -> None:
+    coordinator = double()
+    async with answering(tmp_path, coordinator) as found:
+        folder = prepare(tmp_path / "run", found, coordinator)
+        async with gateway_on(folder, coordinator) as s:
+            for body in ({"env_instances": "a"}, {"env_instances": [5000]}):
+                assert (await s.http.post(s.urls.submit, json=body)).status_code == 400
+        async with gateway_on(folder, coordinator) as s:
+            assert await n_submits(s) == 2
+            answer = await s.http.post(s.urls.submit, json={"env_instances": [0]})
+            assert (answer.status_code, answer.json()["submit_id"]) == (200, 2)

@@ -71,7 +71,7 @@ def check_submit(folder: Path, answer: dict[str, Any]) -> None:
             assert set(json.loads((episode / "error.txt").read_text())) >= ERROR_FIELDS | {"step_index"}
 
 
-def test_a_client_of_the_published_protocol_works_unchanged(tmp_path: Path) -> None:
+async def test_a_client_of_the_published_protocol_works_unchanged(tmp_path: Path) -> None:
     double = Double(opened())
     double.failures = {1: PolicyFailure(category="act_error", step_index=1, message="m", traceback="t")}
 
@@ -117,8 +117,5 @@ def test_a_client_of_the_published_protocol_works_unchanged(tmp_path: Path) -> N
         assert (status, document["status"]) == (409, "run_closed")
         assert post(submit.removesuffix("submit") + "finalize", {})[0] == 405
 
-    async def main() -> None:
-        async with served(tmp_path, double) as s:
-            await asyncio.to_thread(client, s.urls.environment(), s.folder.workspace)
-
-    asyncio.run(main())
+    async with served(tmp_path, double) as s:
+        await asyncio.to_thread(client, s.urls.environment(), s.folder.workspace)

@@ -43,153 +43,124 @@ async def refusal(link: Link, key: str, payload: bytes) -> str:
     return reply.status
 
 
-def test_wrong_join_token_is_refused(coordinator: Coordinator) -> None:
-    async def scenario() -> None:
-        async with connect(coordinator.credentials("worker")) as link:
+async def test_wrong_join_token_is_refused(coordinator: Coordinator) -> None:
+    async with connect(coordinator.credentials("worker")) as link:
+        with pytest.raises(RefusedError) as refused:
+            await InstantWorker(link).register(token="guess")
+        assert refused.value.status == "bad_token"
+
+
+async def test_worker_of_another_wire_version_is_told_what_to_do(coordinator: Coordinator) -> None:
+    async with connect(coordinator.credentials("worker")) as link:
+        instant = InstantWorker(link)
+        message = worker.Register(
+            worker="old",
+            token=link.credentials.token,
+            protocol=codec.WIRE_VERSION + 1,
+            slots=1,
+            tiers=(),
+            environments=(),
+            fingerprint=worker.Fingerprint(code_version="", python="", packages={}, cpu=""),
+        )
+        with pytest.raises(RefusedError, match="install the same version"):
+            await instant.ask.once("register", message, worker.Registered)
+
+
+async def test_unknown_session_is_refused_for_every_request_of_a_worker(coordinator: Coordinator) -> None:
+    async with connect(coordinator.credentials("worker")) as link:
+        instant = InstantWorker(link, "w-known")
+        await instant.register()
+        session = "guess"
+        for verb, message in (
+            ("lease", worker.LeaseRequest(worker="w-known", session=session, n=1, wait_s=0)),
+            ("beat", worker.Heartbeat(worker="w-known", session=session, held=())),
+            ("done", worker.ReportResults(worker="w-known", session=session, results=())),
+            ("blob", worker.BlobGet(sender="w-known", token=session, digest="0" * 64, offset=0)),
+            (
+                "blob",
+                worker.BlobPut(sender="w-known", token=session, digest="0" * 64, size=1, offset=0, data=b"x"),
+            ),
+        ):
             with pytest.raises(RefusedError) as refused:
-                await InstantWorker(link).register(token="guess")
-            assert refused.value.status == "bad_token"
-
-    run(scenario)
+                await instant.ask.once(verb, message, worker.Leases)
+            assert refused.value.status == "unknown_worker"
 
 
-def test_worker_of_another_wire_version_is_told_what_to_do(coordinator: Coordinator) -> None:
-    async def scenario() -> None:
-        async with connect(coordinator.credentials("worker")) as link:
-            instant = InstantWorker(link)
-            message = worker.Register(
-                worker="old",
-                token=link.credentials.token,
-                protocol=codec.WIRE_VERSION + 1,
-                slots=1,
-                tiers=(),
-                environments=(),
-                fingerprint=worker.Fingerprint(code_version="", python="", packages={}, cpu=""),
-            )
-            with pytest.raises(RefusedError, match="install the same version"):
-                await instant.ask.once("register", message, worker.Registered)
-
-    run(scenario)
+async def test_wrong_operator_token_is_refused(coordinator: Coordinator) -> None:
+    async with operator_of(coordinator) as client:
+        client.token = "guess"
+        with pytest.raises(RefusedError) as refused:
+            await client.status()
+        assert refused.value.status == "bad_token"
 
 
-def test_unknown_session_is_refused_for_every_request_of_a_worker(coordinator: Coordinator) -> None:
-    async def scenario() -> None:
-        async with connect(coordinator.credentials("worker")) as link:
-            instant = InstantWorker(link, "w-known")
-            await instant.register()
-            session = "guess"
-            for verb, message in (
-                ("lease", worker.LeaseRequest(worker="w-known", session=session, n=1, wait_s=0)),
-                ("beat", worker.Heartbeat(worker="w-known", session=session, held=())),
-                ("done", worker.ReportResults(worker="w-known", session=session, results=())),
-                ("blob", worker.BlobGet(sender="w-known", token=session, digest="0" * 64, offset=0)),
-                (
-                    "blob",
-                    worker.BlobPut(
-                        sender="w-known", token=session, digest="0" * 64, size=1, offset=0, data=b"x"
-                    ),
-                ),
-            ):
+async def test_gateway_of_one_run_can_do_nothing_with_another(coordinator: Coordinator) -> None:
+    async with operator_of(coordinator) as client:
+        mine, other = await client.create("mine"), await client.create("other")
+        async with gateway_of(coordinator, mine) as intruder:
+            thief = GatewayClient(intruder.ask._link, other.run, mine.capability)
+            blob = {"sender": other.run, "token": mine.capability, "digest": "0" * 64, "offset": 0}
+            asks: list[Callable[[], Awaitable[object]]] = [
+                thief.open,
+                thief.state,
+                thief.close,
+                lambda: thief.submit_digest("0" * 64, (0,), "key"),
+                lambda: thief.results(0),
+                lambda: thief.ask.once("blob", worker.BlobGet(**blob), worker.BlobChunk),
+                lambda: thief.ask.once("blob", worker.BlobPut(**blob, size=1, data=b"x"), worker.BlobAck),
+            ]
+            for ask in asks:
                 with pytest.raises(RefusedError) as refused:
-                    await instant.ask.once(verb, message, worker.Leases)
-                assert refused.value.status == "unknown_worker"
-
-    run(scenario)
-
-
-def test_wrong_operator_token_is_refused(coordinator: Coordinator) -> None:
-    async def scenario() -> None:
-        async with operator_of(coordinator) as client:
-            client.token = "guess"
-            with pytest.raises(RefusedError) as refused:
-                await client.status()
-            assert refused.value.status == "bad_token"
-
-    run(scenario)
+                    await ask()
+                assert refused.value.status == "bad_token"
+        async with gateway_of(coordinator, other) as owner:
+            assert not (await owner.state()).is_finalized
 
 
-def test_gateway_of_one_run_can_do_nothing_with_another(coordinator: Coordinator) -> None:
-    async def scenario() -> None:
-        async with operator_of(coordinator) as client:
-            mine, other = await client.create("mine"), await client.create("other")
-            async with gateway_of(coordinator, mine) as intruder:
-                thief = GatewayClient(intruder.ask._link, other.run, mine.capability)
-                blob = {"sender": other.run, "token": mine.capability, "digest": "0" * 64, "offset": 0}
-                asks: list[Callable[[], Awaitable[object]]] = [
-                    thief.open,
-                    thief.state,
-                    thief.close,
-                    lambda: thief.submit_digest("0" * 64, (0,), "key"),
-                    lambda: thief.results(0),
-                    lambda: thief.ask.once("blob", worker.BlobGet(**blob), worker.BlobChunk),
-                    lambda: thief.ask.once("blob", worker.BlobPut(**blob, size=1, data=b"x"), worker.BlobAck),
-                ]
-                for ask in asks:
-                    with pytest.raises(RefusedError) as refused:
-                        await ask()
-                    assert refused.value.status == "bad_token"
-            async with gateway_of(coordinator, other) as owner:
-                assert not (await owner.state()).is_finalized
-
-    run(scenario)
+async def test_unknown_run_is_answered_like_a_wrong_capability(coordinator: Coordinator) -> None:
+    async with connect(coordinator.credentials("gateway")) as link:
+        with pytest.raises(RefusedError) as unknown:
+            await GatewayClient(link, "r-nowhere", "guess").open()
+    async with operator_of(coordinator) as client:
+        created = await client.create("known")
+    async with connect(coordinator.credentials("gateway")) as link:
+        with pytest.raises(RefusedError) as wrong:
+            await GatewayClient(link, created.run, "guess").open()
+    assert (unknown.value.status, unknown.value.message) == (wrong.value.status, wrong.value.message)
 
 
-def test_unknown_run_is_answered_like_a_wrong_capability(coordinator: Coordinator) -> None:
-    async def scenario() -> None:
-        async with connect(coordinator.credentials("gateway")) as link:
-            with pytest.raises(RefusedError) as unknown:
-                await GatewayClient(link, "r-nowhere", "guess").open()
-        async with operator_of(coordinator) as client:
-            created = await client.create("known")
-        async with connect(coordinator.credentials("gateway")) as link:
-            with pytest.raises(RefusedError) as wrong:
-                await GatewayClient(link, created.run, "guess").open()
-        assert (unknown.value.status, unknown.value.message) == (wrong.value.status, wrong.value.message)
-
-    run(scenario)
+async def test_message_on_another_key_than_its_own_is_refused(coordinator: Coordinator) -> None:
+    async with operator_of(coordinator) as client:
+        created = await client.create("keys")
+    async with connect(coordinator.credentials("gateway")) as link:
+        state = codec.encode(gateway.StateRequest(run=created.run, token=created.capability))
+        for run, verb in ((created.run, "open"), ("r-other", "state"), (f"{created.run}/x", "state")):
+            assert await refusal(link, keys.gateway_key("local", run, verb), state) == "wrong_key"
 
 
-def test_message_on_another_key_than_its_own_is_refused(coordinator: Coordinator) -> None:
-    async def scenario() -> None:
-        async with operator_of(coordinator) as client:
-            created = await client.create("keys")
-        async with connect(coordinator.credentials("gateway")) as link:
-            state = codec.encode(gateway.StateRequest(run=created.run, token=created.capability))
-            for run, verb in ((created.run, "open"), ("r-other", "state"), (f"{created.run}/x", "state")):
-                assert await refusal(link, keys.gateway_key("local", run, verb), state) == "wrong_key"
-
-    run(scenario)
-
-
-def test_bytes_that_are_no_message_are_refused(coordinator: Coordinator) -> None:
-    async def scenario() -> None:
-        async with connect(coordinator.credentials("gateway")) as link:
-            key = keys.gateway_key("local", "r", "open")
-            wrong = msgspec.msgpack.encode({"op": "open_run", "run": 7})
-            operators = codec.encode(StatusRequest(token=""))
-            for payload in (b"", b"\xc1", b"x" * 100_000, wrong, operators, b"\x91" * 50_000):
-                assert await refusal(link, key, payload) == "bad_message"
-
-    run(scenario)
+async def test_bytes_that_are_no_message_are_refused(coordinator: Coordinator) -> None:
+    async with connect(coordinator.credentials("gateway")) as link:
+        key = keys.gateway_key("local", "r", "open")
+        wrong = msgspec.msgpack.encode({"op": "open_run", "run": 7})
+        operators = codec.encode(StatusRequest(token=""))
+        for payload in (b"", b"\xc1", b"x" * 100_000, wrong, operators, b"\x91" * 50_000):
+            assert await refusal(link, key, payload) == "bad_message"
 
 
 @pytest.mark.parametrize("speaker", ["gateway", "worker"])
-def test_router_lets_a_role_ask_on_its_own_keys_only(coordinator: Coordinator, speaker: str) -> None:
-    async def scenario() -> None:
-        operator_token = coordinator.credentials("operator").token
-        async with connect(coordinator.credentials(speaker)) as link:  # type: ignore[arg-type]
-            with pytest.raises(TransportError):
-                await link.ask(
-                    keys.operator_key("local", "status"),
-                    codec.encode(StatusRequest(token=operator_token)),
-                    3,
-                )
-            client = OperatorClient(link)
-            client.token = operator_token
-            with pytest.raises(TransportError):
-                await client.ask.once("status", StatusRequest(token=operator_token), StatusReply)
-
-    run(scenario)
+async def test_router_lets_a_role_ask_on_its_own_keys_only(coordinator: Coordinator, speaker: str) -> None:
+    operator_token = coordinator.credentials("operator").token
+    async with connect(coordinator.credentials(speaker)) as link:  # type: ignore[arg-type]
+        with pytest.raises(TransportError):
+            await link.ask(
+                keys.operator_key("local", "status"),
+                codec.encode(StatusRequest(token=operator_token)),
+                3,
+            )
+        client = OperatorClient(link)
+        client.token = operator_token
+        with pytest.raises(TransportError):
+            await client.ask.once("status", StatusRequest(token=operator_token), StatusReply)
 
 
 def test_wrong_password_is_not_let_in(coordinator: Coordinator) -> None:
@@ -206,95 +177,79 @@ def test_wrong_password_is_not_let_in(coordinator: Coordinator) -> None:
     run(scenario)
 
 
-def test_gateway_fetches_blobs_that_its_own_train_feedback_names_and_no_others(
+async def test_gateway_fetches_blobs_that_its_own_train_feedback_names_and_no_others(
     coordinator: Coordinator,
 ) -> None:
-    async def scenario() -> None:
-        stored: dict[str, bytes] = {}
+    stored: dict[str, bytes] = {}
 
-        def play_with_blob(job: Job, spec: EpisodeSpec) -> EpisodeOutcome:
-            outcome = play(job, spec)
-            assert outcome.trajectory is not None
-            data = outcome.trajectory.inline
-            assert data is not None
-            stored[outcome.trajectory.digest] = data
-            named = BlobRef(digest=outcome.trajectory.digest, size=len(data))
-            return msgspec.structs.replace(outcome, trajectory=named)
+    def play_with_blob(job: Job, spec: EpisodeSpec) -> EpisodeOutcome:
+        outcome = play(job, spec)
+        assert outcome.trajectory is not None
+        data = outcome.trajectory.inline
+        assert data is not None
+        stored[outcome.trajectory.digest] = data
+        named = BlobRef(digest=outcome.trajectory.digest, size=len(data))
+        return msgspec.structs.replace(outcome, trajectory=named)
 
-        async with operator_of(coordinator) as client, connect(coordinator.credentials("worker")) as link:
-            instant = InstantWorker(link, "w-blobs", play=play_with_blob)
-            await instant.register()
-            mine, other = await client.create("blobs"), await client.create("blobs-other")
-            async with gateway_of(coordinator, mine) as owner, gateway_of(coordinator, other) as stranger:
-                bundle = bundle_of("# blobs")
-                await owner.submit(bundle, (0,), "key")
-                (lease,) = [lease for lease in await instant.lease(4, 10) if lease.job.record == "full"]
-                assert (
-                    await instant.ask.download(instant.name, instant.session, bundle.digest) == bundle.packed
-                )
-                with pytest.raises(RefusedError) as refused:
-                    await instant.ask.download(instant.name, instant.session, "1" * 64)
-                assert refused.value.status == "unknown_blob"
-                result = instant.result(lease)
-                with pytest.raises(RefusedError) as refused:
-                    await instant.report_results((result,))
-                assert refused.value.status == "missing_blob"
-                ((digest, data),) = stored.items()
-                await instant.ask.upload(instant.name, instant.session, digest, data)
-                await instant.report_results((result,))
-                ((episode,), _) = await owner.results(0)
-                assert episode.trajectory.digest == digest
-                assert await owner.ask.download(owner.run, owner.token, digest) == data
-                for client_, wanted in (
-                    (stranger, digest),
-                    (owner, bundle.digest),
-                    (stranger, bundle.digest),
-                ):
-                    with pytest.raises(RefusedError) as refused:
-                        await client_.ask.download(client_.run, client_.token, wanted)
-                    assert refused.value.status == "unknown_blob"
-
-    run(scenario)
-
-
-def test_uploaded_bytes_must_be_the_blob_they_are_named_after(coordinator: Coordinator) -> None:
-    async def scenario() -> None:
-        async with operator_of(coordinator) as client:
-            created = await client.create("uploads")
-        async with gateway_of(coordinator, created) as owner:
-            put = {"sender": owner.run, "token": owner.token, "offset": 0, "data": b"xx"}
-            for digest, size in (("0" * 64, 2), ("../../secret", 2), ("0" * 64, 1 << 40), ("0" * 64, -1)):
-                with pytest.raises(RefusedError) as refused:
-                    await owner.ask.once(
-                        "blob", worker.BlobPut(**put, digest=digest, size=size), worker.BlobAck
-                    )
-                assert refused.value.status == "bad_blob"
-
-    run(scenario)
-
-
-def test_closed_run_takes_no_more_bundles(coordinator: Coordinator) -> None:
-    async def scenario() -> None:
-        async with operator_of(coordinator) as client:
-            created = await client.create("closed")
-        async with gateway_of(coordinator, created) as owner:
-            await owner.close()
-            bundle = bundle_of("# too late")
+    async with operator_of(coordinator) as client, connect(coordinator.credentials("worker")) as link:
+        instant = InstantWorker(link, "w-blobs", play=play_with_blob)
+        await instant.register()
+        mine, other = await client.create("blobs"), await client.create("blobs-other")
+        async with gateway_of(coordinator, mine) as owner, gateway_of(coordinator, other) as stranger:
+            bundle = bundle_of("# blobs")
+            await owner.submit(bundle, (0,), "key")
+            (lease,) = [lease for lease in await instant.lease(4, 10) if lease.job.record == "full"]
+            assert await instant.ask.download(instant.name, instant.session, bundle.digest) == bundle.packed
             with pytest.raises(RefusedError) as refused:
-                await owner.ask.upload(owner.run, owner.token, bundle.digest, bundle.packed)
-            assert refused.value.status == "run_closed"
+                await instant.ask.download(instant.name, instant.session, "1" * 64)
+            assert refused.value.status == "unknown_blob"
+            result = instant.result(lease)
+            with pytest.raises(RefusedError) as refused:
+                await instant.report_results((result,))
+            assert refused.value.status == "missing_blob"
+            ((digest, data),) = stored.items()
+            await instant.ask.upload(instant.name, instant.session, digest, data)
+            await instant.report_results((result,))
+            ((episode,), _) = await owner.results(0)
+            assert episode.trajectory.digest == digest
+            assert await owner.ask.download(owner.run, owner.token, digest) == data
+            for client_, wanted in (
+                (stranger, digest),
+                (owner, bundle.digest),
+                (stranger, bundle.digest),
+            ):
+                with pytest.raises(RefusedError) as refused:
+                    await client_.ask.download(client_.run, client_.token, wanted)
+                assert refused.value.status == "unknown_blob"
 
-    run(scenario)
+
+async def test_uploaded_bytes_must_be_the_blob_they_are_named_after(coordinator: Coordinator) -> None:
+    async with operator_of(coordinator) as client:
+        created = await client.create("uploads")
+    async with gateway_of(coordinator, created) as owner:
+        put = {"sender": owner.run, "token": owner.token, "offset": 0, "data": b"xx"}
+        for digest, size in (("0" * 64, 2), ("../../secret", 2), ("0" * 64, 1 << 40), ("0" * 64, -1)):
+            with pytest.raises(RefusedError) as refused:
+                await owner.ask.once("blob", worker.BlobPut(**put, digest=digest, size=size), worker.BlobAck)
+            assert refused.value.status == "bad_blob"
 
 
-def test_bundle_that_arrives_in_many_chunks_is_whole(coordinator: Coordinator) -> None:
-    async def scenario() -> None:
-        async with operator_of(coordinator) as client, working(coordinator, "w-big"):
-            created = await client.create("big")
-            async with gateway_of(coordinator, created) as owner:
-                bundle = bundle_of("#" * 1_000_000)
-                await owner.submit(bundle, (0,), "key")
-                _, done = await owner.results(0)
-                assert done.status == "ok"
+async def test_closed_run_takes_no_more_bundles(coordinator: Coordinator) -> None:
+    async with operator_of(coordinator) as client:
+        created = await client.create("closed")
+    async with gateway_of(coordinator, created) as owner:
+        await owner.close()
+        bundle = bundle_of("# too late")
+        with pytest.raises(RefusedError) as refused:
+            await owner.ask.upload(owner.run, owner.token, bundle.digest, bundle.packed)
+        assert refused.value.status == "run_closed"
 
-    run(scenario)
+
+async def test_bundle_that_arrives_in_many_chunks_is_whole(coordinator: Coordinator) -> None:
+    async with operator_of(coordinator) as client, working(coordinator, "w-big"):
+        created = await client.create("big")
+        async with gateway_of(coordinator, created) as owner:
+            bundle = bundle_of("#" * 1_000_000)
+            await owner.submit(bundle, (0,), "key")
+            _, done = await owner.results(0)
+            assert done.status == "ok"

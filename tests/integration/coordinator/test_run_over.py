@@ -6,7 +6,7 @@ import asyncio
 from pathlib import Path
 
 import pytest
-from coordinator_harness import Coordinator, GatewayClient, bundle_of, gateway_of, operator_of, run, working
+from coordinator_harness import Coordinator, GatewayClient, bundle_of, gateway_of, operator_of, working
 
 from evopolicy_common.errors import RefusedError
 from evopolicy_common.messages import gateway, operator
@@ -20,31 +20,28 @@ WORDS = {
 
 
 @pytest.mark.parametrize("end", WORDS)
-def test_every_refusal_to_an_ended_runs_gateway_says_so(tmp_path: Path, end: str) -> None:
-    async def scenario() -> None:
-        coordinator = Coordinator(tmp_path / "state")
-        try:
-            async with operator_of(coordinator) as asking:
-                created = await asking.create("key", n_validation=1, n_heldout=1)
-                async with gateway_of(coordinator, created) as client:
-                    await ended(coordinator, client, created.run, end)
-                    found = await refusals(client)
-            assert found == {"upload": WORDS[end], "submit": WORDS[end]} | (
-                {} if end == "closed" else {"open": WORDS[end]}
-            )
-            assert set(found.values()) <= RUN_OVER
-            coordinator.kill()
-            coordinator = Coordinator(tmp_path / "state")
+async def test_every_refusal_to_an_ended_runs_gateway_says_so(tmp_path: Path, end: str) -> None:
+    coordinator = Coordinator(tmp_path / "state")
+    try:
+        async with operator_of(coordinator) as asking:
+            created = await asking.create("key", n_validation=1, n_heldout=1)
             async with gateway_of(coordinator, created) as client:
-                after = await refusals(client)
-                # A coordinator that was started again asks for the bundle first, whose upload it then refuses.
-                assert after.pop("submit") in (WORDS[end], Refusal.MISSING_BUNDLE)
-                assert {**after, "submit": WORDS[end]} == found
-                assert (await client.state()).cancelled == (end == "cancelled")
-        finally:
-            coordinator.kill()
-
-    run(scenario, 120)
+                await ended(coordinator, client, created.run, end)
+                found = await refusals(client)
+        assert found == {"upload": WORDS[end], "submit": WORDS[end]} | (
+            {} if end == "closed" else {"open": WORDS[end]}
+        )
+        assert set(found.values()) <= RUN_OVER
+        coordinator.kill()
+        coordinator = Coordinator(tmp_path / "state")
+        async with gateway_of(coordinator, created) as client:
+            after = await refusals(client)
+            # A coordinator that was started again asks for the bundle first, whose upload it then refuses.
+            assert after.pop("submit") in (WORDS[end], Refusal.MISSING_BUNDLE)
+            assert {**after, "submit": WORDS[end]} == found
+            assert (await client.state()).cancelled == (end == "cancelled")
+    finally:
+        coordinator.kill()
 
 
 async def ended(coordinator: Coordinator, client: GatewayClient, run: str, end: str) -> None:

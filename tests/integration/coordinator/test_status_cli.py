@@ -21,7 +21,6 @@ from coordinator_harness import (
     bundle_of,
     gateway_of,
     operator_of,
-    run,
     working,
 )
 from typer.testing import CliRunner, Result
@@ -49,125 +48,108 @@ async def called(coordinator: Coordinator, name: str, *args: str) -> Result:
     return await asyncio.to_thread(call, coordinator, name, *args)
 
 
-def test_status_shows_workers_runs_and_what_waits(coordinator: Coordinator) -> None:
-    async def scenario() -> None:
-        async with operator_of(coordinator) as operator:
-            created = await operator.create("status")
-            async with gateway_of(coordinator, created) as gateway:
-                await gateway.submit(bundle_of("# policy"), (0, 1), "key")
-                text = (await called(coordinator, "status")).stdout
-                assert f"{created.run} waits for" in text
-                async with working(coordinator, "w-shown"):
-                    await gateway.results(0)
+async def test_status_shows_workers_runs_and_what_waits(coordinator: Coordinator) -> None:
+    async with operator_of(coordinator) as operator:
+        created = await operator.create("status")
+        async with gateway_of(coordinator, created) as gateway:
+            await gateway.submit(bundle_of("# policy"), (0, 1), "key")
+            text = (await called(coordinator, "status")).stdout
+            assert f"{created.run} waits for" in text
+            async with working(coordinator, "w-shown"):
+                await gateway.results(0)
+                result = await called(coordinator, "status")
+                # The checkpoint's early validation goes on for a moment.
+                while "0 queued, 0 running" not in result.stdout:
                     result = await called(coordinator, "status")
-                    # The checkpoint's early validation goes on for a moment.
-                    while "0 queued, 0 running" not in result.stdout:
-                        result = await called(coordinator, "status")
-                    assert result.exit_code == 0
-                    for text in ("cluster local", "w-shown", created.run, "toy/line", "14/16"):
-                        assert text in result.stdout
-                    reply = json.loads((await called(coordinator, "status", "--json")).stdout)
-                    assert reply["cluster"] == "local"
-                    (shown,) = [one for one in reply["workers"] if one["worker"] == "w-shown"]
-                    assert shown["versions"]["evopolicy-worker"] == FINGERPRINT.code_version
-                    for name, version in shown["versions"].items():
-                        assert f"{name} {version}" in " ".join(result.stdout.split())
-                    assert created.run in [run["run"] for run in reply["runs"]]
-
-    run(scenario)
+                assert result.exit_code == 0
+                for text in ("cluster local", "w-shown", created.run, "toy/line", "14/16"):
+                    assert text in result.stdout
+                reply = json.loads((await called(coordinator, "status", "--json")).stdout)
+                assert reply["cluster"] == "local"
+                (shown,) = [one for one in reply["workers"] if one["worker"] == "w-shown"]
+                assert shown["versions"]["evopolicy-worker"] == FINGERPRINT.code_version
+                for name, version in shown["versions"].items():
+                    assert f"{name} {version}" in " ".join(result.stdout.split())
+                assert created.run in [run["run"] for run in reply["runs"]]
 
 
 @pytest.mark.parametrize(("command", "state"), [("drain", "draining"), ("pause", "paused")])
-def test_worker_out_of_service_gets_no_work_until_it_is_taken_back(
+async def test_worker_out_of_service_gets_no_work_until_it_is_taken_back(
     coordinator: Coordinator, command: str, state: str
 ) -> None:
     name = f"w-{state}"
 
-    async def scenario() -> None:
-        async with operator_of(coordinator) as operator, working(coordinator, name) as worker:
-            while name not in [found.worker for found in (await operator.status()).workers]:
-                await asyncio.sleep(0.02)
-            assert (await called(coordinator, "workers", command, name)).exit_code == 0
-            created = await operator.create(command)
-            async with gateway_of(coordinator, created) as gateway:
-                await gateway.submit(bundle_of("# policy"), (0,), "key")
-                await asyncio.sleep(0.3)
-                assert not [job for job in worker.jobs if created.run in job.job_id]
-                states = {found.worker: found.state for found in (await operator.status()).workers}
-                assert states[name] == state
-                assert (await called(coordinator, "workers", "resume", name)).exit_code == 0
+    async with operator_of(coordinator) as operator, working(coordinator, name) as worker:
+        while name not in [found.worker for found in (await operator.status()).workers]:
+            await asyncio.sleep(0.02)
+        assert (await called(coordinator, "workers", command, name)).exit_code == 0
+        created = await operator.create(command)
+        async with gateway_of(coordinator, created) as gateway:
+            await gateway.submit(bundle_of("# policy"), (0,), "key")
+            await asyncio.sleep(0.3)
+            assert not [job for job in worker.jobs if created.run in job.job_id]
+            states = {found.worker: found.state for found in (await operator.status()).workers}
+            assert states[name] == state
+            assert (await called(coordinator, "workers", "resume", name)).exit_code == 0
+            await gateway.results(0)
+            assert [job for job in worker.jobs if created.run in job.job_id]
+
+
+async def test_workers_and_runs_are_listed_and_unknown_workers_refused(
+    coordinator: Coordinator,
+) -> None:
+    async with operator_of(coordinator) as operator, working(coordinator, "w-listed"):
+        created = await operator.create("listed")
+        while "w-listed" not in [found.worker for found in (await operator.status()).workers]:
+            await asyncio.sleep(0.02)
+        shown = (await called(coordinator, "workers", "list")).stdout
+        assert "w-listed" in shown
+        assert "toy" in shown
+        listed = json.loads((await called(coordinator, "workers", "list", "--json")).stdout)
+        assert "w-listed" in [one["worker"] for one in listed]
+        assert created.run in (await called(coordinator, "runs", "list")).stdout
+        listed = json.loads((await called(coordinator, "runs", "list", "--json")).stdout)
+        assert created.run in [one["run"] for one in listed]
+        for command in ("pause", "drain", "resume"):
+            wrong = await called(coordinator, "workers", command, "nosuch")
+            assert wrong.exit_code == 2
+            assert "no worker 'nosuch' is connected; there are: " in wrong.stderr
+            assert "w-listed" in wrong.stderr
+            assert (await called(coordinator, "workers", command, "nosuch", "--absent")).exit_code == 0
+
+
+async def test_cancelled_run_is_finished_without_a_score(coordinator: Coordinator) -> None:
+    async with operator_of(coordinator) as operator:
+        created = await operator.create("cancel")
+        assert (await called(coordinator, "runs", "cancel", created.run)).stdout.endswith("is cancelled\n")
+        again = await called(coordinator, "runs", "cancel", created.run)
+        assert "had ended before" in again.stdout
+        finished = await operator.finished(created.run)
+        assert finished.status == "cancelled"
+        assert finished.final_score is None
+
+
+async def test_a_run_continues_on_another_class_after_an_operators_repin(
+    coordinator: Coordinator,
+) -> None:
+    async with operator_of(coordinator) as operator:
+        created = await operator.create("repin", n_validation=1, n_heldout=1)
+        async with gateway_of(coordinator, created) as gateway:
+            async with working(coordinator, "w-old"):
+                await gateway.submit(bundle_of("# policy"), (0,), "first")
                 await gateway.results(0)
-                assert [job for job in worker.jobs if created.run in job.job_id]
-
-    run(scenario)
-
-
-def test_workers_and_runs_are_listed_and_unknown_workers_refused(
-    coordinator: Coordinator,
-) -> None:
-    async def scenario() -> None:
-        async with operator_of(coordinator) as operator, working(coordinator, "w-listed"):
-            created = await operator.create("listed")
-            while "w-listed" not in [found.worker for found in (await operator.status()).workers]:
-                await asyncio.sleep(0.02)
-            shown = (await called(coordinator, "workers", "list")).stdout
-            assert "w-listed" in shown
-            assert "toy" in shown
-            listed = json.loads((await called(coordinator, "workers", "list", "--json")).stdout)
-            assert "w-listed" in [one["worker"] for one in listed]
-            assert created.run in (await called(coordinator, "runs", "list")).stdout
-            listed = json.loads((await called(coordinator, "runs", "list", "--json")).stdout)
-            assert created.run in [one["run"] for one in listed]
-            for command in ("pause", "drain", "resume"):
-                wrong = await called(coordinator, "workers", command, "nosuch")
-                assert wrong.exit_code == 2
-                assert "no worker 'nosuch' is connected; there are: " in wrong.stderr
-                assert "w-listed" in wrong.stderr
-                assert (await called(coordinator, "workers", command, "nosuch", "--absent")).exit_code == 0
-
-    run(scenario)
-
-
-def test_cancelled_run_is_finished_without_a_score(coordinator: Coordinator) -> None:
-    async def scenario() -> None:
-        async with operator_of(coordinator) as operator:
-            created = await operator.create("cancel")
-            assert (await called(coordinator, "runs", "cancel", created.run)).stdout.endswith(
-                "is cancelled\n"
-            )
-            again = await called(coordinator, "runs", "cancel", created.run)
-            assert "had ended before" in again.stdout
-            finished = await operator.finished(created.run)
-            assert finished.status == "cancelled"
-            assert finished.final_score is None
-
-    run(scenario)
-
-
-def test_a_run_continues_on_another_class_after_an_operators_repin(
-    coordinator: Coordinator,
-) -> None:
-    async def scenario() -> None:
-        async with operator_of(coordinator) as operator:
-            created = await operator.create("repin", n_validation=1, n_heldout=1)
-            async with gateway_of(coordinator, created) as gateway:
-                async with working(coordinator, "w-old"):
-                    await gateway.submit(bundle_of("# policy"), (0,), "first")
-                    await gateway.results(0)
-                newer = msgspec.structs.replace(FINGERPRINT, code_version="2")
-                async with working(coordinator, "w-new", fingerprint=newer) as worker:
-                    await gateway.submit(bundle_of("# policy"), (0,), "second")
-                    while not (shown := await worker_shown(operator, "w-new")).refused:
-                        await asyncio.sleep(0.02)
-                    assert "pinned" in shown.refused[created.run]
-                    assert worker.jobs == []
-                    repin = ("repin", created.run, shown.fingerprint, "--reason")
-                    assert (await called(coordinator, "runs", *repin, " ")).exit_code == 2
-                    assert (await called(coordinator, "runs", *repin, "old ones gone")).exit_code == 0
-                    _, done = await gateway.results(1)
-                    assert done.status == "ok"
-
-    run(scenario)
+            newer = msgspec.structs.replace(FINGERPRINT, code_version="2")
+            async with working(coordinator, "w-new", fingerprint=newer) as worker:
+                await gateway.submit(bundle_of("# policy"), (0,), "second")
+                while not (shown := await worker_shown(operator, "w-new")).refused:
+                    await asyncio.sleep(0.02)
+                assert "pinned" in shown.refused[created.run]
+                assert worker.jobs == []
+                repin = ("repin", created.run, shown.fingerprint, "--reason")
+                assert (await called(coordinator, "runs", *repin, " ")).exit_code == 2
+                assert (await called(coordinator, "runs", *repin, "old ones gone")).exit_code == 0
+                _, done = await gateway.results(1)
+                assert done.status == "ok"
 
 
 async def worker_shown(operator: OperatorClient, name: str) -> WorkerStatus:

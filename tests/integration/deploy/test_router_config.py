@@ -114,61 +114,49 @@ def site(tmp_path: Path) -> Site:
 
 
 @pytest.mark.parametrize("role", ["worker", "gateway", "operator"])
-def test_a_sites_router_answers_a_role_on_its_keys_only(site: Site, role: Role) -> None:
-    async def scenario() -> None:
-        async with site.up() as asked, site.link(role) as link:
-            assert await answered(link, OWN_KEY[role], attempts=300)
-            for owner, key in OWN_KEY.items():
-                assert await answered(link, key) == (owner == role), key
-            assert set(asked) == {OWN_KEY[role]}
-
-    asyncio.run(scenario())
+async def test_a_sites_router_answers_a_role_on_its_keys_only(site: Site, role: Role) -> None:
+    async with site.up() as asked, site.link(role) as link:
+        assert await answered(link, OWN_KEY[role], attempts=300)
+        for owner, key in OWN_KEY.items():
+            assert await answered(link, key) == (owner == role), key
+        assert set(asked) == {OWN_KEY[role]}
 
 
-def test_a_machine_of_another_site_is_not_let_in(site: Site) -> None:
-    async def scenario() -> None:
-        async with site.up() as asked:
-            found = credentials.find("worker", (site.endpoint,), site.elsewhere)
-            with pytest.raises(TransportError, match="credentials"):
-                async with transport.connect(found, timeout_s=1.0):
-                    pass
-            assert asked == []
-
-    asyncio.run(scenario())
+async def test_a_machine_of_another_site_is_not_let_in(site: Site) -> None:
+    async with site.up() as asked:
+        found = credentials.find("worker", (site.endpoint,), site.elsewhere)
+        with pytest.raises(TransportError, match="credentials"):
+            async with transport.connect(found, timeout_s=1.0):
+                pass
+        assert asked == []
 
 
-def test_no_machine_answers_or_overhears_another_behind_the_same_router(site: Site) -> None:
-    async def scenario() -> None:
-        found = credentials.find("gateway", (site.endpoint,), site.folders["gateway"])
-        async with (
-            site.up(),
-            site.link("gateway") as honest,
-            eavesdropping(found, keys.gateway_expr(CLUSTER)) as overheard,
-        ):
-            assert await answered(honest, OWN_KEY["gateway"], attempts=300)
-            for _ in range(20):
-                assert await answered(honest, OWN_KEY["gateway"])
-            assert overheard == []
-
-    asyncio.run(scenario())
+async def test_no_machine_answers_or_overhears_another_behind_the_same_router(site: Site) -> None:
+    found = credentials.find("gateway", (site.endpoint,), site.folders["gateway"])
+    async with (
+        site.up(),
+        site.link("gateway") as honest,
+        eavesdropping(found, keys.gateway_expr(CLUSTER)) as overheard,
+    ):
+        assert await answered(honest, OWN_KEY["gateway"], attempts=300)
+        for _ in range(20):
+            assert await answered(honest, OWN_KEY["gateway"])
+        assert overheard == []
 
 
-def test_a_workers_liveliness_is_seen_through_the_router_and_no_one_elses(site: Site) -> None:
-    async def scenario() -> None:
-        alive: list[tuple[str, bool]] = []
-        true, false = (keys.liveliness_key(CLUSTER, name) for name in ("here", "desk"))
-        async with site.up(alive):
-            async with site.link("gateway") as pretender, site.link("worker") as worker:
-                assert await answered(pretender, OWN_KEY["gateway"], attempts=300)
-                pretender.declare_alive(false)
-                worker.declare_alive(true)
-                await eventually(lambda: alive == [(true, True)])
-            await eventually(lambda: alive == [(true, True), (true, False)])
-
-    asyncio.run(scenario())
+async def test_a_workers_liveliness_is_seen_through_the_router_and_no_one_elses(site: Site) -> None:
+    alive: list[tuple[str, bool]] = []
+    true, false = (keys.liveliness_key(CLUSTER, name) for name in ("here", "desk"))
+    async with site.up(alive):
+        async with site.link("gateway") as pretender, site.link("worker") as worker:
+            assert await answered(pretender, OWN_KEY["gateway"], attempts=300)
+            pretender.declare_alive(false)
+            worker.declare_alive(true)
+            await eventually(lambda: alive == [(true, True)])
+        await eventually(lambda: alive == [(true, True), (true, False)])
 
 
-def test_a_router_behind_another_one_passes_on_as_far_as_roles_allow(site: Site) -> None:
+async def test_a_router_behind_another_one_passes_on_as_far_as_roles_allow(site: Site) -> None:
     far = site.certs.issue("router", "far")
     endpoint = f"tls/127.0.0.1:{free_port()}"
     write_router_config(
@@ -189,32 +177,26 @@ def test_a_router_behind_another_one_passes_on_as_far_as_roles_allow(site: Site)
         admit=("router/far", "worker/here"),
     )
 
-    async def scenario() -> None:
-        alive: list[tuple[str, bool]] = []
-        found = credentials.find("worker", (endpoint,), site.elsewhere)
-        async with site.up(alive), open_router(far), transport.connect(found, timeout_s=30.0) as link:
+    alive: list[tuple[str, bool]] = []
+    found = credentials.find("worker", (endpoint,), site.elsewhere)
+    async with site.up(alive), open_router(far), transport.connect(found, timeout_s=30.0) as link:
+        assert await answered(link, OWN_KEY["worker"], attempts=300)
+        assert not await answered(link, OWN_KEY["gateway"])
+        key = keys.liveliness_key(CLUSTER, "elsewhere")
+        link.declare_alive(key)
+        await eventually(lambda: alive == [(key, True)])
+        async with site.link("worker") as other:
+            assert await answered(other, OWN_KEY["worker"], attempts=300)
+
+
+async def test_a_restarted_router_carries_on(site: Site) -> None:
+    async with contextlib.AsyncExitStack() as stack:
+        async with site.up():
+            link = await stack.enter_async_context(site.link("worker"))
             assert await answered(link, OWN_KEY["worker"], attempts=300)
-            assert not await answered(link, OWN_KEY["gateway"])
-            key = keys.liveliness_key(CLUSTER, "elsewhere")
-            link.declare_alive(key)
-            await eventually(lambda: alive == [(key, True)])
-            async with site.link("worker") as other:
-                assert await answered(other, OWN_KEY["worker"], attempts=300)
-
-    asyncio.run(scenario())
-
-
-def test_a_restarted_router_carries_on(site: Site) -> None:
-    async def scenario() -> None:
-        async with contextlib.AsyncExitStack() as stack:
-            async with site.up():
-                link = await stack.enter_async_context(site.link("worker"))
-                assert await answered(link, OWN_KEY["worker"], attempts=300)
-            assert not await answered(link, OWN_KEY["worker"])
-            async with site.up():
-                assert await answered(link, OWN_KEY["worker"], attempts=300)
-
-    asyncio.run(scenario())
+        assert not await answered(link, OWN_KEY["worker"])
+        async with site.up():
+            assert await answered(link, OWN_KEY["worker"], attempts=300)
 
 
 def test_the_file_holds_the_coordinators_own_rules(site: Site) -> None:

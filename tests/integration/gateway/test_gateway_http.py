@@ -6,12 +6,11 @@ import asyncio
 import contextlib
 import json
 import socket
-from collections.abc import Awaitable, Callable
 from pathlib import Path
 from urllib.parse import urlsplit
 
 import pytest
-from gateway_double import Double, Served, opened, served
+from gateway_double import Double, opened, served
 
 from evopolicy_common.messages.episode import PolicyFailure
 from evopolicy_common.messages.worker import BlobPut
@@ -19,25 +18,12 @@ from evopolicy_common.records.summary import decode_summary
 from evopolicy_gateway.submits.submit_request import MAX_BODY_BYTES
 
 
-def play(tmp_path: Path, script: Callable[[Served], Awaitable[None]], double: Double | None = None) -> Double:
-    """Runs `script` against a fresh gateway."""
-    found: list[Double] = []
-
-    async def main() -> None:
-        async with served(tmp_path, double) as service:
-            found.append(service.double)
-            await script(service)
-
-    asyncio.run(main())
-    return found[0]
-
-
 def files_below(folder: Path) -> list[str]:
     return sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file())
 
 
-def test_a_submit_leaves_its_feedback_and_answers_with_the_summary_files_bytes(tmp_path: Path) -> None:
-    async def script(s: Served) -> None:
+async def test_a_submit_leaves_its_feedback_and_answers_with_the_summary_files_bytes(tmp_path: Path) -> None:
+    async with served(tmp_path) as s:
         answer = await s.http.post(s.urls.submit, json={"env_instances": [3, 0, 3]})
         assert answer.status_code == 200
         document = answer.json()
@@ -74,11 +60,9 @@ def test_a_submit_leaves_its_feedback_and_answers_with_the_summary_files_bytes(t
         }
         assert list(s.folder.feedback.iterdir()) == [folder]
 
-    play(tmp_path, script)
 
-
-def test_info_tells_the_run_and_the_submit_that_runs(tmp_path: Path) -> None:
-    async def script(s: Served) -> None:
+async def test_info_tells_the_run_and_the_submit_that_runs(tmp_path: Path) -> None:
+    async with served(tmp_path) as s:
         before = (await s.http.get(s.urls.info)).json()
         assert before["state"] == {"remaining_budget": 12, "n_submits": 0, "is_finalized": False}
         assert before["env_meta"]["n_env_instances"] == 8
@@ -100,11 +84,9 @@ def test_info_tells_the_run_and_the_submit_that_runs(tmp_path: Path) -> None:
             "held_s": 0.0,
         }
 
-    play(tmp_path, script)
 
-
-def test_task_is_markdown_with_spaces_bounds_and_scope(tmp_path: Path) -> None:
-    async def script(s: Served) -> None:
+async def test_task_is_markdown_with_spaces_bounds_and_scope(tmp_path: Path) -> None:
+    async with served(tmp_path) as s:
         answer = await s.http.get(s.urls.task)
         assert answer.headers["content-type"].startswith("text/markdown")
         for needed in (
@@ -116,11 +98,9 @@ def test_task_is_markdown_with_spaces_bounds_and_scope(tmp_path: Path) -> None:
         ):
             assert needed in answer.text
 
-    play(tmp_path, script)
 
-
-def test_an_unwaited_submit_is_asked_for_until_it_is_done(tmp_path: Path) -> None:
-    async def script(s: Served) -> None:
+async def test_an_unwaited_submit_is_asked_for_until_it_is_done(tmp_path: Path) -> None:
+    async with served(tmp_path) as s:
         s.double.go.clear()
         first = await s.http.post(s.urls.submit + "?wait=false", json={"env_instances": "0-2"})
         assert first.status_code == 202
@@ -132,11 +112,9 @@ def test_an_unwaited_submit_is_asked_for_until_it_is_done(tmp_path: Path) -> Non
         assert (await s.http.get(f"{s.urls.submit}/submit_001")).status_code == 404
         assert (await s.http.get(f"{s.urls.submit}/../info")).status_code in (200, 404)
 
-    play(tmp_path, script)
 
-
-def test_a_second_submit_is_a_conflict_that_names_the_first(tmp_path: Path) -> None:
-    async def script(s: Served) -> None:
+async def test_a_second_submit_is_a_conflict_that_names_the_first(tmp_path: Path) -> None:
+    async with served(tmp_path) as s:
         s.double.go.clear()
         await s.http.post(s.urls.submit + "?wait=false", json={"env_instances": [0]})
         second = await s.http.post(s.urls.submit, json={"env_instances": [1]})
@@ -146,12 +124,11 @@ def test_a_second_submit_is_a_conflict_that_names_the_first(tmp_path: Path) -> N
         s.double.go.set()
         await s.pipeline.idle()
         assert (await s.http.post(s.urls.submit, json={"env_instances": [1]})).json()["submit_id"] == 1
+    assert len(s.double.submits) == 2
 
-    assert len(play(tmp_path, script).submits) == 2
 
-
-def test_the_same_key_with_another_body_is_a_conflict(tmp_path: Path) -> None:
-    async def script(s: Served) -> None:
+async def test_the_same_key_with_another_body_is_a_conflict(tmp_path: Path) -> None:
+    async with served(tmp_path) as s:
         key = {"Idempotency-Key": "k-1"}
         s.double.go.clear()
         both = [
@@ -169,12 +146,11 @@ def test_the_same_key_with_another_body_is_a_conflict(tmp_path: Path) -> None:
         other = await s.http.post(s.urls.submit, json={"env_instances": [3]}, headers=key)
         assert other.status_code == 409
         assert "another body" in other.json()["error"]["message"]
+    assert len(s.double.submits) == 1
 
-    assert len(play(tmp_path, script).submits) == 1
 
-
-def test_a_client_that_hangs_up_loses_nothing(tmp_path: Path) -> None:
-    async def script(s: Served) -> None:
+async def test_a_client_that_hangs_up_loses_nothing(tmp_path: Path) -> None:
+    async with served(tmp_path) as s:
         s.double.go.clear()
         request = asyncio.create_task(s.http.post(s.urls.submit, json={"env_instances": [0, 1]}))
         while s.pipeline.machine.in_flight is None:
@@ -185,8 +161,6 @@ def test_a_client_that_hangs_up_loses_nothing(tmp_path: Path) -> None:
         await s.pipeline.idle()
         assert (s.folder.feedback / "submit_000" / "summary.json").is_file()
         assert (await s.http.get(f"{s.urls.submit}/submit_000")).json()["status"] == "ok"
-
-    play(tmp_path, script)
 
 
 REJECTED = [
@@ -201,8 +175,8 @@ REJECTED = [
 ]
 
 
-def test_a_rejected_request_costs_no_budget_and_changes_nothing(tmp_path: Path) -> None:
-    async def script(s: Served) -> None:
+async def test_a_rejected_request_costs_no_budget_and_changes_nothing(tmp_path: Path) -> None:
+    async with served(tmp_path) as s:
         for number, (body, status) in enumerate(REJECTED, start=1):
             answer = await s.http.post(s.urls.submit, content=body)
             assert answer.status_code == 400
@@ -212,14 +186,12 @@ def test_a_rejected_request_costs_no_budget_and_changes_nothing(tmp_path: Path) 
             assert state == {"remaining_budget": 12, "n_submits": 0, "is_finalized": False}
             assert files_below(s.folder.feedback) == []
             assert s.pipeline.machine.n_rejected == number
-
-    double = play(tmp_path, script)
-    assert double.submits == []
-    assert not any(isinstance(message, BlobPut) for message in double.asked)
+    assert s.double.submits == []
+    assert not any(isinstance(message, BlobPut) for message in s.double.asked)
 
 
-def test_a_body_of_100_megabytes_is_refused_and_the_refusal_is_heard(tmp_path: Path) -> None:
-    async def script(s: Served) -> None:
+async def test_a_body_of_100_megabytes_is_refused_and_the_refusal_is_heard(tmp_path: Path) -> None:
+    async with served(tmp_path) as s:
         huge = b'{"env_instances": "' + b"0," * 50_000_000 + b'0"}'
         answer = await s.http.post(s.urls.submit, content=huge)
         assert answer.status_code == 400
@@ -235,11 +207,9 @@ def test_a_body_of_100_megabytes_is_refused_and_the_refusal_is_heard(tmp_path: P
         assert chunked.json()["status"] == "budget_invalid"
         assert (await s.http.post(s.urls.submit, json={"env_instances": [0]})).status_code == 200
 
-    play(tmp_path, script)
 
-
-def test_what_does_not_know_the_token_learns_nothing(tmp_path: Path) -> None:
-    async def script(s: Served) -> None:
+async def test_what_does_not_know_the_token_learns_nothing(tmp_path: Path) -> None:
+    async with served(tmp_path) as s:
         parts = urlsplit(s.urls.info)
         root = f"{parts.scheme}://{parts.netloc}"
         token = parts.path.split("/")[1]
@@ -262,11 +232,9 @@ def test_what_does_not_know_the_token_learns_nothing(tmp_path: Path) -> None:
             assert s.double.capability not in answer.text
             assert "server" not in answer.headers
 
-    play(tmp_path, script)
 
-
-def test_headers_without_end_are_cut_off(tmp_path: Path) -> None:
-    async def script(s: Served) -> None:
+async def test_headers_without_end_are_cut_off(tmp_path: Path) -> None:
+    async with served(tmp_path) as s:
         address = urlsplit(s.urls.info)
         reader, writer = await asyncio.open_connection(address.hostname, address.port)
         writer.write(f"GET {address.path} HTTP/1.1\r\nHost: x\r\n".encode() + b"X-A: " + b"a" * (1 << 20))
@@ -277,80 +245,71 @@ def test_headers_without_end_are_cut_off(tmp_path: Path) -> None:
         assert (await s.http.get(s.urls.info)).status_code == 200
         writer.close()
 
-    play(tmp_path, script)
 
-
-def test_a_verdict_without_a_policy_is_charged_and_told(tmp_path: Path) -> None:
+async def test_a_verdict_without_a_policy_is_charged_and_told(tmp_path: Path) -> None:
     cause = PolicyFailure(
         category="import_error", step_index=None, message="No module named 'torch'", traceback="Traceback …\n"
     )
     double_made: list[Double] = []
 
-    async def main() -> None:
-        double = Double(opened())
-        double.failures = {0: cause, 1: cause}
-        double_made.append(double)
-        async with served(tmp_path, double) as s:
-            answer = (await s.http.post(s.urls.submit, json={"env_instances": [0, 1]})).json()
-            assert answer["status"] == "import_error"
-            summary = answer["summary"]
-            assert summary["n_episodes"] == 2
-            assert summary["remaining_budget"] == 10
-            arrays = (
-                "returns",
-                "mean_return",
-                "episode_lengths",
-                "errors",
-                "timeouts",
-                "max_return",
-            )
-            assert all(summary[name] is None for name in arrays)
-            assert summary["env_instances"] == [0, 1]
-            folder = s.folder.feedback / "submit_000"
-            assert files_below(folder) == ["errors.txt", "summary.json"]
-            line = json.loads((folder / "errors.txt").read_text())
-            assert line["category"] == "import_error"
-            assert "torch" in line["message"]
-            assert set(line) == {"schema_version", "timestamp", "category", "message", "traceback"}
-
-    asyncio.run(main())
+    double = Double(opened())
+    double.failures = {0: cause, 1: cause}
+    double_made.append(double)
+    async with served(tmp_path, double) as s:
+        answer = (await s.http.post(s.urls.submit, json={"env_instances": [0, 1]})).json()
+        assert answer["status"] == "import_error"
+        summary = answer["summary"]
+        assert summary["n_episodes"] == 2
+        assert summary["remaining_budget"] == 10
+        arrays = (
+            "returns",
+            "mean_return",
+            "episode_lengths",
+            "errors",
+            "timeouts",
+            "max_return",
+        )
+        assert all(summary[name] is None for name in arrays)
+        assert summary["env_instances"] == [0, 1]
+        folder = s.folder.feedback / "submit_000"
+        assert files_below(folder) == ["errors.txt", "summary.json"]
+        line = json.loads((folder / "errors.txt").read_text())
+        assert line["category"] == "import_error"
+        assert "torch" in line["message"]
+        assert set(line) == {"schema_version", "timestamp", "category", "message", "traceback"}
 
 
-def test_an_episode_that_failed_has_its_error_file_and_is_listed(tmp_path: Path) -> None:
-    async def main() -> None:
-        double = Double(opened())
-        double.failures = {
-            1: PolicyFailure(category="act_error", step_index=2, message="boom", traceback="tb"),
-            2: PolicyFailure(category="act_timeout", step_index=0, message="slow", limit=20.0, used=20.1),
-        }
-        async with served(tmp_path, double) as s:
-            summary = (await s.http.post(s.urls.submit, json={"env_instances": [4, 4, 5]})).json()["summary"]
-            assert summary["errors"] == [1, 2]
-            assert summary["timeouts"] == [2]
-            episodes = s.folder.feedback / "submit_000" / "episodes"
-            assert not (episodes / "ep_000" / "error.txt").exists()
-            line = json.loads((episodes / "ep_001" / "error.txt").read_text())
-            assert (line["category"], line["step_index"]) == ("act_error", 2)
-            assert json.loads((episodes / "ep_002" / "error.txt").read_text())["limit"] == 20.0
-
-    asyncio.run(main())
+async def test_an_episode_that_failed_has_its_error_file_and_is_listed(tmp_path: Path) -> None:
+    double = Double(opened())
+    double.failures = {
+        1: PolicyFailure(category="act_error", step_index=2, message="boom", traceback="tb"),
+        2: PolicyFailure(category="act_timeout", step_index=0, message="slow", limit=20.0, used=20.1),
+    }
+    async with served(tmp_path, double) as s:
+        summary = (await s.http.post(s.urls.submit, json={"env_instances": [4, 4, 5]})).json()["summary"]
+        assert summary["errors"] == [1, 2]
+        assert summary["timeouts"] == [2]
+        episodes = s.folder.feedback / "submit_000" / "episodes"
+        assert not (episodes / "ep_000" / "error.txt").exists()
+        line = json.loads((episodes / "ep_001" / "error.txt").read_text())
+        assert (line["category"], line["step_index"]) == ("act_error", 2)
+        assert json.loads((episodes / "ep_002" / "error.txt").read_text())["limit"] == 20.0
 
 
-def test_a_submit_timeout_keeps_exactly_the_episodes_before_the_first_unfinished(tmp_path: Path) -> None:
-    async def main() -> None:
-        double = Double(opened())
-        double.order = lambda n: [0, 3, 1]
-        async with served(tmp_path, double) as s:
-            answer = (await s.http.post(s.urls.submit, json={"env_instances": [0, 1, 2, 3]})).json()
-            assert answer["status"] == "rollout_timeout"
-            episodes = s.folder.feedback / "submit_000" / "episodes"
-            assert sorted(path.name for path in episodes.iterdir()) == ["ep_000", "ep_001"]
+async def test_a_submit_timeout_keeps_exactly_the_episodes_before_the_first_unfinished(
+    tmp_path: Path,
+) -> None:
+    double = Double(opened())
+    double.order = lambda n: [0, 3, 1]
+    async with served(tmp_path, double) as s:
+        answer = (await s.http.post(s.urls.submit, json={"env_instances": [0, 1, 2, 3]})).json()
+        assert answer["status"] == "rollout_timeout"
+        episodes = s.folder.feedback / "submit_000" / "episodes"
+        assert sorted(path.name for path in episodes.iterdir()) == ["ep_000", "ep_001"]
 
-    asyncio.run(main())
 
-
-def test_the_budget_is_spent_to_the_last_episode_and_then_refused(tmp_path: Path) -> None:
-    async def script(s: Served) -> None:
+async def test_the_budget_is_spent_to_the_last_episode_and_then_refused(tmp_path: Path) -> None:
+    async with served(tmp_path) as s:
         for _ in range(2):
             assert (await s.http.post(s.urls.submit, json={"env_instances": "0-5"})).status_code == 200
         assert s.pipeline.machine.spent
@@ -362,15 +321,11 @@ def test_the_budget_is_spent_to_the_last_episode_and_then_refused(tmp_path: Path
         names = sorted(path.name for path in (s.folder.feedback / "submit_001/episodes").iterdir())
         assert names == [f"ep_{i:03d}" for i in range(6, 12)]
 
-    play(tmp_path, script)
 
-
-def test_the_service_listens_on_loopback_only(tmp_path: Path) -> None:
-    async def script(s: Served) -> None:
+async def test_the_service_listens_on_loopback_only(tmp_path: Path) -> None:
+    async with served(tmp_path) as s:
         port = urlsplit(s.urls.info).port
         assert urlsplit(s.urls.info).hostname == "127.0.0.1"
         with socket.socket() as probe:
             probe.settimeout(2)
             assert probe.connect_ex(("127.0.0.2", port)) != 0
-
-    play(tmp_path, script)

@@ -38,88 +38,76 @@ def tree_of(folder: Path) -> dict[str, bytes]:
     }
 
 
-def test_a_restarted_gateway_has_the_same_urls_and_completes_the_feedback(tmp_path: Path) -> None:
-    async def main() -> None:
-        double = Double(opened())
-        async with answering(tmp_path, double) as found:
-            folder = prepare(tmp_path / "run", found, double)
-            async with gateway_on(folder, double) as s:
-                urls = s.urls
-                rules = (folder.workspace / "AGENTS.md").read_bytes()
-                double.go.clear()
-                header = {"Idempotency-Key": "mine"}
-                await s.http.post(s.urls.submit + "?wait=false", json=BODY, headers=header)
-                (folder.system / "policy.py").write_text("class Policy: 'edited meanwhile'\n")
-            assert not (folder.feedback / "submit_000").exists()
-            double.go.set()
-            async with gateway_on(folder, double) as s:
-                assert s.urls == urls
-                assert (folder.workspace / "AGENTS.md").read_bytes() == rules
-                again = await s.http.post(s.urls.submit, json=BODY, headers=header)
-                assert again.status_code == 200
-                assert (folder.feedback / "submit_000" / "summary.json").read_bytes() in again.content
-                assert (await s.http.post(s.urls.submit, json=BODY)).json()["submit_id"] == 1
-        assert [submit.env_instances for submit in double.submits] == [(1, 2, 3), (1, 2, 3)]
-        assert double.submits[0].bundle != double.submits[1].bundle
-
-    asyncio.run(main())
+async def test_a_restarted_gateway_has_the_same_urls_and_completes_the_feedback(tmp_path: Path) -> None:
+    double = Double(opened())
+    async with answering(tmp_path, double) as found:
+        folder = prepare(tmp_path / "run", found, double)
+        async with gateway_on(folder, double) as s:
+            urls = s.urls
+            rules = (folder.workspace / "AGENTS.md").read_bytes()
+            double.go.clear()
+            header = {"Idempotency-Key": "mine"}
+            await s.http.post(s.urls.submit + "?wait=false", json=BODY, headers=header)
+            (folder.system / "policy.py").write_text("class Policy: 'edited meanwhile'\n")
+        assert not (folder.feedback / "submit_000").exists()
+        double.go.set()
+        async with gateway_on(folder, double) as s:
+            assert s.urls == urls
+            assert (folder.workspace / "AGENTS.md").read_bytes() == rules
+            again = await s.http.post(s.urls.submit, json=BODY, headers=header)
+            assert again.status_code == 200
+            assert (folder.feedback / "submit_000" / "summary.json").read_bytes() in again.content
+            assert (await s.http.post(s.urls.submit, json=BODY)).json()["submit_id"] == 1
+    assert [submit.env_instances for submit in double.submits] == [(1, 2, 3), (1, 2, 3)]
+    assert double.submits[0].bundle != double.submits[1].bundle
 
 
-def test_an_answer_survives_a_restart_and_a_changed_file(tmp_path: Path) -> None:
-    async def main() -> None:
-        double = Double(opened())
-        async with answering(tmp_path, double) as found:
-            folder = prepare(tmp_path / "run", found, double)
-            async with gateway_on(folder, double) as s:
-                before = await s.http.post(s.urls.submit, json=BODY)
-            (folder.feedback / "submit_000" / "summary.json").write_text("{}")
-            async with gateway_on(folder, double) as s:
-                after = await s.http.get(f"{s.urls.submit}/submit_000")
-                assert after.content == before.content
-
-    asyncio.run(main())
+async def test_an_answer_survives_a_restart_and_a_changed_file(tmp_path: Path) -> None:
+    double = Double(opened())
+    async with answering(tmp_path, double) as found:
+        folder = prepare(tmp_path / "run", found, double)
+        async with gateway_on(folder, double) as s:
+            before = await s.http.post(s.urls.submit, json=BODY)
+        (folder.feedback / "submit_000" / "summary.json").write_text("{}")
+        async with gateway_on(folder, double) as s:
+            after = await s.http.get(f"{s.urls.submit}/submit_000")
+            assert after.content == before.content
 
 
-def test_a_submit_waits_for_a_coordinator_that_is_away(tmp_path: Path) -> None:
-    async def main() -> None:
-        double = Double(opened())
-        async with served(tmp_path, double) as s:
+async def test_a_submit_waits_for_a_coordinator_that_is_away(tmp_path: Path) -> None:
+    double = Double(opened())
+    async with served(tmp_path, double) as s:
+        double.up = False
+        request = asyncio.create_task(s.http.post(s.urls.submit, json=BODY))
+        info = await s.http.get(s.urls.info)
+        assert info.status_code == 200
+        assert info.json()["state"]["n_submits"] == 0
+        await asyncio.sleep(0.3)
+        assert not request.done()
+        double.up = True
+        assert (await request).status_code == 200
+    keys = {message.key for message in double.asked if isinstance(message, Submit)}
+    assert len(keys) == 1
+
+
+async def test_a_request_written_down_but_never_sent_is_sent_after_the_restart(tmp_path: Path) -> None:
+    double = Double(opened())
+    async with answering(tmp_path, double) as found:
+        folder = prepare(tmp_path / "run", found, double)
+        async with gateway_on(folder, double) as s:
             double.up = False
             request = asyncio.create_task(s.http.post(s.urls.submit, json=BODY))
-            info = await s.http.get(s.urls.info)
-            assert info.status_code == 200
-            assert info.json()["state"]["n_submits"] == 0
-            await asyncio.sleep(0.3)
-            assert not request.done()
-            double.up = True
-            assert (await request).status_code == 200
-        keys = {message.key for message in double.asked if isinstance(message, Submit)}
-        assert len(keys) == 1
-
-    asyncio.run(main())
+            while not folder.journal.read_bytes():
+                await asyncio.sleep(0.01)
+        request.cancel()
+        assert double.submits == []
+        double.up = True
+        async with gateway_on(folder, double) as s:
+            await s.pipeline.idle()
+            assert (folder.feedback / "submit_000" / "summary.json").is_file()
 
 
-def test_a_request_written_down_but_never_sent_is_sent_after_the_restart(tmp_path: Path) -> None:
-    async def main() -> None:
-        double = Double(opened())
-        async with answering(tmp_path, double) as found:
-            folder = prepare(tmp_path / "run", found, double)
-            async with gateway_on(folder, double) as s:
-                double.up = False
-                request = asyncio.create_task(s.http.post(s.urls.submit, json=BODY))
-                while not folder.journal.read_bytes():
-                    await asyncio.sleep(0.01)
-            request.cancel()
-            assert double.submits == []
-            double.up = True
-            async with gateway_on(folder, double) as s:
-                await s.pipeline.idle()
-                assert (folder.feedback / "submit_000" / "summary.json").is_file()
-
-    asyncio.run(main())
-
-
-def test_a_feedback_folder_that_cannot_be_written_is_written_once_it_can(
+async def test_a_feedback_folder_that_cannot_be_written_is_written_once_it_can(
     tmp_path: Path, monkeypatch: Any
 ) -> None:
     monkeypatch.setattr(submits, "DISK_PAUSE_S", 0.01)
@@ -133,123 +121,102 @@ def test_a_feedback_folder_that_cannot_be_written_is_written_once_it_can(
 
     monkeypatch.setattr(SubmitTree, "put_episode", put_episode)
 
-    async def main() -> None:
-        async with served(tmp_path) as s:
-            assert (await s.http.post(s.urls.submit, json=BODY)).status_code == 200
-            episodes = s.folder.feedback / "submit_000" / "episodes"
-            assert sorted(path.name for path in episodes.iterdir()) == ["ep_000", "ep_001", "ep_002"]
-
-    asyncio.run(main())
+    async with served(tmp_path) as s:
+        assert (await s.http.post(s.urls.submit, json=BODY)).status_code == 200
+        episodes = s.folder.feedback / "submit_000" / "episodes"
+        assert sorted(path.name for path in episodes.iterdir()) == ["ep_000", "ep_001", "ep_002"]
 
 
-def test_feedback_tampered_with_while_written_comes_out_whole(tmp_path: Path) -> None:
-    async def main() -> None:
-        outside = tmp_path / "outside"
-        outside.mkdir()
-        async with served(tmp_path) as s:
-            feedback = s.folder.feedback
-            shutil.rmtree(feedback)
-            feedback.symlink_to(outside)
-            await s.http.post(s.urls.submit, json=BODY)
-            assert not feedback.is_symlink()
-            (feedback / "submit_001").mkdir()
-            (feedback / "submit_001" / "forged").write_text("x")
-            (feedback / "submit_001.partial").symlink_to(outside)
-            await s.http.post(s.urls.submit, json=BODY)
-            assert sorted(path.name for path in (feedback / "submit_001").iterdir()) == [
-                "episodes",
-                "summary.json",
-            ]
-        assert list(outside.iterdir()) == []
-
-    asyncio.run(main())
+async def test_feedback_tampered_with_while_written_comes_out_whole(tmp_path: Path) -> None:
+    outside = tmp_path / "outside"
+    outside.mkdir()
+    async with served(tmp_path) as s:
+        feedback = s.folder.feedback
+        shutil.rmtree(feedback)
+        feedback.symlink_to(outside)
+        await s.http.post(s.urls.submit, json=BODY)
+        assert not feedback.is_symlink()
+        (feedback / "submit_001").mkdir()
+        (feedback / "submit_001" / "forged").write_text("x")
+        (feedback / "submit_001.partial").symlink_to(outside)
+        await s.http.post(s.urls.submit, json=BODY)
+        assert sorted(path.name for path in (feedback / "submit_001").iterdir()) == [
+            "episodes",
+            "summary.json",
+        ]
+    assert list(outside.iterdir()) == []
 
 
-def test_the_same_results_give_the_same_bytes_whatever_the_order_of_arrival(tmp_path: Path) -> None:
-    async def main() -> None:
-        trees = []
-        for name, order in (("a", list), ("b", lambda n: list(range(n))[::-1])):
-            double = Double(opened())
-            double.order = lambda n, order=order: list(order(range(n)) if order is list else order(n))
-            (tmp_path / name).mkdir()
-            async with served(tmp_path / name, double) as s:
-                await s.http.post(s.urls.submit, json={"env_instances": "0-5"})
-                trees.append(tree_of(s.folder.feedback))
-        assert trees[0] == trees[1]
-        assert len(trees[0]) == 1 + 6 * 3
-
-    asyncio.run(main())
-
-
-def test_a_coordinator_that_refuses_for_want_of_disk_is_asked_again(tmp_path: Path) -> None:
-    async def main() -> None:
+async def test_the_same_results_give_the_same_bytes_whatever_the_order_of_arrival(tmp_path: Path) -> None:
+    trees = []
+    for name, order in (("a", list), ("b", lambda n: list(range(n))[::-1])):
         double = Double(opened())
-        async with served(tmp_path, double) as s:
-            double.world.full = True
-            request = asyncio.create_task(s.http.post(s.urls.submit, json=BODY))
-            await asyncio.sleep(0.2)
-            assert not request.done()
-            double.world.full = False
-            assert (await request).status_code == 200
-
-    asyncio.run(main())
+        double.order = lambda n, order=order: list(order(range(n)) if order is list else order(n))
+        (tmp_path / name).mkdir()
+        async with served(tmp_path / name, double) as s:
+            await s.http.post(s.urls.submit, json={"env_instances": "0-5"})
+            trees.append(tree_of(s.folder.feedback))
+    assert trees[0] == trees[1]
+    assert len(trees[0]) == 1 + 6 * 3
 
 
-def test_a_run_that_the_operator_cancelled_takes_no_more_submits(tmp_path: Path) -> None:
-    async def main() -> None:
-        double = Double(opened())
-        async with served(tmp_path, double) as s:
-            await double.cancel()
-            for _ in range(2):
-                answer = await s.http.post(s.urls.submit, json=BODY)
-                assert answer.status_code == 409
-                assert answer.json()["status"] == "cancelled"
-                assert "cancelled" in answer.json()["error"]["message"]
-                assert double.run_id not in answer.text
-            assert s.pipeline.machine.spent
-            assert (await s.http.get(s.urls.info)).json()["state"]["is_finalized"] is True
-
-    asyncio.run(main())
+async def test_a_coordinator_that_refuses_for_want_of_disk_is_asked_again(tmp_path: Path) -> None:
+    double = Double(opened())
+    async with served(tmp_path, double) as s:
+        double.world.full = True
+        request = asyncio.create_task(s.http.post(s.urls.submit, json=BODY))
+        await asyncio.sleep(0.2)
+        assert not request.done()
+        double.world.full = False
+        assert (await request).status_code == 200
 
 
-def test_closing_finishes_the_submit_in_flight_first(tmp_path: Path) -> None:
-    async def main() -> None:
-        double = Double(opened())
-        double.go.clear()
-        async with served(tmp_path, double) as s:
-            await s.http.post(s.urls.submit + "?wait=false", json=BODY)
-            closing = asyncio.create_task(s.close("wall_limit"))
-            await asyncio.sleep(0.1)
-            assert double.closed is None
-            double.go.set()
-            assert await closing
-            assert double.closed is not None
-            assert double.closed.reason == "wall_limit"
-            assert (s.folder.feedback / "submit_000" / "summary.json").is_file()
-        assert isinstance(double.asked[-1], CloseRun)
-
-    asyncio.run(main())
+async def test_a_run_that_the_operator_cancelled_takes_no_more_submits(tmp_path: Path) -> None:
+    double = Double(opened())
+    async with served(tmp_path, double) as s:
+        await double.cancel()
+        for _ in range(2):
+            answer = await s.http.post(s.urls.submit, json=BODY)
+            assert answer.status_code == 409
+            assert answer.json()["status"] == "cancelled"
+            assert "cancelled" in answer.json()["error"]["message"]
+            assert double.run_id not in answer.text
+        assert s.pipeline.machine.spent
+        assert (await s.http.get(s.urls.info)).json()["state"]["is_finalized"] is True
 
 
-def test_a_port_that_somebody_else_has_taken_is_reported(tmp_path: Path, monkeypatch: Any) -> None:
+async def test_closing_finishes_the_submit_in_flight_first(tmp_path: Path) -> None:
+    double = Double(opened())
+    double.go.clear()
+    async with served(tmp_path, double) as s:
+        await s.http.post(s.urls.submit + "?wait=false", json=BODY)
+        closing = asyncio.create_task(s.close("wall_limit"))
+        await asyncio.sleep(0.1)
+        assert double.closed is None
+        double.go.set()
+        assert await closing
+        assert double.closed is not None
+        assert double.closed.reason == "wall_limit"
+        assert (s.folder.feedback / "submit_000" / "summary.json").is_file()
+    assert isinstance(double.asked[-1], CloseRun)
+
+
+async def test_a_port_that_somebody_else_has_taken_is_reported(tmp_path: Path, monkeypatch: Any) -> None:
     monkeypatch.setattr(server, "_REBIND_TRIES", 2)
     monkeypatch.setattr(server, "_REBIND_PAUSE_S", 0.01)
 
-    async def main() -> None:
-        double = Double(opened())
-        async with answering(tmp_path, double) as found:
-            folder = prepare(tmp_path / "run", found, double)
-            async with gateway_on(folder, double) as s:
-                port = urlsplit(s.urls.info).port
-            with socket.socket() as thief:
-                thief.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-                thief.bind(("127.0.0.1", port))
-                thief.listen()
-                with pytest.raises(ConfigError, match=f"port {port}"):
-                    async with gateway_on(folder, double):
-                        pass
-
-    asyncio.run(main())
+    double = Double(opened())
+    async with answering(tmp_path, double) as found:
+        folder = prepare(tmp_path / "run", found, double)
+        async with gateway_on(folder, double) as s:
+            port = urlsplit(s.urls.info).port
+        with socket.socket() as thief:
+            thief.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            thief.bind(("127.0.0.1", port))
+            thief.listen()
+            with pytest.raises(ConfigError, match=f"port {port}"):
+                async with gateway_on(folder, double):
+                    pass
 
 
 def test_a_gateway_that_stops_during_a_submit_shows_no_traceback(
@@ -278,39 +245,36 @@ def test_a_gateway_that_stops_during_a_submit_shows_no_traceback(
     assert [record.message for record in caplog.records if record.exc_info] == []
 
 
-def test_a_gateway_keeps_nothing_of_the_episodes_that_it_has_answered(tmp_path: Path) -> None:
+async def test_a_gateway_keeps_nothing_of_the_episodes_that_it_has_answered(tmp_path: Path) -> None:
     n, cases = 100, tuple(range(1001, 1201, 2))
 
-    async def main() -> None:
-        budget = 30 * n
-        run = opened(
-            n_env_instances=2000,
-            episode_budget=budget,
-            max_episodes_per_submit=n,
-        )
-        double = Double(run)
-        async with served(tmp_path, double) as s:
+    budget = 30 * n
+    run = opened(
+        n_env_instances=2000,
+        episode_budget=budget,
+        max_episodes_per_submit=n,
+    )
+    double = Double(run)
+    async with served(tmp_path, double) as s:
 
-            async def play(submits: int) -> int:
-                """Bytes that the gateway's modules hold afterwards."""
-                for _ in range(submits):
-                    body = {"env_instances": cases}
-                    assert (await s.http.post(s.urls.submit, json=body)).status_code == 200
-                gc.collect()
-                found = tracemalloc.take_snapshot().statistics("filename")
-                return sum(each.size for each in found if "evopolicy_gateway" in each.traceback[0].filename)
+        async def play(submits: int) -> int:
+            """Bytes that the gateway's modules hold afterwards."""
+            for _ in range(submits):
+                body = {"env_instances": cases}
+                assert (await s.http.post(s.urls.submit, json=body)).status_code == 200
+            gc.collect()
+            found = tracemalloc.take_snapshot().statistics("filename")
+            return sum(each.size for each in found if "evopolicy_gateway" in each.traceback[0].filename)
 
-            tracemalloc.start()
-            try:
-                before = await play(4)
-                after = await play(12)
-            finally:
-                tracemalloc.stop()
-            first = await s.http.get(f"{s.urls.submit}/submit_0000")
-            assert len(first.json()["summary"]["returns"]) == n
-        assert (after - before) / (12 * n) < 20.0, "bytes for each episode"
-
-    asyncio.run(main())
+        tracemalloc.start()
+        try:
+            before = await play(4)
+            after = await play(12)
+        finally:
+            tracemalloc.stop()
+        first = await s.http.get(f"{s.urls.submit}/submit_0000")
+        assert len(first.json()["summary"]["returns"]) == n
+    assert (after - before) / (12 * n) < 20.0, "bytes for each episode"
 
 
 def test_a_damaged_journal_is_refused_and_leaves_no_socket_open(tmp_path: Path) -> None:

@@ -55,104 +55,86 @@ def remote(folder: RunFolder, agent_host: str) -> None:
     save(folder.intended, IntendedRun(key="k", settings=settings))
 
 
-def test_nothing_is_served_before_the_permit_and_the_operator_hears_why(tmp_path: Path) -> None:
-    async def main() -> None:
-        double = Double(opened())
-        async with answering(tmp_path, double) as found:
-            await double.score_another_run(host.boot_id())
-            folder = prepare(tmp_path / "run", found, double)
-            gateway, events = quiet(folder)
-            task = asyncio.create_task(gateway.run())
-            await until(lambda: events)
-            assert set(events) == {"hidden cases on this machine to be postponed"}
-            assert not folder.workspace.exists()
-            double.scoring.clear()
-            await until(lambda: len(events) > 1 and events[-2] == "")
-            assert gateway.permit_s > 0.0
-            gateway.tell(None)
-            assert not await task
-        opening = asked(double, OpenRun)[0]
-        assert isinstance(opening, OpenRun)
-        assert opening.asks_permit
-        first = asked(double, RequestPermit)[0]
-        assert isinstance(first, RequestPermit)
-        assert (first.run, first.boot_id) == (double.run_id, host.boot_id())
-
-    asyncio.run(main())
+async def test_nothing_is_served_before_the_permit_and_the_operator_hears_why(tmp_path: Path) -> None:
+    double = Double(opened())
+    async with answering(tmp_path, double) as found:
+        await double.score_another_run(host.boot_id())
+        folder = prepare(tmp_path / "run", found, double)
+        gateway, events = quiet(folder)
+        task = asyncio.create_task(gateway.run())
+        await until(lambda: events)
+        assert set(events) == {"hidden cases on this machine to be postponed"}
+        assert not folder.workspace.exists()
+        double.scoring.clear()
+        await until(lambda: len(events) > 1 and events[-2] == "")
+        assert gateway.permit_s > 0.0
+        gateway.tell(None)
+        assert not await task
+    opening = asked(double, OpenRun)[0]
+    assert isinstance(opening, OpenRun)
+    assert opening.asks_permit
+    first = asked(double, RequestPermit)[0]
+    assert isinstance(first, RequestPermit)
+    assert (first.run, first.boot_id) == (double.run_id, host.boot_id())
 
 
-def test_gateway_that_is_started_again_asks_again(tmp_path: Path) -> None:
-    async def main() -> None:
-        double = Double(opened())
-        async with answering(tmp_path, double) as found:
-            folder = prepare(tmp_path / "run", found, double)
-            for _ in range(2):
-                async with gateway_on(folder, double):
-                    pass
-        assert len(asked(double, RequestPermit)) >= 2
-        assert double.closed is None
-
-    asyncio.run(main())
+async def test_gateway_that_is_started_again_asks_again(tmp_path: Path) -> None:
+    double = Double(opened())
+    async with answering(tmp_path, double) as found:
+        folder = prepare(tmp_path / "run", found, double)
+        for _ in range(2):
+            async with gateway_on(folder, double):
+                pass
+    assert len(asked(double, RequestPermit)) >= 2
+    assert double.closed is None
 
 
-def test_an_agent_whose_permit_was_ended_by_mistake_gets_another(
+async def test_an_agent_whose_permit_was_ended_by_mistake_gets_another(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(coordinator_client, "RENEWAL_S", 1.0)
 
-    async def main() -> None:
-        double = Double(opened())
-        async with answering(tmp_path, double) as found:
-            folder = prepare(tmp_path / "run", found, double)
-            async with gateway_on(folder, double):
-                await double.agent_gone()
-                assert not double.has_permit()
-                await until(double.has_permit)
-            assert double.closed is None
-
-    asyncio.run(main())
+    double = Double(opened())
+    async with answering(tmp_path, double) as found:
+        folder = prepare(tmp_path / "run", found, double)
+        async with gateway_on(folder, double):
+            await double.agent_gone()
+            assert not double.has_permit()
+            await until(double.has_permit)
+        assert double.closed is None
 
 
-def test_run_that_is_cancelled_while_it_waits_is_over(tmp_path: Path) -> None:
-    async def main() -> None:
-        double = Double(opened())
-        async with answering(tmp_path, double) as found:
-            await double.score_another_run(host.boot_id())
-            gateway, events = quiet(prepare(tmp_path / "run", found, double))
-            task = asyncio.create_task(gateway.run())
-            await until(lambda: events)
-            await double.cancel()
-            assert await task
-        assert events[-1] == ""
-
-    asyncio.run(main())
+async def test_run_that_is_cancelled_while_it_waits_is_over(tmp_path: Path) -> None:
+    double = Double(opened())
+    async with answering(tmp_path, double) as found:
+        await double.score_another_run(host.boot_id())
+        gateway, events = quiet(prepare(tmp_path / "run", found, double))
+        task = asyncio.create_task(gateway.run())
+        await until(lambda: events)
+        await double.cancel()
+        assert await task
+    assert events[-1] == ""
 
 
-def test_an_ended_agents_gateway_closes_the_run_without_a_permit(tmp_path: Path) -> None:
-    async def main() -> None:
-        double = Double(opened())
-        async with answering(tmp_path, double) as found:
-            await double.score_another_run(host.boot_id())
-            gateway, _ = quiet(prepare(tmp_path / "run", found, double))
-            gateway.tell(Close(reason="agent_stopped"))
-            assert await gateway.run()
-        assert double.closed is not None
-
-    asyncio.run(main())
+async def test_an_ended_agents_gateway_closes_the_run_without_a_permit(tmp_path: Path) -> None:
+    double = Double(opened())
+    async with answering(tmp_path, double) as found:
+        await double.score_another_run(host.boot_id())
+        gateway, _ = quiet(prepare(tmp_path / "run", found, double))
+        gateway.tell(Close(reason="agent_stopped"))
+        assert await gateway.run()
+    assert double.closed is not None
 
 
-def test_coordinator_of_an_older_version_is_an_error_with_the_remedy(tmp_path: Path) -> None:
-    async def main() -> None:
-        double = Double(opened())
-        older = Refused(status=Refusal.BAD_MESSAGE, message="not a message")
-        double.intercept = lambda message: older if isinstance(message, RequestPermit) else None
-        async with answering(tmp_path, double) as found:
-            gateway, events = quiet(prepare(tmp_path / "run", found, double))
-            with pytest.raises(ConfigError, match=r"older version.*update it"):
-                await gateway.run()
-        assert events == [""]
-
-    asyncio.run(main())
+async def test_coordinator_of_an_older_version_is_an_error_with_the_remedy(tmp_path: Path) -> None:
+    double = Double(opened())
+    older = Refused(status=Refusal.BAD_MESSAGE, message="not a message")
+    double.intercept = lambda message: older if isinstance(message, RequestPermit) else None
+    async with answering(tmp_path, double) as found:
+        gateway, events = quiet(prepare(tmp_path / "run", found, double))
+        with pytest.raises(ConfigError, match=r"older version.*update it"):
+            await gateway.run()
+    assert events == [""]
 
 
 @pytest.mark.parametrize(("agent_host", "asks_for"), [("", ""), (KERNEL, KERNEL), (ELSEWHERE, "")])
@@ -166,90 +148,75 @@ def test_a_remote_agents_permit_is_for_the_named_kernel(
     assert listener.ends_unseen(folder) == (agent_host != ELSEWHERE)
 
 
-def test_a_remote_agents_run_closes_on_its_operators_word(tmp_path: Path) -> None:
-    async def main() -> None:
-        double = Double(opened())
-        async with answering(tmp_path, double) as found:
-            folder = prepare(tmp_path / "run", found, double)
-            remote(folder, KERNEL)
-            async with gateway_on(folder, double) as service:
-                service.gateway.tell(Close(reason="budget_spent"))
-                await until(lambda: len(service.waits) > 1)
-                assert "evopolicy finish" in service.waits[1]
-                assert double.closed is None
-                assert service.pipeline.machine.closed
-                listener.finish(folder)
-                assert await service.task
-        assert [message.reason for message in asked(double, CloseRun) if isinstance(message, CloseRun)] == [
-            "budget_spent"
-        ]
-
-    asyncio.run(main())
+async def test_a_remote_agents_run_closes_on_its_operators_word(tmp_path: Path) -> None:
+    double = Double(opened())
+    async with answering(tmp_path, double) as found:
+        folder = prepare(tmp_path / "run", found, double)
+        remote(folder, KERNEL)
+        async with gateway_on(folder, double) as service:
+            service.gateway.tell(Close(reason="budget_spent"))
+            await until(lambda: len(service.waits) > 1)
+            assert "evopolicy finish" in service.waits[1]
+            assert double.closed is None
+            assert service.pipeline.machine.closed
+            listener.finish(folder)
+            assert await service.task
+    assert [message.reason for message in asked(double, CloseRun) if isinstance(message, CloseRun)] == [
+        "budget_spent"
+    ]
 
 
-def test_run_whose_operator_vouches_for_its_agent_is_closed_at_once(tmp_path: Path) -> None:
-    async def main() -> None:
-        double = Double(opened())
-        async with answering(tmp_path, double) as found:
-            folder = prepare(tmp_path / "run", found, double)
-            remote(folder, ELSEWHERE)
-            async with gateway_on(folder, double) as service:
-                assert await service.close()
-        assert double.closed is not None
-
-    asyncio.run(main())
+async def test_run_whose_operator_vouches_for_its_agent_is_closed_at_once(tmp_path: Path) -> None:
+    double = Double(opened())
+    async with answering(tmp_path, double) as found:
+        folder = prepare(tmp_path / "run", found, double)
+        remote(folder, ELSEWHERE)
+        async with gateway_on(folder, double) as service:
+            assert await service.close()
+    assert double.closed is not None
 
 
-def test_a_gateway_stopped_before_its_agents_end_leaves_the_run_open(tmp_path: Path) -> None:
-    async def main() -> None:
-        double = Double(opened())
-        async with answering(tmp_path, double) as found:
-            folder = prepare(tmp_path / "run", found, double)
-            remote(folder, "")
-            async with gateway_on(folder, double) as service:
-                service.gateway.tell(Close(reason="wall_limit"))
-                await until(lambda: len(service.waits) > 1)
-                service.gateway.tell(None)
-                assert not await service.task
-        assert double.closed is None
-
-    asyncio.run(main())
+async def test_a_gateway_stopped_before_its_agents_end_leaves_the_run_open(tmp_path: Path) -> None:
+    double = Double(opened())
+    async with answering(tmp_path, double) as found:
+        folder = prepare(tmp_path / "run", found, double)
+        remote(folder, "")
+        async with gateway_on(folder, double) as service:
+            service.gateway.tell(Close(reason="wall_limit"))
+            await until(lambda: len(service.waits) > 1)
+            service.gateway.tell(None)
+            assert not await service.task
+    assert double.closed is None
 
 
-def test_agent_that_nobody_watches_ends_by_its_operators_word(tmp_path: Path) -> None:
-    async def main() -> None:
-        double = Double(opened(episode_budget=1))
-        async with answering(tmp_path, double) as found:
-            folder = prepare(tmp_path / "run", found, double)
-            async with gateway_on(folder, double, alone=True, place=AgentPlace(boot_id=KERNEL)) as service:
-                await service.http.post(service.urls.submit, json={"env_instances": [1]})
-                await until(lambda: len(service.waits) > 1)
-                assert "evopolicy finish" in service.waits[1]
-                assert double.closed is None
-                listener.finish(folder)
-                assert await service.task
-        permit = asked(double, RequestPermit)[0]
-        assert isinstance(permit, RequestPermit)
-        assert permit.boot_id == KERNEL
-
-    asyncio.run(main())
+async def test_agent_that_nobody_watches_ends_by_its_operators_word(tmp_path: Path) -> None:
+    double = Double(opened(episode_budget=1))
+    async with answering(tmp_path, double) as found:
+        folder = prepare(tmp_path / "run", found, double)
+        async with gateway_on(folder, double, alone=True, place=AgentPlace(boot_id=KERNEL)) as service:
+            await service.http.post(service.urls.submit, json={"env_instances": [1]})
+            await until(lambda: len(service.waits) > 1)
+            assert "evopolicy finish" in service.waits[1]
+            assert double.closed is None
+            listener.finish(folder)
+            assert await service.task
+    permit = asked(double, RequestPermit)[0]
+    assert isinstance(permit, RequestPermit)
+    assert permit.boot_id == KERNEL
 
 
-def test_time_held_by_hidden_episodes_counts_against_no_limit(tmp_path: Path) -> None:
-    async def main() -> None:
-        double = Double(opened())
-        double.held_s = 5.0
-        double.go.clear()
-        async with served(tmp_path, double) as service:
-            assert service.pipeline.machine.held_s == 5.0
-            await service.http.post(service.urls.submit + "?wait=false", json={"env_instances": [1]})
-            double.held_s = 7.5
-            await until(lambda: service.pipeline.machine.held_s == 7.5)
-            running = (await service.http.get(service.urls.info)).json()["submit_in_flight"]
-            assert running["waits_for"] == "a free slot"
-            assert running["held_s"] >= 2.5
-            double.go.set()
-            await service.pipeline.idle()
-            assert service.pipeline.machine.tickets[0].held_s == 2.5
-
-    asyncio.run(main())
+async def test_time_held_by_hidden_episodes_counts_against_no_limit(tmp_path: Path) -> None:
+    double = Double(opened())
+    double.held_s = 5.0
+    double.go.clear()
+    async with served(tmp_path, double) as service:
+        assert service.pipeline.machine.held_s == 5.0
+        await service.http.post(service.urls.submit + "?wait=false", json={"env_instances": [1]})
+        double.held_s = 7.5
+        await until(lambda: service.pipeline.machine.held_s == 7.5)
+        running = (await service.http.get(service.urls.info)).json()["submit_in_flight"]
+        assert running["waits_for"] == "a free slot"
+        assert running["held_s"] >= 2.5
+        double.go.set()
+        await service.pipeline.idle()
+        assert service.pipeline.machine.tickets[0].held_s == 2.5

@@ -33,7 +33,7 @@ def rows(folder: Path, episode: str, submit: str = "submit_000") -> list[dict[st
 
 
 @pytest.mark.parametrize("kind", ["junk", "too long"])
-def test_an_episode_whose_trajectory_cannot_be_written_is_put_aside(
+async def test_an_episode_whose_trajectory_cannot_be_written_is_put_aside(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
 ) -> None:
     real = packed_episode
@@ -41,35 +41,29 @@ def test_an_episode_whose_trajectory_cannot_be_written_is_put_aside(
     monkeypatch.setattr(gateway_double, "packed_episode", lambda case: junk if case == 3 else real(case))
     monkeypatch.setattr(rendered, "MAX_ROWS_BYTES", 5000)
 
-    async def main() -> None:
-        async with served(tmp_path) as s:
-            answer = await s.http.post(s.urls.submit, json=BODY)
-            assert (answer.status_code, answer.json()["status"]) == (200, "ok")
-            assert len(answer.json()["summary"]["returns"]) == 3
-            assert files_of(s.folder.feedback) == {
-                "ep_000": WHOLE,
-                "ep_001": WHOLE,
-                "ep_002": {"error.txt", "stdout.txt", "stderr.txt"},
-            }
-            (line,) = rows(s.folder.feedback, "ep_002")
-            assert line["category"] == "feedback_error"
-            assert "cannot be written; the episode's return counts" in line["message"]
-
-    asyncio.run(main())
+    async with served(tmp_path) as s:
+        answer = await s.http.post(s.urls.submit, json=BODY)
+        assert (answer.status_code, answer.json()["status"]) == (200, "ok")
+        assert len(answer.json()["summary"]["returns"]) == 3
+        assert files_of(s.folder.feedback) == {
+            "ep_000": WHOLE,
+            "ep_001": WHOLE,
+            "ep_002": {"error.txt", "stdout.txt", "stderr.txt"},
+        }
+        (line,) = rows(s.folder.feedback, "ep_002")
+        assert line["category"] == "feedback_error"
+        assert "cannot be written; the episode's return counts" in line["message"]
 
 
-def test_an_episode_whose_recording_is_gone_is_put_aside(tmp_path: Path) -> None:
-    async def main() -> None:
-        double = Double(opened())
-        double.lost = {2}
-        async with served(tmp_path, double) as s:
-            assert (await s.http.post(s.urls.submit, json=BODY)).json()["status"] == "ok"
-            assert [line["message"] for line in rows(s.folder.feedback, "ep_001")] == [
-                "this episode's trajectory or video is not stored any more; the episode's return counts"
-            ]
-            assert files_of(s.folder.feedback)["ep_000"] == WHOLE
-
-    asyncio.run(main())
+async def test_an_episode_whose_recording_is_gone_is_put_aside(tmp_path: Path) -> None:
+    double = Double(opened())
+    double.lost = {2}
+    async with served(tmp_path, double) as s:
+        assert (await s.http.post(s.urls.submit, json=BODY)).json()["status"] == "ok"
+        assert [line["message"] for line in rows(s.folder.feedback, "ep_001")] == [
+            "this episode's trajectory or video is not stored any more; the episode's return counts"
+        ]
+        assert files_of(s.folder.feedback)["ep_000"] == WHOLE
 
 
 KILLED = """
@@ -102,36 +96,33 @@ asyncio.run(main())
 """
 
 
-def test_an_episode_that_kills_two_gateways_is_set_aside(tmp_path: Path) -> None:
+async def test_an_episode_that_kills_two_gateways_is_set_aside(tmp_path: Path) -> None:
     async def child(folder: Path) -> int:
         process = await asyncio.create_subprocess_exec(sys.executable, "-c", KILLED, str(folder))
         return await asyncio.wait_for(process.wait(), 120)
 
-    async def main() -> None:
-        double = Double(opened())
-        async with answering(tmp_path, double) as found:
-            folder = prepare(tmp_path / "run", found, double)
-            async with gateway_on(folder, double) as s:
-                double.go.clear()
-                await s.http.post(s.urls.submit + "?wait=false", json={"env_instances": [1, 2, 3, 4]})
-            double.go.set()
-            ends = [await child(folder.root) for _ in range(3)]
-            assert ends == [-9, -9, 0]
-            journal = Journal(folder.journal)
-            died = [entry.episodes for entry in journal.entries if isinstance(entry, Died)]
-            journal.close()
-            assert died[0] in ((2,), (3, 2), (2, 3))
-            assert died[1:] == [(2,)]
-            found_files = files_of(folder.feedback)
-            assert found_files["ep_002"] == {"error.txt", "stdout.txt", "stderr.txt"}
-            assert {frozenset(files) for name, files in found_files.items() if name != "ep_002"} == {
-                frozenset(WHOLE)
-            }
-            assert "ended 2 times" in rows(folder.feedback, "ep_002")[0]["message"]
-            async with gateway_on(folder, double) as s:
-                assert (await s.http.get(f"{s.urls.submit}/submit_000")).json()["status"] == "ok"
-
-    asyncio.run(main())
+    double = Double(opened())
+    async with answering(tmp_path, double) as found:
+        folder = prepare(tmp_path / "run", found, double)
+        async with gateway_on(folder, double) as s:
+            double.go.clear()
+            await s.http.post(s.urls.submit + "?wait=false", json={"env_instances": [1, 2, 3, 4]})
+        double.go.set()
+        ends = [await child(folder.root) for _ in range(3)]
+        assert ends == [-9, -9, 0]
+        journal = Journal(folder.journal)
+        died = [entry.episodes for entry in journal.entries if isinstance(entry, Died)]
+        journal.close()
+        assert died[0] in ((2,), (3, 2), (2, 3))
+        assert died[1:] == [(2,)]
+        found_files = files_of(folder.feedback)
+        assert found_files["ep_002"] == {"error.txt", "stdout.txt", "stderr.txt"}
+        assert {frozenset(files) for name, files in found_files.items() if name != "ep_002"} == {
+            frozenset(WHOLE)
+        }
+        assert "ended 2 times" in rows(folder.feedback, "ep_002")[0]["message"]
+        async with gateway_on(folder, double) as s:
+            assert (await s.http.get(f"{s.urls.submit}/submit_000")).json()["status"] == "ok"
 
 
 async def ended_by_a_submit(folder: RunFolder, double: Double) -> None:
@@ -140,7 +131,7 @@ async def ended_by_a_submit(folder: RunFolder, double: Double) -> None:
         await asyncio.wait([s.task])
 
 
-def test_a_submit_that_ends_two_gateways_is_put_aside(
+async def test_a_submit_that_ends_two_gateways_is_put_aside(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     real = formatting.summary_bytes
@@ -152,24 +143,21 @@ def test_a_submit_that_ends_two_gateways_is_put_aside(
 
     monkeypatch.setattr(formatting, "summary_bytes", summary_bytes)
 
-    async def main() -> None:
-        double = Double(opened())
-        async with answering(tmp_path, double) as found:
-            folder = prepare(tmp_path / "run", found, double)
-            with pytest.raises(KeyError):
-                await ended_by_a_submit(folder, double)
-            async with gateway_on(folder, double) as s:
-                await s.pipeline.idle()
-                answer = await s.http.get(f"{s.urls.submit}/submit_000")
-                assert (answer.status_code, answer.json()["status"]) == (500, "gateway_failed")
-                assert "charged" in answer.json()["error"]["message"]
-                again = await s.http.post(s.urls.submit, json=BODY)
-                assert (again.json()["submit_id"], again.json()["status"]) == (1, "ok")
-            async with gateway_on(folder, double) as s:
-                assert (await s.http.get(f"{s.urls.submit}/submit_000")).status_code == 500
-                assert (await s.http.get(f"{s.urls.submit}/submit_001")).status_code == 200
-            journal = Journal(folder.journal)
-            assert sum(isinstance(entry, SetAside) for entry in journal.entries) == 1
-            journal.close()
-
-    asyncio.run(main())
+    double = Double(opened())
+    async with answering(tmp_path, double) as found:
+        folder = prepare(tmp_path / "run", found, double)
+        with pytest.raises(KeyError):
+            await ended_by_a_submit(folder, double)
+        async with gateway_on(folder, double) as s:
+            await s.pipeline.idle()
+            answer = await s.http.get(f"{s.urls.submit}/submit_000")
+            assert (answer.status_code, answer.json()["status"]) == (500, "gateway_failed")
+            assert "charged" in answer.json()["error"]["message"]
+            again = await s.http.post(s.urls.submit, json=BODY)
+            assert (again.json()["submit_id"], again.json()["status"]) == (1, "ok")
+        async with gateway_on(folder, double) as s:
+            assert (await s.http.get(f"{s.urls.submit}/submit_000")).status_code == 500
+            assert (await s.http.get(f"{s.urls.submit}/submit_001")).status_code == 200
+        journal = Journal(folder.journal)
+        assert sum(isinstance(entry, SetAside) for entry in journal.entries) == 1
+        journal.close()

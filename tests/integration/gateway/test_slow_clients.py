@@ -5,7 +5,8 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import socket
-from collections.abc import Awaitable, Callable
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 from pathlib import Path
 from urllib.parse import SplitResult, urlsplit
 
@@ -19,13 +20,12 @@ SHORT_S = 0.5
 TIMEOUT_S = 60.0
 
 
-def play(tmp_path: Path, script: Callable[[Served], Awaitable[None]]) -> None:
-    async def main() -> None:
-        async with served(tmp_path) as service:
-            await script(service)
-            assert (await service.http.get(service.urls.info)).status_code == 200
-
-    asyncio.run(main())
+@asynccontextmanager
+async def living(tmp_path: Path) -> AsyncIterator[Served]:
+    """A gateway that still answers afterwards."""
+    async with served(tmp_path) as service:
+        yield service
+        assert (await service.http.get(service.urls.info)).status_code == 200
 
 
 async def drip(address: SplitResult, start: bytes, drop: bytes) -> bytes:
@@ -58,42 +58,38 @@ async def drip(address: SplitResult, start: bytes, drop: bytes) -> bytes:
     [(b"", b""), (b"G", b""), (b"GET / HTTP/1.1\r\nHost: x\r\n", b"X-A: b\r\n")],
     ids=["says nothing", "begins and stops", "drips its headers"],
 )
-def test_headers_that_do_not_come_are_not_waited_for(
+async def test_headers_that_do_not_come_are_not_waited_for(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, start: bytes, drop: bytes
 ) -> None:
     monkeypatch.setattr(server, "HEADERS_WAIT_S", SHORT_S)
 
-    async def script(s: Served) -> None:
+    async with living(tmp_path) as s:
         slow = [drip(urlsplit(s.urls.info), start, drop) for _ in range(20)]
         answers = asyncio.gather(*slow)
         assert (await s.http.get(s.urls.info)).status_code == 200
         assert await answers == [b""] * 20
 
-    play(tmp_path, script)
 
-
-def test_a_second_request_on_a_connection_may_not_drip_either(
+async def test_a_second_request_on_a_connection_may_not_drip_either(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(server, "HEADERS_WAIT_S", SHORT_S)
 
-    async def script(s: Served) -> None:
+    async with living(tmp_path) as s:
         address = urlsplit(s.urls.info)
         request = f"GET {address.path} HTTP/1.1\r\nHost: x\r\n\r\n".encode()
         answer = await drip(address, request + b"GET ", b"x")
         assert answer.count(b"HTTP/1.1 200") == 1
 
-    play(tmp_path, script)
 
-
-def test_a_body_that_drips_is_refused_and_costs_nothing(
+async def test_a_body_that_drips_is_refused_and_costs_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(http, "BODY_WAIT_S", SHORT_S)
     monkeypatch.setattr(http, "LINGER", (1 << 20, SHORT_S))
     monkeypatch.setattr(server, "HEADERS_WAIT_S", SHORT_S)
 
-    async def script(s: Served) -> None:
+    async with living(tmp_path) as s:
         address = urlsplit(s.urls.submit)
         head = f"POST {address.path} HTTP/1.1\r\nHost: x\r\nContent-Length: 500000\r\n\r\n".encode()
         answer = await drip(address, head, b" ")
@@ -101,15 +97,13 @@ def test_a_body_that_drips_is_refused_and_costs_nothing(
         assert b"did not arrive" in answer
         assert s.double.submits == []
 
-    play(tmp_path, script)
 
-
-def test_an_answer_that_nobody_reads_is_not_kept_for_ever(
+async def test_an_answer_that_nobody_reads_is_not_kept_for_ever(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(server, "ANSWER_WAIT_S", SHORT_S)
 
-    async def script(s: Served) -> None:
+    async with living(tmp_path) as s:
         address = urlsplit(s.urls.task)
         request = f"GET {address.path} HTTP/1.1\r\nHost: x\r\n\r\n".encode()
         loop = asyncio.get_running_loop()
@@ -125,5 +119,3 @@ def test_an_answer_that_nobody_reads_is_not_kept_for_ever(
 
             with pytest.raises(ConnectionError):
                 await asyncio.wait_for(ask(), TIMEOUT_S)
-
-    play(tmp_path, script)

@@ -64,99 +64,79 @@ async def answered(link: Link, key: str) -> bool:
 
 
 @pytest.mark.parametrize("role", ["worker", "gateway", "operator"])
-def test_a_role_is_answered_on_its_own_keys_only(tmp_path: Path, role: Role) -> None:
-    async def scenario() -> None:
-        async with coordinator(tmp_path) as asked, transport.connect(credentials(tmp_path, role)) as link:
-            for owner, key in OWN_KEY.items():
-                assert await answered(link, key) == (owner == role), key
-            assert asked == [OWN_KEY[role]]
-
-    asyncio.run(scenario())
+async def test_a_role_is_answered_on_its_own_keys_only(tmp_path: Path, role: Role) -> None:
+    async with coordinator(tmp_path) as asked, transport.connect(credentials(tmp_path, role)) as link:
+        for owner, key in OWN_KEY.items():
+            assert await answered(link, key) == (owner == role), key
+        assert asked == [OWN_KEY[role]]
 
 
 @pytest.mark.parametrize(("role", "password"), [("worker", "wrong"), ("gateway", PASSWORDS["worker"])])
-def test_a_wrong_password_is_not_let_in(tmp_path: Path, role: Role, password: str) -> None:
-    async def scenario() -> None:
-        async with coordinator(tmp_path) as asked:
-            with pytest.raises(TransportError, match="credentials"):
-                async with transport.connect(credentials(tmp_path, role, password), timeout_s=1.0):
-                    pass
-            assert asked == []
-
-    asyncio.run(scenario())
+async def test_a_wrong_password_is_not_let_in(tmp_path: Path, role: Role, password: str) -> None:
+    async with coordinator(tmp_path) as asked:
+        with pytest.raises(TransportError, match="credentials"):
+            async with transport.connect(credentials(tmp_path, role, password), timeout_s=1.0):
+                pass
+        assert asked == []
 
 
-def test_a_session_without_password_is_not_let_in(tmp_path: Path) -> None:
-    async def scenario() -> None:
-        async with coordinator(tmp_path) as asked:
-            config = zenoh.Config()
-            config.insert_json5("mode", '"client"')
-            config.insert_json5("connect/endpoints", f'["unixsock-stream/{tmp_path}/sock"]')
-            config.insert_json5("connect/timeout_ms", "1000")
-            config.insert_json5("scouting/multicast/enabled", "false")
-            with pytest.raises(zenoh.ZError):
-                await asyncio.to_thread(zenoh.open, config)
-            assert asked == []
-
-    asyncio.run(scenario())
+async def test_a_session_without_password_is_not_let_in(tmp_path: Path) -> None:
+    async with coordinator(tmp_path) as asked:
+        config = zenoh.Config()
+        config.insert_json5("mode", '"client"')
+        config.insert_json5("connect/endpoints", f'["unixsock-stream/{tmp_path}/sock"]')
+        config.insert_json5("connect/timeout_ms", "1000")
+        config.insert_json5("scouting/multicast/enabled", "false")
+        with pytest.raises(zenoh.ZError):
+            await asyncio.to_thread(zenoh.open, config)
+        assert asked == []
 
 
-def test_one_gateway_cannot_answer_or_overhear_another(tmp_path: Path) -> None:
-    async def scenario() -> None:
-        own = credentials(tmp_path, "gateway")
-        async with (
-            coordinator(tmp_path),
-            transport.connect(own) as honest,
-            eavesdropping(own, keys.gateway_expr(CLUSTER)) as overheard,
-        ):
-            await asyncio.sleep(0.3)
-            for _ in range(20):
-                assert await answered(honest, OWN_KEY["gateway"])
-            assert overheard == []
-
-    asyncio.run(scenario())
+async def test_one_gateway_cannot_answer_or_overhear_another(tmp_path: Path) -> None:
+    own = credentials(tmp_path, "gateway")
+    async with (
+        coordinator(tmp_path),
+        transport.connect(own) as honest,
+        eavesdropping(own, keys.gateway_expr(CLUSTER)) as overheard,
+    ):
+        await asyncio.sleep(0.3)
+        for _ in range(20):
+            assert await answered(honest, OWN_KEY["gateway"])
+        assert overheard == []
 
 
-def test_only_a_worker_can_claim_to_be_alive(tmp_path: Path) -> None:
-    async def scenario() -> None:
-        seen: list[tuple[str, bool]] = []
-        key = keys.liveliness_key(CLUSTER, "w1")
-        (tmp_path / "passwords").write_text("".join(f"{user}:{word}\n" for user, word in PASSWORDS.items()))
-        config = transport.server_config(
-            CLUSTER,
-            [f"unixsock-stream/{tmp_path}/sock"],
-            tmp_path / "passwords",
-            {role: role for role in PASSWORDS},
-        )
-        async with transport.serve(config, lambda queries: None) as server:
-            server.watch_liveliness(
-                keys.liveliness_expr(CLUSTER), lambda name, alive: seen.append((name, alive))
-            )
-            async with transport.connect(credentials(tmp_path, "gateway")) as link:
-                link.declare_alive(key)
-                await asyncio.sleep(0.2)
-                assert seen == []
-            async with transport.connect(credentials(tmp_path, "worker")) as link:
-                link.declare_alive(key)
-                await eventually(lambda: seen == [(key, True)])
-            await eventually(lambda: seen == [(key, True), (key, False)])
-
-    asyncio.run(scenario())
+async def test_only_a_worker_can_claim_to_be_alive(tmp_path: Path) -> None:
+    seen: list[tuple[str, bool]] = []
+    key = keys.liveliness_key(CLUSTER, "w1")
+    (tmp_path / "passwords").write_text("".join(f"{user}:{word}\n" for user, word in PASSWORDS.items()))
+    config = transport.server_config(
+        CLUSTER,
+        [f"unixsock-stream/{tmp_path}/sock"],
+        tmp_path / "passwords",
+        {role: role for role in PASSWORDS},
+    )
+    async with transport.serve(config, lambda queries: None) as server:
+        server.watch_liveliness(keys.liveliness_expr(CLUSTER), lambda name, alive: seen.append((name, alive)))
+        async with transport.connect(credentials(tmp_path, "gateway")) as link:
+            link.declare_alive(key)
+            await asyncio.sleep(0.2)
+            assert seen == []
+        async with transport.connect(credentials(tmp_path, "worker")) as link:
+            link.declare_alive(key)
+            await eventually(lambda: seen == [(key, True)])
+        await eventually(lambda: seen == [(key, True), (key, False)])
 
 
-def test_a_client_finds_its_way_back_to_a_restarted_coordinator(tmp_path: Path) -> None:
-    async def scenario() -> None:
-        async with contextlib.AsyncExitStack() as stack:
-            async with coordinator(tmp_path):
-                link = await stack.enter_async_context(transport.connect(credentials(tmp_path, "worker")))
-                assert await answered(link, OWN_KEY["worker"])
-            assert not await answered(link, OWN_KEY["worker"])
-            async with coordinator(tmp_path):
-                await eventually(lambda: link.connected)
-                for _ in range(100):
-                    if await answered(link, OWN_KEY["worker"]):
-                        return
-                    await asyncio.sleep(0.05)
-                raise AssertionError("not answered after the restart")
-
-    asyncio.run(scenario())
+async def test_a_client_finds_its_way_back_to_a_restarted_coordinator(tmp_path: Path) -> None:
+    async with contextlib.AsyncExitStack() as stack:
+        async with coordinator(tmp_path):
+            link = await stack.enter_async_context(transport.connect(credentials(tmp_path, "worker")))
+            assert await answered(link, OWN_KEY["worker"])
+        assert not await answered(link, OWN_KEY["worker"])
+        async with coordinator(tmp_path):
+            await eventually(lambda: link.connected)
+            for _ in range(100):
+                if await answered(link, OWN_KEY["worker"]):
+                    return
+                await asyncio.sleep(0.05)
+            raise AssertionError("not answered after the restart")

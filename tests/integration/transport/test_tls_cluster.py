@@ -112,85 +112,76 @@ def test_a_run_is_played_by_machines_that_have_certificates(
 
 
 @pytest.mark.slow  # until the leases have run out
-def test_a_revoked_worker_loses_its_leases_to_an_honest_one(
+async def test_a_revoked_worker_loses_its_leases_to_an_honest_one(
     certs: OwnCerts, coordinator: Coordinator
 ) -> None:
-    async def scenario() -> None:
-        boss = certs.issue("operator", "boss")
-        honest, cheat = certs.issue("worker", "honest"), certs.issue("worker", "cheat")
-        async with operators(boss) as operator, joined(cheat, "cheat", slots=2) as revoked:
-            playing = asyncio.create_task(play_run(operator, boss))
-            leases = await revoked.lease(2, 30.0)
-            assert leases
-            certs.revoke("cheat")
-            # Its results count no more, on whatever way they would come: here over this machine's own socket.
-            async with connect(coordinator.credentials("worker")) as link:
-                way_round = InstantWorker(link, "cheat")
-                way_round.session = revoked.session
-                assert await refusal(way_round.lease(1, 0.0)) == "revoked"
-                assert await refusal(way_round.register(of(cheat).token)) == "bad_token"
-                results = tuple(way_round.result(lease) for lease in leases)
-                assert await refusal(way_round.report_results(results)) == "revoked"
-                upload = way_round.ask.upload("cheat", revoked.session, "0" * 64, b"blob")
-                assert await refusal(upload) == "revoked"
-            async with joined(honest, "honest") as worker, at_work(worker):
-                finished = await playing
-            assert finished.status == "completed"
-            stolen = {lease.job.job_id for lease in leases}
-            assert stolen <= {job.job_id for job in worker.jobs}
-        with pytest.raises(TransportError):
-            async with connect(of(cheat), timeout_s=0.5):
-                pass
-
-    run(scenario, 150)
+    boss = certs.issue("operator", "boss")
+    honest, cheat = certs.issue("worker", "honest"), certs.issue("worker", "cheat")
+    async with operators(boss) as operator, joined(cheat, "cheat", slots=2) as revoked:
+        playing = asyncio.create_task(play_run(operator, boss))
+        leases = await revoked.lease(2, 30.0)
+        assert leases
+        certs.revoke("cheat")
+        # Its results count no more, on whatever way they would come: here over this machine's own socket.
+        async with connect(coordinator.credentials("worker")) as link:
+            way_round = InstantWorker(link, "cheat")
+            way_round.session = revoked.session
+            assert await refusal(way_round.lease(1, 0.0)) == "revoked"
+            assert await refusal(way_round.register(of(cheat).token)) == "bad_token"
+            results = tuple(way_round.result(lease) for lease in leases)
+            assert await refusal(way_round.report_results(results)) == "revoked"
+            upload = way_round.ask.upload("cheat", revoked.session, "0" * 64, b"blob")
+            assert await refusal(upload) == "revoked"
+        async with joined(honest, "honest") as worker, at_work(worker):
+            finished = await playing
+        assert finished.status == "completed"
+        stolen = {lease.job.job_id for lease in leases}
+        assert stolen <= {job.job_id for job in worker.jobs}
+    with pytest.raises(TransportError):
+        async with connect(of(cheat), timeout_s=0.5):
+            pass
 
 
-def test_a_revoked_operator_asks_for_nothing_more(certs: OwnCerts, coordinator: Coordinator) -> None:
-    async def scenario() -> None:
-        boss = certs.issue("operator", "boss")
-        async with operators(boss) as operator:
-            await operator.status()
-        async with connect(
-            msgspec.structs.replace(coordinator.credentials("operator"), token=of(boss, "operator").token)
-        ) as link:
+async def test_a_revoked_operator_asks_for_nothing_more(certs: OwnCerts, coordinator: Coordinator) -> None:
+    boss = certs.issue("operator", "boss")
+    async with operators(boss) as operator:
+        await operator.status()
+    async with connect(
+        msgspec.structs.replace(coordinator.credentials("operator"), token=of(boss, "operator").token)
+    ) as link:
+        await OperatorClient(link).status()
+        certs.revoke("operator/boss")
+        with pytest.raises(RefusedError, match="bad_token"):
             await OperatorClient(link).status()
-            certs.revoke("operator/boss")
-            with pytest.raises(RefusedError, match="bad_token"):
-                await OperatorClient(link).status()
-        async with operator_of(coordinator) as own:
-            await own.status()
-
-    run(scenario, 120)
+    async with operator_of(coordinator) as own:
+        await own.status()
 
 
-def test_machines_reconnect_after_an_issue_or_a_restart(
+async def test_machines_reconnect_after_an_issue_or_a_restart(
     certs: OwnCerts,
 ) -> None:
-    async def scenario() -> None:
-        boss, machine = certs.issue("operator", "boss"), certs.issue("worker", "w")
-        first = Coordinator(certs.state, "--listen", certs.endpoint, "--hidden-isolation", "off")
-        try:
-            async with operators(boss) as operator, joined(machine, "w") as worker, at_work(worker):
-                one = await play_run(operator, boss)
-                certs.issue("worker", "late")
-                first.kill()
-                second = Coordinator(certs.state, "--listen", certs.endpoint, "--hidden-isolation", "off")
-                try:
-                    created = await operator.create("again")
-                    async with connect(of(boss, "gateway"), timeout_s=TIMEOUT_S) as link:
-                        gateway = GatewayClient(link, created.run, created.capability)
-                        await gateway.submit(bundle_of("policy"), IDS, "first")
-                        certs.issue("worker", "later")
-                        await gateway.results(0)
-                        await gateway.close()
-                    two = await operator.finished(created.run)
-                finally:
-                    assert second.stop() == 0
-            assert comparable(one)["submits"] == comparable(two)["submits"]
-        finally:
+    boss, machine = certs.issue("operator", "boss"), certs.issue("worker", "w")
+    first = Coordinator(certs.state, "--listen", certs.endpoint, "--hidden-isolation", "off")
+    try:
+        async with operators(boss) as operator, joined(machine, "w") as worker, at_work(worker):
+            one = await play_run(operator, boss)
+            certs.issue("worker", "late")
             first.kill()
-
-    run(scenario, 150)
+            second = Coordinator(certs.state, "--listen", certs.endpoint, "--hidden-isolation", "off")
+            try:
+                created = await operator.create("again")
+                async with connect(of(boss, "gateway"), timeout_s=TIMEOUT_S) as link:
+                    gateway = GatewayClient(link, created.run, created.capability)
+                    await gateway.submit(bundle_of("policy"), IDS, "first")
+                    certs.issue("worker", "later")
+                    await gateway.results(0)
+                    await gateway.close()
+                two = await operator.finished(created.run)
+            finally:
+                assert second.stop() == 0
+        assert comparable(one)["submits"] == comparable(two)["submits"]
+    finally:
+        first.kill()
 
 
 @pytest.mark.slow  # until the certificate is over, and the leases

@@ -172,21 +172,18 @@ async def whole_run(coordinator: Coordinator, key: str = "run") -> dict[str, Any
         return comparable(await operator.finished(created.run))
 
 
-def test_a_whole_run_goes_through_the_supervisor(coordinator: Coordinator, tmp_path: Path) -> None:
-    async def scenario() -> None:
-        async with supervising(coordinator, tmp_path) as worker:
-            finished = await whole_run(coordinator)
-            assert finished["status"] == "completed"
-            assert len(finished["heldout_returns"]) == 4
-            assert finished["nondeterministic_results"] == 0
-            # 16 train, 2 × 3 validation, 4 held-out, 4 random; the second submit may have stopped validation that was
-            # played by the time it heard of it.
-            assert 30 <= worker.jobs_done <= 33
-
-    run(scenario)
+async def test_a_whole_run_goes_through_the_supervisor(coordinator: Coordinator, tmp_path: Path) -> None:
+    async with supervising(coordinator, tmp_path) as worker:
+        finished = await whole_run(coordinator)
+        assert finished["status"] == "completed"
+        assert len(finished["heldout_returns"]) == 4
+        assert finished["nondeterministic_results"] == 0
+        # 16 train, 2 × 3 validation, 4 held-out, 4 random; the second submit may have stopped validation that was
+        # played by the time it heard of it.
+        assert 30 <= worker.jobs_done <= 33
 
 
-def test_an_environment_that_failed_is_told_and_tried_again(
+async def test_an_environment_that_failed_is_told_and_tried_again(
     coordinator: Coordinator, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(supervisor, "PROBE_PAUSE_S", 0.05)
@@ -198,36 +195,33 @@ def test_an_environment_that_failed_is_told_and_tried_again(
         tried.set()
         return ((LINE,), {}) if works.is_set() else ((), {"toy/line": again})
 
-    async def scenario() -> None:
-        failed = {"toy/line": "step 3: it raised KeyError"}
-        async with (
-            supervising(coordinator, tmp_path, failed=failed, describe=describe),
-            operator_of(coordinator) as operator,
-        ):
-            played = asyncio.create_task(whole_run(coordinator, "waits"))
-            async with asyncio.timeout(30):
-                await tried.wait()
-                while True:
-                    status = await operator.status()
-                    waits = [run.waits_for for run in status.runs if again in run.waits_for]
-                    if waits and status.workers[0].failed_environments == {"toy/line": again}:
-                        break
-                    await asyncio.sleep(0.05)
-            assert f"it failed on w-1: {again}" in waits[0]
-            file = coordinator.ready["credentials"]["operator"]
-            for app, *arguments in ((status_app,), (workers_app, "list"), (envs_app,)):
-                arguments += ["--credentials", file]
-                shown = await asyncio.to_thread(CliRunner().invoke, app, arguments)
-                assert again in shown.stdout.replace("\n", " ")
-            works.set()
-            assert (await played)["status"] == "completed"
-            (worker,) = (await operator.status()).workers
-            assert (worker.environments, worker.failed_environments) == (("toy/line",), {})
-
-    run(scenario)
+    failed = {"toy/line": "step 3: it raised KeyError"}
+    async with (
+        supervising(coordinator, tmp_path, failed=failed, describe=describe),
+        operator_of(coordinator) as operator,
+    ):
+        played = asyncio.create_task(whole_run(coordinator, "waits"))
+        async with asyncio.timeout(30):
+            await tried.wait()
+            while True:
+                status = await operator.status()
+                waits = [run.waits_for for run in status.runs if again in run.waits_for]
+                if waits and status.workers[0].failed_environments == {"toy/line": again}:
+                    break
+                await asyncio.sleep(0.05)
+        assert f"it failed on w-1: {again}" in waits[0]
+        file = coordinator.ready["credentials"]["operator"]
+        for app, *arguments in ((status_app,), (workers_app, "list"), (envs_app,)):
+            arguments += ["--credentials", file]
+            shown = await asyncio.to_thread(CliRunner().invoke, app, arguments)
+            assert again in shown.stdout.replace("\n", " ")
+        works.set()
+        assert (await played)["status"] == "completed"
+        (worker,) = (await operator.status()).workers
+        assert (worker.environments, worker.failed_environments) == (("toy/line",), {})
 
 
-def test_a_tier_that_failed_once_is_told_and_tried_again(
+async def test_a_tier_that_failed_once_is_told_and_tried_again(
     coordinator: Coordinator, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(supervisor, "PROBE_PAUSE_S", 0.05)
@@ -238,39 +232,36 @@ def test_a_tier_that_failed_once_is_told_and_tried_again(
         if not works.is_set():
             raise SandboxError(f"{tier}: still no namespaces")
 
-    async def scenario() -> None:
-        missing: dict[Tier, str] = {"bwrap": "no namespaces"}
-        async with (
-            supervising(coordinator, tmp_path, tiers=("landlock",), missing=missing, probe=probe),
-            operator_of(coordinator) as operator,
-        ):
-            played = asyncio.create_task(whole_run(coordinator, "waits"))
-            async with asyncio.timeout(30):
-                await probed.wait()
-                while True:
-                    status = await operator.status()
-                    waits = [run.waits_for for run in status.runs if "tier bwrap" in run.waits_for]
-                    if waits and status.workers[0].missing_tiers == {"bwrap": "bwrap: still no namespaces"}:
-                        break
-                    await asyncio.sleep(0.05)
-            assert status.workers[0].tiers == ("landlock",)
-            file = coordinator.ready["credentials"]["operator"]
-            for app, *arguments in ((status_app,), (workers_app, "list")):
-                arguments += ["--credentials", file]
-                shown = await asyncio.to_thread(CliRunner().invoke, app, arguments)
-                assert "w-1 has no sandbox tier bwrap: bwrap: still no namespaces" in shown.stdout.replace(
-                    "\n", " "
-                )
-            assert "does not work on w-1: bwrap: still no namespaces" in waits[0]
-            works.set()
-            assert (await played)["status"] == "completed"
-            (worker,) = (await operator.status()).workers
-            assert (worker.tiers, worker.missing_tiers) == (("bwrap", "landlock"), {})
-
-    run(scenario)
+    missing: dict[Tier, str] = {"bwrap": "no namespaces"}
+    async with (
+        supervising(coordinator, tmp_path, tiers=("landlock",), missing=missing, probe=probe),
+        operator_of(coordinator) as operator,
+    ):
+        played = asyncio.create_task(whole_run(coordinator, "waits"))
+        async with asyncio.timeout(30):
+            await probed.wait()
+            while True:
+                status = await operator.status()
+                waits = [run.waits_for for run in status.runs if "tier bwrap" in run.waits_for]
+                if waits and status.workers[0].missing_tiers == {"bwrap": "bwrap: still no namespaces"}:
+                    break
+                await asyncio.sleep(0.05)
+        assert status.workers[0].tiers == ("landlock",)
+        file = coordinator.ready["credentials"]["operator"]
+        for app, *arguments in ((status_app,), (workers_app, "list")):
+            arguments += ["--credentials", file]
+            shown = await asyncio.to_thread(CliRunner().invoke, app, arguments)
+            assert "w-1 has no sandbox tier bwrap: bwrap: still no namespaces" in shown.stdout.replace(
+                "\n", " "
+            )
+        assert "does not work on w-1: bwrap: still no namespaces" in waits[0]
+        works.set()
+        assert (await played)["status"] == "completed"
+        (worker,) = (await operator.status()).workers
+        assert (worker.tiers, worker.missing_tiers) == (("bwrap", "landlock"), {})
 
 
-def test_a_slot_that_dies_or_fails_changes_no_result(tmp_path: Path) -> None:
+async def test_a_slot_that_dies_or_fails_changes_no_result(tmp_path: Path) -> None:
     died: Counter[str] = Counter()
     failed: set[str] = set()
 
@@ -285,25 +276,21 @@ def test_a_slot_that_dies_or_fails_changes_no_result(tmp_path: Path) -> None:
 
     make_data(tmp_path / "data")
 
-    async def scenario() -> None:
-        results = []
-        for name, script in (("calm", at_once), ("troubled", trouble)):
-            (tmp_path / name).mkdir()
-            coordinator = Coordinator(tmp_path / name / "state", "--data", str(tmp_path / "data"))
-            try:
-                async with supervising(coordinator, tmp_path / name, script):
-                    results.append(await whole_run(coordinator))
-            finally:
-                coordinator.stop()
-        assert died
-        assert failed
-        assert results[0] == results[1]
-
-    # Half a minute of it are pauses before a slot is started again.
-    run(scenario, 180.0)
+    results = []
+    for name, script in (("calm", at_once), ("troubled", trouble)):
+        (tmp_path / name).mkdir()
+        coordinator = Coordinator(tmp_path / name / "state", "--data", str(tmp_path / "data"))
+        try:
+            async with supervising(coordinator, tmp_path / name, script):
+                results.append(await whole_run(coordinator))
+        finally:
+            coordinator.stop()
+    assert died
+    assert failed
+    assert results[0] == results[1]
 
 
-def test_slots_are_prepared_before_there_is_work(coordinator: Coordinator, tmp_path: Path) -> None:
+async def test_slots_are_prepared_before_there_is_work(coordinator: Coordinator, tmp_path: Path) -> None:
     made: list[ScriptedSlot] = []
 
     class Watched(ScriptedSlot):
@@ -311,28 +298,22 @@ def test_slots_are_prepared_before_there_is_work(coordinator: Coordinator, tmp_p
             made.append(self)
             await super().prepare(env_ids)
 
-    async def scenario() -> None:
-        async with supervising(coordinator, tmp_path, kind=Watched):
-            while [slot.prepared for slot in made] != [("toy/line",)] * 2:
-                await asyncio.sleep(0.01)
-            await whole_run(coordinator)
-        assert [slot.started for slot in made] == [1, 1]
-
-    run(scenario)
+    async with supervising(coordinator, tmp_path, kind=Watched):
+        while [slot.prepared for slot in made] != [("toy/line",)] * 2:
+            await asyncio.sleep(0.01)
+        await whole_run(coordinator)
+    assert [slot.started for slot in made] == [1, 1]
 
 
-def test_an_unprepared_slot_is_started_again_for_its_first_lease(
+async def test_an_unprepared_slot_is_started_again_for_its_first_lease(
     coordinator: Coordinator, tmp_path: Path
 ) -> None:
     class Unprepared(ScriptedSlot):
         async def prepare(self, env_ids: Sequence[str]) -> None:
             raise WorkerError("not yet")
 
-    async def scenario() -> None:
-        async with supervising(coordinator, tmp_path, kind=Unprepared):
-            assert (await whole_run(coordinator))["status"] == "completed"
-
-    run(scenario)
+    async with supervising(coordinator, tmp_path, kind=Unprepared):
+        assert (await whole_run(coordinator))["status"] == "completed"
 
 
 def test_a_restarted_coordinator_is_registered_with_again(tmp_path: Path) -> None:
@@ -387,25 +368,22 @@ def test_a_drained_worker_hands_back_what_it_has_not_played(coordinator: Coordin
     run(lambda: leaves_in_the_middle(coordinator, tmp_path, stuck, reached))
 
 
-def test_a_submit_of_128_talkative_episodes_is_handed_in_and_blocks_nothing(
+async def test_a_submit_of_128_talkative_episodes_is_handed_in_and_blocks_nothing(
     coordinator: Coordinator, tmp_path: Path
 ) -> None:
-    async def scenario() -> None:
-        async with supervising(coordinator, tmp_path, dress=talkative), operator_of(coordinator) as operator:
-            created = await operator.create(policy_scope="submit", budget=128, n_validation=2, n_heldout=2)
-            async with gateway_of(coordinator, created) as gateway:
-                await gateway.submit(bundle_of("loud"), tuple(range(64)) * 2, "k")
-                episodes, done = await gateway.results(0)
-                await gateway.close()
-            assert (done.status, len(episodes)) == ("ok", 128)
-            assert {(len(each.stdout), len(each.stderr)) for each in episodes} == {(65536, 65536)}
-            finished = await operator.finished(created.run)
-            assert (finished.status, finished.infrastructure_retries) == ("completed", 0)
-
-    run(scenario)
+    async with supervising(coordinator, tmp_path, dress=talkative), operator_of(coordinator) as operator:
+        created = await operator.create(policy_scope="submit", budget=128, n_validation=2, n_heldout=2)
+        async with gateway_of(coordinator, created) as gateway:
+            await gateway.submit(bundle_of("loud"), tuple(range(64)) * 2, "k")
+            episodes, done = await gateway.results(0)
+            await gateway.close()
+        assert (done.status, len(episodes)) == ("ok", 128)
+        assert {(len(each.stdout), len(each.stderr)) for each in episodes} == {(65536, 65536)}
+        finished = await operator.finished(created.run)
+        assert (finished.status, finished.infrastructure_retries) == ("completed", 0)
 
 
-def test_what_the_coordinator_has_lost_is_sent_again(
+async def test_what_the_coordinator_has_lost_is_sent_again(
     coordinator: Coordinator, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     lost: list[str] = []
@@ -421,15 +399,12 @@ def test_what_the_coordinator_has_lost_is_sent_again(
     monkeypatch.setattr(Requester, "upload", upload)
     monkeypatch.setattr(outbox, "PAUSE_S", 0.05)
 
-    async def scenario() -> None:
-        async with supervising(coordinator, tmp_path):
-            assert (await whole_run(coordinator))["status"] == "completed"
-        assert len(lost) == 3
-
-    run(scenario)
+    async with supervising(coordinator, tmp_path):
+        assert (await whole_run(coordinator))["status"] == "completed"
+    assert len(lost) == 3
 
 
-def test_results_are_batched_while_jobs_wait_but_not_the_last(
+async def test_results_are_batched_while_jobs_wait_but_not_the_last(
     coordinator: Coordinator, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # As good as for ever: a run that ends has not waited for the time to pass.
@@ -446,16 +421,13 @@ def test_results_are_batched_while_jobs_wait_but_not_the_last(
 
     monkeypatch.setattr(Requester, "until_answered", until_answered)
 
-    async def scenario() -> None:
-        async with supervising(coordinator, tmp_path):
-            assert (await whole_run(coordinator))["status"] == "completed"
-        assert max(reports) > 2
-
-    run(scenario)
+    async with supervising(coordinator, tmp_path):
+        assert (await whole_run(coordinator))["status"] == "completed"
+    assert max(reports) > 2
 
 
 @pytest.mark.parametrize("bulk", [40, 200_000, 2_000_000])
-def test_a_result_that_is_refused_for_good_blocks_no_other(
+async def test_a_result_that_is_refused_for_good_blocks_no_other(
     coordinator: Coordinator, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, bulk: int
 ) -> None:
     monkeypatch.setattr(outbox, "PAUSE_S", 0.05)
@@ -473,19 +445,16 @@ def test_a_result_that_is_refused_for_good_blocks_no_other(
             )
         return large(outcome)
 
-    async def scenario() -> None:
-        async with supervising(coordinator, tmp_path, dress=wrong), operator_of(coordinator) as operator:
-            created = await operator.create(n_validation=1, n_heldout=1)
-            async with gateway_of(coordinator, created) as gateway:
-                await gateway.submit(bundle_of("policy"), tuple(range(8)), "k")
-                episodes, done = await gateway.results(0)
-                await gateway.close()
-            assert (done.status, len(episodes)) == ("ok", 8)
-            finished = await operator.finished(created.run)
-            assert finished.status == "completed"
-            assert finished.infrastructure_retries == len(broken) == 4
-
-    run(scenario)
+    async with supervising(coordinator, tmp_path, dress=wrong), operator_of(coordinator) as operator:
+        created = await operator.create(n_validation=1, n_heldout=1)
+        async with gateway_of(coordinator, created) as gateway:
+            await gateway.submit(bundle_of("policy"), tuple(range(8)), "k")
+            episodes, done = await gateway.results(0)
+            await gateway.close()
+        assert (done.status, len(episodes)) == ("ok", 8)
+        finished = await operator.finished(created.run)
+        assert finished.status == "completed"
+        assert finished.infrastructure_retries == len(broken) == 4
 
 
 def test_a_slot_that_heeds_nothing_does_not_hold_up_the_workers_end(
@@ -501,7 +470,7 @@ def test_a_slot_that_heeds_nothing_does_not_hold_up_the_workers_end(
     run(lambda: leaves_in_the_middle(coordinator, tmp_path, deaf, reached, grace_s=0.2))
 
 
-def test_a_worker_whose_coordinator_is_away_ends_all_the_same(
+async def test_a_worker_whose_coordinator_is_away_ends_all_the_same(
     coordinator: Coordinator, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(supervisor, "WITHDRAW_TIMEOUT_S", 0.2)
@@ -511,20 +480,19 @@ def test_a_worker_whose_coordinator_is_away_ends_all_the_same(
         played.set()
         await come_back.wait()
 
-    async def scenario() -> None:
-        async with supervising(coordinator, tmp_path, until_it_is_away, grace_s=0.2) as leaver:
-            run_task = asyncio.create_task(whole_run(coordinator))
-            await played.wait()
-            coordinator.kill()
-            come_back.set()
-            leaver.drain()
-        run_task.cancel()
-        await asyncio.gather(run_task, return_exceptions=True)
-
-    run(scenario)
+    async with supervising(coordinator, tmp_path, until_it_is_away, grace_s=0.2) as leaver:
+        run_task = asyncio.create_task(whole_run(coordinator))
+        await played.wait()
+        coordinator.kill()
+        come_back.set()
+        leaver.drain()
+    run_task.cancel()
+    await asyncio.gather(run_task, return_exceptions=True)
 
 
-def test_a_silent_coordinator_stops_hidden_episodes_only(coordinator: Coordinator, tmp_path: Path) -> None:
+async def test_a_silent_coordinator_stops_hidden_episodes_only(
+    coordinator: Coordinator, tmp_path: Path
+) -> None:
     stopped: list[str] = []
     playing = asyncio.Event()
     go_on = asyncio.Event()
@@ -541,34 +509,31 @@ def test_a_silent_coordinator_stops_hidden_episodes_only(coordinator: Coordinato
             if slot.stopped.is_set():
                 stopped.append(job.job_id)
 
-    async def scenario() -> None:
-        async with (
-            supervising(coordinator, tmp_path, hang_once, slots=4) as worker,
-            operator_of(coordinator) as operator,
-        ):
-            created = await operator.create(n_validation=2, n_heldout=2)
-            async with gateway_of(coordinator, created) as gateway:
-                await gateway.submit(bundle_of("policy"), (0,), "k0")
-                await gateway.results(0)
-                await gateway.close()
-            await playing.wait()
-            worker._lease_ttl_s = 2.0
-            coordinator.process.send_signal(signal.SIGSTOP)
-            try:
-                async with asyncio.timeout(60.0):
-                    while len(stopped) < 2:
-                        await asyncio.sleep(0.05)
-            finally:
-                coordinator.process.send_signal(signal.SIGCONT)
-            go_on.set()
-            finished = await operator.finished(created.run)
-        assert sorted(name.rsplit("/", 2)[1] for name in stopped) == ["validation", "validation"]
-        assert (finished.status, finished.infrastructure_retries) == ("completed", 0)
-
-    run(scenario)
+    async with (
+        supervising(coordinator, tmp_path, hang_once, slots=4) as worker,
+        operator_of(coordinator) as operator,
+    ):
+        created = await operator.create(n_validation=2, n_heldout=2)
+        async with gateway_of(coordinator, created) as gateway:
+            await gateway.submit(bundle_of("policy"), (0,), "k0")
+            await gateway.results(0)
+            await gateway.close()
+        await playing.wait()
+        worker._lease_ttl_s = 2.0
+        coordinator.process.send_signal(signal.SIGSTOP)
+        try:
+            async with asyncio.timeout(60.0):
+                while len(stopped) < 2:
+                    await asyncio.sleep(0.05)
+        finally:
+            coordinator.process.send_signal(signal.SIGCONT)
+        go_on.set()
+        finished = await operator.finished(created.run)
+    assert sorted(name.rsplit("/", 2)[1] for name in stopped) == ["validation", "validation"]
+    assert (finished.status, finished.infrastructure_retries) == ("completed", 0)
 
 
-def test_a_waiting_submit_stops_hidden_episodes_that_would_never_end(
+async def test_a_waiting_submit_stops_hidden_episodes_that_would_never_end(
     coordinator: Coordinator, tmp_path: Path
 ) -> None:
     hanging = asyncio.Event()
@@ -586,27 +551,24 @@ def test_a_waiting_submit_stops_hidden_episodes_that_would_never_end(
                 stopped.append(job.job_id)
                 raise SandboxError("cancelled")
 
-    async def scenario() -> None:
-        async with (
-            supervising(coordinator, tmp_path, hang_while_hidden),
-            operator_of(coordinator) as operator,
-        ):
-            created = await operator.create(n_validation=3, n_heldout=2)
-            async with gateway_of(coordinator, created) as gateway:
-                for number in range(3):
-                    await gateway.submit(bundle_of(f"policy {number}"), (0, 1, 2), f"k{number}")
-                    await gateway.results(number)
-                    await hanging.wait()
-                    hanging.clear()
-                go_on.set()
-                await gateway.close()
-            finished = await operator.finished(created.run)
-        assert finished.status == "completed"
-        assert stopped
-        # Being stopped is nobody's failure.
-        assert finished.infrastructure_retries == 0
-
-    run(scenario)
+    async with (
+        supervising(coordinator, tmp_path, hang_while_hidden),
+        operator_of(coordinator) as operator,
+    ):
+        created = await operator.create(n_validation=3, n_heldout=2)
+        async with gateway_of(coordinator, created) as gateway:
+            for number in range(3):
+                await gateway.submit(bundle_of(f"policy {number}"), (0, 1, 2), f"k{number}")
+                await gateway.results(number)
+                await hanging.wait()
+                hanging.clear()
+            go_on.set()
+            await gateway.close()
+        finished = await operator.finished(created.run)
+    assert finished.status == "completed"
+    assert stopped
+    # Being stopped is nobody's failure.
+    assert finished.infrastructure_retries == 0
 
 
 @pytest.mark.parametrize(

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import time
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import AsyncIterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -151,17 +152,14 @@ def register(world: World) -> Requested:
     return asked
 
 
-def play(
-    root: Path, scenario: Callable[[World], Awaitable[None]], settings: CoreSettings = SETTINGS
-) -> World:
-    async def run() -> World:
-        world = World(root, settings)
-        await world.service.start()
-        try:
-            await asyncio.wait_for(scenario(world), 30)
-        finally:
-            await world.service.stop()
-            world.store.close()
-        return world
-
-    return asyncio.run(run())
+@contextlib.asynccontextmanager
+async def started(root: Path, settings: CoreSettings = SETTINGS) -> AsyncIterator[World]:
+    """A world whose service runs, for 30 seconds at most."""
+    world = World(root, settings)
+    await world.service.start()
+    try:
+        async with asyncio.timeout(30):
+            yield world
+    finally:
+        await world.service.stop()
+        world.store.close()

@@ -12,7 +12,7 @@ import sys
 import time
 import urllib.error
 import urllib.request
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -44,22 +44,12 @@ async def open_listener(tmp_path: Path, listener: Listener | None = None) -> Asy
             yield service
 
 
-def play(
-    tmp_path: Path, script: Callable[[Served], Awaitable[None]], listener: Listener | None = None
-) -> None:
-    async def main() -> None:
-        async with open_listener(tmp_path, listener) as service:
-            await script(service)
-
-    asyncio.run(main())
-
-
 def token_of(folder: RunFolder) -> str:
     return folder.bearer.read_text().strip()
 
 
-def test_without_the_bearer_token_everything_is_the_same_401(tmp_path: Path) -> None:
-    async def script(s: Served) -> None:
+async def test_without_the_bearer_token_everything_is_the_same_401(tmp_path: Path) -> None:
+    async with open_listener(tmp_path) as s:
         token = token_of(s.folder)
         root = s.urls.info.removesuffix("/info")
         given: list[dict[str, str] | list[tuple[str, str]]] = [
@@ -90,11 +80,9 @@ def test_without_the_bearer_token_everything_is_the_same_401(tmp_path: Path) -> 
         assert s.double.submits == []
         assert s.pipeline.machine.n_rejected == 0
 
-    play(tmp_path, script)
 
-
-def test_with_the_bearer_token_a_remote_agent_is_served_as_any_other(tmp_path: Path) -> None:
-    async def script(s: Served) -> None:
+async def test_with_the_bearer_token_a_remote_agent_is_served_as_any_other(tmp_path: Path) -> None:
+    async with open_listener(tmp_path) as s:
         for scheme in ("Bearer", "bearer"):
             headers = {"Authorization": f"{scheme} {token_of(s.folder)}"}
             assert (await s.http.get(s.urls.info, headers=headers)).status_code == 200
@@ -104,11 +92,9 @@ def test_with_the_bearer_token_a_remote_agent_is_served_as_any_other(tmp_path: P
         assert (await s.http.get(elsewhere, headers=headers)).status_code == 404
         assert urlsplit(s.urls.info).hostname == HOST
 
-    play(tmp_path, script)
 
-
-def test_a_large_body_of_a_stranger_is_not_read_to_its_end(tmp_path: Path) -> None:
-    async def script(s: Served) -> None:
+async def test_a_large_body_of_a_stranger_is_not_read_to_its_end(tmp_path: Path) -> None:
+    async with open_listener(tmp_path) as s:
         address = urlsplit(s.urls.submit)
         _, writer = await asyncio.open_connection(address.hostname, address.port)
         head = f"POST {address.path} HTTP/1.1\r\nHost: x\r\nContent-Length: {1 << 30}\r\n\r\n"
@@ -122,26 +108,21 @@ def test_a_large_body_of_a_stranger_is_not_read_to_its_end(tmp_path: Path) -> No
         assert sent < 64 << 20
         writer.close()
 
-    play(tmp_path, script)
+
+async def test_the_token_is_a_lasting_file_for_the_operator_alone(tmp_path: Path) -> None:
+    async with open_listener(tmp_path) as s:
+        assert stat.S_IMODE(s.folder.bearer.stat().st_mode) == 0o600
+        first = (s.urls, token_of(s.folder))
+        assert len(bytes.fromhex(first[1])) * 8 == 256
+        assert not s.folder.bearer.is_relative_to(s.folder.workspace)
+        assert first[1] not in (s.folder.workspace / "AGENTS.md").read_text()
+        folder, double = s.folder, s.double
+    async with answering(tmp_path, double), gateway_on(folder, double) as s:
+        assert (s.urls, token_of(s.folder)) == first
 
 
-def test_the_token_is_a_lasting_file_for_the_operator_alone(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with open_listener(tmp_path) as s:
-            assert stat.S_IMODE(s.folder.bearer.stat().st_mode) == 0o600
-            first = (s.urls, token_of(s.folder))
-            assert len(bytes.fromhex(first[1])) * 8 == 256
-            assert not s.folder.bearer.is_relative_to(s.folder.workspace)
-            assert first[1] not in (s.folder.workspace / "AGENTS.md").read_text()
-            folder, double = s.folder, s.double
-        async with answering(tmp_path, double), gateway_on(folder, double) as s:
-            assert (s.urls, token_of(s.folder)) == first
-
-    asyncio.run(main())
-
-
-def test_every_command_in_a_remote_agents_rules_runs_as_it_stands(tmp_path: Path) -> None:
-    async def script(s: Served) -> None:
+async def test_every_command_in_a_remote_agents_rules_runs_as_it_stands(tmp_path: Path) -> None:
+    async with open_listener(tmp_path) as s:
         text = (s.folder.workspace / "AGENTS.md").read_text()
         surroundings = {**os.environ, "EVOPOLICYGYM_TOKEN": token_of(s.folder)}
         shell = [block.split("```")[0] for block in text.split("```bash\n")[1:]]
@@ -161,15 +142,11 @@ def test_every_command_in_a_remote_agents_rules_runs_as_it_stands(tmp_path: Path
         assert json.loads(lines[2])["status"] == "ok"
         assert lines[-1].startswith("feedback/submit_001 ok")
 
-    play(tmp_path, script)
 
-
-def test_the_rules_tell_the_url_by_which_the_agent_reaches_the_service(tmp_path: Path) -> None:
-    async def script(s: Served) -> None:
+async def test_the_rules_tell_the_url_by_which_the_agent_reaches_the_service(tmp_path: Path) -> None:
+    async with open_listener(tmp_path, Listener(host=HOST, port=0, url="https://gym.example/run-7")) as s:
         assert s.urls.submit.startswith("https://gym.example/run-7/")
         assert s.urls.submit in (s.folder.workspace / "AGENTS.md").read_text()
-
-    play(tmp_path, script, Listener(host=HOST, port=0, url="https://gym.example/run-7"))
 
 
 @pytest.mark.parametrize(

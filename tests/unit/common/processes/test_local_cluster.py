@@ -149,19 +149,18 @@ def test_workers_count_as_ended_once_no_process_of_the_last_command_lives(
     os.close(held)
 
 
-def test_a_worker_keeps_the_lock_of_its_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_worker_keeps_the_lock_of_its_command(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     programs(monkeypatch, SERVES)
     monkeypatch.setattr(local_cluster, "END_GRACE_S", SOON_S)
 
-    async def main() -> None:
-        async with local_cluster.local_cluster("test", state=tmp_path) as cluster:
-            await cluster.start_workers(["toy/line"], slots=1)
-            processes, *_ = cluster._start_workers.args
-            for child in processes._running:
-                held = [fd.resolve() for fd in Path(f"/proc/{child.pid}/fd").iterdir()]
-                assert tmp_path / local_cluster.PROCESSES in held, child.log
-
-    asyncio.run(main())
+    async with local_cluster.local_cluster("test", state=tmp_path) as cluster:
+        await cluster.start_workers(["toy/line"], slots=1)
+        processes, *_ = cluster._start_workers.args
+        for child in processes._running:
+            held = [fd.resolve() for fd in Path(f"/proc/{child.pid}/fd").iterdir()]
+            assert tmp_path / local_cluster.PROCESSES in held, child.log
 
 
 def test_a_worker_that_dies_again_and_again_is_given_up(
@@ -182,21 +181,18 @@ def test_a_worker_whose_modules_are_missing_is_given_up_at_once(
     assert starts.read_text() == "."
 
 
-def test_a_worker_that_dies_now_and_then_is_started_again_however_often(
+async def test_a_worker_that_dies_now_and_then_is_started_again_however_often(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     deaths = tmp_path / "deaths"
     programs(monkeypatch, SERVES, f"open({str(deaths)!r}, 'a').write('.'); raise SystemExit(1)")
     monkeypatch.setattr(local_cluster, "_SOON_S", 0.0)
 
-    async def main() -> None:
-        async with local_cluster.local_cluster("test", state=tmp_path) as cluster:
-            await cluster.start_workers(["toy/line"], slots=1)
-            while not deaths.exists() or len(deaths.read_text()) <= local_cluster._MAX_DEATHS + 2:
-                assert not cluster.failed.done(), cluster.failed.exception()
-                await asyncio.sleep(0.02)
-
-    asyncio.run(main())
+    async with local_cluster.local_cluster("test", state=tmp_path) as cluster:
+        await cluster.start_workers(["toy/line"], slots=1)
+        while not deaths.exists() or len(deaths.read_text()) <= local_cluster._MAX_DEATHS + 2:
+            assert not cluster.failed.done(), cluster.failed.exception()
+            await asyncio.sleep(0.02)
 
 
 def test_workers_divide_the_slots_of_an_audited_cluster(

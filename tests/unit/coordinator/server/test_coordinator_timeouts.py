@@ -6,7 +6,7 @@ import sqlite3
 from pathlib import Path
 
 import pytest
-from rigs.service_world import Requested, World, play
+from rigs.service_world import Requested, started
 
 from evopolicy_common.errors import StorageError
 from evopolicy_common.messages import operator
@@ -18,20 +18,18 @@ from evopolicy_coordinator.storage.store import Store
 SOON_S = 0.2
 
 
-def test_a_query_that_nobody_waits_for_any_more_is_let_go(
+async def test_a_query_that_nobody_waits_for_any_more_is_let_go(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(service, "_FORGET_S", SOON_S)
     monkeypatch.setattr(service, "_SWEEP_S", SOON_S / 4)
 
-    async def scenario(world: World) -> None:
+    async with started(tmp_path) as world:
         created = await world.create()
         wait = operator.WaitRun(token="operate", run=created.run, wait_s=60)
         waiting = Requested(keys.operator_key("c", "wait"), wait)
         world.ask(waiting)
         assert await waiting.message() is None
-
-    play(tmp_path, scenario)
 
 
 def test_a_database_that_another_keeps_locked_is_reported(

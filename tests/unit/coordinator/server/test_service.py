@@ -14,7 +14,7 @@ from typing import Any
 import msgspec
 import pytest
 import structlog
-from rigs.service_world import Requested, World, play, register
+from rigs.service_world import Requested, World, register, started
 from structlog.testing import capture_logs
 
 from evopolicy_common.errors import DamagedStoreError, PartFailedError
@@ -29,8 +29,8 @@ from evopolicy_coordinator.core.machine import Core
 from evopolicy_coordinator.server import core_host, process, service
 
 
-def test_all_events_of_a_tick_share_one_write(tmp_path: Path) -> None:
-    async def scenario(world: World) -> None:
+async def test_all_events_of_a_tick_share_one_write(tmp_path: Path) -> None:
+    async with started(tmp_path) as world:
         runs = [await world.create(f"run-{n}") for n in range(20)]
         before = world.writes
         asked = [world.submit(created, "key") for created in runs]
@@ -39,30 +39,29 @@ def test_all_events_of_a_tick_share_one_write(tmp_path: Path) -> None:
             assert isinstance(await one.message(), gateway.SubmitAccepted)
         assert world.writes == before + 1
 
-    play(tmp_path, scenario)
 
-
-def test_what_was_answered_is_there_after_a_restart(tmp_path: Path) -> None:
+async def test_what_was_answered_is_there_after_a_restart(tmp_path: Path) -> None:
     kept: list[operator.RunCreated] = []
 
-    async def first(world: World) -> None:
+    async with started(tmp_path) as world:
         kept.append(await world.create())
         asked = world.submit(kept[0], "key")
         world.ask(asked)
         assert (await asked.message()).remaining_budget == 98
-
-    async def second(world: World) -> None:
+    async with started(tmp_path) as world:
         assert await world.create() == kept[0]
         asked = world.state(kept[0])
         world.ask(asked)
         assert (await asked.message()).state.remaining_budget == 98
 
-    play(tmp_path, first)
-    play(tmp_path, second)
 
+async def test_an_unwritten_request_did_not_happen_and_may_be_repeated(tmp_path: Path) -> None:
+    async def asked_again(world: World, created: operator.RunCreated) -> Any:
+        asked = world.submit(created, "key")
+        world.ask(asked)
+        return await asked.message()
 
-def test_an_unwritten_request_did_not_happen_and_may_be_repeated(tmp_path: Path) -> None:
-    async def scenario(world: World) -> None:
+    async with started(tmp_path) as world:
         created = await world.create()
         world.full = True
         lost = world.submit(created, "key")
@@ -89,16 +88,9 @@ def test_an_unwritten_request_did_not_happen_and_may_be_repeated(tmp_path: Path)
         assert answer.submit_index == 0
         assert answer.remaining_budget == 98
 
-    async def asked_again(world: World, created: operator.RunCreated) -> Any:
-        asked = world.submit(created, "key")
-        world.ask(asked)
-        return await asked.message()
 
-    play(tmp_path, scenario)
-
-
-def test_operators_are_answered_while_the_store_cannot_write(tmp_path: Path) -> None:
-    async def scenario(world: World) -> None:
+async def test_operators_are_answered_while_the_store_cannot_write(tmp_path: Path) -> None:
+    async with started(tmp_path) as world:
         created = await world.create()
         world.full = True
         lost = world.submit(created, "key")
@@ -125,11 +117,9 @@ def test_operators_are_answered_while_the_store_cannot_write(tmp_path: Path) -> 
             status = await asked.message()
             await asyncio.sleep(0.02)
 
-    play(tmp_path, scenario)
 
-
-def test_an_open_run_without_a_gateway_for_an_hour_is_abandoned(tmp_path: Path) -> None:
-    async def scenario(world: World) -> None:
+async def test_an_open_run_without_a_gateway_for_an_hour_is_abandoned(tmp_path: Path) -> None:
+    async with started(tmp_path) as world:
         created, other = await world.create(), await world.create("other")
         now = world.service.host.now
         world.service.host.now = lambda: now() + 3601.0  # type: ignore[method-assign]
@@ -143,10 +133,8 @@ def test_an_open_run_without_a_gateway_for_an_hour_is_abandoned(tmp_path: Path) 
         assert line.endswith(f"end it with evopolicy runs cancel {created.run}")
         assert "1 h" in line or "60 min" in line
 
-    play(tmp_path, scenario)
 
-
-def test_core_that_fails_is_loaded_anew_and_others_are_served_on(
+async def test_core_that_fails_is_loaded_anew_and_others_are_served_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     handle = Core.handle
@@ -158,7 +146,7 @@ def test_core_that_fails_is_loaded_anew_and_others_are_served_on(
 
     monkeypatch.setattr(Core, "handle", stumble)
 
-    async def scenario(world: World) -> None:
+    async with started(tmp_path) as world:
         created = await world.create()
         poison = world.submit(created, "poison")
         world.ask(poison)
@@ -171,11 +159,9 @@ def test_core_that_fails_is_loaded_anew_and_others_are_served_on(
             await asyncio.sleep(0.02)
         assert answer.remaining_budget == 98
 
-    play(tmp_path, scenario)
 
-
-def test_stopping_answers_what_was_handled_and_ends_every_wait(tmp_path: Path) -> None:
-    async def scenario(world: World) -> None:
+async def test_stopping_answers_what_was_handled_and_ends_every_wait(tmp_path: Path) -> None:
+    async with started(tmp_path) as world:
         created = await world.create()
         wait = operator.WaitRun(token="operate", run=created.run, wait_s=60)
         waiting = Requested(keys.operator_key("c", "wait"), wait)
@@ -188,11 +174,11 @@ def test_stopping_answers_what_was_handled_and_ends_every_wait(tmp_path: Path) -
         world.ask(late)
         assert await late.message() is None
 
-    play(tmp_path, scenario)
 
-
-def test_a_stuck_disk_is_named_in_status_and_log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    async def scenario(world: World) -> None:
+async def test_a_stuck_disk_is_named_in_status_and_log(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async with started(tmp_path, CoreSettings(stall_s=0.1)) as world:
         goes_on = threading.Event()
         write = world.store.write
 
@@ -220,11 +206,10 @@ def test_a_stuck_disk_is_named_in_status_and_log(tmp_path: Path, monkeypatch: py
         goes_on.set()
         assert isinstance(await created.message(), operator.RunCreated)
 
-    play(tmp_path, scenario, CoreSettings(stall_s=0.1))
 
+async def test_any_number_of_watchers_costs_one_status(tmp_path: Path) -> None:
+    async with started(tmp_path) as world:
 
-def test_any_number_of_watchers_costs_one_status(tmp_path: Path) -> None:
-    async def scenario(world: World) -> None:
         async def shown(max_age_s: float) -> tuple[float, int]:
             message = StatusRequest(token="operate", max_age_s=max_age_s)
             asked = Requested(keys.operator_key("c", "status"), message)
@@ -239,11 +224,9 @@ def test_any_number_of_watchers_costs_one_status(tmp_path: Path) -> None:
         assert (uptime_s > first[0], n_runs) == (True, 1), "after a change of one's own it is made anew"
         assert await shown(60.0) == (uptime_s, n_runs)
 
-    play(tmp_path, scenario)
 
-
-def test_the_status_tells_of_the_disk(tmp_path: Path) -> None:
-    async def scenario(world: World) -> None:
+async def test_the_status_tells_of_the_disk(tmp_path: Path) -> None:
+    async with started(tmp_path) as world:
         while True:
             asked = Requested(keys.operator_key("c", "status"), StatusRequest(token="operate"))
             world.ask(asked)
@@ -252,11 +235,9 @@ def test_the_status_tells_of_the_disk(tmp_path: Path) -> None:
             await asyncio.sleep(0.01)
         assert 0 < disk.free < disk.total
 
-    play(tmp_path, scenario)
 
-
-def test_long_poll_ends_by_itself(tmp_path: Path) -> None:
-    async def scenario(world: World) -> None:
+async def test_long_poll_ends_by_itself(tmp_path: Path) -> None:
+    async with started(tmp_path) as world:
         registering = register(world)
         session = (await registering.message()).session
         polling = Requested(
@@ -266,29 +247,23 @@ def test_long_poll_ends_by_itself(tmp_path: Path) -> None:
         world.ask(polling)
         assert await polling.message() == worker.Leases(leases=())
 
-    play(tmp_path, scenario)
 
-
-def test_a_clock_set_back_between_two_starts_ends_nothing_before_it_began(
+async def test_a_clock_set_back_between_two_starts_ends_nothing_before_it_began(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     began: list[float] = []
 
-    async def first(world: World) -> None:
+    true_time = time.time
+    async with started(tmp_path) as world:
         await world.create()
         began.append(world.service.host.now())
-
-    async def second(world: World) -> None:
+    monkeypatch.setattr(time, "time", lambda: true_time() - 5 * 3600.0)
+    async with started(tmp_path) as world:
         assert world.service.host.now() >= began[0] - 60.0
 
-    true_time = time.time
-    play(tmp_path, first)
-    monkeypatch.setattr(time, "time", lambda: true_time() - 5 * 3600.0)
-    play(tmp_path, second)
 
-
-def test_a_poll_given_up_during_a_blocked_loop_gets_no_lease(tmp_path: Path) -> None:
-    async def scenario(world: World) -> None:
+async def test_a_poll_given_up_during_a_blocked_loop_gets_no_lease(tmp_path: Path) -> None:
+    async with started(tmp_path) as world:
         session = (await register(world).message()).session
         created = await world.create()
         request = worker.LeaseRequest(worker="w", session=session, n=1, wait_s=10.0)
@@ -308,8 +283,6 @@ def test_a_poll_given_up_during_a_blocked_loop_gets_no_lease(tmp_path: Path) -> 
         assert await stale.message() == worker.Leases(leases=())
         assert len((await fresh.message()).leases) == 1
 
-    play(tmp_path, scenario)
-
 
 async def failed(world: World) -> str:
     """Why the service cannot go on."""
@@ -318,10 +291,10 @@ async def failed(world: World) -> str:
     return str(error.value)
 
 
-def test_an_unloadable_state_ends_the_service_with_the_reason(
+async def test_an_unloadable_state_ends_the_service_with_the_reason(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    async def scenario(world: World) -> None:
+    async with started(tmp_path) as world:
         created = await world.create()
 
         def broken(*_: Any) -> Any:
@@ -336,24 +309,20 @@ def test_an_unloadable_state_ends_the_service_with_the_reason(
         world.ask(asked)
         assert await asked.message() is None
 
-    play(tmp_path, scenario)
 
-
-def test_a_state_that_cannot_be_loaded_at_the_start_is_reported(
+async def test_a_state_that_cannot_be_loaded_at_the_start_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def broken(*_: Any) -> Any:
         raise KeyError("a row that is not there")
 
-    async def scenario(world: World) -> None:
-        raise AssertionError("it must not start")
-
     monkeypatch.setattr(Core, "load", broken)
     with pytest.raises(PartFailedError, match="loading the state failed: KeyError"):
-        play(tmp_path, scenario)
+        async with started(tmp_path):
+            pass
 
 
-def test_a_core_failing_after_each_load_ends_the_service(
+async def test_a_core_failing_after_each_load_ends_the_service(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     loads: list[float] = []
@@ -366,7 +335,9 @@ def test_a_core_failing_after_each_load_ends_the_service(
     def broken(*_: Any) -> Any:
         raise ZeroDivisionError("planted")
 
-    async def scenario(world: World) -> None:
+    monkeypatch.setattr(core_host, "_LONGEST_PAUSE_S", 0.2)
+    monkeypatch.setattr(Core, "load", counted)
+    async with started(tmp_path) as world:
         created = await world.create()
         monkeypatch.setattr(Core, "handle", broken)
         failing = asyncio.create_task(failed(world))
@@ -376,15 +347,13 @@ def test_a_core_failing_after_each_load_ends_the_service(
         assert await failing == "the core, 6 times in a row, failed: ZeroDivisionError: planted"
         assert len(loads) == 1 + 5
 
-    monkeypatch.setattr(core_host, "_LONGEST_PAUSE_S", 0.2)
-    monkeypatch.setattr(Core, "load", counted)
-    play(tmp_path, scenario)
 
-
-def test_a_core_that_fails_now_and_then_is_loaded_each_time(
+async def test_a_core_that_fails_now_and_then_is_loaded_each_time(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    async def scenario(world: World) -> None:
+    monkeypatch.setattr(core_host, "_SOON_S", 0.0)
+    monkeypatch.setattr(core_host, "_LONGEST_PAUSE_S", 0.01)
+    async with started(tmp_path) as world:
         created = await world.create()
         handle = Core.handle
 
@@ -402,14 +371,12 @@ def test_a_core_that_fails_now_and_then_is_loaded_each_time(
                 await asyncio.sleep(0.01)
             assert isinstance(answer, gateway.StateReply)
 
-    monkeypatch.setattr(core_host, "_SOON_S", 0.0)
-    play(tmp_path, scenario)
 
-
-def test_a_row_that_the_store_refuses_ends_the_service(
+async def test_a_row_that_the_store_refuses_ends_the_service(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    async def scenario(world: World) -> None:
+    monkeypatch.setattr(core_host, "_LONGEST_PAUSE_S", 0.2)
+    async with started(tmp_path) as world:
         created = await world.create()
 
         def contradicts(rows: Any) -> None:
@@ -422,12 +389,9 @@ def test_a_row_that_the_store_refuses_ends_the_service(
             await asyncio.sleep(0.01)
         assert "refuses a row that contradicts another" in await failing
 
-    monkeypatch.setattr(core_host, "_LONGEST_PAUSE_S", 0.2)
-    play(tmp_path, scenario)
 
-
-def test_an_unreadable_row_ends_the_service_with_the_remedy(tmp_path: Path) -> None:
-    async def scenario(world: World) -> None:
+async def test_an_unreadable_row_ends_the_service_with_the_remedy(tmp_path: Path) -> None:
+    async with started(tmp_path) as world:
         created = await world.create()
         with contextlib.closing(sqlite3.connect(tmp_path / "db")) as db, db:
             db.execute("UPDATE runs SET data = x'00'")
@@ -437,11 +401,9 @@ def test_an_unreadable_row_ends_the_service_with_the_remedy(tmp_path: Path) -> N
         for named in ("table runs", created.run, "Restore a backup"):
             assert named in why
 
-    play(tmp_path, scenario)
 
-
-def test_a_request_for_unreadable_data_is_refused_and_others_served(tmp_path: Path) -> None:
-    async def scenario(world: World) -> None:
+async def test_a_request_for_unreadable_data_is_refused_and_others_served(tmp_path: Path) -> None:
+    async with started(tmp_path) as world:
         created = await world.create()
         claim = operator.Claim(token="operate", suite="s", name="n", holder="h", ttl_s=9.0)
         await world.service._writer.call(lambda store: store.write_claim("s", "n", b"\0"))
@@ -465,28 +427,22 @@ def test_a_request_for_unreadable_data_is_refused_and_others_served(tmp_path: Pa
         world.ask(state)
         assert isinstance(await state.message(), gateway.StateReply)
 
-    play(tmp_path, scenario)
 
-
-def test_the_process_ends_when_its_service_cannot_go_on(tmp_path: Path) -> None:
-    async def scenario(world: World) -> None:
+async def test_the_process_ends_when_its_service_cannot_go_on(tmp_path: Path) -> None:
+    async with started(tmp_path) as world:
         waiting = asyncio.create_task(process._until(asyncio.Event(), world.service))
         await asyncio.sleep(0)
         world.service.host.fail("a test", RuntimeError("why"))
         with pytest.raises(PartFailedError, match="a test failed: RuntimeError: why"):
             await asyncio.wait_for(waiting, 20)
-
-    async def stopped(world: World) -> None:
+    async with started(tmp_path) as world:
         stop = asyncio.Event()
         stop.set()
         await asyncio.wait_for(process._until(stop, world.service), 20)
 
-    play(tmp_path, scenario)
-    play(tmp_path, stopped)
 
-
-def test_a_bug_in_the_writers_thread_ends_the_service_with_the_reason(tmp_path: Path) -> None:
-    async def scenario(world: World) -> None:
+async def test_a_bug_in_the_writers_thread_ends_the_service_with_the_reason(tmp_path: Path) -> None:
+    async with started(tmp_path) as world:
         created = await world.create()
 
         def broken(rows: Any) -> None:
@@ -498,13 +454,11 @@ def test_a_bug_in_the_writers_thread_ends_the_service_with_the_reason(tmp_path: 
         assert await failed(world) == "writing the store failed: TypeError: no such row"
         assert await asked.message() is None
 
-    play(tmp_path, scenario)
 
-
-def test_a_timer_that_cannot_be_set_ends_the_service_with_the_reason(
+async def test_a_timer_that_cannot_be_set_ends_the_service_with_the_reason(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    async def scenario(world: World) -> None:
+    async with started(tmp_path) as world:
         created = await world.create()
 
         def broken(self: Core) -> float:
@@ -514,13 +468,11 @@ def test_a_timer_that_cannot_be_set_ends_the_service_with_the_reason(
         world.ask(world.submit(created, "key"))
         assert await failed(world) == "the outbox failed: ZeroDivisionError: no deadline"
 
-    play(tmp_path, scenario)
 
-
-def test_an_answer_that_cannot_be_made_holds_up_no_other(
+async def test_an_answer_that_cannot_be_made_holds_up_no_other(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    async def scenario(world: World) -> None:
+    async with started(tmp_path) as world:
         created = await world.create()
         real = service.answer_bytes
 
@@ -534,15 +486,13 @@ def test_an_answer_that_cannot_be_made_holds_up_no_other(
         world.ask(world.state(created), asked)
         assert isinstance(await asked.message(), gateway.SubmitAccepted)
 
-    play(tmp_path, scenario)
 
-
-def test_uploads_that_no_submit_named_are_deleted_once_their_run_is_over(
+async def test_uploads_that_no_submit_named_are_deleted_once_their_run_is_over(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(service, "_SWEEP_S", 0.05)
 
-    async def scenario(world: World) -> None:
+    async with started(tmp_path) as world:
         one, other = await world.create("one"), await world.create("other")
 
         async def put(created: operator.RunCreated, data: bytes, part: slice = slice(None)) -> None:
@@ -598,5 +548,3 @@ def test_uploads_that_no_submit_named_are_deleted_once_their_run_is_over(
         assert all(world.blobs.read(digest_of(data)) == data for data in in_use)
         assert world.uploads.has_sent(other.run, digest_of(b"in both runs"))
         assert not world.uploads.has_sent(one.run, digest_of(b"named"))
-
-    play(tmp_path, scenario)

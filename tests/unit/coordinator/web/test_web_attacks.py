@@ -218,24 +218,23 @@ def few_descriptors() -> Iterator[None]:
     resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
 
 
-def test_unfinished_requests_keep_nobody_out_and_are_limited(tmp_path: Path, few_descriptors: None) -> None:
-    async def attack() -> None:
-        async with (
-            served_view(tmp_path) as (host, port),
-            held_open(host, port, HEAD, 1200) as readers,
-            httpx.AsyncClient(timeout=60) as browser,
-            asyncio.timeout(60),
-        ):
-            assert (await browser.get(f"http://{host}:{port}/healthz")).status_code == 200
-            for _ in range(1200 - server.MAX_CONNECTIONS):
-                # Cut off, long before their time is up: the oldest first.
-                with contextlib.suppress(ConnectionResetError):
-                    assert await readers.pop(0).read() == b""
+async def test_unfinished_requests_keep_nobody_out_and_are_limited(
+    tmp_path: Path, few_descriptors: None
+) -> None:
+    async with (
+        served_view(tmp_path) as (host, port),
+        held_open(host, port, HEAD, 1200) as readers,
+        httpx.AsyncClient(timeout=60) as browser,
+        asyncio.timeout(60),
+    ):
+        assert (await browser.get(f"http://{host}:{port}/healthz")).status_code == 200
+        for _ in range(1200 - server.MAX_CONNECTIONS):
+            # Cut off, long before their time is up: the oldest first.
+            with contextlib.suppress(ConnectionResetError):
+                assert await readers.pop(0).read() == b""
 
-    asyncio.run(attack())
 
-
-def test_unfinished_handshakes_keep_nobody_out(tmp_path: Path, few_descriptors: None) -> None:
+async def test_unfinished_handshakes_keep_nobody_out(tmp_path: Path, few_descriptors: None) -> None:
     now = dt.datetime.now(dt.UTC)
     authority = certs.make_authority("lab", now)
     made = certs.issue(authority, "coordinator/lab", now, 1, hosts=["127.0.0.1"], serves=True)
@@ -243,15 +242,12 @@ def test_unfinished_handshakes_keep_nobody_out(tmp_path: Path, few_descriptors: 
     certificate.write_bytes(made.certificate)
     key.write_bytes(made.private_key)
 
-    async def attack() -> None:
-        async with (
-            served_view(tmp_path, certificate=certificate, private_key=key) as (host, port),
-            held_open(host, port, b"", 1200),
-            httpx.AsyncClient(timeout=60, verify=False) as browser,
-        ):
-            assert (await browser.get(f"https://{host}:{port}/healthz")).status_code == 200
-
-    asyncio.run(attack())
+    async with (
+        served_view(tmp_path, certificate=certificate, private_key=key) as (host, port),
+        held_open(host, port, b"", 1200),
+        httpx.AsyncClient(timeout=60, verify=False) as browser,
+    ):
+        assert (await browser.get(f"https://{host}:{port}/healthz")).status_code == 200
 
 
 @pytest.mark.parametrize(("start", "answer"), [(HEAD, b""), (POST, b"HTTP/1.1 401")])

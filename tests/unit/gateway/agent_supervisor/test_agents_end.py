@@ -105,7 +105,7 @@ class Cluster(Operations):
         self.asked.append(f"gone {run}")
 
 
-def test_run_of_a_killed_command_is_dropped_when_its_agent_is_gone(
+async def test_run_of_a_killed_command_is_dropped_when_its_agent_is_gone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(locks, "_PAUSE_S", 0.01)
@@ -113,20 +113,17 @@ def test_run_of_a_killed_command_is_dropped_when_its_agent_is_gone(
     folder.state.mkdir(parents=True)
     cluster = Cluster()
 
-    async def main() -> None:
-        await cluster.drop(folder)
+    await cluster.drop(folder)
+    assert cluster.asked == []
+    save(folder.opened_run, OpenedRun(run="r-1"))
+    with folder.supervisor_lock.open("w") as held:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        dropping = asyncio.create_task(cluster.drop(folder))
+        await asyncio.sleep(0.1)
         assert cluster.asked == []
-        save(folder.opened_run, OpenedRun(run="r-1"))
-        with folder.supervisor_lock.open("w") as held:
-            fcntl.flock(held, fcntl.LOCK_EX)
-            dropping = asyncio.create_task(cluster.drop(folder))
-            await asyncio.sleep(0.1)
-            assert cluster.asked == []
-        await asyncio.wait_for(dropping, TIMEOUT_S)
-        assert cluster.asked == ["cancel r-1", "gone r-1"]
-        # Of a remote agent nobody here knows whether it has ended.
-        save(folder.listener, Listener(host="127.0.0.1", port=0))
-        await cluster.drop(folder)
-        assert cluster.asked[2:] == ["cancel r-1"]
-
-    asyncio.run(main())
+    await asyncio.wait_for(dropping, TIMEOUT_S)
+    assert cluster.asked == ["cancel r-1", "gone r-1"]
+    # Of a remote agent nobody here knows whether it has ended.
+    save(folder.listener, Listener(host="127.0.0.1", port=0))
+    await cluster.drop(folder)
+    assert cluster.asked[2:] == ["cancel r-1"]

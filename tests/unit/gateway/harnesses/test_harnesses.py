@@ -98,21 +98,18 @@ def test_a_program_that_works_without_a_word_is_not_silent(tmp_path: Path, work:
     assert ending.reason == "agent_stopped"
 
 
-def test_an_agent_is_not_silent_during_its_submits(tmp_path: Path) -> None:
-    async def main() -> None:
-        activity = Activity(0.5, tmp_path / "nothing", cpu_s=lambda: 0.0)
-        silence = asyncio.create_task(activity.silence())
-        activity.note(1, True)
-        await asyncio.sleep(1.0)
-        assert not silence.done()
-        activity.note(1, False)
-        for submits in range(2, 6):
-            await asyncio.sleep(0.2)
-            activity.note(submits, False)
-        assert not silence.done()
-        assert "0.5 s" in await asyncio.wait_for(silence, 30.0)
-
-    asyncio.run(main())
+async def test_an_agent_is_not_silent_during_its_submits(tmp_path: Path) -> None:
+    activity = Activity(0.5, tmp_path / "nothing", cpu_s=lambda: 0.0)
+    silence = asyncio.create_task(activity.silence())
+    activity.note(1, True)
+    await asyncio.sleep(1.0)
+    assert not silence.done()
+    activity.note(1, False)
+    for submits in range(2, 6):
+        await asyncio.sleep(0.2)
+        activity.note(submits, False)
+    assert not silence.done()
+    assert "0.5 s" in await asyncio.wait_for(silence, 30.0)
 
 
 def test_program_that_prints_objects_and_never_reads_plays_until_it_exits(tmp_path: Path) -> None:

@@ -96,16 +96,13 @@ def test_a_head_without_end_is_cut() -> None:
     assert asyncio.run(ask(b"x" * 100_000)) == b""
 
 
-def test_a_program_that_ended_before_it_passed_its_sockets_opens_no_listener() -> None:
-    async def main() -> None:
-        opened = JailProxy({}, frozenset())
-        here, there = socket.socketpair()
-        there.close()
-        await asyncio.wait_for(opened.serve(here), 30)
-        await opened.close()
-        here.close()
-
-    asyncio.run(main())
+async def test_a_program_that_ended_before_it_passed_its_sockets_opens_no_listener() -> None:
+    opened = JailProxy({}, frozenset())
+    here, there = socket.socketpair()
+    there.close()
+    await asyncio.wait_for(opened.serve(here), 30)
+    await opened.close()
+    here.close()
 
 
 def test_a_jailed_program_that_asks_for_nothing_is_hung_up_on(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -213,7 +213,7 @@ except KeyboardInterrupt:
     assert done.stdout == "in order\ninterrupted\n", done.stderr
 
 
-def test_a_cancelled_await_cancels_the_work_and_waits_for_it() -> None:
+async def test_a_cancelled_await_cancels_the_work_and_waits_for_it() -> None:
     ended: list[float] = []
 
     async def work() -> None:
@@ -223,12 +223,9 @@ def test_a_cancelled_await_cancels_the_work_and_waits_for_it() -> None:
             await asyncio.sleep(0.1)
             ended.append(time.monotonic())
 
-    async def main() -> None:
-        task = asyncio.create_task(_loop.awaited(work()))
-        await asyncio.sleep(0.1)
-        task.cancel()
-        with pytest.raises(asyncio.CancelledError):
-            await task
-        assert ended
-
-    asyncio.run(main())
+    task = asyncio.create_task(_loop.awaited(work()))
+    await asyncio.sleep(0.1)
+    task.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await task
+    assert ended

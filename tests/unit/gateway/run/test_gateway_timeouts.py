@@ -241,20 +241,17 @@ def test_a_body_of_a_stranger_is_not_waited_for(monkeypatch: pytest.MonkeyPatch)
     assert received[-1]["more_body"] is False
 
 
-def test_an_unawaited_submit_is_answered_before_it_is_decided(
+async def test_an_unawaited_submit_is_answered_before_it_is_decided(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(http, "DECIDED_WAIT_S", SOON_S)
 
-    async def main() -> None:
-        async with served(tmp_path) as s:
-            s.double.up = False
-            answer = await s.http.post(s.urls.submit + "?wait=false", json={"env_instances": [0]})
-            assert answer.status_code == 202
-            s.double.up = True
-            await s.pipeline.idle()
-
-    asyncio.run(main())
+    async with served(tmp_path) as s:
+        s.double.up = False
+        answer = await s.http.post(s.urls.submit + "?wait=false", json={"env_instances": [0]})
+        assert answer.status_code == 202
+        s.double.up = True
+        await s.pipeline.idle()
 
 
 def test_an_idle_connection_is_closed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -267,28 +264,25 @@ def test_an_idle_connection_is_closed(tmp_path: Path, monkeypatch: pytest.Monkey
     assert asyncio.run(main()).startswith(b"HTTP/1.1 200")
 
 
-def test_an_endless_request_does_not_delay_the_services_end(
+async def test_an_endless_request_does_not_delay_the_services_end(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(server, "CLOSE_GRACE_S", 1)
 
-    async def main() -> None:
-        asked = asyncio.Event()
+    asked = asyncio.Event()
 
-        async def never(scope: Any, receive: Any, send: Any) -> None:
-            asked.set()
-            await asyncio.sleep(1000)
-            await PlainTextResponse("late")(scope, receive, send)
+    async def never(scope: Any, receive: Any, send: Any) -> None:
+        asked.set()
+        await asyncio.sleep(1000)
+        await PlainTextResponse("late")(scope, receive, send)
 
-        sock = socket.socket()
-        sock.bind(("127.0.0.1", 0))
-        async with asyncio.timeout(60), server.serving(never, sock):
-            _, writer = await asyncio.open_connection(*sock.getsockname())
-            writer.write(b"GET / HTTP/1.1\r\nhost: x\r\n\r\n")
-            await asked.wait()
-        writer.close()
-
-    asyncio.run(main())
+    sock = socket.socket()
+    sock.bind(("127.0.0.1", 0))
+    async with asyncio.timeout(60), server.serving(never, sock):
+        _, writer = await asyncio.open_connection(*sock.getsockname())
+        writer.write(b"GET / HTTP/1.1\r\nhost: x\r\n\r\n")
+        await asked.wait()
+    writer.close()
 
 
 # The operator's side.
@@ -305,7 +299,7 @@ def test_a_child_that_ignores_being_asked_is_killed(tmp_path: Path) -> None:
     assert asyncio.run(main()) == -signal.SIGKILL
 
 
-def test_giving_up_a_run_ends_although_nobody_hears_of_it(
+async def test_giving_up_a_run_ends_although_nobody_hears_of_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(lifecycle, "GIVE_UP_TIMEOUT_S", SOON_S)
@@ -314,13 +308,10 @@ def test_giving_up_a_run_ends_although_nobody_hears_of_it(
         async def cancel(self, run: str) -> None:
             await asyncio.sleep(1000)
 
-    async def main() -> None:
-        plan: Any = SimpleNamespace(folder=None, name="", settings=SimpleNamespace(env="toy/line"))
-        running = RunLifecycle(plan, Deaf(), None, None)  # type: ignore[arg-type]
-        async with asyncio.timeout(60):
-            await running._give_up(None)
-
-    asyncio.run(main())
+    plan: Any = SimpleNamespace(folder=None, name="", settings=SimpleNamespace(env="toy/line"))
+    running = RunLifecycle(plan, Deaf(), None, None)  # type: ignore[arg-type]
+    async with asyncio.timeout(60):
+        await running._give_up(None)
 
 
 UNKILLABLE = """
