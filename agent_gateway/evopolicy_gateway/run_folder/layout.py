@@ -14,7 +14,7 @@ import msgspec
 
 from evopolicy_common.catalogue import earlier_folder_name, folder_name
 from evopolicy_common.errors import DECODE_ERRORS, ConfigError
-from evopolicy_common.records import model_record, open_run
+from evopolicy_common.records import model_calls, model_record, open_run
 from evopolicy_common.records.blobs import write_atomically
 from evopolicy_common.records.policies.trees import HISTORY, TREES
 from evopolicy_common.records.run_record import Artifacts
@@ -84,7 +84,7 @@ class RunFolder(msgspec.Struct, frozen=True):
     @property
     def model_requests(self) -> Path:
         """The relay's ledger: a line for each request to the agent's model."""
-        return self.root / "logs" / "model_requests.jsonl"
+        return self.root / model_calls.LEDGER
 
     @property
     def model_record(self) -> Path:

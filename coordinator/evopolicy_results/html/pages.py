@@ -11,6 +11,7 @@ import msgspec
 from jinja2 import DictLoader, Environment, StrictUndefined
 from markupsafe import Markup, escape
 
+from evopolicy_common.records import model_calls
 from evopolicy_common.records.policies.trees import changes
 from evopolicy_common.records.words import in_words
 from evopolicy_results.behaviour.trace import Trace, TraceRow, diff, sources
@@ -318,6 +319,7 @@ def trace_page(
     transitions = [row.transition for row in trace.rows if row.transition is not None]
     checkpoints = _checkpoints(trace)
     anchors = {view["label"]: view["anchor"] for view in checkpoints}
+    starts = [row.submit.started_at for row in trace.rows]
     has_evidence = any(row.evidence is not None for row in trace.rows)
     note = "" if has_evidence else "This run's log does not tell what was read or said before which submit."
     facts = [
@@ -347,7 +349,10 @@ def trace_page(
         budget=run.budget,
         timeline=Markup(svg),
         log_note=note,
-        rows=[_trace_row(row, trace, anchors, image_links.get(row.submit.index, ()), videos.get(row.submit.index)) for row in trace.rows],
+        rows=[
+            _trace_row(row, trace, anchors, image_links.get(row.submit.index, ()), videos.get(row.submit.index), words)
+            for row, words in zip(trace.rows, model_calls.before(run.path, starts), strict=True)
+        ],
         unplaced=trace.unplaced,
         simulation_allowed=run.simulation_allowed,
         flags=[_evidence(each) for each in run.simulator_flags],
@@ -377,6 +382,7 @@ def _trace_row(
     anchors: Mapping[str, str],
     images: Sequence[tuple[str, str]],
     video: str | None,
+    calls: str,
 ) -> dict[str, Any]:
     submit, transition, evidence = row.submit, row.transition, row.evidence
     messages = list(evidence.messages) if evidence is not None else []
@@ -396,6 +402,7 @@ def _trace_row(
         "video": video,
         "edit": transition.edit if transition is not None else "",
         "change": _change(row),
+        "calls": calls,
         "workspace": changes(trace.run.path, submit.index),
         "outcome": _outcome(submit, row, trace),
         "hit": transition is not None and transition.hit,

@@ -53,6 +53,7 @@ class SubmitFacts(msgspec.Struct, frozen=True, kw_only=True):
     """Mean steps of an episode."""
     failed: int
     """Episodes in which the policy failed."""
+    started_at: str
     completed_at: str
     wall_s: float
     warning: str
@@ -295,6 +296,7 @@ def _submit(summary: Summary) -> SubmitFacts:
         most=summary.max_return,
         length=summary.mean_episode_length,
         failed=len(summary.errors or ()),
+        started_at=summary.submit_started_at,
         completed_at=summary.submit_completed_at,
         wall_s=summary.wall_time_seconds,
         warning=summary.warning or "",

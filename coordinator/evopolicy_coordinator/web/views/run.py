@@ -8,6 +8,7 @@ from typing import Any
 from markupsafe import Markup
 
 from evopolicy_common.messages.status import RetriedJobs, StatusReply
+from evopolicy_common.records.model_calls import before
 from evopolicy_common.records.policies.trees import changes
 from evopolicy_common.records.summary import utc_text
 from evopolicy_common.terminal import duration, number
@@ -214,6 +215,9 @@ def submit_values(run: RunFacts, reader: Reader, index: int) -> dict[str, Any] |
         "next": index + 1 if index + 1 in submits else None,
         "diffs": _diffs(previous, code) if previous else [],
         "files": code,
+        "calls": before(
+            run.path, [each.started_at for at in (index - 1, index) if (each := submits.get(at))]
+        )[-1],
         "workspace": changes(run.path, index),
         "episodes": episodes,
         "left_out": max(0, submit.n_episodes - MAX_EPISODES),
