@@ -245,7 +245,7 @@ BUGS = (
         "if settled == 0:",
         "if True:",
     ),
-    Bug("forget what a silent worker may still play", occupancies, "left", "if sure:", "if True:"),
+    Bug("forget what a silent worker may still play", occupancies, "vacate", "if sure:", "if True:"),
     Bug(
         "take all kernels for free after a restart",
         occupancies,

@@ -185,8 +185,9 @@ def index_page(
         ),
     ]  # fmt: skip
     if n_envs < _RANKS_FROM:
-        evolution = sections.pop(3)
-        sections[:0] = [section("returns", "Returns", title="Held-out returns", tables=returns), evolution]
+        first = [section("returns", "Returns", title="Held-out returns", tables=returns)]
+        first += [each for each in sections if each["id"] == "evolution"]
+        sections = first + [each for each in sections if each["id"] != "evolution"]
     kept = [
         s for s in sections if s["figures"] or s["tables"] or s["links"] or s["id"] in ("replays", "left-out")
     ]

@@ -7,7 +7,7 @@ from typing import Any
 
 import msgspec
 import pytest
-from rigs.service_world import Requested, World, play
+from rigs.service_world import Requested, World, started
 
 from evopolicy_common.messages import gateway, operator
 from evopolicy_common.messages.run_settings import RunSettings, Start
@@ -66,8 +66,8 @@ def start_of(world: World, created: Any) -> Start:
     return start
 
 
-def test_a_start_from_an_open_run_is_committed_to_as_unscored(tmp_path: Path) -> None:
-    async def scenario(world: World) -> None:
+async def test_a_start_from_an_open_run_is_committed_to_as_unscored(tmp_path: Path) -> None:
+    async with started(tmp_path) as world:
         before = await parent(world)
         wanted = Start(run=before.run, submit_index=0, tree=TREE, parent_scored=True)
         after = await create(world, "child", wanted)
@@ -77,12 +77,10 @@ def test_a_start_from_an_open_run_is_committed_to_as_unscored(tmp_path: Path) ->
         opening = msgspec.json.decode(documents[0].data, type=journal.Opening)
         assert opening.settings.start == start_of(world, after)
 
-    play(tmp_path, scenario)
-
 
 @pytest.mark.parametrize("forged", ["tree", "submit", "run", "environment", "unrecorded", "profile"])
-def test_a_forged_start_is_refused(tmp_path: Path, forged: str) -> None:
-    async def scenario(world: World) -> None:
+async def test_a_forged_start_is_refused(tmp_path: Path, forged: str) -> None:
+    async with started(tmp_path) as world:
         before = await parent(world, tree="" if forged == "unrecorded" else TREE)
         start = Start(run=before.run, submit_index=0, tree=TREE)
         settings: dict[str, Any] = {}
@@ -106,11 +104,9 @@ def test_a_forged_start_is_refused(tmp_path: Path, forged: str) -> None:
         assert core is not None
         assert list(core.state.runs) == [before.run]
 
-    play(tmp_path, scenario)
 
-
-def test_a_start_from_an_ended_run_hands_its_stamp_on(tmp_path: Path) -> None:
-    async def scenario(world: World) -> None:
+async def test_a_start_from_an_ended_run_hands_its_stamp_on(tmp_path: Path) -> None:
+    async with started(tmp_path) as world:
         before = await parent(world)
         message = gateway.CloseRun(run=before.run, token=before.capability, reason="agent_stopped", agent={})
         closed = Requested(keys.gateway_key("c", before.run, "close"), message)
@@ -122,11 +118,9 @@ def test_a_start_from_an_ended_run_hands_its_stamp_on(tmp_path: Path) -> None:
         grandchild = await create(world, "grandchild", Start(run=child.run, submit_index=0, tree=TREE))
         assert start_of(world, grandchild).parent_scored
 
-    play(tmp_path, scenario)
 
-
-def test_parent_and_start_are_related_when_each_has_its_own_hidden_cases(tmp_path: Path) -> None:
-    async def scenario(world: World) -> None:
+async def test_parent_and_start_are_related_when_each_has_its_own_hidden_cases(tmp_path: Path) -> None:
+    async with started(tmp_path) as world:
         before = await parent(world, hidden_cases="per_run")
         start = Start(run=before.run, submit_index=0, tree=TREE)
         child = await parent(world, key="child", start=start, hidden_cases="per_run")
@@ -144,5 +138,3 @@ def test_parent_and_start_are_related_when_each_has_its_own_hidden_cases(tmp_pat
         family = {before.run, child.run, grandchild.run}
         assert [relatives(one) for one in (before, child, grandchild)] == [family, family, family]
         assert relatives(stranger) == {stranger.run}
-
-    play(tmp_path, scenario)

@@ -26,7 +26,7 @@ def parent(tmp_path: Path) -> RunFolder:
     """An open run with one submit, and hidden results beside its workspace."""
     folder = RunFolder(tmp_path / RUN)
     folder.state.mkdir(parents=True)
-    save(folder.opened, OpenedRun(run="r-1"))
+    save(folder.opened_run, OpenedRun(run="r-1"))
     (folder.feedback / "submit_000").mkdir(parents=True)
     (folder.feedback / "submit_000" / "summary.json").write_text("{}")
     folder.system.mkdir()
