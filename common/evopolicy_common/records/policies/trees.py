@@ -43,8 +43,9 @@ HISTORY = "history"
 LEFT_OUT = frozenset({"AGENTS.md", "feedback", HISTORY})
 MAX_FILES = 5000
 """Of a tree. Twice as many files and folders are looked at."""
-MAX_FILE_BYTES = 64 << 20
-MAX_TREE_BYTES = 256 << 20
+MAX_FILE_BYTES = 16 << 20
+"""Of a file outside the bundle. The search for keys, which takes a second for 25 to 90 MB, holds up the gateway."""
+MAX_TREE_BYTES = 128 << 20
 MAX_STORED_BYTES = 1 << 30
 """All contents of one run; with more, changed files are omitted."""
 MAX_LISTED = 100
@@ -256,7 +257,7 @@ class Recorder:
         self, path: str, executable: bool, data: bytes, left: int, passed: Passed | None
     ) -> TreeFile | str:
         """The file, stored, or why it is omitted."""
-        if len(data) > min(left, MAX_FILE_BYTES):
+        if len(data) > left:
             return f"{len(data):,} bytes are too many"
         digest = digest_of(data)
         if not self._blobs.has(digest):
