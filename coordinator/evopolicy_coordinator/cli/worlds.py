@@ -35,6 +35,7 @@ from evopolicy_common.wire import credentials, transport
 from evopolicy_common.worlds.rules import PARAMETERS, Rules
 from evopolicy_common.worlds.transformed import transformed, varied
 from evopolicy_coordinator import splits, worlds
+from evopolicy_coordinator.storage.state_folder import held
 from evopolicy_results.evaluations import Evaluations
 
 _COUNTS: dict[Split, int] = {"train": worlds.CASES, "validation": 1, "heldout": 1}
@@ -62,9 +63,9 @@ def accept_worlds(
         env_ids = catalogue.resolve(env or ["core16"])
         if others := [each for each in env_ids if each not in core16]:
             raise ConfigError(f"{others[0]} has no worlds; those of Core16 have some: {', '.join(core16)}")
-        root.mkdir(mode=0o700, parents=True, exist_ok=True)
-        secret = splits.load_or_create_secret(root / splits.SECRET)
-        run_to_end(_accept(env_ids, policies, _Journal(root / worlds.JOURNAL, secret), slots))
+        with held(root):
+            secret = splits.load_or_create_secret(root / splits.SECRET)
+            run_to_end(_accept(env_ids, policies, _Journal(root / worlds.JOURNAL, secret), slots))
     say(f"next: evopolicy-coordinator --state {root}")
 
 

@@ -24,6 +24,7 @@ import os
 import secrets
 import socket
 import stat
+from collections.abc import Iterator
 from pathlib import Path
 
 import msgspec
@@ -147,6 +148,18 @@ def cluster_of(root: Path, cluster: str | None) -> str:
     """
     _make_private(root, cluster)
     return _identity(root, cluster).cluster
+
+
+@contextlib.contextmanager
+def held(root: Path) -> Iterator[None]:
+    """The folder, created if it is missing, while no coordinator and no other command changes it. Raises
+    ConfigError as `StateFolder.open`."""
+    _make_private(root, None)
+    lock_fd = _lock(root)
+    try:
+        yield
+    finally:
+        os.close(lock_fd)
 
 
 def _make_private(root: Path, cluster: str | None) -> None:

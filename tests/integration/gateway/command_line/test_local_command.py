@@ -39,7 +39,7 @@ def test_local_plays_a_whole_run_and_leaves_nothing_behind(tmp_path: Path) -> No
     assert record.agent.harness == record.agent.entry == "evolve"
     assert record.versions.fingerprint["numpy"]
     left = {path.name for path in folder.iterdir()}
-    assert left == {PASSED, "checkpoints", "logs", "run.json", "workspace"}
+    assert left == {PASSED, "checkpoints", "logs", "run.json", "trees", "workspace"}
     # Digests of what the agent got by the tests' `--jail-env`, and of nothing else.
     passed = read_passed(folder)
     assert passed is not None
