@@ -72,16 +72,26 @@ _MINIGRID = (
     "MiniGrid-ObstructedMaze-1Q-v1",
 )
 _HIGHWAY = (
-    *(
-        "exit-v0",
-        "exit-v1",
-        "highway-fast-v0",
-        "highway-v0",
-        "intersection-v0",
-        "intersection-v1",
-        "intersection-v2",
-    ),
-    *("parking-v0", "roundabout-v0"),
+    "exit-v0",
+    "exit-v1",
+    "highway-fast-v0",
+    "highway-v0",
+    "intersection-multi-agent-v0",
+    "intersection-v0",
+    "intersection-v1",
+    "intersection-v2",
+    "merge-generic-v0",
+    "merge-generic-v1",
+    "merge-v0",
+    "merge-v1",
+    "parking-ActionRepeat-v0",
+    "parking-parked-v0",
+    "parking-v0",
+    "racetrack-large-v0",
+    "racetrack-large-v1",
+    "racetrack-oval-v0",
+    "racetrack-oval-v1",
+    "roundabout-v0",
 )
 """Those of which 128 seeds were compared. The code serves the family's other ids too, but `lane-keeping-v0`."""
 
