@@ -50,7 +50,7 @@ class World(Environment):
         if not (isinstance(key, str) and KEY.fullmatch(key)):
             raise WorkerError(
                 f"{self.description.env}: a case has no valid key of its world; its options need {OPTION!r} with 32"
-                " hexadecimal digits"
+                " hexadecimal digits, or these, a hyphen, and a candidate's number"
             )
         if self._rules is None or self._rules[0] != key:
             self._rules = key, Rules(key, *self._given)
