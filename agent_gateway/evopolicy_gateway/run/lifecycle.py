@@ -192,7 +192,9 @@ class RunLifecycle:
         # Checking starts programs that try the jail, which another run's search would take for orphans.
         async with child_process.starting():
             plan.check_held()
-        key = await self._ask() if folder.root.exists() or folder.asked.exists() else uuid.uuid4().hex
+        wanted = self._wanted
+        if folder.root.exists() or folder.asked.exists():
+            wanted = await self._ask(wanted)
         await self._operations.drop(folder)
         if self._put_aside is not None:
             self._put_aside()
@@ -201,34 +203,43 @@ class RunLifecycle:
         folder.state.mkdir(mode=0o700)
         if plan.start_from:
             await asyncio.to_thread(starts.stage, starts.find(plan.start_from, plan.started_in), folder)
-        save(folder.intended, IntendedRun(key=key, settings=plan.settings))
+        save(folder.intended, wanted)
         folder.asked.unlink(missing_ok=True)
         if (replays := plan.replays) is not None:
             save(folder.service, Address(host=LOOPBACK, port=replays.port, token=replays.token))
         if plan.listener is not None:
             save(folder.listener, plan.listener)
 
-    async def _ask(self) -> str:
-        """Opens the run and returns its key while the folder has its earlier run, which a refusal keeps.
+    @property
+    def _wanted(self) -> IntendedRun:
+        """A new request for the run."""
+        replays = self._plan.replays
+        return IntendedRun(
+            key=uuid.uuid4().hex,
+            settings=self._plan.settings,
+            replay_key="" if replays is None else replays.key,
+        )
+
+    async def _ask(self, wanted: IntendedRun) -> IntendedRun:
+        """Opens the run and returns the request for it while the folder has its earlier run, which a refusal keeps.
 
         The request is kept beside the folder, so that a command that is killed meanwhile finds the run again.
         """
-        folder, settings, key = self._folder, self._plan.settings, uuid.uuid4().hex
+        folder = self._folder
         if folder.asked.exists():
             before = saved(folder.asked, IntendedRun)
-            if before.settings == settings:
-                key = before.key
+            if before.settings == wanted.settings:
+                wanted = before
             else:
                 with contextlib.suppress(EvopolicyError):
-                    other = await self._operations.create(before.settings, before.key)
-                    await self._operations.cancel(other.run)
-        save(folder.asked, IntendedRun(key=key, settings=settings))
+                    await self._operations.cancel((await self._operations.create(before)).run)
+        save(folder.asked, wanted)
         try:
-            self.run = (await self._operations.create(settings, key)).run
+            self.run = (await self._operations.create(wanted)).run
         except EvopolicyError:
             folder.asked.unlink()
             raise
-        return key
+        return wanted
 
     async def _withdraw(self, error: BaseException) -> None:
         """Cancels the run that was asked for, as its folder cannot be had."""
@@ -246,8 +257,7 @@ class RunLifecycle:
                 credentials.read(folder.credentials).token,
             )
         else:
-            key = saved(folder.intended, IntendedRun).key
-            created = await self._operations.create(self._plan.settings, key)
+            created = await self._operations.create(saved(folder.intended, IntendedRun))
             self.run, token = created.run, created.capability
         credentials.write(msgspec.structs.replace(self._credentials, token=token), folder.credentials)
         if resumed:
@@ -478,6 +488,8 @@ class RunLifecycle:
             replays = Replays(
                 folder=self._folder.model_record,
                 root=self._folder.root,
+                run=self.run,
+                key=saved(self._folder.intended, IntendedRun).key,
                 port=service.port,
                 token=service.token,
                 model_port=made.port,

@@ -21,7 +21,6 @@ from evopolicy_common.messages.operator import (
     RunProgress,
     WaitRun,
 )
-from evopolicy_common.messages.run_settings import RunSettings
 from evopolicy_common.messages.worker import Message
 from evopolicy_common.processes.notices import notify_if_slow
 from evopolicy_common.records.open_run import IntendedRun, OpenedRun
@@ -53,9 +52,11 @@ class Operations(OperatorClient):
         if self._opened is not None:
             self._opened(run, locks)
 
-    async def create(self, settings: RunSettings, key: str) -> RunCreated:
+    async def create(self, wanted: IntendedRun) -> RunCreated:
         """Opens a run; the same key returns the same run. Raises ConfigError for refused settings."""
-        message = CreateRun(token=self._token, key=key, settings=settings)
+        message = CreateRun(
+            token=self._token, key=wanted.key, settings=wanted.settings, replay_key=wanted.replay_key
+        )
         try:
             return await self._once_available("create", message, RunCreated, timeout_s=TIMEOUT_S)
         except RefusedError as error:
@@ -128,7 +129,7 @@ class Operations(OperatorClient):
             # The coordinator may have opened it, and the command was killed before it had the answer.
             intended = saved(folder.intended, IntendedRun)
             try:
-                run = (await self.create(intended.settings, intended.key)).run
+                run = (await self.create(intended)).run
             except (ConfigError, RefusedError):
                 return
         else:

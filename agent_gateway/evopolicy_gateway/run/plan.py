@@ -43,6 +43,10 @@ class Replays(msgspec.Struct, frozen=True, kw_only=True):
     """Of the record of model calls."""
     root: Path
     """The run's folder, as its agent saw it."""
+    run: str
+    """The coordinator's name of the run."""
+    key: str
+    """With which the run was created: shows the coordinator that its own operator replays it."""
     port: int
     """Of the run's service."""
     token: str

@@ -235,6 +235,7 @@ def run_record(
         audit=finished.audit,
         committed=finished.committed,
         start=settings.start or plan.settings.start,  # an older coordinator keeps none
+        replay_of=plan.settings.replay_of,
         trees={str(submit.submit_index): submit.tree for submit in finished.submits if submit.tree},
     )
 

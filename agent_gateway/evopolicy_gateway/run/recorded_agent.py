@@ -71,14 +71,16 @@ def plan_of(run: Path, runs: Path, *, trusted: bool = False) -> Plan:
             f"{run} was not recorded by you on this machine, and a replay runs the programs that it names: read"
             f" {folder.replay}, then repeat with --trust"
         )
+    if not folder.run_json.exists():
+        raise ConfigError(f"{run} is not finished; finish it with --resume, or name a finished run")
     if why := model_record.stopped(folder.root):
         raise ConfigError(f"the record of {run} is not whole, and cannot be replayed: {why}")
     for name in _keys(plan):
         os.environ.setdefault(name, _NO_KEY)
     replays = msgspec.structs.replace(replays, folder=folder.model_record)
-    return msgspec.structs.replace(
-        plan, runs=runs, overwrite=True, resume=False, record_model="digests", replays=replays
-    )
+    settings = msgspec.structs.replace(plan.settings, replay_of=replays.run)
+    again = {"overwrite": True, "resume": False, "record_model": "digests"}
+    return msgspec.structs.replace(plan, runs=runs, settings=settings, replays=replays, **again)
 
 
 def outcome(run: Path, plan: Plan) -> str:

@@ -43,6 +43,8 @@ class CreateRun(Message, frozen=True, kw_only=True, tag="create_run"):
     key: Word
     """Idempotency key: creating twice with one key returns the same run."""
     settings: RunSettings
+    replay_key: Word = ""
+    """With `settings.replay_of`: the key with which that run was created, which only its operator knows."""
 
 
 class RunCreated(Message, frozen=True, kw_only=True, tag="run_created"):

@@ -93,6 +93,8 @@ class RunSettings(msgspec.Struct, frozen=True, kw_only=True):
     """Boot id of the agent's kernel, or `ELSEWHERE`; empty: the gateway's own kernel, or unknown for a remote agent."""
     start: Start | None = None
     """None: the run starts with the usual workspace."""
+    replay_of: Word = ""
+    """The coordinator's name of the run whose agent is played again; empty: a run of its own."""
 
     @property
     def recorded_heldout(self) -> VideoOption:

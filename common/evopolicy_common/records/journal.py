@@ -50,6 +50,8 @@ class Opened(msgspec.Struct, frozen=True, kw_only=True, tag="opened", tag_field=
     attempt: Int
     at: Number
     """Unix time, seconds."""
+    replay_of: Word = ""
+    """As in the settings."""
 
 
 class Ended(msgspec.Struct, frozen=True, kw_only=True, tag="ended", tag_field="kind"):

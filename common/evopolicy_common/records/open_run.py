@@ -37,6 +37,8 @@ class IntendedRun(msgspec.Struct, frozen=True, kw_only=True):
 
     key: str
     settings: RunSettings
+    replay_key: str = ""
+    """As in `CreateRun`."""
 
 
 class Entry(msgspec.Struct, frozen=True, kw_only=True, tag_field="what"):

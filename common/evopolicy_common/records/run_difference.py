@@ -33,6 +33,7 @@ EXCLUDED_FIELDS: Mapping[str, Mapping[str, str]] = {
         "exp_id": "the run's own name",
         "attempt": "counts what was begun anew",
         "run": "the coordinator's name of the run",
+        "replay_of": "the coordinator's name of another run",
         "timing": "times",
         "agent.retries": "counts what was asked again",
         "agent.resources": "what the agent used of its machine, and how that one limits it",

@@ -466,6 +466,8 @@ class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
     """The coordinator's commitment before the agent started; None for runs from before the journal."""
     start: Start | None = None
     """The submit of an earlier run whose workspace this one began with; None: the usual workspace."""
+    replay_of: str = ""
+    """The coordinator's name of the run that `evopolicy replay` played again; empty: a run of its own."""
     trees: dict[str, str] = {}
     """Submit index (decimal text) to the SHA-256 of `trees/submit_NNN.json`, the workspace at that submit; empty in
     older files."""

@@ -181,6 +181,18 @@ class ServiceReader:
         except DamagedStoreError as error:
             raise damaged(error) from error
 
+    def replayed(self, run: str) -> RunRow | None:
+        """The finished run that is to be played again; None for an unknown one. Reads the database. Raises RefusedError
+        for an open run, and when the row cannot be read."""
+        finished = self.finished_run(run)
+        try:
+            if finished is None and self._reader.run(run) is not None:
+                text = f"run {run[:64]} is open; only a finished run is replayed: wait until it is scored, or cancel it"
+                raise RefusedError(Refusal.BUSY, text)
+        except DamagedStoreError as error:
+            raise damaged(error) from error
+        return finished
+
     def close(self) -> None:
         for pool in (self._pages, self._audits, *self._lanes):
             pool.shutdown(wait=True, cancel_futures=True)

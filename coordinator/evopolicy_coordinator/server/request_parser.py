@@ -9,6 +9,7 @@ Rules that this module owns:
 
 from __future__ import annotations
 
+import hmac
 import secrets
 from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
@@ -326,9 +327,8 @@ class RequestParser:
                 largest = max(most, len(cases.validation), len(cases.heldout))
             check_job((*cases.train, *cases.validation, *cases.heldout), largest)
         row = RunRow(
-            run=f"r-{secrets.token_hex(8)}",
+            **_new_secrets(),
             key=m.key,
-            capability=secrets.token_urlsafe(32),
             secret=secrets.token_bytes(32),
             settings=wanted,
             budget=budget,
@@ -340,7 +340,6 @@ class RequestParser:
             split_hashes=cases.hashes(),
             split_secret=cases.secret,
             epoch=cases.epoch,
-            salt=secrets.token_bytes(SALT_BYTES),
             allowed_imports=self._allowed_imports,
             denied_imports=self._denied_imports,
             max_steps=_max_steps(wanted.env, wanted.step_limit),
@@ -348,6 +347,30 @@ class RequestParser:
                 case for case in related if case not in cases.validation and case not in cases.heldout
             ),
         )
+        return events.RunCreated(stimulus_id=stimulus, request=request, message=m, row=row)
+
+    def run_replayed(self, m: operator.CreateRun, request: int, stimulus: str, of: RunRow) -> AnyEvent:
+        """Builds the event that opens a replay of the finished run `of`, with its cases and its secret."""
+        check_idempotency_key(m.key)
+        if not hmac.compare_digest(m.replay_key.encode(), of.key.encode()):
+            raise RefusedError(
+                Refusal.BAD_REQUEST,
+                f"run {of.run} is another operator's, or its .replay.json is lost or changed: only the operator"
+                " that opened a run replays it with its cases",
+            )
+        wanted, known = m.settings, of.settings
+        if wanted.start is not None and known.start is not None:
+            wanted = replace(wanted, start=replace(wanted.start, parent_scored=known.start.parent_scored))
+        same = replace(known, replay_of=of.run, notes=wanted.notes)
+        if wanted != same:
+            names = [
+                each for each in wanted.__struct_fields__ if getattr(wanted, each) != getattr(same, each)
+            ]
+            raise RefusedError(
+                Refusal.INVALID_SETTINGS,
+                f"a replay of run {of.run} has other settings than the run: {', '.join(names)}",
+            )
+        row = replace(of, key=m.key, settings=wanted, committed=None, **_new_secrets())
         return events.RunCreated(stimulus_id=stimulus, request=request, message=m, row=row)
 
     def evaluation_requested(
@@ -638,6 +661,15 @@ def _derived(run: RunRow | None) -> RunRow | None:
     """Returns the run if its cases came from a secret; its coordinator may have another one now (see
     `splits.secret_of`)."""
     return run if run is not None and run.split_hashes.keys() == set(SPLITS) else None
+
+
+def _new_secrets() -> dict[str, Any]:
+    """The name and the secrets that every run has of its own, a replay too."""
+    return {
+        "run": f"r-{secrets.token_hex(8)}",
+        "capability": secrets.token_urlsafe(32),
+        "salt": secrets.token_bytes(SALT_BYTES),
+    }
 
 
 def _started(

@@ -255,6 +255,11 @@ class Service:
         if isinstance(message, operator.Evaluate) and message.as_in is not None:
             row = self._reader.finished_run(message.as_in.run)
             return self._parser.evaluation_requested(message, request, stimulus, row)
+        # A run of another coordinator is played again as any run, with this one's cases and a new secret.
+        if isinstance(message, operator.CreateRun) and (
+            of := self._reader.replayed(message.settings.replay_of)
+        ):
+            return self._parser.run_replayed(message, request, stimulus, of)
         if isinstance(message, operator.CreateRun) and message.settings.start is not None:
             parent = self._reader.parent(message.settings.start)
             return self._parser.run_created(message, request, stimulus, parent)

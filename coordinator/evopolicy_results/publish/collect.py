@@ -104,6 +104,8 @@ def find_runs(paths: Sequence[Path]) -> tuple[list[tuple[Path, RunRecord]], list
                 left.append(
                     (folder, "it has no commitment: its coordinator kept no journal when it opened the run")
                 )
+            elif record.replay_of:
+                left.append((folder, f"it is a replay of run {record.replay_of}, and no run of its own"))
             elif record.run in found:
                 left.append((folder, f"it repeats the run in {found[record.run][0]}"))
             else:

@@ -208,7 +208,7 @@ class Listed(msgspec.Struct, frozen=True, kw_only=True):
     repeat: int
     attempt: int
     state: str
-    """`published`, or what became of it: a status of `run.json`, or `not finished`."""
+    """`published`, or what became of it: a status of `run.json`, `not finished`, or `replayed` for a replay."""
     replaced_by: str = ""
     """The run that was opened later in its place; empty for none."""
 
@@ -225,12 +225,15 @@ def listing(entries: Iterable[journal.Entry], published: Iterable[str]) -> tuple
         elif isinstance(entry, journal.Ended):
             status[entry.run] = entry.status
     names = {each.entry for each in opened if each.run in chosen}
-    last = {(each.exp_id, each.entry, each.env, each.repeat): each.run for each in opened}
+    last = {
+        (each.exp_id, each.entry, each.env, each.repeat): each.run for each in opened if not each.replay_of
+    }
     found = []
     for each in opened:
         if each.entry not in names:
             continue
-        later = last[each.exp_id, each.entry, each.env, each.repeat]
+        later = last.get((each.exp_id, each.entry, each.env, each.repeat), each.run)
+        left = "replayed" if each.replay_of else status.get(each.run, "not finished")
         found.append(
             Listed(
                 run=each.run,
@@ -239,8 +242,8 @@ def listing(entries: Iterable[journal.Entry], published: Iterable[str]) -> tuple
                 exp_id=each.exp_id,
                 repeat=each.repeat,
                 attempt=each.attempt,
-                state="published" if each.run in chosen else status.get(each.run, "not finished"),
-                replaced_by="" if later == each.run else later,
+                state="published" if each.run in chosen else left,
+                replaced_by="" if later == each.run or each.replay_of else later,
             )
         )
     return tuple(found)

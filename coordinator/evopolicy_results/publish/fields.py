@@ -52,6 +52,7 @@ _RUN: dict[Cover, str] = {
         outcome.auxiliary.nondeterministic_results outcome.auxiliary.code_metrics_best.**
         outcome.auxiliary.code_metrics_by_submit.** outcome.auxiliary.code_metrics_trend.**
         versions.cases_hashes.* versions.data_secret {_all("committed", Committed)} {_all("start", Start)} trees.*
+        replay_of
     """,  # noqa: E501
     "committed": f"""
         jail hidden_isolation env_title env_family agent.harness agent.cli_version agent.model_string agent.retries

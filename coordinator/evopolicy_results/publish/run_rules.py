@@ -139,6 +139,11 @@ def _commitment(run: PublishedRun, history: History) -> Iterator[Fault]:
         entry.epoch,
     ):
         yield Fault("record", "run.json tells another commitment or head of the journal than the journal has")
+    if settings.replay_of or entry.replay_of:
+        yield Fault(
+            "commitment",
+            f"it is a replay of run {settings.replay_of or entry.replay_of}, and no run of its own",
+        )
     cases = {split: run.cases(split) for split in SPLITS}
     if repeated := overlaps(cases):
         yield Fault("commitment", f"its splits are not disjoint: {repeated[0]}")
@@ -185,6 +190,7 @@ def _record(run: PublishedRun, history: History) -> Iterator[Fault]:
         ("sandbox_tier", record.sandbox_tier, settings.sandbox_tier),
         ("episode_budget", dimensions.episode_budget, opening.budget),
         ("start", record.start, settings.start),
+        ("replay_of", record.replay_of, settings.replay_of),
         ("trees", record.trees, {str(one.submit_index): one.tree for one in result.submits if one.tree}),
         ("versions.data_secret", record.versions.data_secret, opening.cases_secret),
     ]

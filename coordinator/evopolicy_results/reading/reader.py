@@ -89,6 +89,9 @@ def load_runs(
         if isinstance(result, LeftOut):
             left_out.append(result)
             continue
+        if of := result.record.replay_of:
+            left_out.append(LeftOut(path=result.path, reason=f"a replay of run {of}, and no run of its own"))
+            continue
         key = (result.is_published, result.entry, result.env, result.record.exp_id, result.record.repeat)
         if key in seen:
             left_out.append(LeftOut(path=result.path, reason=f"repeats the run in {seen[key]}"))

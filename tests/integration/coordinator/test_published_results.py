@@ -97,6 +97,13 @@ def entry_edited(lines: list[bytes]) -> list[bytes]:
     return [lines[0].replace(b'"entry":"mine"', b'"entry":"ours"'), *lines[1:]]
 
 
+START = {"run": "r-1", "submit_index": 0, "tree": "ab" * 32, "parent_scored": False}
+
+
+def replay_entry(lines: list[bytes]) -> list[bytes]:
+    return [lines[0].replace(b'"replay_of":""', b'"replay_of":"r-1"'), *lines[1:]]
+
+
 def better_result(forger: Forger) -> None:
     """All that the forger can raise consistently."""
     for name, path in ((RESULT, ("heldout_returns",)), (RUN, ("outcome", "heldout_returns"))):
@@ -142,6 +149,12 @@ SIGNED_ANEW: dict[str, tuple[Edit, str, str]] = {
     "another agent's name": (lambda f: f.json(RUN, put("agent", "entry", value="theirs")), "record", "agent.entry"),
     "another environment": (lambda f: f.json(RUN, put("env", value="gym/acrobot")), "record", "env"),
     "another repeat": (lambda f: f.json(RUN, put("repeat", value=5)), "record", "repeat"),
+    "a start that it did not have": (lambda f: f.json(RUN, lambda record: {**record, "start": START}), "record", "start"),
+    "a start in the opening too": (lambda f: f.json(OPENING, put("settings", "start", value=START)), "commitment", "not those that were committed to"),
+    "a tree that was not recorded": (lambda f: f.json(RUN, put("trees", "0", value="ab" * 32)), "record", "trees"),
+    "a replay, by its record": (lambda f: f.json(RUN, put("replay_of", value="r-1")), "record", "replay_of"),
+    "a replay, by its opening": (lambda f: f.json(OPENING, put("settings", "replay_of", value="r-1")), "commitment", "is a replay of run r-1"),
+    "a replay, by its journal": (lambda f: f.entries(replay_entry), "commitment", "is a replay of run r-1"),
     "another place in the journal": (lambda f: f.json(RUN, put("committed", "opened_head", value="00" * 32)), "record", "another commitment or head"),
     "no place in the journal": (lambda f: f.json(RUN, put("committed", value=None)), "record", "another commitment or head"),
     "recorded rewards edited": (rerecorded, "recordings", "rewards come to"),

@@ -69,6 +69,14 @@ def test_a_run_whose_agent_never_played_is_left_out(tmp_path: Path) -> None:
     assert "failed before it used any budget" in left.reason
 
 
+def test_a_replay_is_left_out_as_no_run_of_its_own(tmp_path: Path) -> None:
+    folder = write_run(tmp_path, VERSIONS)
+    record = json.loads((folder / "run.json").read_text())
+    (folder / "run.json").write_text(json.dumps({**record, "replay_of": "r-1"}))
+    (left,) = load_runs([tmp_path]).left_out
+    assert left.reason == "a replay of run r-1, and no run of its own"
+
+
 def test_unknown_fields_are_skipped(tmp_path: Path) -> None:
     folder = write_run(tmp_path, VERSIONS)
     record = json.loads((folder / "run.json").read_text())

@@ -4,7 +4,7 @@ Rules that this module owns:
 - Every run has an entry from its opening on, whatever happens to it, and another when it is over.
 - The content that an entry commits to is stored with it, as the bytes that were hashed.
 - An epoch is revealed when one of its runs is published, and not while any run of it is unfinished. No new run gets a
-  revealed epoch's secret cases; public cases may still be played.
+  revealed epoch's secret cases; public cases may still be played, and a replay, no new run, has those of its run.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from evopolicy_coordinator.core.tables.step import Step
 
 def fault(state: State, row: RunRow) -> Reason | None:
     """Why no run may be opened on these cases; None when one may."""
-    if row.split_secret and row.epoch in state.revealed:
+    if row.split_secret and row.epoch in state.revealed and not row.settings.replay_of:
         return because("epoch_revealed", epoch=row.epoch)
     return None
 
@@ -69,6 +69,7 @@ def opened(state: State, row: RunRow, step: Step) -> RunRow:
             repeat=settings.repeat,
             attempt=settings.attempt,
             at=step.now,
+            replay_of=settings.replay_of,
         ),
         step,
     )

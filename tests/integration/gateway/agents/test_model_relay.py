@@ -264,9 +264,14 @@ def test_a_run_is_recorded_whole_and_stamped(tmp_path: Path, operator: Path) -> 
     assert b"sk-0123456789abcdefghij" not in held
 
 
-EDIT = Step(
-    command="sed -i 's/pass/pass  # it waits/' system/policy.py; pwd; date; ls -l; cat AGENTS.md feedback/*/*"
-)
+LUCK = """
+import random
+class Policy:
+    def __init__(self, *about): pass
+    def reset(self, episode_index): pass
+    def act(self, obs): return [random.uniform(-1, 1)]
+"""
+EDIT = Step(command=f"echo '{LUCK}' > system/policy.py; pwd; date; ls -l; cat AGENTS.md feedback/*/*")
 
 
 @pytest.mark.parametrize("protocol", ["openai", "anthropic"])
@@ -285,6 +290,7 @@ def test_a_recorded_agent_replays_to_the_byte_without_its_model(
         assert running.finish()[:2] == (0, "identical\n"), running.text
     (other,) = (tmp_path / "replayed").glob("*/toy_line/t")
     assert record_in(other).outcome == record_in(run_dir(tmp_path)).outcome
+    assert record_in(other).replay_of == record_in(run_dir(tmp_path)).run
     # The same agent with another system prompt: its first request is another one.
     kept = run_dir(tmp_path) / ".replay.json"
     document = json.loads(kept.read_bytes())
