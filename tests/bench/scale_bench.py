@@ -49,6 +49,7 @@ from evopolicy_coordinator.core.contract.records import train_group
 from evopolicy_coordinator.storage.store import Reader
 from evopolicy_gateway.run_folder.layout import RunFolder, save
 from evopolicy_worker import environments
+from evopolicy_worker.capabilities import Capabilities
 from evopolicy_worker.slot_protocol import slot_messages
 from evopolicy_worker.supervisor import Options, Supervisor
 
@@ -149,15 +150,18 @@ async def answer(options: Any) -> None:
             own = Options(
                 name=name,
                 slots=options.slots,
-                tiers=("bwrap",),
-                environments=(outcomes.env,),
                 fingerprint=FINGERPRINT,
                 host="bench",
                 scratch=folder / name,
             )
             own.scratch.mkdir()
             link = await stack.enter_async_context(transport.connect(found))
-            supervisor = Supervisor(link, own, lambda index, tier: AnsweringSlot(outcomes))
+            supervisor = Supervisor(
+                link,
+                own,
+                Capabilities(("bwrap",), (outcomes.env,)),
+                lambda index, tier: AnsweringSlot(outcomes),
+            )
             tasks.append(asyncio.create_task(supervisor.run()))
         print("ready", flush=True)
         await asyncio.to_thread(sys.stdin.read)

@@ -34,6 +34,7 @@ from evopolicy_common.terminal import say, say_json
 from evopolicy_common.wire import credentials, keys, transport
 from evopolicy_common.wire.ready import read_ready
 from evopolicy_worker import check_env, descriptions, environments, setup
+from evopolicy_worker.capabilities import Capabilities, log_missing
 from evopolicy_worker.environments.interface.calls import USUAL, Limits
 from evopolicy_worker.environments.interface.fingerprint import fingerprint
 from evopolicy_worker.environments.interface.settings import use_browser
@@ -41,7 +42,7 @@ from evopolicy_worker.sandbox import SANDBOXED, available_tiers, why_not
 from evopolicy_worker.sandbox.doctor import best_tier, examine
 from evopolicy_worker.slots.cores import Cores
 from evopolicy_worker.slots.slot import Slot
-from evopolicy_worker.supervisor import MAX_PREPARED, Describe, Options, Probe, Supervisor, tell_missing
+from evopolicy_worker.supervisor import MAX_PREPARED, Options, Supervisor
 
 app = App(add_completion=True)
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
@@ -179,7 +180,7 @@ def work(
         else:
             tiers = available_tiers(unsandboxed=unsandboxed, wanted=needed or SANDBOXED)
         missing = {tier: why_not(tier) or "" for tier in needed or SANDBOXED if tier not in (*tiers, "none")}
-        tell_missing(missing)
+        log_missing(missing)
         if not tiers:
             raise MachineError(
                 "no sandbox works on this machine: `evopolicy-worker doctor` names the cause and the remedy;"
@@ -338,14 +339,18 @@ async def _run(
         if len(env_ids) > MAX_PREPARED:
             await first.close()
         found = await joined()
+        capabilities = Capabilities(
+            tiers,
+            importing(sorted(known, key=lambda each: env_ids.index(each.env))),
+            missing_tiers=missing,
+            undescribed=later,
+            failed_environments=failed,
+            probe=probe,
+            describe=describe,
+        )
         options = Options(
             name=name or default_name(found),
             slots=len(taken),
-            tiers=tiers,
-            missing_tiers=missing,
-            environments=importing(sorted(known, key=lambda each: env_ids.index(each.env))),
-            undescribed=tuple(later),
-            failed_environments=failed,
             fingerprint=own,
             host=socket.gethostname(),
             boot_id=host.boot_id(),
@@ -356,7 +361,7 @@ async def _run(
             log.warning("this worker gets no hidden episodes", why=host.NO_BOOT_ID)
         log.info("waiting for the coordinator", endpoints=found.endpoints)
         with contextlib.suppress(asyncio.CancelledError):
-            await _serve(found, read_again, options, make_slot, describe, probe)
+            await _serve(found, read_again, options, capabilities, make_slot)
     finally:
         for slot in kept:
             await slot.close()
@@ -367,9 +372,8 @@ async def _serve(
     found: credentials.Credentials,
     read_again: Callable[[], credentials.Credentials] | None,
     options: Options,
+    capabilities: Capabilities,
     make_slot: Callable[[int, Tier], Slot],
-    describe: Describe,
-    probe: Probe,
 ) -> None:
     loop = asyncio.get_running_loop()
     main = asyncio.current_task()
@@ -387,7 +391,7 @@ async def _serve(
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, stop)
     async with transport.connect(found, timeout_s=None, read_again=read_again) as link:
-        supervisor = Supervisor(link, options, make_slot, describe, probe)
+        supervisor = Supervisor(link, options, capabilities, make_slot)
         await supervisor.run()
         log.info("stopped", jobs_done=supervisor.jobs_done)
 

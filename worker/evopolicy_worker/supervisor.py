@@ -18,9 +18,9 @@ import asyncio
 import contextlib
 import time
 from collections import OrderedDict
-from collections.abc import Awaitable, Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Protocol, get_args
+from typing import Protocol
 
 import msgspec
 
@@ -33,7 +33,6 @@ from evopolicy_common.errors import (
     TransportError,
 )
 from evopolicy_common.logs import structlog
-from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome, Job, Tier
 from evopolicy_common.messages.worker import (
     Fingerprint,
@@ -55,6 +54,7 @@ from evopolicy_common.wire import codec, keys
 from evopolicy_common.wire.requests import Requester
 from evopolicy_common.wire.transport import Link
 from evopolicy_worker.bundle_cache import BundleCache
+from evopolicy_worker.capabilities import Capabilities
 from evopolicy_worker.heartbeat import HeartbeatThread, HeldLeases
 from evopolicy_worker.outbox import Outbox
 from evopolicy_worker.slot_protocol.begun import HandedBack
@@ -68,12 +68,6 @@ CANCEL_TIMEOUT_S = 2.0
 """How long the worker waits, when it exits, for slots to stop their cancelled jobs."""
 WITHDRAW_TIMEOUT_S = 1.0
 SILENCE_LOOK_S = 0.5
-PROBE_PAUSE_S, LONGEST_PROBE_PAUSE_S = 30.0, 600.0
-"""Before a tier that does not work is tried again; the pause doubles each time."""
-MAX_WHY = 500
-"""Characters of the reason why a tier does not work."""
-MAX_FAILURE, MAX_FAILURES = 2000, 60_000
-"""Characters of the reason why an environment failed, and of all such reasons; the log has them whole."""
 MAX_PREPARED = 4
 """A worker that offers at most this many environments has its slots import all their simulators before work arrives."""
 
@@ -97,29 +91,15 @@ class SlotLike(Protocol):
     async def close(self) -> None: ...
 
 
-Probe = Callable[[Tier], Awaitable[None]]
-"""Starts a sandbox of a tier and ends it. Raises EvopolicyError or OSError when it does not start."""
-Describe = Callable[[Sequence[str]], Awaitable[tuple[tuple[EnvironmentDescription, ...], dict[str, str]]]]
-"""Describes environments; see `descriptions.describe_all`."""
-
-
 class Options(msgspec.Struct, frozen=True, kw_only=True):
     """A worker's start options."""
 
     name: str
     slots: int
-    tiers: tuple[Tier, ...]
-    environments: tuple[EnvironmentDescription, ...]
-    undescribed: tuple[str, ...] = ()
-    """Shipped environments that are described once runs wait for them."""
-    failed_environments: dict[str, str] = {}
-    """Environments that could not be described, with the reasons; tried again from time to time."""
     fingerprint: Fingerprint
     host: str
     boot_id: str = ""
     """Boot id of this kernel. Empty: unknown; this worker gets no hidden episodes."""
-    missing_tiers: dict[Tier, str] = {}
-    """Sandbox tiers that should work here and do not, with the reasons; tried again from time to time."""
     scratch: Path
     grace_s: float = 10.0
     """How long running episodes may continue after SIGTERM."""
@@ -132,22 +112,13 @@ class Supervisor:
         self,
         link: Link,
         options: Options,
+        capabilities: Capabilities,
         make_slot: Callable[[int, Tier], SlotLike],
-        describe: Describe | None = None,
-        probe: Probe | None = None,
     ) -> None:
-        """`describe`: needed where `options.undescribed` or `options.failed_environments` has any. `probe`: where
-        `options.missing_tiers` has any."""
         self._link = link
-        self._tiers, self._missing_tiers = set(options.tiers), dict(options.missing_tiers)
-        self._probe = probe
         self._options = options
+        self._capabilities = capabilities
         self._make_slot = make_slot
-        self._describe = describe
-        self._described = {each.env: each for each in options.environments}
-        self._undescribed = dict.fromkeys(options.undescribed)
-        self._failed_environments = dict(options.failed_environments)
-        self._describing: asyncio.Task[None] | None = None
         cluster = link.credentials.cluster
         self._ask: Requester[WorkerReply] = Requester(
             link, lambda verb: keys.worker_key(cluster, verb), codec.worker_replies
@@ -197,7 +168,7 @@ class Supervisor:
         report_results = asyncio.create_task(self._outbox.run())
         report_results.add_done_callback(self._report_ended)
         working = asyncio.create_task(self._work_and_report())
-        probing = asyncio.create_task(self._try_again())
+        trying = asyncio.create_task(self._capabilities.keep_trying(self._register))
         try:
             await asyncio.wait([working, self._failed], return_when=asyncio.FIRST_COMPLETED)
             if self._failed.done():
@@ -205,12 +176,7 @@ class Supervisor:
             await working
         finally:
             self._heartbeat.stop()
-            tasks = [
-                working,
-                report_results,
-                probing,
-                *([self._describing] if self._describing is not None else []),
-            ]
+            tasks = [working, report_results, trying]
             for task in tasks:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
@@ -261,17 +227,17 @@ class Supervisor:
 
     async def _register(self) -> None:
         async with self._registering:
-            options = self._options
+            options, capabilities = self._options, self._capabilities
             message = Register(
                 worker=options.name,
                 token=self._link.credentials.token,
                 protocol=codec.WIRE_VERSION,
                 slots=options.slots,
-                tiers=tuple(tier for tier in get_args(Tier) if tier in self._tiers),
-                missing_tiers={tier: why[:MAX_WHY] for tier, why in self._missing_tiers.items()},
-                environments=tuple(self._described.values()),
-                undescribed=tuple(self._undescribed),
-                failed_environments=_told(self._failed_environments),
+                tiers=capabilities.tiers,
+                missing_tiers=capabilities.missing_tiers,
+                environments=capabilities.environments,
+                undescribed=capabilities.undescribed,
+                failed_environments=capabilities.failed_environments,
                 fingerprint=options.fingerprint,
                 host=options.host,
                 boot_id=options.boot_id,
@@ -310,59 +276,7 @@ class Supervisor:
         if reply.drain and not self._draining.is_set():
             log.info("draining on request")
             self.drain()
-        wanted = [each for each in reply.describe if each in self._undescribed]
-        if wanted and (self._describing is None or self._describing.done()):
-            self._describing = asyncio.create_task(self._describe_wanted(wanted))
-
-    async def _describe_wanted(self, wanted: Sequence[str]) -> None:
-        """Describes environments that runs wait for, or that failed before, and registers with the outcome. Where no
-        slot starts, it is tried again when the next heartbeat asks."""
-        assert self._describe is not None
-        log.info("describing", environments=wanted)
-        try:
-            descriptions, failed = await self._describe(wanted)
-        except (EvopolicyError, OSError) as error:
-            log.error("environments are not described", environments=wanted, why=str(error))
-            return
-        before = self._failed_environments
-        self._failed_environments = {env: why for env, why in before.items() if env not in wanted} | failed
-        self._described |= {each.env: each for each in descriptions}
-        for env_id in wanted:
-            self._undescribed.pop(env_id, None)
-        if descriptions or self._failed_environments != before:
-            with contextlib.suppress(RefusedError):  # the lease loop meets the same refusal
-                await self._register()
-
-    async def _try_again(self) -> None:
-        """Tries tiers and environments that do not work from time to time, and registers with each that does, or has
-        another reason."""
-        pause_s = PROBE_PAUSE_S
-        while True:
-            await asyncio.sleep(pause_s)
-            failing = bool(self._missing_tiers or self._failed_environments)
-            pause_s = min(2 * pause_s, LONGEST_PROBE_PAUSE_S) if failing else PROBE_PAUSE_S
-            if self._missing_tiers and self._probe is not None:
-                await self._probe_tiers(self._probe)
-            if self._failed_environments and (self._describing is None or self._describing.done()):
-                self._describing = asyncio.create_task(
-                    self._describe_wanted(tuple(self._failed_environments))
-                )
-
-    async def _probe_tiers(self, probe: Probe) -> None:
-        before = dict(self._missing_tiers)
-        for tier in before:
-            try:
-                await probe(tier)
-            except (EvopolicyError, OSError) as error:
-                self._missing_tiers[tier] = str(error)
-            else:
-                del self._missing_tiers[tier]
-                self._tiers.add(tier)
-                log.info("sandbox tier works now", tier=tier)
-        if self._missing_tiers != before:
-            tell_missing(self._missing_tiers)
-            with contextlib.suppress(RefusedError):  # the lease loop meets the same refusal
-                await self._register()
+        self._capabilities.describe_wanted(reply.describe)
 
     def _cancel(self, lease_id: str) -> None:
         """Returns the waiting job, or stops the running one, of a lease that this worker no longer holds."""
@@ -425,7 +339,7 @@ class Supervisor:
 
     async def _slot_loop(self, index: int) -> None:
         slot = await self._prepared(index)
-        tier: Tier | None = self._options.tiers[0]
+        tier: Tier | None = self._capabilities.tiers[0]
         pause = RESTART_PAUSE_S
         try:
             while (lease := await self._next_lease()) is not None:
@@ -453,8 +367,8 @@ class Supervisor:
         None when that fails (the first lease hits the same failure and reports it), or when the worker is drained
         meanwhile.
         """
-        offered = [*self._described, *self._undescribed]
-        slot = self._make_slot(index, self._options.tiers[0])
+        offered = [*(each.env for each in self._capabilities.environments), *self._capabilities.undescribed]
+        slot = self._make_slot(index, self._capabilities.tiers[0])
         preparing = asyncio.create_task(slot.prepare(offered if len(offered) <= MAX_PREPARED else ()))
         drained = asyncio.create_task(self._draining.wait())
         try:
@@ -636,21 +550,6 @@ class Supervisor:
             await self._ask.once("lease", request, Leases)
         await asyncio.wait({lease}, timeout=WITHDRAW_TIMEOUT_S)
         lease.cancel()
-
-
-def tell_missing(tiers: Mapping[Tier, str]) -> None:
-    """Logs the sandbox tiers that do not work, with the reasons."""
-    for tier, why in tiers.items():
-        log.warning("sandbox tier does not work; it is tried again", tier=tier, why=why)
-
-
-def _told(failed: Mapping[str, str]) -> dict[str, str]:
-    """The reasons as they are announced: all environments, and of the reasons as much as the coordinator takes."""
-    remaining, told = MAX_FAILURES, {}
-    for env, why in failed.items():
-        told[env] = why[: min(MAX_FAILURE, remaining)]
-        remaining -= len(told[env])
-    return told
 
 
 def _held(lease: Lease, *, running: bool, episodes_done: int = 0, steps: int = 0) -> HeldLease:

@@ -28,6 +28,7 @@ from evopolicy_common.records.blobs import BlobStore
 from evopolicy_common.records.episodes.trajectory import decode
 from evopolicy_common.wire.transport import connect
 from evopolicy_coordinator.core.contract.records import BegunRow, OutcomeRow, validation_group
+from evopolicy_worker.capabilities import Capabilities
 from evopolicy_worker.slot_protocol import begun
 from evopolicy_worker.slots.slot import Slot
 from evopolicy_worker.supervisor import Options, Supervisor
@@ -150,13 +151,12 @@ def test_an_agent_that_stops_its_validation_again_and_again_gets_one_throw(
     options = Options(
         name="w-1",
         slots=1,
-        tiers=("bwrap",),
-        environments=(asyncio.run(described(tmp_path)),),
         fingerprint=FINGERPRINT,
         host="test",
         boot_id="kernel-of-w-1",
         scratch=tmp_path / "w-1",
     )
+    capabilities = Capabilities(("bwrap",), (asyncio.run(described(tmp_path)),))
 
     def coordinator_of() -> Coordinator:
         return Coordinator(tmp_path / "state", "--data", str(tmp_path / "data"))
@@ -172,7 +172,9 @@ def test_an_agent_that_stops_its_validation_again_and_again_gets_one_throw(
     async def scenario() -> None:
         coordinator = coordinators[0]
         async with connect(coordinator.credentials("worker")) as link, operator_of(coordinator) as operator:
-            worker = Supervisor(link, options, lambda index, tier: slot_of(tmp_path / f"slot-{index}"))
+            worker = Supervisor(
+                link, options, capabilities, lambda index, tier: slot_of(tmp_path / f"slot-{index}")
+            )
             working = asyncio.create_task(worker.run())
             created = await operator.create(env=ENTRY.id, n_validation=1, n_heldout=1)
             groups = [validation_group(created.run, number) for number in range(N_STOPS + 1)]

@@ -38,9 +38,10 @@ from evopolicy_common.wire.requests import Requester
 from evopolicy_common.wire.transport import connect
 from evopolicy_coordinator.cli.envs import app as envs_app
 from evopolicy_coordinator.cli.status import status_app, workers_app
-from evopolicy_worker import outbox, supervisor
+from evopolicy_worker import capabilities, outbox, supervisor
+from evopolicy_worker.capabilities import Capabilities, Describe, Probe
 from evopolicy_worker.slot_protocol.begun import HandedBack
-from evopolicy_worker.supervisor import Describe, Options, Probe, Supervisor
+from evopolicy_worker.supervisor import Options, Supervisor
 
 pytestmark = pytest.mark.slow
 
@@ -136,22 +137,26 @@ async def supervising(
     options = Options(
         name=name,
         slots=slots,
-        tiers=tiers,
-        missing_tiers=missing or {},
-        environments=() if failed else (LINE,),
-        failed_environments=failed or {},
         fingerprint=FINGERPRINT,
         host="test",
         boot_id=f"kernel-of-{name}",
         scratch=scratch / name,
         grace_s=grace_s,
     )
+    works = Capabilities(
+        tiers,
+        () if failed else (LINE,),
+        missing_tiers=missing,
+        failed_environments=failed,
+        probe=probe,
+        describe=describe,
+    )
 
     def make_slot(index: int, tier: Tier) -> ScriptedSlot:
         return kind(script, dress)
 
     async with connect(coordinator.credentials("worker")) as link:
-        found = Supervisor(link, options, make_slot, describe, probe)
+        found = Supervisor(link, options, works, make_slot)
         task = asyncio.create_task(found.run())
         try:
             yield found
@@ -186,7 +191,7 @@ async def test_a_whole_run_goes_through_the_supervisor(coordinator: Coordinator,
 async def test_an_environment_that_failed_is_told_and_tried_again(
     coordinator: Coordinator, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(supervisor, "PROBE_PAUSE_S", 0.05)
+    monkeypatch.setattr(capabilities, "RETRY_PAUSE_S", 0.05)
     works, tried = asyncio.Event(), asyncio.Event()
     again = "step 4: it raised KeyError again"
 
@@ -224,7 +229,7 @@ async def test_an_environment_that_failed_is_told_and_tried_again(
 async def test_a_tier_that_failed_once_is_told_and_tried_again(
     coordinator: Coordinator, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(supervisor, "PROBE_PAUSE_S", 0.05)
+    monkeypatch.setattr(capabilities, "RETRY_PAUSE_S", 0.05)
     works, probed = asyncio.Event(), asyncio.Event()
 
     async def probe(tier: Tier) -> None:
