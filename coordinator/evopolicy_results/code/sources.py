@@ -11,8 +11,10 @@ import ast
 import hashlib
 import os
 import stat
+from collections import OrderedDict
 from collections.abc import Mapping
 from pathlib import Path
+from typing import NamedTuple
 
 from evopolicy_common.records.code_metrics import parse
 from evopolicy_common.regular_files import read_regular
@@ -21,6 +23,25 @@ MAX_FILE_BYTES = 1 << 20
 """Larger Python files are not parsed: they are data in disguise, and would stall a report."""
 
 MAX_FILES = 400
+
+_MAX_KEPT_BYTES = 1 << 20
+"""Sources whose trees are kept: a tree takes about a hundred times the memory."""
+_kept: OrderedDict[bytes, tuple[ast.AST, ...]] = OrderedDict()
+
+
+def parsed(source: bytes) -> tuple[ast.AST, ...]:
+    """All nodes of a Python source, its module first, breadth first; none if it cannot be parsed.
+
+    Several passes read each source of a run, and most checkpoints share sources: the latest trees are kept.
+    """
+    nodes = _kept.pop(source, None)
+    if nodes is None:
+        tree = parse(source)
+        nodes = () if tree is None else tuple(ast.walk(tree))
+    _kept[source] = nodes
+    while sum(map(len, _kept)) > _MAX_KEPT_BYTES:
+        _kept.popitem(last=False)
+    return nodes
 
 
 def read_python_files(system_dir: Path) -> dict[str, bytes]:
@@ -47,19 +68,19 @@ def read_python_files(system_dir: Path) -> dict[str, bytes]:
     return dict(sorted(found.items()))
 
 
-class Module:
-    """One reachable module: its path, bytes, tree (None when unparseable) and the local modules that it imports."""
+class Module(NamedTuple):
+    """One reachable module."""
 
-    __slots__ = ("imports", "locals", "name", "path", "source", "tree")
+    name: str
+    path: str
+    source: bytes
+    nodes: tuple[ast.AST, ...]
+    """As `parsed` gives them; none if the source cannot be parsed."""
 
-    def __init__(self, name: str, path: str, source: bytes, tree: ast.Module | None) -> None:
-        self.name = name
-        self.path = path
-        self.source = source
-        self.tree = tree
-        self.imports: list[ast.Import | ast.ImportFrom] = [] if tree is None else import_statements(tree)
-        self.locals: set[str] = set()
-        """Dotted names of the local modules that its imports reach."""
+    @property
+    def imports(self) -> list[ast.Import | ast.ImportFrom]:
+        """Every import statement, also inside functions."""
+        return [node for node in self.nodes if isinstance(node, ast.Import | ast.ImportFrom)]
 
 
 def reachable_modules(files: Mapping[str, bytes]) -> dict[str, Module]:
@@ -77,14 +98,9 @@ def reachable_modules(files: Mapping[str, bytes]) -> dict[str, Module]:
         path = by_name.get(name)
         if path is None or name in modules:
             continue
-        module = modules[name] = Module(name, path, files[path], parse(files[path]))
-        if module.tree is None:
-            continue
+        module = modules[name] = Module(name, path, files[path], parsed(files[path]))
         for target in _imported(module, path.endswith("__init__.py")):
-            for part in _prefixes(target, depth):
-                if part in by_name:
-                    module.locals.add(part)
-                    queue.append(part)
+            queue += _prefixes(target, depth)
     return dict(sorted(modules.items()))
 
 
@@ -111,25 +127,6 @@ def _prefixes(dotted: str, depth: int) -> list[str]:
     return [".".join(parts[: i + 1]) for i in range(len(parts))]
 
 
-def import_statements(tree: ast.Module) -> list[ast.Import | ast.ImportFrom]:
-    """Every import statement, also inside functions. Visiting only statements makes this fast."""
-    found: list[ast.Import | ast.ImportFrom] = []
-    queue: list[ast.AST] = [tree]
-    while queue:
-        node = queue.pop()
-        for field in _BLOCKS:
-            for child in getattr(node, field, ()):
-                if isinstance(child, _IMPORTS):
-                    found.append(child)
-                else:
-                    queue.append(child)
-    return found
-
-
-_IMPORTS = (ast.Import, ast.ImportFrom)
-_BLOCKS = ("body", "orelse", "handlers", "finalbody", "cases")
-
-
 def _imported(module: Module, is_package: bool) -> set[str]:
     targets: set[str] = set()
     for node in module.imports:
@@ -140,14 +137,8 @@ def _imported(module: Module, is_package: bool) -> set[str]:
             if base:
                 targets.add(base)
             targets.update(f"{base}.{alias.name}" if base else alias.name for alias in node.names)
-    if module.tree is not None and any(name in module.source for name in (b"import_module", b"__import__")):
-        targets |= _imported_by_call(module.tree)
-    return targets
-
-
-def _imported_by_call(tree: ast.Module) -> set[str]:
-    targets: set[str] = set()
-    for node in ast.walk(tree):
+    by_call = any(name in module.source for name in (b"import_module", b"__import__"))
+    for node in module.nodes if by_call else ():
         if not isinstance(node, ast.Call) or not node.args or not isinstance(node.args[0], ast.Constant):
             continue
         called, literal = node.func, node.args[0].value

@@ -51,7 +51,7 @@ def describe(modules: Mapping[str, Module]) -> tuple[str, Features]:
     walker = _Walker(set(modules))
     opaque: list[str] = []
     for module in modules.values():
-        if module.tree is not None:
+        if module.nodes:
             try:
                 walker.module(module)
                 continue
@@ -86,11 +86,12 @@ class _Walker:
         """Class and first parameter of the visited method."""
 
     def module(self, module: Module) -> None:
-        assert module.tree is not None
+        tree = module.nodes[0]
+        assert isinstance(tree, ast.Module)
         scope = Scope()
         for node in module.imports:
             self._bind_import(node, scope, module)
-        for statement in module.tree.body:
+        for statement in tree.body:
             unit = self._statement_unit(statement, scope, self.names.top_defs)
             if unit is not None:
                 self.units.append(unit)

@@ -12,14 +12,13 @@ from __future__ import annotations
 
 import ast
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence, Set
 from functools import lru_cache
 
 import msgspec
 
-from evopolicy_common.records.code_metrics import parse
 from evopolicy_common.simulators import SIMULATORS
-from evopolicy_results.code.sources import MAX_FILE_BYTES
+from evopolicy_results.code.sources import MAX_FILE_BYTES, parsed
 from evopolicy_results.scan.constants import dynamics_constants
 from evopolicy_results.scan.signals import Kind, Signal, signal
 
@@ -57,32 +56,37 @@ def code_signals(index: int, files: Mapping[str, bytes], env: str = "") -> Itera
                 yield msgspec.structs.replace(one, submits=(index,))
 
 
-@lru_cache(maxsize=128)
 def file_signals(path: str, source: bytes, env: str) -> tuple[Signal, ...]:
-    """Cached: most files of a run's checkpoints are equal."""
-    tree = parse(source) if len(source) <= MAX_FILE_BYTES else None
-    if tree is None:
-        return ()
-    try:
-        return tuple(_module(tree, path, source.decode("utf-8", "replace").splitlines(), env))
-    except RecursionError:
-        return ()
+    """Signals of one file."""
+    return tuple(msgspec.structs.replace(one, path=path) for one in _signals_in(source, env))
 
 
-def _module(tree: ast.Module, path: str, lines: list[str], env: str) -> Iterator[Signal]:
+@lru_cache(maxsize=128)
+def _signals_in(source: bytes, env: str) -> tuple[Signal, ...]:
+    """Signals without their path. Cached: most files of a run's checkpoints are equal, and its workspace has one."""
+    nodes = parsed(source) if len(source) <= MAX_FILE_BYTES else ()
+    return tuple(_module(nodes, source.decode("utf-8", "replace").splitlines(), env))
+
+
+def _module(nodes: Sequence[ast.AST], lines: list[str], env: str) -> Iterator[Signal]:
     def at(kind: Kind, node: ast.AST, reason: str) -> Signal:
         line = getattr(node, "lineno", 0)
         quote = lines[line - 1].strip() if 0 < line <= len(lines) else ""
-        return signal(kind, path, line, reason, quote)
+        return signal(kind, "", line, reason, quote)
 
-    if constants := dynamics_constants(tree, env):
+    if constants := dynamics_constants(nodes, env):
         first = min(constants.values(), key=lambda node: node.lineno)
         yield at(
             "simulator", first, f"has {len(constants)} numbers of this environment's dynamics, and a loop"
         )
-    literals = _episode_literals(tree)
-    hashed, numbers = _tainted(tree)
-    for node in ast.walk(tree):
+    assigned = [
+        (name, node.value)
+        for node in nodes
+        if isinstance(node, ast.Assign) and len(node.targets) == 1 and (name := _name(node.targets[0]))
+    ]
+    literals = frozenset(name for name, value in assigned if _is_episodes(value))
+    hashed, numbers = _tainted(assigned)
+    for node in nodes:
         for name in _imports(node):
             if name in _NETWORK:
                 yield at("network", node, f"imports {name}")
@@ -142,7 +146,7 @@ def _name(node: ast.expr) -> str:
     return node.attr if isinstance(node, ast.Attribute) else ""
 
 
-def _is_hash(node: ast.expr, hashed: frozenset[str]) -> bool:
+def _is_hash(node: ast.expr, hashed: Set[str]) -> bool:
     if isinstance(node, ast.Call):
         name = _name(node.func)
         if name in _DIGESTS and isinstance(node.func, ast.Attribute):
@@ -151,45 +155,33 @@ def _is_hash(node: ast.expr, hashed: frozenset[str]) -> bool:
     return _name(node) in hashed
 
 
-def _is_number(node: ast.expr, numbers: frozenset[str]) -> bool:
+def _is_number(node: ast.expr, numbers: Set[str]) -> bool:
     if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Mod):
         node = node.left
     return _name(node) in numbers
 
 
-def _tainted(tree: ast.Module) -> tuple[frozenset[str], frozenset[str]]:
+def _tainted(assigned: Sequence[tuple[str, ast.expr]]) -> tuple[frozenset[str], frozenset[str]]:
     """Names and attributes that hold a hash of something, and those that hold the episode's index."""
     hashed: set[str] = set()
     numbers = {"episode_index"}
     for _ in range(3):
-        for node in ast.walk(tree):
-            if not isinstance(node, ast.Assign) or len(node.targets) != 1:
-                continue
-            name = _name(node.targets[0])
-            if name and _is_hash(node.value, frozenset(hashed)):
+        for name, value in assigned:
+            if _is_hash(value, hashed):
                 hashed.add(name)
-            elif name and _is_number(node.value, frozenset(numbers)):
+            elif _is_number(value, numbers):
                 numbers.add(name)
     return frozenset(hashed), frozenset(numbers)
 
 
-def _episode_literals(tree: ast.Module) -> frozenset[str]:
-    """Names of literals that hold several sequences, each long enough to be an episode's actions."""
-    found: set[str] = set()
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Assign) and len(node.targets) == 1:
-            value = node.value
-            members = (
-                value.values
-                if isinstance(value, ast.Dict)
-                else value.elts
-                if isinstance(value, ast.List | ast.Tuple)
-                else []
-            )
-            long = sum(
-                isinstance(member, ast.List | ast.Tuple) and len(member.elts) >= _FEWEST_STEPS
-                for member in members
-            )
-            if long >= 2 and (name := _name(node.targets[0])):
-                found.add(name)
-    return frozenset(found)
+def _is_episodes(value: ast.expr) -> bool:
+    """Whether a literal holds several sequences, each long enough to be an episode's actions."""
+    members = (
+        value.values
+        if isinstance(value, ast.Dict)
+        else value.elts
+        if isinstance(value, ast.List | ast.Tuple)
+        else []
+    )
+    long = (isinstance(each, ast.List | ast.Tuple) and len(each.elts) >= _FEWEST_STEPS for each in members)
+    return sum(long) >= 2

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ast
 import math
+from collections.abc import Iterable
 
 DYNAMICS: dict[str, tuple[tuple[float, ...], int]] = {
     "gym/acrobot": ((4 * math.pi, 9 * math.pi, 9.8, 0.2, 0.5), 4),
@@ -17,12 +18,12 @@ DYNAMICS: dict[str, tuple[tuple[float, ...], int]] = {
 _TOLERANCE = 1e-3
 
 
-def dynamics_constants(tree: ast.Module, env: str) -> dict[float, ast.expr]:
+def dynamics_constants(nodes: Iterable[ast.AST], env: str) -> dict[float, ast.expr]:
     """The numbers of `env`'s dynamics in a module with their first places; empty for too few of them."""
     numbers, enough = DYNAMICS.get(env, ((), 0))
     found: dict[float, ast.expr] = {}
     loops = 0
-    for node in ast.walk(tree) if numbers else ():
+    for node in nodes if numbers else ():
         loops += isinstance(node, ast.For | ast.While | ast.comprehension)
         if isinstance(node, ast.expr) and (value := _value(node)) is not None:
             for number in numbers:

@@ -16,8 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from evopolicy_common.records.code_metrics import parse
 from evopolicy_common.records.episodes.npz import read_arrays
+from evopolicy_results.code.sources import parsed
 from evopolicy_results.scan.signals import Files, Signal, Trajectories, signal
 
 _WINDOW = 24
@@ -126,8 +126,7 @@ def _sequences(path: str, data: bytes) -> Iterator[list[float]]:
     if len(data) > _MAX_FILE:
         return
     if path.endswith(".py"):
-        tree = parse(data)
-        for node in ast.walk(tree) if tree is not None else ():
+        for node in parsed(data):
             if isinstance(node, ast.List | ast.Tuple) and len(node.elts) * 8 >= _WINDOW:
                 numbers = _numbers(node)
                 if len(numbers) >= _WINDOW:
