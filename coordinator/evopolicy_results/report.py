@@ -14,7 +14,7 @@ from __future__ import annotations
 import hashlib
 import re
 import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -35,7 +35,7 @@ from evopolicy_results.html.pages import (
     trace_page,
 )
 from evopolicy_results.reading.environments import names_in_runs, ordered_environments
-from evopolicy_results.reading.parallel import in_processes
+from evopolicy_results.reading.parallel import ALONE, Processes
 from evopolicy_results.reading.records import Run, path_text
 from evopolicy_results.studies.palette import Look, looks
 from evopolicy_results.studies.study import Study
@@ -58,13 +58,13 @@ def write_report(
     *,
     title: str | None = None,
     traces: bool = True,
-    jobs: int = 1,
+    processes: Processes = ALONE,
     progress: Progress | None = None,
 ) -> Path:
     """Writes the report of `study` into the folder `out` (created if missing) and returns its `index.html`.
 
     Raises ConfigError when `out` exists and is neither empty nor an earlier report. Without `traces` the pages of
-    single runs are left out, which saves most of the time and space of a large report. `jobs` processes draw figures
+    single runs are left out, which saves most of the time and space of a large report. `processes` draw figures
     and write the pages of runs; call it on the main thread.
     """
     tell = progress if progress is not None else lambda what, done, total: None
@@ -76,7 +76,8 @@ def write_report(
     submits: list[dict[str, Any]] = []
     drawings = drawings_of(study)
     pages = _pages(study, out, look) if traces else []
-    for done, made in enumerate(_all_made([*drawings, *pages], jobs), start=1):
+    work = [(names_in_runs, each) for each in (*drawings, *pages)]
+    for done, made in enumerate(processes.map(_made, work, _lost, at_once=1), start=1):
         if done <= len(drawings):
             plots += [made] if made is not None else []
             tell("figures", done, len(drawings))
@@ -128,14 +129,6 @@ def _prepare(out: Path) -> None:
             shutil.rmtree(out / name, ignore_errors=True)
     for name in ("figures", "tables"):
         (out / name).mkdir(parents=True, exist_ok=True)
-
-
-def _all_made(work: Sequence[partial[Any]], jobs: int) -> Iterator[Any]:
-    """The results of `work`, in order."""
-    items = [(names_in_runs, each) for each in work]
-    if jobs <= 1:
-        return map(_made, items)
-    return in_processes(_made, items, jobs, _lost, at_once=1)
 
 
 def _made(item: tuple[dict[str, set[tuple[str, str]]], partial[Any]]) -> Any:

@@ -25,6 +25,7 @@ from evopolicy_common.records.rescores import is_name
 from evopolicy_common.regular_files import read_given
 from evopolicy_common.terminal import say, say_json, say_lines
 from evopolicy_results.reading.comparability import REMEDIES, UNKNOWN_ISOLATION, MixedRunsError
+from evopolicy_results.reading.parallel import Processes
 from evopolicy_results.reading.reader import load_runs
 from evopolicy_results.reading.rescored import rescored
 from evopolicy_results.scoring.scores import ScoreTable, read_score_csv
@@ -98,18 +99,20 @@ def report(
     ] = False,
 ) -> None:
     """Write a report on finished runs: leaderboard, figures and diagnostics."""
-    # Here, not above: it needs jinja2, and `evopolicy` loads this module to list its commands.
-    from evopolicy_results.report import write_report
-
     try:
         check_writable(out, "--out")
-        with _progress() as tell:
-            jobs = jobs or os.cpu_count() or 1
-            study = _study(runs, scores, allow_mixed, allow_unknown, jobs, tell)
-            if not study.suites:
+        jobs = jobs or os.cpu_count() or 1
+        with Processes(jobs, "evopolicy_results.report", "evopolicy_results.figures.style") as processes:
+            # Here, not above: it needs jinja2, and `evopolicy` loads this module to list its commands.
+            from evopolicy_results.report import write_report
+
+            with _progress() as tell:
+                study = _study(runs, scores, allow_mixed, allow_unknown, processes, tell)
                 index = None
-            else:
-                index = write_report(study, out, title=title, traces=pages, jobs=jobs, progress=tell)
+                if study.suites:
+                    index = write_report(
+                        study, out, title=title, traces=pages, processes=processes, progress=tell
+                    )
     except MixedRunsError as error:
         options = sorted(
             {
@@ -158,14 +161,19 @@ def report(
 
 
 def _study(
-    paths: list[Path], rescore: str | None, allow_mixed: bool, allow_unknown: bool, jobs: int, tell: Tell
+    paths: list[Path],
+    rescore: str | None,
+    allow_mixed: bool,
+    allow_unknown: bool,
+    processes: Processes,
+    tell: Tell,
 ) -> Study:
     tables = [path for path in paths if path.suffix == ".csv" and path.is_file()]
     if len(tables) > 1:
         raise ConfigError(f"one CSV of held-out returns at most, not {len(tables)}")
     loaded = load_runs(
         [path for path in paths if path not in tables],
-        jobs=jobs,
+        processes=processes,
         progress=lambda done, total: tell("runs read", done, total),
     )
     if rescore and not is_name(rescore):

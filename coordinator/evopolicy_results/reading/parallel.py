@@ -14,7 +14,9 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, TypeVar
+from importlib import import_module
+from types import TracebackType
+from typing import TypeVar
 
 from evopolicy_common.processes.parent_death import ending_with_parent
 
@@ -22,56 +24,94 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
-def in_processes(
-    function: Callable[[Item], Result],
-    items: Sequence[Item],
-    jobs: int,
-    when_lost: Callable[[Item, str], Result],
-    *,
-    at_once: int = 8,
-) -> Iterator[Result]:
-    """Yields `function` of each item, in order; for an item whose process ended, `when_lost` of the item and the
-    reason. A process receives `at_once` items at a time.
+class Processes:
+    """Child processes of a command, for all its stages. With one job there are none: this process does the work."""
 
-    The children import `function` by its name; items and results are pickled. Call it on the main thread.
-    """
-    children = [_Child(function) for _ in range(jobs)]
-    idle: queue.SimpleQueue[_Child] = queue.SimpleQueue()
-    for each in children:
-        idle.put(each)
+    def __init__(self, jobs: int = 1, *modules: str) -> None:
+        """Starts the children. They import `modules` at once, while this process does something else."""
+        self._children = [_Child(modules) for _ in range(jobs if jobs > 1 else 0)]
+        # A child ends with the thread that started it, and a thread may have to start one anew.
+        self._threads = ThreadPoolExecutor(max(1, len(self._children)))
 
-    def work(some: Sequence[Item]) -> list[Result]:
-        child = idle.get()
+    def map(
+        self,
+        function: Callable[[Item], Result],
+        items: Sequence[Item],
+        when_lost: Callable[[Item, str], Result],
+        *,
+        at_once: int = 8,
+    ) -> Iterator[Result]:
+        """Yields `function` of each item, in order; for an item whose process ended, `when_lost` of the item and the
+        reason. A child receives `at_once` items at a time. If the iteration is closed early, the children are ended.
+
+        The children import `function` by its name; items and results are pickled. Call it on the main thread.
+        """
+        if not self._children:
+            yield from map(function, items)
+            return
+        idle: queue.SimpleQueue[_Child] = queue.SimpleQueue()
+        for each in self._children:
+            idle.put(each)
+
+        def work(some: Sequence[Item]) -> list[Result]:
+            child = idle.get()
+            try:
+                return child.results(function, some, when_lost)
+            finally:
+                idle.put(child)
+
         try:
-            return child.results(some, when_lost)
-        finally:
-            idle.put(child)
+            for results in self._threads.map(
+                work, [items[i : i + at_once] for i in range(0, len(items), at_once)]
+            ):
+                yield from results
+        except BaseException:
+            self.end()  # unfinished items are not needed
+            raise
 
-    pool = ThreadPoolExecutor(jobs)
-    try:
-        for results in pool.map(work, [items[i : i + at_once] for i in range(0, len(items), at_once)]):
-            yield from results
-    finally:
-        for each in children:
-            each.end()  # unfinished items are not needed
-        pool.shutdown(cancel_futures=True)
-        for each in children:
+    def end(self) -> None:
+        """Kills the children."""
+        for each in self._children:
+            each.end()
+        self._threads.shutdown(cancel_futures=True)
+        for each in self._children:
             each.end()  # children that were just being restarted
+
+    def __enter__(self) -> Processes:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.end()
+
+
+ALONE = Processes()
+"""This process without children."""
 
 
 class _Child:
     """A child process for items. Several threads may use it, one at a time."""
 
-    def __init__(self, function: Callable[[Any], Any]) -> None:
-        self._function = function
+    def __init__(self, modules: Sequence[str]) -> None:
+        self._modules = modules
         self._over = False
         self._process = self._started()
 
-    def results(self, items: Sequence[Item], when_lost: Callable[[Item, str], Result]) -> list[Result]:
+    def results(
+        self,
+        function: Callable[[Item], Result],
+        items: Sequence[Item],
+        when_lost: Callable[[Item, str], Result],
+    ) -> list[Result]:
+        stdin, stdout = self._process.stdin, self._process.stdout
+        assert stdin is not None
+        assert stdout is not None
         try:
-            self._tell(items)
-            found: list[Result] = pickle.load(self._output)
-            return found
+            pickle.dump((function, items), stdin)
+            stdin.flush()
+            results: list[Result] = pickle.load(stdout)
+            return results
         except (OSError, EOFError, pickle.UnpicklingError):
             if self._over:
                 raise
@@ -81,7 +121,7 @@ class _Child:
         if len(items) == 1:
             return [when_lost(items[0], why)]
         # Items sent one by one show which of them ends the process.
-        return [result for item in items for result in self.results([item], when_lost)]
+        return [result for item in items for result in self.results(function, [item], when_lost)]
 
     def end(self) -> None:
         """Kills the process for good; does nothing if it has ended."""
@@ -98,7 +138,7 @@ class _Child:
 
     def _started(self) -> subprocess.Popen[bytes]:
         # Not `-m`: this module may be imported with its package before, and runpy would warn of that on the terminal.
-        main = f"from {__name__} import main; main()"
+        main = f"from {__name__} import main; main({self._modules!r})"
         # A session of its own, so that Ctrl-C reaches only the command.
         return subprocess.Popen(
             ending_with_parent([sys.executable, "-P", "-c", main], signal.SIGKILL),
@@ -107,20 +147,13 @@ class _Child:
             start_new_session=True,
         )
 
-    def _tell(self, items: Sequence[Any]) -> None:
-        assert self._process.stdin is not None
-        pickle.dump((self._function, items), self._process.stdin)
-        self._process.stdin.flush()
 
-    @property
-    def _output(self) -> Any:
-        return self._process.stdout
-
-
-def main() -> None:
+def main(modules: Sequence[str]) -> None:
     """Main loop of a child: processes items from stdin until it is closed."""
     results = sys.stdout.buffer
     sys.stdout = sys.stderr
+    for module in modules:
+        import_module(module)
     while True:
         try:
             function, items = pickle.load(sys.stdin.buffer)

@@ -29,7 +29,7 @@ from evopolicy_results.code.line_diff import n_changed
 from evopolicy_results.code.sources import reachable_modules, read_python_files, source_digest
 from evopolicy_results.code.topology import describe
 from evopolicy_results.reading import published
-from evopolicy_results.reading.parallel import in_processes
+from evopolicy_results.reading.parallel import ALONE, Processes
 from evopolicy_results.reading.published import PUBLISHED, PublishedSummary
 from evopolicy_results.reading.records import LeftOut, Run, Source, Submit, checkpoint_folder
 from evopolicy_results.reading.softwares import reconciled
@@ -39,8 +39,6 @@ from evopolicy_results.scan.signals import Signal
 Files = Mapping[str, bytes]
 
 _MAX_REASON_CHARS = 1000
-_PARALLEL_FROM = 40
-"""Number of runs from which parallel reading outweighs the start of its processes."""
 
 
 class Loaded(msgspec.Struct, frozen=True, kw_only=True):
@@ -73,17 +71,21 @@ def find_run_dirs(paths: Iterable[Path]) -> tuple[list[Path], list[LeftOut]]:
 
 
 def load_runs(
-    paths: Iterable[Path], *, jobs: int = 1, progress: Callable[[int, int], None] | None = None
+    paths: Iterable[Path],
+    *,
+    processes: Processes = ALONE,
+    progress: Callable[[int, int], None] | None = None,
 ) -> Loaded:
     """Reads all complete runs at or under `paths`, and lists what is left out with the reason.
 
-    `jobs` processes read in parallel once there are enough runs; `progress` is called with (done, total). A run with
-    the software, entry, environment, experiment id and repeat of an earlier one is left out as its duplicate.
+    `processes` read in parallel; `progress` is called with (done, total). A run with the software, entry, environment,
+    experiment id and repeat of an earlier one is left out as its duplicate.
     """
     folders, left_out = find_run_dirs(paths)
+    read = processes.map(read_or_explain, folders, lambda folder, why: LeftOut(path=folder, reason=why))
     runs: list[Run] = []
     seen: dict[tuple[bool, str, str, str, int], Path] = {}
-    for done, result in enumerate(_read_all(folders, jobs), start=1):
+    for done, result in enumerate(read, start=1):
         if progress is not None:
             progress(done, len(folders))
         if isinstance(result, LeftOut):
@@ -99,12 +101,6 @@ def load_runs(
         seen[key] = result.path
         runs.append(result)
     return Loaded(runs=reconciled(runs), left_out=tuple(left_out))
-
-
-def _read_all(folders: list[Path], jobs: int) -> Iterable[Run | LeftOut]:
-    if jobs <= 1 or len(folders) < _PARALLEL_FROM:
-        return map(read_or_explain, folders)
-    return in_processes(read_or_explain, folders, jobs, lambda folder, why: LeftOut(path=folder, reason=why))
 
 
 def read_or_explain(folder: Path) -> Run | LeftOut:

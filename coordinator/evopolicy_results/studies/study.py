@@ -13,6 +13,7 @@ from evopolicy_results.behaviour.edits import EditRates, Transition, classify, e
 from evopolicy_results.behaviour.structure import EditSizeBin, StructureMean, edit_size_bins, structure_means
 from evopolicy_results.reading.comparability import UNKNOWN_ISOLATION, MixedRunsError, Mixture, mixtures
 from evopolicy_results.reading.environments import learn_names, ordered_environments, suite_title, suites_of
+from evopolicy_results.reading.parallel import Processes
 from evopolicy_results.reading.reader import load_runs
 from evopolicy_results.reading.records import LeftOut, Run
 from evopolicy_results.reading.rescored import rescored
@@ -172,7 +173,8 @@ def study(
 ) -> Study:
     """Reads the runs at or under `paths` and computes every metric; see `study_of`. `rescore`: name of a re-score whose
     results replace the runs' held-out results."""
-    loaded = load_runs([Path(path) for path in paths], jobs=jobs)
+    with Processes(jobs) as processes:
+        loaded = load_runs([Path(path) for path in paths], processes=processes)
     runs = rescored(loaded.runs, rescore) if rescore else loaded.runs
     return study_of(runs, left_out=loaded.left_out, allow_mixed=allow_mixed, allow_unknown=allow_unknown)
 

@@ -19,6 +19,7 @@ from typer.testing import CliRunner
 
 from evopolicy_results.cli.report import app
 from evopolicy_results.notebook import figures_of, rows, write_report
+from evopolicy_results.reading.parallel import Processes
 from evopolicy_results.report import write_report as write
 from evopolicy_results.scoring import paper
 from evopolicy_results.studies.study import study
@@ -165,7 +166,8 @@ def test_progress_of_each_stage_has_a_total_that_stays(runs: Path, tmp_path: Pat
     def tell(what: str, done: int, total: int) -> None:
         told.setdefault(what, []).append((done, total))
 
-    write(found, tmp_path / "report", progress=tell, jobs=2)
+    with Processes(2) as processes:
+        write(found, tmp_path / "report", progress=tell, processes=processes)
     assert list(told) == ["figures", "run pages", "tables"]
     for steps in told.values():
         assert [done for done, _ in steps] == list(range(1, len(steps) + 1))

@@ -21,7 +21,7 @@ from waiting import wait_until
 
 from evopolicy_common.records.rescores import Rescored, RescoreRecord, encode_rescore, rescore_path
 from evopolicy_results.reading.comparability import IN_QUESTION, UNKNOWN_ISOLATION, MixedRunsError, mixtures
-from evopolicy_results.reading.parallel import in_processes
+from evopolicy_results.reading.parallel import Processes
 from evopolicy_results.reading.reader import count_changed_lines, find_run_dirs, load_runs, read_run
 from evopolicy_results.reading.records import rows
 from evopolicy_results.reading.rescored import rescored
@@ -231,7 +231,8 @@ def test_reading_in_several_processes_gives_the_same_runs_and_prints_nothing(
     for number in range(45):
         write_run(tmp_path, VERSIONS[:1], exp_id=f"e{number:02d}")
     (tmp_path / "Agent-A" / "gym_acrobot" / "e07" / "run.json").write_text("{")
-    assert load_runs([tmp_path], jobs=2) == load_runs([tmp_path], jobs=1)
+    with Processes(2) as processes:
+        assert load_runs([tmp_path], processes=processes) == load_runs([tmp_path])
     assert capfd.readouterr() == ("", "")
 
 
@@ -239,7 +240,9 @@ def test_an_item_over_which_its_process_ends_costs_that_item_alone() -> None:
     items: list[Any] = [partial(abs, -number) for number in range(20)]
     items[5] = partial(os._exit, 7)
     items[19] = partial(os.kill, 0, signal.SIGKILL)
-    found = list(in_processes(operator.call, items, 2, lambda item, why: (item, why)))
+    with Processes(2) as processes:
+        found = list(processes.map(operator.call, items, lambda item, why: (item, why)))
+        assert list(processes.map(abs, [-1], lambda item, why: why)) == [1]  # the next stage has children too
     assert found[:5] + found[6:19] == [*range(5), *range(6, 19)]
     assert found[5] == (items[5], "the process that read it ended with status 7")
     assert found[19][1] == "the process that read it ended with status -9"
@@ -247,15 +250,16 @@ def test_an_item_over_which_its_process_ends_costs_that_item_alone() -> None:
 
 def test_who_stops_reading_waits_for_no_item() -> None:
     items: list[Any] = [partial(abs, -1)] * 8 + [partial(time.sleep, 1000.0)] * 8
-    found = in_processes(operator.call, items, 1, lambda item, why: (item, why))
+    found = Processes(2).map(operator.call, items, lambda item, why: (item, why))
     assert next(found) == 1
     found.close()
 
 
 READS = "import sys, time; from pathlib import Path\nfrom evopolicy_results.reading.reader import load_runs\n"
+READS += "from evopolicy_results.reading.parallel import Processes\n"
 # It waits at the first run that is read, since a quick machine has read them all before a test looks.
 READS += "def tell(done, total):\n    print(done, flush=True)\n    time.sleep(60)\n"
-READS += "load_runs([Path(sys.argv[1])], jobs=2, progress=tell)"
+READS += "load_runs([Path(sys.argv[1])], processes=Processes(2), progress=tell)"
 
 
 def semaphores() -> set[str]:
