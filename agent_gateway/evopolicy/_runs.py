@@ -14,7 +14,7 @@ import msgspec
 from evopolicy._arguments import take
 from evopolicy._records import Records, bars, table
 from evopolicy_common.errors import DECODE_ERRORS, ConfigError, ProtocolError
-from evopolicy_common.records.run_files import read_record, run_folders, submit_folders
+from evopolicy_common.records.run_files import no_run_below, read_record, run_folders, submit_folders
 from evopolicy_common.records.run_record import RunRecord
 from evopolicy_common.records.summary import Summary, decode_summary
 from evopolicy_common.regular_files import open_regular, read_regular
@@ -283,7 +283,7 @@ def load_runs(*paths: str | os.PathLike[str]) -> Runs:
         raise ConfigError("load_runs needs a folder, such as runs/")
     found, without = run_folders(take("folder", path) for path in paths)
     if without:
-        raise ConfigError(f"{without[0]}: no run directory here")
+        raise ConfigError(no_run_below(without[0]))
     runs, left_out = [], []
     for folder in found:
         try:

@@ -26,7 +26,7 @@ import msgspec
 from evopolicy._runs import summaries_in
 from evopolicy_common.errors import DECODE_ERRORS, ConfigError, ProtocolError
 from evopolicy_common.records.blobs import write_atomically
-from evopolicy_common.records.run_files import RUN_JSON, read_record, run_folders
+from evopolicy_common.records.run_files import RUN_JSON, no_run_below, read_record, run_folders
 from evopolicy_common.records.run_record import RunRecord
 from evopolicy_common.records.suite_folder import INDEX, Index
 from evopolicy_common.records.summary import Summary
@@ -110,7 +110,7 @@ def track(paths: list[Path], tracker: Tracker, *, follow: bool) -> Iterator[str]
             awaited = _awaited(paths)
             folders = run_folders(path for path in paths if path.exists())[0]
             if not folders and not follow:
-                raise ConfigError(f"{', '.join(map(str, paths))}: no run directory here")
+                raise ConfigError(no_run_below(*paths))
             for folder in folders:
                 if folder in done:
                     continue

@@ -191,7 +191,7 @@ class RunView(View[Row]):
     """The view of `evopolicy run` and `evopolicy local`."""
 
     new_row = Row
-    above = ("note", "held")
+    above = ("note", "held", "submit")
 
     def words(self, kind: str, run: str, details: dict[str, Any]) -> str:
         if kind == "submit":
@@ -206,23 +206,22 @@ class RunView(View[Row]):
 
     def render(self) -> Table:
         table = NarrowTable()
-        for title in ("run", "budget used", "submits", "last", "best visible mean", "now"):
+        for title in ("run", "budget used", "submits", "best mean", "now"):
             table.add_column(title, no_wrap=title != "now", overflow="ellipsis")
         for name, row in self.rows.items():
             table.add_row(name, *map(Text, _cells(row)))
+        table.show_header = bool(self.rows)
         return table
 
 
 def _cells(row: Row) -> tuple[str, ...]:
     progress = row.progress
     if progress is None:
-        return ("", "", "", "", f"waiting for {row.held}" if row.held else "starting")
+        return ("", "", "", f"waiting for {row.held}" if row.held else "starting")
     used = progress.episode_budget - progress.remaining_budget
-    mean = "" if progress.last_mean is None else f" {progress.last_mean:.4g}"
     return (
         f"{_bar(used, progress.episode_budget)} {used}/{progress.episode_budget}",
         str(progress.n_submits),
-        "" if progress.last_submit_id is None else f"{in_words(progress.last_status or '')}{mean}",
         "" if progress.best_mean is None else f"{progress.best_mean:.4g}",
         _now(row, progress),
     )

@@ -146,7 +146,8 @@ def episode_counts(settings: RunSettings, suite: Suite) -> tuple[int, int, int]:
     most = min(given(settings.max_episodes_per_submit, suite.max_episodes_per_submit), budget)
     if not 1 <= least <= most:
         raise ConfigError(
-            f"budget {budget} and {least} to {most} episodes a submit contradict each other; all must be at least 1"
+            f"a budget of {budget} episodes leaves no submit of {least} to {most} episodes; give a budget of at least"
+            f" {max(least, 1)}, or other numbers of episodes in a submit"
         )
     for what, n, limit in (
         ("a budget", budget, MAX_BUDGET),

@@ -72,6 +72,11 @@ def run_folders(paths: Iterable[Path]) -> tuple[list[Path], list[Path]]:
     return sorted(found), without
 
 
+def no_run_below(*paths: Path) -> str:
+    """The text of an error."""
+    return f"no run directory at or below {', '.join(map(str, paths))}; name one, or a folder of them, such as runs"
+
+
 def submit_folders(folder: Path) -> dict[int, Path]:
     """The folders `submit_NNN` in `folder` by their indices, in order; empty if it has none or does not exist.
 

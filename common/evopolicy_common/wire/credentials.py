@@ -183,8 +183,8 @@ def find(role: Role, connect: tuple[str, ...] = (), file: Path | None = None) ->
                     " llm:openai/MODEL"
                 )
             raise ConfigError(
-                f"no {role} credentials{where}: looked at {file}. Start evopolicy-coordinator on this machine, or copy"
-                f" a folder here that its `certs issue {role} NAME` made, and name it with --credentials{local}"
+                f"no {role} credentials{where}: looked at {file}. Start evopolicy-coordinator on this machine, or name"
+                f" a folder that `evopolicy-coordinator certs issue {role} NAME` wrote with --credentials{local}"
             )
     found = read(file)
     if found.role != role:

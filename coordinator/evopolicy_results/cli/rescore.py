@@ -25,7 +25,7 @@ from evopolicy_common.console import Terminal, listing, terminal
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.processes.packages import packages_in
 from evopolicy_common.records.rescores import is_name
-from evopolicy_common.records.run_files import run_folders
+from evopolicy_common.records.run_files import no_run_below, run_folders
 from evopolicy_common.terminal import number, one_line, say, say_json
 from evopolicy_results.cli.cluster import Local, Slots, State, Where, play, playing, where_of
 from evopolicy_results.rescore.play import Finished, Rescorer, Wanted, Written, read_finished
@@ -103,7 +103,7 @@ def rescore(
     with fail_on_our_errors():
         found, empty = run_folders(runs)
         if empty:
-            raise ConfigError(f"{empty[0]} holds no run directory")
+            raise ConfigError(no_run_below(empty[0]))
         finished, without, failed = read_finished(found)
         for text in without:
             say(f"left out: {one_line(text)}", err=True)

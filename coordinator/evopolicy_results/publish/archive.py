@@ -98,7 +98,7 @@ def _places(file: BinaryIO) -> dict[str, tuple[int, int, int]]:
     file.seek(total - _END.size)
     magic, disk, first_disk, n_here, n, size, start, comment = _END.unpack(file.read(_END.size))
     if magic != b"PK\5\6" or comment:
-        raise ProtocolError("not published results: the end of the file has another form")
+        raise ProtocolError("not published results: no whole file of `evopolicy publish`")
     if disk or first_disk or n_here != n or n > MAX_FILES:
         raise ProtocolError(f"{n} files, {MAX_FILES:,} are allowed, in one part")
     if start + size != total - _END.size or size > n * (_ENTRY.size + _MAX_NAME):

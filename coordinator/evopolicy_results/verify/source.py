@@ -113,7 +113,8 @@ def read_run(root: Path) -> RunUnderTest:
         if text := described(root):
             raise ConfigError(f"{root} is {text}") from error
         raise ConfigError(
-            f"{root} is not the directory of a finished run: {RUN_JSON}: {error.strerror}"
+            f"{root} is not the directory of a finished run: {RUN_JSON}: {error.strerror}; name a folder such as"
+            " runs/evolve/gym_acrobot/first"
         ) from error
     except ProtocolError as error:
         raise ConfigError(f"{root / RUN_JSON}: {error}") from error

@@ -240,7 +240,7 @@ def test_runs_that_cannot_be_rescored_are_refused_with_the_reason(played: Played
         assert done.returncode == 2, done.stdout + done.stderr
         return done.stderr
 
-    assert "holds no run directory" in refused("missing", "--cases", "2")
+    assert "no run directory at or below" in refused("missing", "--cases", "2")
     assert "name the new cases" in refused(str(run))
     unfinished = tmp_path / "unfinished"
     shutil.copytree(run, unfinished)

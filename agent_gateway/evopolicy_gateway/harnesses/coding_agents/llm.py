@@ -99,7 +99,7 @@ def config_of(rest: str) -> AgentConfig:
     protocol, slash, model = rest.partition("/")
     if protocol not in ("openai", "anthropic") or not slash or not model:
         raise ConfigError(
-            f"--agent llm:{rest}: say it as llm:openai/MODEL or llm:anthropic/MODEL; for another endpoint that is"
+            f"--agent llm:{rest}: write llm:openai/MODEL or llm:anthropic/MODEL; for another endpoint that is"
             ' compatible with one of them, use --agent file:AGENT.toml with harness = "llm" and a table [api]'
         )
     api = ApiTable(protocol="openai" if protocol == "openai" else "anthropic")

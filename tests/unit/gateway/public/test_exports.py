@@ -385,7 +385,7 @@ def vars_of(entry: Entry) -> dict[str, Any]:
     ("words", "expected"),
     [
         (("nowhere", "--to", "csv"), "nowhere"),
-        (("nowhere", "--to", "tensorboard"), "no run directory here"),
+        (("nowhere", "--to", "tensorboard"), "no run directory at or below"),
         (("nowhere", "--to", "csv", "--follow"), "--follow: csv"),
         (("{runs}", "--to", "mlflow", "--out", "nosuch://x"), "--to mlflow"),
         (("{runs}", "--to", "mlflow", "--out", "mlruns"), "sqlite:///mlflow.db"),
