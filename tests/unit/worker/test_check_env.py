@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import secrets
 import subprocess
 import sys
 import time
@@ -86,7 +87,8 @@ def test_a_time_says_whether_the_machine_was_busy() -> None:
     assert InASlot(bare_us=12.345).times() == ("12.3", "")
 
 
-MARK = b"of test_check_env"
+MARK = f"of test_check_env {secrets.token_hex()}".encode()
+"""Other plays of the tests on this machine have processes of their own."""
 BUSY = [sys.executable, "-S", "-c", f"while True: '{MARK.decode()}'"]
 
 
@@ -157,8 +159,7 @@ conformance.registry.load = lambda env_id: None
 conformance.os.dup2 = lambda old, new: None
 print(list(conformance.play_all(["slow"], 1)))
 """
-    mark = b"left by test_check_env"
-    command = [sys.executable, "-c", program, mark.decode()]
+    command = [sys.executable, "-c", program, MARK.decode()]
     started = subprocess.Popen(command, stderr=subprocess.PIPE)
     assert started.stderr is not None
     assert started.stderr.readline() == b"plays\n"
@@ -167,7 +168,7 @@ print(list(conformance.play_all(["slow"], 1)))
     # Closed by the last process that has it.
     assert started.stderr.read() == b""
     started.stderr.close()
-    assert not [each for each in Path("/proc").glob("[0-9]*") if mark in _command_line(each)]
+    assert not [each for each in Path("/proc").glob("[0-9]*") if MARK in _command_line(each)]
 
 
 def test_a_process_whose_environment_forbids_files_ends_and_is_no_second_check(tmp_path: Path) -> None:
