@@ -1,0 +1,81 @@
+"""A relay between an HTTP client and a model API on loopback."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import httpx
+
+from evopolicy_common.wire.http import bound, serving
+from evopolicy_gateway.relay.apis import Protocol, Upstream
+from evopolicy_gateway.relay.ledger import read
+from evopolicy_gateway.relay.limits import Used
+from evopolicy_gateway.relay.service import Order, Relay
+from stages.model_api import ModelApi, Step
+
+NOON = 1768564800.0
+"""2026-01-16 12:00:00 UTC."""
+KEY = "sk-the-real-key-0123456789"
+TOKEN = "token-of-the-run-0123456789"
+TOOLS = [{"type": "function", "function": {"name": "bash"}, "name": "bash"}]
+PATHS = {"chat/completions": "openai", "responses": "openai", "messages": "anthropic"}
+
+
+class Served:
+    """A running relay, with what it reported."""
+
+    def __init__(self, ledger: Path, api: ModelApi) -> None:
+        self.ledger, self.api = ledger, api
+        self.notes: list[str] = []
+        self.spent: list[str] = []
+        self.client: httpx.AsyncClient
+        self.port = 0
+
+    @property
+    def used(self) -> Used:
+        return read(self.ledger)
+
+    async def ask(self, path: str = "chat/completions", **more: Any) -> httpx.Response:
+        body = {"model": "m", "stream": True, "tools": TOOLS, "messages": [], "input": [], **more}
+        return await self.client.post(f"/v1/{path}", json=body)
+
+
+@asynccontextmanager
+async def relay(
+    tmp_path: Path, api: ModelApi, protocol: Protocol = "openai", **more: Any
+) -> AsyncIterator[Served]:
+    served = Served(tmp_path / "ledger.jsonl", api)
+    base = f"{api.base_url}/v1" if protocol == "openai" else api.base_url
+    upstream = Upstream(protocol=protocol, base_url=base, key=KEY, **more.pop("upstream", {}))
+    order = Order(upstream=upstream, token=TOKEN, ledger=str(served.ledger), **more)
+    app = Relay(
+        order, counted=lambda: None, note=served.notes.append, spent=served.spent.append, now=lambda: NOON
+    )
+    sock = bound("127.0.0.1", 0)
+    served.port = sock.getsockname()[1]
+    async with serving(app, sock):
+        headers = {"authorization": f"Bearer {TOKEN}"}
+        url = f"http://127.0.0.1:{served.port}"
+        async with httpx.AsyncClient(base_url=url, headers=headers, trust_env=False) as served.client:
+            yield served
+    await app.close()
+
+
+def played(
+    tmp_path: Path, script: list[Step], act: Callable[[Served], Awaitable[Any]], **more: Any
+) -> Served:
+    """Does `act` with a relay to an API that plays the script."""
+    found: list[Served] = []
+
+    async def main() -> None:
+        async with relay(tmp_path, api, **more) as served:
+            found.append(served)
+            await act(served)
+
+    with ModelApi(script) as api:
+        asyncio.run(main())
+    return found[0]
