@@ -1,4 +1,5 @@
-"""The relay of one run: its process, which is started again when it dies, and the address and token for the agent.
+"""The relay of one run: its order, its process, which is started again when it dies, and the address and token for the
+agent.
 
 It is a child of the command that plays the run and not of the agent's supervisor, which ends all that is below it and
 holds no credentials. The command keeps the listening socket, so that a relay that is started again has its address.
@@ -12,6 +13,7 @@ import secrets
 import sys
 import sysconfig
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +23,23 @@ import evopolicy_common
 import evopolicy_gateway
 from evopolicy_common.errors import EvopolicyError
 from evopolicy_common.processes.preflight import LOOPBACK
+from evopolicy_common.records.open_run import IntendedRun
+from evopolicy_common.records.secrets import Redaction, without_keys
 from evopolicy_common.wire.http import bound
+from evopolicy_gateway import harnesses
+from evopolicy_gateway.agent_supervisor.supervisor import secrets_in
+from evopolicy_gateway.http.server import Address
+from evopolicy_gateway.inputs import own_config
 from evopolicy_gateway.jail.view import confined
-from evopolicy_gateway.processes.child_messages import AgentDoing, ModelBudgetSpent, StartRelay
+from evopolicy_gateway.processes.agent_process import environment_of
+from evopolicy_gateway.processes.child_messages import AgentDoing, ModelBudgetSpent, Ready, StartRelay
 from evopolicy_gateway.processes.child_rpc import Child
 from evopolicy_gateway.relay.service import Order
+from evopolicy_gateway.run import recorded_agent
+from evopolicy_gateway.run.open_run import OpenRun
+from evopolicy_gateway.run.plan import Replays
+from evopolicy_gateway.run_folder.layout import saved
+from evopolicy_gateway.workspace import staging as workspace
 
 _MAX_DEATHS = 20
 _PAUSE_S = 0.2
@@ -88,6 +102,76 @@ class ModelRelay:
         self._sock.close()
         if self._child is not None:
             await self._child.end(grace_s)
+
+
+def of_run(run: OpenRun, ready: Ready, model_spent: asyncio.Event) -> ModelRelay | None:
+    """The relay for the agent's model, or None where it has none or cannot use one. Prints the limits. `model_spent` is
+    set when the relay refuses a request beyond them."""
+    plan, folder, replays = run.plan, run.folder, run.plan.replays
+    terms = plan.harness().model
+    if terms is None:
+        return None
+    if terms.upstream is None:
+        how = "counted by the agent itself, so that only its tokens are limited"
+        run.note(f"model limits: {terms.limits}; metering: agent ({how})")
+        return None
+    run.note(f"model limits: {terms.limits}; metering: relay")
+    upstream, service = terms.upstream, saved(folder.service, Address)
+
+    def spent(what: str) -> None:
+        if not model_spent.is_set():
+            run.note(f"the model budget is spent: {what}" if replays is None else f"the replay ends: {what}")
+        model_spent.set()
+
+    made = ModelRelay(
+        lambda token: Order(
+            upstream=upstream,
+            token=token,
+            ledger=str(folder.model_requests),
+            limits=terms.limits,
+            prices=terms.prices,
+            model=terms.model,
+            declared_only=terms.declared_only,
+            own_tools_only=terms.own_tools_only,
+            record=plan.record_model,
+            replay="" if replays is None else str(replays.folder),
+            folder=str(folder.model_record),
+            tokens=(service.token, token),
+            secrets=_secrets(run, ready),
+        ),
+        folder.model_requests,
+        folder.harness_log,
+        jailed=plan.jail.mode != "none",
+        doing=partial(run.watch.doing, plan.name),
+        spent=spent,
+        port=0 if replays is None else replays.model_port,
+        token="" if replays is None else replays.model_token,
+    )
+    # A replay needs the jail, for its paths; and an agent without one could read this file.
+    if plan.record_model == "full" and plan.jail.mode != "none":
+        kept = Replays(
+            folder=folder.model_record,
+            root=folder.root,
+            run=run.run,
+            key=saved(folder.intended, IntendedRun).key,
+            port=service.port,
+            token=service.token,
+            model_port=made.port,
+            model_token=made.token,
+        )
+        recorded_agent.keep(folder, plan, kept)
+    return made
+
+
+def _secrets(run: OpenRun, ready: Ready) -> tuple[str, ...]:
+    """Texts that the record of model calls leaves out, as the agent's log does."""
+    plan, harness = run.plan, run.plan.harness()
+    config = plan.agent_config or harnesses.config_of(plan.agent, plan.started_in)
+    variables = environment_of({**ready.variables, **workspace.variables(run.folder)})
+    on_command_line: list[str] = []
+    without_keys([plan.agent, msgspec.to_builtins(config)], on_command_line)
+    in_variables = Redaction.of(secrets_in(variables, config), ready.variables).secrets
+    return (*in_variables, *on_command_line, *own_config.secrets(harness.own_files))
 
 
 def _program(fd: int, more: list[Path], written: list[Path], jailed: bool) -> list[str]:

@@ -1,0 +1,175 @@
+"""The agent's side of an open run: gateway, relay and agent, from their start to the closed run.
+
+They start in this order: the agent needs the gateway's address, and the relay's. They end once the agent has ended, its
+budget or its model's is spent, its wall limit is reached, or the run is cancelled. The agent ends first, with all that
+it started; then the relay; the gateway closes the run last.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Coroutine
+from typing import Any, TypeVar
+
+from evopolicy_common.errors import BrokenEnvironmentError
+from evopolicy_common.messages.gateway import CANCELLED
+from evopolicy_common.processes.notices import Waiting
+from evopolicy_common.records.secrets import without_keys
+from evopolicy_common.records.words import in_words
+from evopolicy_common.wire.credentials import Credentials
+from evopolicy_gateway.processes import child_rpc
+from evopolicy_gateway.processes.child_messages import (
+    AgentEnded,
+    CloseRun,
+    Progress,
+    Ready,
+    StopAgent,
+    SubmitsSeen,
+)
+from evopolicy_gateway.run import model_relay, record
+from evopolicy_gateway.run.gateway_process import GatewayProcess
+from evopolicy_gateway.run.open_run import OpenRun
+from evopolicy_gateway.run.operations import Operations
+from evopolicy_gateway.run.supervised_agent import SupervisedAgent
+from evopolicy_gateway.workspace.agents_md import LAST_WORDS_S
+
+T = TypeVar("T")
+END_GRACE_S = 15.0
+
+
+class AgentSide:
+    """Plays once."""
+
+    def __init__(
+        self,
+        run: OpenRun,
+        operations: Operations,
+        gateway: Credentials,
+        served: asyncio.Future[Ready],
+        *,
+        closed: bool,
+    ) -> None:
+        """`served`, `closed`: as for `GatewayProcess`; a closed run's agent has ended."""
+        self._run = run
+        self._operations = operations
+        self._served = served
+        self._spent = asyncio.Event()
+        """The budget is spent, or the run is cancelled."""
+        self._model_spent = asyncio.Event()
+        """A request beyond the limits of the run's model was refused."""
+        self.cancelled = False
+        """The run was cancelled at the coordinator by someone else."""
+        self._gateway = GatewayProcess(run, served, self._on_progress, closed=closed)
+        self.agent = SupervisedAgent(run, gateway)
+
+    @property
+    def closed(self) -> bool:
+        """Whether the coordinator has closed the run, so that the agent has ended."""
+        return self._gateway.closed.is_set()
+
+    @property
+    def agent_at_work(self) -> bool:
+        """Whether the agent has begun, and the run's closing was not requested yet."""
+        return self.agent.has_begun and not self._gateway.is_closing
+
+    async def play(self) -> None:
+        """Plays until the run is closed; returns at once if it is. Raises EvopolicyError."""
+        if self.closed:
+            return
+        tasks: list[asyncio.Task[Any]] = []
+
+        def begin(work: Coroutine[Any, Any, T]) -> asyncio.Task[T]:
+            task = asyncio.create_task(work)
+            tasks.append(task)
+            return task
+
+        relay: model_relay.ModelRelay | None = None
+        serving = begin(self._gateway.keep())
+        begin(self._follow())
+        ends = [begin(self._model_spent.wait()), begin(self._spent.wait())]
+        try:
+            up: list[asyncio.Future[Any]] = [serving, self._served]
+            await asyncio.wait(up, return_when=asyncio.FIRST_COMPLETED)
+            if serving.done():
+                serving.result()
+            if not self._served.done():
+                return  # cancelled before it was served
+            ready = self._served.result()
+            self._run.stopwatch.opened()
+            relay = model_relay.of_run(self._run, ready, self._model_spent)
+            relaying = [] if relay is None else [begin(relay.serve())]
+            keeping = begin(self.agent.keep(ready, relay, self._spent))
+            going: list[asyncio.Future[Any]] = [serving, keeping, *ends, *relaying]
+            await asyncio.wait(going, return_when=asyncio.FIRST_COMPLETED)
+            for task in relaying:
+                if task.done():
+                    task.result()
+            if not serving.done() and not keeping.done():
+                either: list[asyncio.Future[Any]] = [serving, keeping]
+                await asyncio.wait(either, timeout=LAST_WORDS_S, return_when=asyncio.FIRST_COMPLETED)
+            if serving.done() and not self.closed:
+                serving.result()
+            if not keeping.done():
+                await self.agent.tell(StopAgent())
+            await self._close(await keeping)
+            await serving
+        finally:
+            for each in tasks:
+                # At the loop's end they are being cancelled too. A second time would interrupt the clean-up.
+                if not each.cancelling():
+                    each.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
+            for child in (self.agent, relay, self._gateway):
+                if child is not None:
+                    await child.end(END_GRACE_S)
+            self.agent.survivors = await child_rpc.end_orphans()
+            self._run.stopwatch.closed()
+
+    async def _follow(self) -> None:
+        """Prints why the run is not served yet. Ends the agent when the run is cancelled at the coordinator,
+        which the gateway may not learn."""
+        served, waiting = self._served, Waiting()
+        async for progress in self._operations.wait(self._run.run):
+            if not served.done() and progress.env_failure and self._operations.own:
+                served.set_exception(BrokenEnvironmentError(progress.env_failure))
+            if not served.done() and waiting.worth_saying(progress.waits_for):
+                self._run.note(f"waiting for {progress.waits_for}")
+            if progress.finished is not None and progress.finished.status == CANCELLED:
+                self.cancelled = True
+                self._spent.set()
+
+    async def _on_progress(self, progress: Progress) -> None:
+        stopwatch = self._run.stopwatch
+        stopwatch.gateway_reported(progress.in_flight_s, progress.feedback_s)
+        self._run.watch.progress(self._run.plan.name, progress)
+        before, held_s = stopwatch.times.held_s, stopwatch.held_reported(progress.held_s)
+        if held_s > before:
+            await self.agent.note_held(held_s)
+        asked, running = progress.n_submits + progress.n_rejected, progress.submit_id is not None
+        await self.agent.note_submits(SubmitsSeen(asked=asked, running=running))
+        self.cancelled = self.cancelled or progress.cancelled
+        if progress.spent:
+            self._spent.set()
+
+    async def _close(self, ended: AgentEnded) -> None:
+        """Prints why the agent ended, and has the run closed."""
+        run = self._run
+        reason = "budget_spent" if self._spent.is_set() else ended.reason
+        if self._model_spent.is_set() and reason in ("agent_stopped", "agent_failed", "told"):
+            reason = "model_budget_spent"
+        reason = CANCELLED if self.cancelled else reason
+        how = f"agent ended: {in_words(reason)}"
+        run.note(f"{how}, {ended.detail}" if ended.detail else how)
+        if reason == "agent_failed":
+            for line in ended.stderr_tail:
+                run.note(f"stderr: {line}")
+            without = "" if ended.stderr_tail else "the agent printed no errors; "
+            run.note(f"{without}full log: {run.folder.agent_log}")
+        facts = without_keys(ended.facts)
+        about = {"turns": ended.turns, "retries": ended.retries, "detail": ended.detail, **facts}
+        try:
+            about["record"] = record.told_at_close(run.folder, run.plan, about, run.stopwatch.times)
+        except Exception as error:  # the agent has ended: no bug in this costs the run
+            why = record.why_failed(error, run.folder.harness_log)
+            run.note(f"the coordinator does not commit to this side of run.json: {why}")
+        await self._gateway.close(CloseRun(reason=reason, agent=about))
