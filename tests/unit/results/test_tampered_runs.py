@@ -160,11 +160,12 @@ def _web(run: Path, whole: Path) -> None:
         assert facts.path is not None
         detail = Detail(facts.path)
         for submit in reader.submits(facts.path):
-            detail.code(submit.index, checkpoints=True)
-            detail.summary(submit.index)
-            for episode in detail.episodes(submit.index):
+            index = submit.summary.submit_index
+            detail.code(index, checkpoints=True)
+            detail.summary(index)
+            for episode in detail.episodes(index):
                 try:
-                    detail.played(detail.episode_files(submit.index, episode)[0])
+                    detail.played(detail.episode_files(index, episode)[0])
                 except NotThereError:
                     continue
         detail.messages()

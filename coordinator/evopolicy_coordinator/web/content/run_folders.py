@@ -10,12 +10,13 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import hashlib
+import itertools
 import os
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 
@@ -34,29 +35,21 @@ from evopolicy_results.reading.environments import learn_names
 from evopolicy_results.reading.reader import find_run_dirs
 
 _MAX_SUMMARY_BYTES = 8 << 20
+_BY_EPISODE = ("env_instances", "returns", "episode_lengths", "reward_components_per_episode", "successes")
 
 
-class SubmitFacts(msgspec.Struct, frozen=True, kw_only=True):
-    """One submit, as its agent sees it."""
+class Submit(NamedTuple):
+    """One submit of a run."""
 
-    index: int
-    status: str
-    n_episodes: int
+    summary: Summary
+    """Without its fields by episode, which are read again for its page: a run has thousands of episodes."""
     consumed: int
     """Episodes charged up to its end."""
-    remaining: int
-    mean: float | None
-    std: float | None
-    least: float | None
-    most: float | None
-    length: float | None
-    """Mean steps of an episode."""
-    failed: int
-    """Episodes in which the policy failed."""
-    started_at: str
-    completed_at: str
-    wall_s: float
-    warning: str
+
+    @property
+    def mean(self) -> float | None:
+        """Mean train return; None unless it is ok."""
+        return self.summary.mean_return if self.summary.status == "ok" else None
 
 
 class RunFacts(msgspec.Struct, frozen=True, kw_only=True):
@@ -145,7 +138,7 @@ class Reader:
     def __init__(self, roots: Sequence[Path]) -> None:
         self.roots = tuple(root.resolve() for root in roots)
         self._records: dict[Path, tuple[tuple[int, int], RunFacts]] = {}
-        self._submits: dict[Path, dict[str, SubmitFacts]] = {}
+        self._submits: dict[Path, dict[str, Summary]] = {}
         self._known: frozenset[Path] = frozenset()
 
     def read(self, cluster: Sequence[RunStatus] | None, *, cluster_is_known: bool) -> Runs:
@@ -207,7 +200,7 @@ class Reader:
             known = self._records[folder] = stamp, _finished(folder)
         return known[1] if entry is None else msgspec.structs.replace(known[1], repeat=entry.repeat)
 
-    def submits(self, folder: Path) -> list[SubmitFacts]:
+    def submits(self, folder: Path) -> list[Submit]:
         """The submits of a run, in order; each summary is read once."""
         confined = Confined(folder)
         try:
@@ -225,18 +218,15 @@ class Reader:
                 )
             except (NotThereError, ProtocolError):
                 continue
-            known[name.name] = _submit(summary)
-        consumed, found = 0, []
-        for submit in sorted(known.values(), key=lambda each: each.index):
-            consumed += submit.n_episodes
-            found.append(msgspec.structs.replace(submit, consumed=consumed))
-        return found
+            known[name.name] = msgspec.structs.replace(summary, **dict.fromkeys(_BY_EPISODE))
+        summaries = sorted(known.values(), key=lambda each: each.submit_index)
+        consumed = itertools.accumulate(each.n_episodes for each in summaries)
+        return list(map(Submit, summaries, consumed))
 
     def _open(self, folder: Path, entry: Entry | None, by_run: Mapping[str, RunStatus]) -> RunFacts:
         settings, run = _settings(folder), _opened(folder)
         status = by_run.get(run)
         submits = self.submits(folder)
-        means = [submit.mean for submit in submits if submit.status == "ok" and submit.mean is not None]
         entry_name, env, exp_id = folder.parts[-3], folder.parts[-2].replace("_", "/", 1), folder.name
         budget, repeat, hidden_cases = None, 0, "shared"
         if settings is not None:
@@ -245,7 +235,7 @@ class Reader:
         elif entry is not None:
             entry_name, env, repeat = entry.agent, entry.env, entry.repeat
         if submits and budget is None:
-            budget = submits[-1].consumed + submits[-1].remaining
+            budget = submits[-1].consumed + submits[-1].summary.remaining_budget
         alive = _agent_alive(folder) if status is None else _may_be_alive(status)
         state = "open" if alive else "interrupted"
         if status is not None:
@@ -266,7 +256,7 @@ class Reader:
             budget=budget,
             used=submits[-1].consumed if submits else 0,
             n_submits=len(submits),
-            best=max(means, default=None),
+            best=_best(submits),
             waits_for="" if status is None else status.waits_for,
             running=0 if status is None else status.running,
             queued=0 if status is None else status.queued,
@@ -283,24 +273,8 @@ class Reader:
                 del known[path]
 
 
-def _submit(summary: Summary) -> SubmitFacts:
-    return SubmitFacts(
-        index=summary.submit_index,
-        status=summary.status,
-        n_episodes=summary.n_episodes,
-        consumed=0,
-        remaining=summary.remaining_budget,
-        mean=summary.mean_return,
-        std=summary.std_return,
-        least=summary.min_return,
-        most=summary.max_return,
-        length=summary.mean_episode_length,
-        failed=len(summary.errors or ()),
-        started_at=summary.submit_started_at,
-        completed_at=summary.submit_completed_at,
-        wall_s=summary.wall_time_seconds,
-        warning=summary.warning or "",
-    )
+def _best(submits: Iterable[Submit]) -> float | None:
+    return max((one.mean for one in submits if one.mean is not None), default=None)
 
 
 def _finished(folder: Path) -> RunFacts:
@@ -327,7 +301,6 @@ def _of_record(folder: Path, record: RunRecord) -> RunFacts:
     tokens = None if record.agent.tokens is None else msgspec.to_builtins(record.agent.tokens)
     retries = outcome.auxiliary.get("infrastructure_retries")
     submits = Reader([]).submits(folder)
-    means = [submit.mean for submit in submits if submit.status == "ok" and submit.mean is not None]
     return RunFacts(
         key=key_of(str(folder)),
         path=folder,
@@ -341,7 +314,7 @@ def _of_record(folder: Path, record: RunRecord) -> RunFacts:
         budget=dimensions.episode_budget,
         used=outcome.budget_used,
         n_submits=len(submits),
-        best=max(means, default=None),
+        best=_best(submits),
         tokens=_n_tokens(tokens),
         cost=_cost(tokens),
         error=outcome.error or "",

@@ -23,7 +23,7 @@ from evopolicy_coordinator.web.content.run_detail import (
     Happened,
     Series,
 )
-from evopolicy_coordinator.web.content.run_folders import Reader, RunFacts, Runs, SubmitFacts
+from evopolicy_coordinator.web.content.run_folders import Reader, RunFacts, Runs, Submit
 from evopolicy_coordinator.web.content.tables import Words, ident
 from evopolicy_results.behaviour.trace import diff
 from evopolicy_results.html import notice
@@ -68,12 +68,13 @@ def run_view(
     best = float("-inf")
     rises = []
     for submit in submits:
-        rises.append(submit.mean is not None and submit.status == "ok" and submit.mean > best)
+        rises.append(submit.mean is not None and submit.mean > best)
         best = max(best, submit.mean) if rises[-1] and submit.mean is not None else best
     for submit, rise in list(zip(submits, rises, strict=True))[::-1][:MAX_SUBMITS]:
-        name = f"submit-{submit.index}"
+        name = f"submit-{submit.summary.submit_index}"
         lists["submit-rows"].append(name)
-        parts[name] = part("submit_row", ident=name, key=run.key, submit=submit, best=rise)
+        shown = {"submit": submit.summary, "consumed": submit.consumed}
+        parts[name] = part("submit_row", ident=name, key=run.key, best=rise, **shown)
     messages = [] if detail is None else detail.messages(words.before)
     for one in messages:
         name = f"message-{one.at}"
@@ -147,10 +148,10 @@ def _one_run_notices(run: RunFacts, may_show: bool) -> list[dict[str, Any]]:
     return notices
 
 
-def _curve(submits: Sequence[SubmitFacts], run: RunFacts, reference: tuple[str, float] | None) -> str:
+def _curve(submits: Sequence[Submit], run: RunFacts, reference: tuple[str, float] | None) -> str:
     points, best, rising = [], float("-inf"), []
     for submit in submits:
-        if submit.status == "ok" and submit.mean is not None:
+        if submit.mean is not None:
             points.append((float(submit.consumed), submit.mean))
             best = max(best, submit.mean)
             rising.append((float(submit.consumed), best))
@@ -185,7 +186,7 @@ def submit_values(run: RunFacts, reader: Reader, index: int) -> dict[str, Any] |
     """The parts of one submit's page; None for an unknown submit."""
     if run.path is None:
         return None
-    submits = {submit.index: submit for submit in reader.submits(run.path)}
+    submits = {one.summary.submit_index: one for one in reader.submits(run.path)}
     submit = submits.get(index)
     if submit is None:
         return None
@@ -207,20 +208,22 @@ def submit_values(run: RunFacts, reader: Reader, index: int) -> dict[str, Any] |
             "length": _at(lengths, at),
             "failed": at in failed,
         }
-        for at in range(min(MAX_EPISODES, submit.n_episodes))
+        for at in range(min(MAX_EPISODES, submit.summary.n_episodes))
     ]
     return {
-        "submit": submit,
+        "submit": submit.summary,
+        "consumed": submit.consumed,
         "previous": index - 1 if index - 1 in submits else None,
         "next": index + 1 if index + 1 in submits else None,
         "diffs": _diffs(previous, code) if previous else [],
         "files": code,
         "calls": before(
-            run.path, [each.started_at for at in (index - 1, index) if (each := submits.get(at))]
+            run.path,
+            [each.summary.submit_started_at for at in (index - 1, index) if (each := submits.get(at))],
         )[-1],
         "workspace": changes(run.path, index),
         "episodes": episodes,
-        "left_out": max(0, submit.n_episodes - MAX_EPISODES),
+        "left_out": max(0, submit.summary.n_episodes - MAX_EPISODES),
     }
 
 

@@ -68,4 +68,4 @@ def test_a_summary_that_an_agent_forged_is_passed_over(tmp_path: Path) -> None:
         place = folder / "workspace" / "feedback" / name
         place.mkdir()
         (place / "summary.json").write_text(text)
-    assert [submit.index for submit in Reader([tmp_path]).submits(folder)] == [0]
+    assert [one.summary.submit_index for one in Reader([tmp_path]).submits(folder)] == [0]
