@@ -26,85 +26,51 @@ T = TypeVar("T")
 _ODD = re.compile(r"[^A-Za-z0-9._()+ -]")
 
 
+class Place:
+    """A path below a run's folder, as an attribute of `RunFolder`."""
+
+    def __init__(self, path: str) -> None:
+        self._path = path
+
+    def __get__(self, folder: RunFolder, kind: type[RunFolder]) -> Path:
+        return folder.root / self._path
+
+
 class RunFolder(msgspec.Struct, frozen=True):
     """Paths of one run."""
 
     root: Path
 
-    @property
-    def workspace(self) -> Path:
-        """The agent's working directory."""
-        return self.root / "workspace"
-
-    @property
-    def agents_md(self) -> Path:
-        """The rules for the agent."""
-        return self.workspace / "AGENTS.md"
-
-    @property
-    def system(self) -> Path:
-        """The policy that the agent edits."""
-        return self.workspace / "system"
-
-    @property
-    def feedback(self) -> Path:
-        """The results of its submits, one folder each."""
-        return self.workspace / "feedback"
-
-    @property
-    def history(self) -> Path:
-        """The feedback of the run that this one starts from, read-only."""
-        return self.workspace / HISTORY
-
-    @property
-    def checkpoints(self) -> Path:
-        """The submitted policies with their metrics, written at the end."""
-        return self.root / "checkpoints"
-
-    @property
-    def trees(self) -> Path:
-        """The workspace at each submit (`evopolicy_common.records.policies.trees`)."""
-        return self.root / TREES
-
-    @property
-    def run_json(self) -> Path:
-        """The run's record, written last."""
-        return self.root / "run.json"
-
-    @property
-    def harness_log(self) -> Path:
-        """The log of gateway and agent supervisor."""
-        return self.root / "logs" / "harness.log"
-
-    @property
-    def agent_log(self) -> Path:
-        """The prompts to the agent's programs and all their output."""
-        return self.root / "logs" / "agent.jsonl"
-
-    @property
-    def model_requests(self) -> Path:
-        """The relay's ledger: a line for each request to the agent's model."""
-        return self.root / model_calls.LEDGER
-
-    @property
-    def model_record(self) -> Path:
-        """The record of the calls of the agent's model; see `evopolicy_common/records/model_record.py`."""
-        return self.root / model_record.FOLDER
-
-    @property
-    def env_log(self) -> Path:
-        """Played episodes with their results, written at the end."""
-        return self.root / "logs" / "env.log"
-
-    @property
-    def passed(self) -> Path:
-        """Digests of values that the agent got; stays when the run ends, and is never published."""
-        return self.root / PASSED
-
-    @property
-    def replay(self) -> Path:
-        """`Recorded` (`run/recorded_agent.py`): what a replay of the agent needs; stays, and is never published."""
-        return self.root / ".replay.json"
+    workspace = Place("workspace")
+    """The agent's working directory."""
+    agents_md = Place("workspace/AGENTS.md")
+    """The rules for the agent."""
+    system = Place("workspace/system")
+    """The policy that the agent edits."""
+    feedback = Place("workspace/feedback")
+    """The results of its submits, one folder each."""
+    history = Place(f"workspace/{HISTORY}")
+    """The feedback of the run that this one starts from, read-only."""
+    checkpoints = Place("checkpoints")
+    """The submitted policies with their metrics, written at the end."""
+    trees = Place(TREES)
+    """The workspace at each submit (`evopolicy_common.records.policies.trees`)."""
+    run_json = Place("run.json")
+    """The run's record, written last."""
+    harness_log = Place("logs/harness.log")
+    """The log of gateway and agent supervisor."""
+    agent_log = Place("logs/agent.jsonl")
+    """The prompts to the agent's programs and all their output."""
+    model_requests = Place(model_calls.LEDGER)
+    """The relay's ledger: a line for each request to the agent's model."""
+    model_record = Place(model_record.FOLDER)
+    """The record of the calls of the agent's model; see `evopolicy_common/records/model_record.py`."""
+    env_log = Place("logs/env.log")
+    """Played episodes with their results, written at the end."""
+    passed = Place(PASSED)
+    """Digests of values that the agent got; stays when the run ends, and is never published."""
+    replay = Place(".replay.json")
+    """`Recorded` (`run/recorded_agent.py`): what a replay of the agent needs; stays, and is never published."""
 
     def artifacts(self) -> Artifacts:
         """The existing files of a finished run, under their names in `run.json`."""
@@ -119,55 +85,26 @@ class RunFolder(msgspec.Struct, frozen=True):
         found = {name: path for name, path in places.items() if path.exists()}
         return Artifacts(**{name: path.relative_to(self.root).as_posix() for name, path in found.items()})
 
-    @property
-    def state(self) -> Path:
-        """The gateway's own folder, while the run is open."""
-        return self.root / open_run.STATE
-
-    @property
-    def credentials(self) -> Path:
-        """The gateway's credentials, with the run's capability."""
-        return self.state / "credentials.json"
-
-    @property
-    def service(self) -> Path:
-        """Port and token of the HTTP service, which a restarted gateway keeps."""
-        return self.state / "service.json"
-
-    @property
-    def listener(self) -> Path:
-        """The address that serves a remote agent: `Listener`. Missing for an agent that is started here."""
-        return self.root / open_run.LISTENER
-
-    @property
-    def bearer(self) -> Path:
-        """A remote agent's bearer token, as text."""
-        return self.state / "bearer"
-
-    @property
-    def finish(self) -> Path:
-        """Created when the operator reports the end of an agent that was not started here."""
-        return self.state / "finish"
-
-    @property
-    def unwatched(self) -> Path:
-        """Created by a gateway that was started by hand: only the operator knows the end of its unwatched agent."""
-        return self.root / open_run.UNWATCHED
-
-    @property
-    def journal(self) -> Path:
-        """The gateway's record of requests; see `journal.py`."""
-        return self.root / open_run.JOURNAL
-
-    @property
-    def blobs(self) -> Path:
-        """Submitted snapshots of `system/`."""
-        return self.root / open_run.BUNDLES
-
-    @property
-    def opened_run(self) -> Path:
-        """The id of the run that the folder belongs to: `OpenedRun`."""
-        return self.root / open_run.OPENED
+    state = Place(open_run.STATE)
+    """The gateway's own folder, while the run is open."""
+    credentials = Place(f"{open_run.STATE}/credentials.json")
+    """The gateway's credentials, with the run's capability."""
+    service = Place(f"{open_run.STATE}/service.json")
+    """Port and token of the HTTP service, which a restarted gateway keeps."""
+    listener = Place(open_run.LISTENER)
+    """The address that serves a remote agent: `Listener`. Missing for an agent that is started here."""
+    bearer = Place(f"{open_run.STATE}/bearer")
+    """A remote agent's bearer token, as text."""
+    finish = Place(f"{open_run.STATE}/finish")
+    """Created when the operator reports the end of an agent that was not started here."""
+    unwatched = Place(open_run.UNWATCHED)
+    """Created by a gateway that was started by hand: only the operator knows the end of its unwatched agent."""
+    journal = Place(open_run.JOURNAL)
+    """The gateway's record of requests; see `journal.py`."""
+    blobs = Place(open_run.BUNDLES)
+    """Submitted snapshots of `system/`."""
+    opened_run = Place(open_run.OPENED)
+    """The id of the run that the folder belongs to: `OpenedRun`."""
 
     @property
     def lock(self) -> Path:
@@ -179,40 +116,20 @@ class RunFolder(msgspec.Struct, frozen=True):
         """`IntendedRun` of a run that is to take the place of the folder's; beside it, as the lock."""
         return self.root.with_name(f".{self.root.name}.asked")
 
-    @property
-    def supervisor_lock(self) -> Path:
-        """Lock of the agent supervisor while the agent may be alive, even if the command that started it was killed."""
-        return self.state / "keeper.lock"
-
-    @property
-    def intended(self) -> Path:
-        """The request to open the run, written before it is sent: `IntendedRun`."""
-        return self.root / open_run.INTENDED
-
-    @property
-    def session(self) -> Path:
-        """A coding agent's session: `SessionState`."""
-        return self.state / "session.json"
-
-    @property
-    def times(self) -> Path:
-        """Time spent on its train side so far: `Times`."""
-        return self.state / "times.json"
-
-    @property
-    def agent(self) -> Path:
-        """A jailed agent's files outside its workspace: home and /tmp."""
-        return self.state / "agent"
-
-    @property
-    def start(self) -> Path:
-        """`Start` of a run whose workspace is that of an earlier submit."""
-        return self.state / "start.json"
-
-    @property
-    def staged(self) -> Path:
-        """Hashes and bounds of the staged workspace: `Staged`."""
-        return self.state / "staged.json"
+    supervisor_lock = Place(f"{open_run.STATE}/keeper.lock")
+    """Lock of the agent supervisor while the agent may be alive, even if the command that started it was killed."""
+    intended = Place(open_run.INTENDED)
+    """The request to open the run, written before it is sent: `IntendedRun`."""
+    session = Place(f"{open_run.STATE}/session.json")
+    """A coding agent's session: `SessionState`."""
+    times = Place(f"{open_run.STATE}/times.json")
+    """Time spent on its train side so far: `Times`."""
+    agent = Place(f"{open_run.STATE}/agent")
+    """A jailed agent's files outside its workspace: home and /tmp."""
+    start = Place(f"{open_run.STATE}/start.json")
+    """`Start` of a run whose workspace is that of an earlier submit."""
+    staged = Place(f"{open_run.STATE}/staged.json")
+    """Hashes and bounds of the staged workspace: `Staged`."""
 
 
 class Staged(msgspec.Struct, frozen=True, kw_only=True):
