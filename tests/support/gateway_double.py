@@ -47,7 +47,8 @@ from evopolicy_common.records.policies.bundles import BundleFile
 from evopolicy_common.wire import codec, credentials, keys, transport
 from evopolicy_common.wire.credentials import Credentials
 from evopolicy_coordinator.core.contract.settings import CoreSettings
-from evopolicy_gateway.run.gateway import Close, Gateway
+from evopolicy_gateway.processes import child_messages
+from evopolicy_gateway.run.gateway import Gateway
 from evopolicy_gateway.run_folder.layout import RunFolder, save
 from evopolicy_gateway.submits.pipeline import SubmitPipeline
 from evopolicy_gateway.workspace.agents_md import Urls
@@ -496,7 +497,7 @@ class Served(msgspec.Struct, frozen=True):
     http: httpx.AsyncClient
 
     async def close(self, reason: str = "agent_stopped") -> bool:
-        self.gateway.tell(Close(reason=reason))
+        self.gateway.tell(child_messages.CloseRun(reason=reason))
         return await self.task
 
 

@@ -21,7 +21,7 @@ from evopolicy_common.logs import structlog
 from evopolicy_common.processes.preflight import foreseen
 from evopolicy_gateway.processes import child_messages
 from evopolicy_gateway.processes.child_messages import Orders, Progress, Ready, RunClosed, Waits
-from evopolicy_gateway.run.gateway import Close, Gateway
+from evopolicy_gateway.run.gateway import Gateway
 from evopolicy_gateway.run_folder.layout import RunFolder, folder_of
 from evopolicy_gateway.run_folder.listener import AgentPlace, place_of
 from evopolicy_gateway.run_folder.locks import alone
@@ -183,7 +183,7 @@ async def _listen(gateway: Gateway) -> None:
             gateway.tell(None)
             return
         if isinstance(order, child_messages.CloseRun):
-            gateway.tell(Close(reason=order.reason, agent=order.agent))
+            gateway.tell(order)
 
 
 def progress_of(machine: TicketMachine) -> Progress:

@@ -34,7 +34,6 @@ from evopolicy_common.wire.credentials import SWEEP_STATE
 from evopolicy_gateway.cli import options
 from evopolicy_gateway.cli.option_groups import Of, Shown, spread
 from evopolicy_gateway.operator.cluster import Cluster, connected
-from evopolicy_gateway.run.options import settings_of
 from evopolicy_gateway.run.plan import Plan
 from evopolicy_gateway.run.run_options import ClusterOptions, RunOptions
 from evopolicy_gateway.run_folder.locks import alone
@@ -119,7 +118,7 @@ def suite(
             limits = msgspec.structs.replace(wanted.parallel, machine=parallel)
             wanted = msgspec.structs.replace(wanted, parallel=limits)
         if profile is not None:
-            defaults = msgspec.structs.replace(wanted.defaults, profile=settings_of(profile)["profile"])
+            defaults = msgspec.structs.replace(wanted.defaults, profile=profile)
             wanted = msgspec.structs.replace(wanted, defaults=defaults)
         root = (runs or Path("runs") / wanted.name).absolute()
         expanded = suite_file.expand(wanted, root, Path.cwd(), tuple(only or ()))

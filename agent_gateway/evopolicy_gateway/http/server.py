@@ -14,7 +14,7 @@ from evopolicy_common.records.blobs import write_atomically
 from evopolicy_common.wire.http import bound
 from evopolicy_gateway.run_folder.layout import RunFolder, save, saved
 from evopolicy_gateway.run_folder.listener import Listener
-from evopolicy_gateway.workspace.agents_md import Urls, urls_at, urls_below
+from evopolicy_gateway.workspace.agents_md import Urls, base_url, urls_below
 
 _REBIND_TRIES = 20
 _REBIND_PAUSE_S = 0.25
@@ -33,10 +33,8 @@ class Address(msgspec.Struct, frozen=True, kw_only=True):
     """URL for the agent; empty for `http://host:port`."""
 
     def urls(self) -> Urls:
-        if self.url:
-            return urls_below(self.url, self.token, bearer=bool(self.bearer))
-        found = urls_at(self.host, self.port, self.token)
-        return msgspec.structs.replace(found, bearer=bool(self.bearer))
+        base = self.url or base_url(self.host, self.port)
+        return urls_below(base, self.token, bearer=bool(self.bearer))
 
 
 async def bind(folder: RunFolder) -> tuple[socket.socket, Address]:

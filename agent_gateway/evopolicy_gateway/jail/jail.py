@@ -173,8 +173,8 @@ class Jail:
         home = os.path.expanduser("~")
         self._home = home if os.path.isabs(home) and home != "/" else "/home/agent"
         self._hosts = frozenset(map(host, (*HARNESS_HOSTS.get(harness, ()), *hosts, *settings.hosts)))
-        self._forwards = {found.port: ("127.0.0.1", found.port) for found in map(_address, urls.values())}
-        self._forwards |= {port: ("127.0.0.1", port) for name, port in self._hosts if name in _LOOPBACK_NAMES}
+        ports = [*map(_port, urls.values()), *(port for name, port in self._hosts if name in _LOOPBACK_NAMES)]
+        self._forwards = {port: ("127.0.0.1", port) for port in ports}
         self._view = View(
             workspace=workspace,
             shown=Path(order.shown) if order.shown else workspace,
@@ -226,14 +226,9 @@ def _at_home(path: str, home: str) -> str:
     return f"{home}/{path[2:]}" if path.startswith("~/") else path
 
 
-class _Address(msgspec.Struct, frozen=True):
-    name: str
-    port: int
-
-
-def _address(url: str) -> _Address:
+def _port(url: str) -> int:
     parts = urlsplit(url)
-    return _Address(parts.hostname or "", parts.port or (HTTPS if parts.scheme == "https" else 80))
+    return parts.port or (HTTPS if parts.scheme == "https" else 80)
 
 
 def _base_python() -> str:

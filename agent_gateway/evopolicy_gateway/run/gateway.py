@@ -32,6 +32,7 @@ from evopolicy_common.wire import credentials, transport
 from evopolicy_common.wire.http import serving
 from evopolicy_gateway.http.server import bind
 from evopolicy_gateway.http.service import make_app
+from evopolicy_gateway.processes.child_messages import CloseRun
 from evopolicy_gateway.run_folder.journal import Journal
 from evopolicy_gateway.run_folder.layout import RunFolder, saved
 from evopolicy_gateway.run_folder.listener import AgentPlace, agent_place, ends_unseen
@@ -43,13 +44,6 @@ from evopolicy_gateway.workspace.agents_md import Urls
 _LOOK_S = 1.0
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
-
-
-class Close(msgspec.Struct, frozen=True, kw_only=True):
-    """The agent and all its children are gone; the gateway reports that to the coordinator."""
-
-    reason: str
-    agent: dict[str, Any] = {}
 
 
 class Gateway:
@@ -84,10 +78,10 @@ class Gateway:
         """Set to leave the run open."""
         self.permit_s = 0.0
         """Seconds spent waiting for the agent's permit."""
-        self._orders: asyncio.Future[Close | None] = asyncio.get_running_loop().create_future()
+        self._orders: asyncio.Future[CloseRun | None] = asyncio.get_running_loop().create_future()
         self._changed = asyncio.Event()
 
-    def tell(self, close: Close | None) -> None:
+    def tell(self, close: CloseRun | None) -> None:
         """Ends the gateway: closes the run, or with None leaves it open, even while the closing waits."""
         if close is None:
             self._stopped.set()
@@ -152,8 +146,8 @@ class Gateway:
             self._on_wait("")
         return not self._stopped.is_set() if granted is None else granted
 
-    async def _watch(self, pipeline: SubmitPipeline, http: asyncio.Task[None]) -> Close | None:
-        """Reports changes until `tell`; returns its argument, or a `Close` when the gateway itself decides to end."""
+    async def _watch(self, pipeline: SubmitPipeline, http: asyncio.Task[None]) -> CloseRun | None:
+        """Reports changes until `tell`; returns its argument, or a `CloseRun` of its own when it decides to end."""
         self._changed.set()
         while True:
             changed = asyncio.ensure_future(self._changed.wait())
@@ -170,10 +164,10 @@ class Gateway:
             self._changed.clear()
             self._on_change(pipeline)
             if self._alone and (pipeline.machine.spent or self._folder.finish.exists()):
-                return Close(reason="budget_spent" if pipeline.machine.spent else "agent_stopped")
+                return CloseRun(reason="budget_spent" if pipeline.machine.spent else "agent_stopped")
 
     async def _close(
-        self, session: CoordinatorClient, journal: Journal, pipeline: SubmitPipeline, close: Close
+        self, session: CoordinatorClient, journal: Journal, pipeline: SubmitPipeline, close: CloseRun
     ) -> bool:
         # The agent is gone, but its last submit is still played and written.
         pipeline.machine.close()

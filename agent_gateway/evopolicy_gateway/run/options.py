@@ -6,14 +6,13 @@ import contextlib
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any
 
 import msgspec
 
 from evopolicy_common import catalogue
 from evopolicy_common.errors import ConfigError, ProtocolError, RequestError
 from evopolicy_common.messages.episode import LARGEST_LIMIT, LARGEST_LIMITS, ResourceLimits
-from evopolicy_common.messages.gateway import Profile
 from evopolicy_common.messages.run_settings import HIDDEN_COUNTS, PUBLISHED, RunSettings, episode_counts
 from evopolicy_common.processes.packages import checked_names, packages_in, policy_versions
 from evopolicy_common.records.run_files import read_record
@@ -46,9 +45,9 @@ def settings_of(profile: str | None, **given: str | None) -> dict[str, str]:
     """The settings that a profile decides, and the profile; `given` by name of `RunSettings`, None for what was not
     given.
 
-    ConfigError for a profile that there is not, or that sets otherwise what was given.
+    ConfigError for a profile that has another value than a given one.
     """
-    chosen = one_of("--profile", profile or "own", Profile)
+    chosen = profile or "own"
     usual = OWN if chosen == "own" else PUBLISHED
     for name, value in given.items():
         if chosen != "own" and value not in (None, usual[name]):
@@ -71,7 +70,7 @@ def run_settings(given: Any, **named: Any) -> RunSettings:
     )
     chosen: dict[str, Any] = settings_of(
         given.profile,
-        hidden_cases=hidden_cases_of(given.hidden_cases),
+        hidden_cases=given.hidden_cases and given.hidden_cases.replace("-", "_"),
         **{name: getattr(given, name) for name in names},
     )
     if chosen["feedback"] != "pictures" and given.video != "off":
@@ -193,18 +192,3 @@ def packages_for(policy: Path, requested: Sequence[str] | None) -> tuple[str, ..
                 ) from error
             return found
     return ()
-
-
-def hidden_cases_of(text: str | None) -> str | None:
-    """The hidden cases that `--hidden-cases` names, if it does. ConfigError when there are none of that name."""
-    if text is None:
-        return None
-    return one_of("--hidden-cases", text, Literal["shared", "per-run"]).replace("-", "_")
-
-
-def one_of(option: str, text: str, kind: object) -> str:
-    """`text`, which is one of the values of the Literal `kind`. ConfigError naming `option` when it is not."""
-    allowed = get_args(kind)
-    if text not in allowed:
-        raise ConfigError(f"{option} {text!r}: there are {', '.join(allowed)}")
-    return text

@@ -24,7 +24,7 @@ from evopolicy_gateway.run.record import why_failed
 from evopolicy_gateway.run.watch import RunObserver
 from evopolicy_gateway.suite.decisions import Decision, side_by_side
 from evopolicy_gateway.suite.suite_file import Parallel
-from evopolicy_gateway.suite.suite_index import directory_of
+from evopolicy_gateway.suite.suite_index import directory_of, waiting
 
 LOOK_S = 1.0
 MAX_SCORED = 256
@@ -115,17 +115,8 @@ class Sweep(ABC):
 
     def _begun(self, decision: Decision) -> Entry:
         """The index entry of a starting run."""
-        run = decision.run
-        return Entry(
-            name=run.name,
-            agent=run.entry,
-            env=run.settings.env,
-            repeat=run.settings.repeat,
-            digest=run.digest,
-            state="running",
-            attempt=decision.attempt,
-            directory=directory_of(run),
-        )
+        run, now = decision.run, {"state": "running", "attempt": decision.attempt}
+        return msgspec.structs.replace(waiting(run), **now, directory=directory_of(run))
 
     def _why(self, run: Plan, error: Exception) -> str:
         """Why a run failed, in one line."""

@@ -37,11 +37,6 @@ class Urls(msgspec.Struct, frozen=True, kw_only=True):
         }
 
 
-def urls_at(host: str, port: int, token: str) -> Urls:
-    """The URLs of a service at that address."""
-    return urls_below(base_url(host, port), token)
-
-
 def base_url(host: str, port: int) -> str:
     """The URL of an address, without a trailing `/`."""
     return f"http://{f'[{host}]' if ':' in host else host}:{port}"

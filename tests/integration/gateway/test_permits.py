@@ -16,7 +16,8 @@ from evopolicy_common.messages.worker import Message, Refused
 from evopolicy_common.processes import host
 from evopolicy_common.records.open_run import IntendedRun
 from evopolicy_common.refusals import Refusal
-from evopolicy_gateway.run.gateway import Close, Gateway
+from evopolicy_gateway.processes import child_messages
+from evopolicy_gateway.run.gateway import Gateway
 from evopolicy_gateway.run_folder import listener
 from evopolicy_gateway.run_folder.layout import RunFolder, save
 from evopolicy_gateway.run_folder.listener import AgentPlace, Listener
@@ -121,7 +122,7 @@ async def test_an_ended_agents_gateway_closes_the_run_without_a_permit(tmp_path:
     async with answering(tmp_path, double) as found:
         await double.score_another_run(host.boot_id())
         gateway, _ = quiet(prepare(tmp_path / "run", found, double))
-        gateway.tell(Close(reason="agent_stopped"))
+        gateway.tell(child_messages.CloseRun(reason="agent_stopped"))
         assert await gateway.run()
     assert double.closed is not None
 
@@ -154,7 +155,7 @@ async def test_a_remote_agents_run_closes_on_its_operators_word(tmp_path: Path) 
         folder = prepare(tmp_path / "run", found, double)
         remote(folder, KERNEL)
         async with gateway_on(folder, double) as service:
-            service.gateway.tell(Close(reason="budget_spent"))
+            service.gateway.tell(child_messages.CloseRun(reason="budget_spent"))
             await until(lambda: len(service.waits) > 1)
             assert "evopolicy finish" in service.waits[1]
             assert double.closed is None
@@ -182,7 +183,7 @@ async def test_a_gateway_stopped_before_its_agents_end_leaves_the_run_open(tmp_p
         folder = prepare(tmp_path / "run", found, double)
         remote(folder, "")
         async with gateway_on(folder, double) as service:
-            service.gateway.tell(Close(reason="wall_limit"))
+            service.gateway.tell(child_messages.CloseRun(reason="wall_limit"))
             await until(lambda: len(service.waits) > 1)
             service.gateway.tell(None)
             assert not await service.task

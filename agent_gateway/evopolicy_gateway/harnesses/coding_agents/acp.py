@@ -31,7 +31,11 @@ from evopolicy_gateway.harnesses.coding_agents.acp_stream import (
 from evopolicy_gateway.harnesses.coding_agents.cli_agent import CliAgent
 from evopolicy_gateway.harnesses.coding_agents.dialect import TurnReader, mapping, string
 from evopolicy_gateway.harnesses.coding_agents.turn import Capped
-from evopolicy_gateway.harnesses.coding_agents.turn_failure import TurnFailure, turn_failure_of
+from evopolicy_gateway.harnesses.coding_agents.turn_failure import (
+    TurnFailure,
+    turn_failure_of,
+    with_last_errors,
+)
 from evopolicy_gateway.harnesses.interface.base import AgentError, Stage
 from evopolicy_gateway.processes import trees as processes
 from evopolicy_gateway.processes.agent_process import AgentProcess
@@ -235,15 +239,8 @@ class AcpAgent(CliAgent):
         if self._link is not None:
             with contextlib.suppress(TimeoutError):
                 await asyncio.wait_for(self._link.process.ended(), 1.0)
-        last = " | ".join(line for line in list(stage.log.last_errors)[-3:] if line)
-        known = turn_failure_of(last) if last else None
         why = str(error) or f"no answer within {_START_TIMEOUT_S:g} s"
-        message = f"{self._program[0]}: {why}" + (f": {last}" if last else "")
-        if known is None:
-            return TurnFailure(kind="passing", message=message)
-        return TurnFailure(
-            kind=known.kind, message=message[:1000], provider=known.provider, wait_s=known.wait_s
-        )
+        return with_last_errors(f"{self._program[0]}: {why}", list(stage.log.last_errors))
 
     async def _hang_up(self, stage: Stage) -> None:
         link, self._link = self._link, None

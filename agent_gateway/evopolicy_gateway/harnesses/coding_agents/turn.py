@@ -12,7 +12,7 @@ from collections.abc import Callable
 import orjson
 
 from evopolicy_gateway.harnesses.coding_agents.dialect import Dialect, TurnReader
-from evopolicy_gateway.harnesses.coding_agents.turn_failure import TurnFailure, turn_failure_of
+from evopolicy_gateway.harnesses.coding_agents.turn_failure import TurnFailure, with_last_errors
 from evopolicy_gateway.harnesses.interface.base import Stage
 from evopolicy_gateway.processes import trees as processes
 from evopolicy_gateway.processes.agent_process import AgentProcess
@@ -105,11 +105,4 @@ async def _feed(process: AgentProcess, prompt: str) -> None:
 def _crash(program: str, code: int, errors: list[str]) -> TurnFailure:
     """The failure of a program that ended without reporting how its turn ended."""
     how = f"exit status {code}" if code >= 0 else f"signal {-code}"
-    last = " | ".join(line for line in errors[-3:] if line)
-    failure = turn_failure_of(last) if last else None
-    message = f"{program} ended with {how} in the middle of its turn" + (f": {last}" if last else "")
-    if failure is None:
-        return TurnFailure(kind="passing", message=message)
-    return TurnFailure(
-        kind=failure.kind, message=message[:1000], provider=failure.provider, wait_s=failure.wait_s
-    )
+    return with_last_errors(f"{program} ended with {how} in the middle of its turn", errors)

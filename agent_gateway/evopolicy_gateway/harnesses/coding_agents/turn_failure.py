@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 import re
 import time
+from collections.abc import Sequence
 from typing import Literal
 
 import msgspec
@@ -83,6 +84,14 @@ def turn_failure_of(message: str, status: int | None = None, now: float | None =
         return TurnFailure(kind="final", message=text, provider=True)
     provider = code is not None or _PROVIDER.search(text) is not None
     return TurnFailure(kind="passing", message=text, provider=provider, wait_s=wait_s)
+
+
+def with_last_errors(message: str, errors: Sequence[str]) -> TurnFailure:
+    """The failure of a program that broke off its turn: of the kind that its last lines on stderr tell, if any."""
+    last = " | ".join(line for line in errors[-3:] if line)
+    if not last:
+        return TurnFailure(kind="passing", message=message)
+    return msgspec.structs.replace(turn_failure_of(last), message=f"{message}: {last}"[:1000])
 
 
 def backoff_s(attempt: int, base_s: float, chance: float) -> float:

@@ -19,11 +19,11 @@ from evopolicy_common.records.blobs import digest_of
 from evopolicy_gateway.http.info import info_document
 from evopolicy_gateway.http.task import task_markdown
 from evopolicy_gateway.run_folder.layout import RunFolder, run_folder
-from evopolicy_gateway.workspace.agents_md import NO_URLS, STANDARD, agents_md, check_agents_md, urls_at
+from evopolicy_gateway.workspace.agents_md import NO_URLS, STANDARD, agents_md, check_agents_md, urls_below
 from evopolicy_gateway.workspace.initial_policy import constant_action, initial_policy
 from evopolicy_gateway.workspace.staging import stage
 
-URLS = urls_at("127.0.0.1", 4711, "ab" * 16)
+URLS = urls_below("http://127.0.0.1:4711", "ab" * 16)
 
 
 def folder_at(tmp_path: Path) -> RunFolder:
@@ -47,7 +47,7 @@ def test_a_workspace_is_staged_once(tmp_path: Path) -> None:
 
 def test_equal_rules_have_equal_hashes_whatever_the_urls(tmp_path: Path) -> None:
     one = stage(folder_at(tmp_path / "a"), opened(), URLS)
-    two = stage(folder_at(tmp_path / "b"), opened(), urls_at("127.0.0.1", 1, "cd" * 16))
+    two = stage(folder_at(tmp_path / "b"), opened(), urls_below("http://127.0.0.1:1", "cd" * 16))
     other = stage(folder_at(tmp_path / "c"), opened(episode_budget=99), URLS)
     assert one.agents_md_hash == two.agents_md_hash == digest_of(agents_md(opened(), NO_URLS).encode())
     assert other.agents_md_hash != one.agents_md_hash
