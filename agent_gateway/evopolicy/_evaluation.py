@@ -16,6 +16,7 @@ from evopolicy._records import Records, bars, table
 from evopolicy_common.messages.episode import EpisodeOutcome
 from evopolicy_common.records.aggregates import mean
 from evopolicy_common.records.episodes.trajectory import decode
+from evopolicy_gateway.submits.formatting import failure_text
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,19 +125,14 @@ class Evaluation(Sequence[Episode]):
 
 def episode_of(case: int, outcome: EpisodeOutcome, packed: bytes | None) -> Episode:
     """Combines an outcome with its trajectory. `packed`: the trajectory's bytes, None when there is none."""
-    failed = outcome.failure
     played = None if packed is None else decode(packed)
-    failure = None
-    if failed is not None:
-        at = "" if failed.step_index is None else f" at step {failed.step_index}"
-        failure = f"{failed.category}{at}: {failed.message}"
     return Episode(
         case=case,
         episode_return=outcome.episode_return if outcome.length else None,
         length=outcome.length,
         terminated=outcome.terminated,
         truncated=outcome.truncated,
-        failure=failure,
+        failure=failure_text(outcome.failure),
         observations=None if played is None else played.obs,
         actions=[] if played is None else played.actions,
         rewards=np.zeros(0) if played is None else played.rewards,

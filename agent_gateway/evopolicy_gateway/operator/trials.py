@@ -27,7 +27,7 @@ from evopolicy_common.records.policies.checkpoints import bundle_of
 from evopolicy_common.terminal import one_line, say, say_json
 from evopolicy_gateway.operator.cluster import Cluster, connected
 from evopolicy_gateway.run.operations import Operations
-from evopolicy_gateway.submits.formatting import cut_text
+from evopolicy_gateway.submits.formatting import cut_text, failure_text
 
 
 class Trial(msgspec.Struct, frozen=True, kw_only=True):
@@ -189,17 +189,12 @@ async def _tried(outcome: EpisodeOutcome, case: int, folder: Path, operations: O
     target = folder / f"ep_{outcome.index:03d}"
     packed = None if outcome.trajectory is None else await operations.fetch(outcome.trajectory)
     await asyncio.to_thread(_write, target, packed, outcome)
-    failed, failure, failed_at = outcome.failure, None, None
-    if failed is not None:
-        failed_at = failed.step_index
-        at = "" if failed_at is None else f" at step {failed_at}"
-        failure = f"{failed.category}{at}: {failed.message}"
     return TriedEpisode(
         case=case,
         episode_return=outcome.episode_return if outcome.length else None,
         length=outcome.length,
-        failure=failure,
-        failed_at=failed_at,
+        failure=failure_text(outcome.failure),
+        failed_at=None if outcome.failure is None else outcome.failure.step_index,
         folder=str(target),
     )
 

@@ -73,6 +73,13 @@ _RESUMABLE = (OSError, StorageError, TransportError, ConfigError)
 """Errors with a remedy, after which `--resume` writes everything."""
 
 
+_SAME_DIMENSIONS = (
+    *("policy_scope", "observations", "simulation", "video", "limits", "finish", "feedback", "step_limit"),
+    *("failed_episodes", "hidden_evaluation", "profile", "hidden_cases"),
+)
+"""Settings that `run.json` records as its experiment's dimensions, under the same names."""
+
+
 class _Parts:
     """The parts of a run's directory that were left out."""
 
@@ -170,6 +177,7 @@ def run_record(
     settings = finished.settings
     suite = catalogue.suite_of(settings.env)
     heldout = finished.heldout_returns
+    dimensions = {name: getattr(settings, name) for name in _SAME_DIMENSIONS}
     return RunRecord(
         model=settings.model,
         env=settings.env,
@@ -187,24 +195,13 @@ def run_record(
             episode_budget=finished.episode_budget,
             min_episodes_per_submit=staged.min_episodes_per_submit if staged else 0,
             max_episodes_per_submit=staged.max_episodes_per_submit if staged else 0,
-            policy_scope=settings.policy_scope,
-            observations=settings.observations,
-            simulation=settings.simulation,
             n_train=staged.n_train if staged else 0,
             n_validation=settings.n_validation or suite.n_validation,
             n_heldout=len(heldout or finished.random_heldout_returns)
             or settings.n_heldout
             or suite.n_heldout,
-            video=settings.video,
-            limits=settings.limits,
-            finish=settings.finish,
-            feedback=settings.feedback,
             agents_md=sha256_text(settings.agents_md) if settings.agents_md else "",
-            step_limit=settings.step_limit,
-            failed_episodes=settings.failed_episodes,
-            hidden_evaluation=settings.hidden_evaluation,
-            profile=settings.profile,
-            hidden_cases=settings.hidden_cases,
+            **dimensions,
         ),
         timing=Timing(
             start_time=utc_text(finished.created_at),

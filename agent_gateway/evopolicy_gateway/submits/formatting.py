@@ -45,6 +45,14 @@ def cut_text(data: bytes) -> bytes:
     return data[:MAX_TEXT_BYTES]
 
 
+def failure_text(failure: PolicyFailure | None) -> str | None:
+    """Category, step and message of a failure, for people; None for none."""
+    if failure is None:
+        return None
+    at = "" if failure.step_index is None else f" at step {failure.step_index}"
+    return f"{failure.category}{at}: {failure.message}"
+
+
 def failure_line(failure: PolicyFailure, at: float, *, with_step: bool) -> bytes:
     """A failure as a line of `errors.txt` or, with the step, of an episode's `error.txt`; cut to 64 KiB.
 

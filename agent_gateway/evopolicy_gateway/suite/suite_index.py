@@ -62,11 +62,8 @@ def entry_of(plan: Plan, record: RunRecord, **more: Any) -> Entry:
     """The index entry of a finished run."""
     outcome = record.outcome
     state = state_of(record)
-    return Entry(
-        name=plan.name,
-        agent=plan.entry,
-        env=plan.settings.env,
-        repeat=plan.settings.repeat,
+    return msgspec.structs.replace(
+        waiting(plan),
         state=state,
         attempt=record.attempt,
         directory=directory_of(plan),
@@ -79,7 +76,7 @@ def entry_of(plan: Plan, record: RunRecord, **more: Any) -> Entry:
         error=outcome.error or (_NO_RUN if state == "error" else None),
         wall_s=record.timing.wall_time_seconds,
         finished_at=record.timing.end_time,
-        **{"digest": plan.digest, **more},
+        **more,
     )
 
 
