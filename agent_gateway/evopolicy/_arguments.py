@@ -1,4 +1,4 @@
-"""What each argument of the public functions may be. A wrong one is refused before anything starts."""
+"""The rules for each argument of the public functions. A wrong one is refused before anything starts."""
 
 from __future__ import annotations
 

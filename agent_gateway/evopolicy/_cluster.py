@@ -418,10 +418,10 @@ async def run_async(
 async def _evaluated(
     trial: Trial, policy: Path | PolicyFunction, slots: int, packages: Iterable[str], progress: bool
 ) -> Evaluation:
-    found: Iterable[str] = take("policy_packages", packages)
+    names: Iterable[str] = take("policy_packages", packages)
     if isinstance(policy, Path):
-        found = packages_for(shipped.found(policy, Path.cwd()), tuple(found))
-    async with _opened(Cluster.local(slots, policy_packages=found)) as cluster:
+        names = packages_for(shipped.found(policy, Path.cwd()), tuple(names))
+    async with _opened(Cluster.local(slots, policy_packages=names)) as cluster:
         return await cluster._evaluate(trial, progress)
 
 

@@ -281,11 +281,11 @@ def load_runs(*paths: str | os.PathLike[str]) -> Runs:
     """
     if not paths:
         raise ConfigError("load_runs needs a folder, such as runs/")
-    found, without = run_folders(take("folder", path) for path in paths)
+    folders, without = run_folders(take("folder", path) for path in paths)
     if without:
         raise ConfigError(no_run_below(without[0]))
     runs, left_out = [], []
-    for folder in found:
+    for folder in folders:
         try:
             runs.append(read_run(folder))
         except (ProtocolError, OSError) as error:

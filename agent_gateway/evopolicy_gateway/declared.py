@@ -64,12 +64,12 @@ class Declared(NamedTuple):
 @functools.cache
 def declared(options: type[msgspec.Struct]) -> dict[str, Declared]:
     """The options that a class declares, by name."""
-    found, plain, noted = {}, get_type_hints(options), get_type_hints(options, include_extras=True)
+    fields, plain, noted = {}, get_type_hints(options), get_type_hints(options, include_extras=True)
     helps = field_texts(options)
     for field in msgspec.structs.fields(options):
         notes = _notes(noted[field.name])
         (own,) = (each for each in options.__mro__ if field.name in inspect.get_annotations(each))
-        found[field.name] = Declared(
+        fields[field.name] = Declared(
             field.name,
             plain[field.name],
             noted[field.name],
@@ -79,11 +79,11 @@ def declared(options: type[msgspec.Struct]) -> dict[str, Declared]:
             vars(own)["group"],
             next((note for note in notes if isinstance(note, Option)), Option()),
         )
-    return found
+    return fields
 
 
 def _notes(kind: Any) -> list[Any]:
-    """What a type is annotated with, the types of a union included."""
+    """The annotations of a type, those of a union's types included."""
     if get_origin(kind) is Annotated:
         return [*kind.__metadata__, *_notes(kind.__origin__)]
     return [note for each in get_args(kind) if get_origin(each) is Annotated for note in _notes(each)]

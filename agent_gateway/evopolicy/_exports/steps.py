@@ -75,7 +75,7 @@ def read_steps(path: Path) -> list[LogStep]:
             for line in file.read(MAX_LOG_BYTES).splitlines():
                 log.read(line)
             if file.read(1):
-                log.step("system").texts.append(f"The log goes on after {MAX_LOG_BYTES} bytes.")
+                log.step("system").texts.append(f"The log continues after {MAX_LOG_BYTES} bytes.")
     except OSError:
         pass
     return log.steps
@@ -181,8 +181,8 @@ class _Log:
         self._calls[known] = self._calls[unique] = step, call
 
     def result(self, identity: Any, content: Any, failed: bool) -> None:
-        found = self._calls.get(identity if isinstance(identity, str) else "")
-        step, call = found or (self.step("system"), None)
+        known = self._calls.get(identity if isinstance(identity, str) else "")
+        step, call = known or (self.step("system"), None)
         step.results.append(Result(call=call, text=_text(content), failed=failed))
 
 

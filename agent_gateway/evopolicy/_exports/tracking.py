@@ -307,9 +307,9 @@ class MLflow:
 
     def _find(self, curve: Curve) -> Any:
         if curve.id not in self._runs:
-            found = self._client.search_runs([self._experiment], f"tags.`evopolicy.id` = '{curve.id}'")
-            if found:
-                self._runs[curve.id] = found[0]
+            matches = self._client.search_runs([self._experiment], f"tags.`evopolicy.id` = '{curve.id}'")
+            if matches:
+                self._runs[curve.id] = matches[0]
         return self._runs.get(curve.id)
 
     def n_known(self, curve: Curve) -> int:

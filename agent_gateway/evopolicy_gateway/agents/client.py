@@ -168,8 +168,8 @@ def _extended(url: str, *, path: str = "", query: str = "") -> str:
 def exit_after(agent: str, play: Callable[[Client], int]) -> NoReturn:
     """Exits with 0 when `play` returns that any submit was accepted, and with 1 otherwise, or without a gateway."""
     try:
-        taken = play(Client.from_environment())
+        accepted = play(Client.from_environment())
     except ProtocolError as error:
         print(f"{agent}: {error}", file=sys.stderr)
         raise SystemExit(1) from None
-    raise SystemExit(0 if taken else 1)
+    raise SystemExit(0 if accepted else 1)

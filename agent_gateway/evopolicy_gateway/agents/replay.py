@@ -27,8 +27,8 @@ def policies_in(folder: Path) -> list[Path]:
     itself = _policy(folder)
     if itself is not None:
         return [itself]
-    found = (_policy(child) for child in sorted(folder.iterdir()) if child.is_dir())
-    return [policy for policy in found if policy is not None]
+    policies = (_policy(child) for child in sorted(folder.iterdir()) if child.is_dir())
+    return [policy for policy in policies if policy is not None]
 
 
 def folder_for(folder: Path, env: str) -> Path:

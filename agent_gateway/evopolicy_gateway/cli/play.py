@@ -327,8 +327,8 @@ def _plans(given: RunOptions, env_ids: list[str], agent_host: str = "", **more: 
 
 
 def _play(plans: list[Plan], where: Cluster, parallel: int, as_json: bool, *, web: bool = False) -> None:
-    found = {"unjailed": _unjailed(plans), "web": plans[0].runs if web else None}
-    where = msgspec.structs.replace(where, **found)
+    known = {"unjailed": _unjailed(plans), "web": plans[0].runs if web else None}
+    where = msgspec.structs.replace(where, **known)
     console = terminal(stderr=as_json)
     try:
         played = run_to_end(plain_runs.play(plans, where, parallel, console))

@@ -77,24 +77,24 @@ def schema(name: str) -> dict[str, Any]:
 
 def _structs(root: type[msgspec.Struct]) -> list[type[msgspec.Struct]]:
     """The struct types that a type holds, itself first, in the order of its fields."""
-    found: dict[type[msgspec.Struct], None] = {}
+    structs: dict[type[msgspec.Struct], None] = {}
 
-    def look(each: Any) -> None:
+    def visit(each: Any) -> None:
         if isinstance(each, msgspec.inspect.StructType):
-            if each.cls in found:
+            if each.cls in structs:
                 return
-            found[each.cls] = None
+            structs[each.cls] = None
             for field in each.fields:
-                look(field.type)
+                visit(field.type)
         elif isinstance(each, msgspec.Struct):
             for name in each.__struct_fields__:
                 inner = getattr(each, name)
                 for one in inner if isinstance(inner, tuple) else (inner,):
                     if isinstance(one, msgspec.inspect.Type):
-                        look(one)
+                        visit(one)
 
-    look(msgspec.inspect.type_info(root))
-    return list(found)
+    visit(msgspec.inspect.type_info(root))
+    return list(structs)
 
 
 def page() -> str:

@@ -38,7 +38,7 @@ from evopolicy_gateway.run.plan import Plan
 from evopolicy_gateway.run.run_options import ClusterOptions, RunOptions
 from evopolicy_gateway.run_folder.locks import alone
 from evopolicy_gateway.suite import decisions, suite_file, suite_index
-from evopolicy_gateway.suite.claimed import ClaimedSweep, look
+from evopolicy_gateway.suite.claimed import ClaimedSweep, facts_of
 from evopolicy_gateway.suite.decisions import Changed, Decision
 from evopolicy_gateway.suite.ends import exit_code, next_step
 from evopolicy_gateway.suite.suite_file import SuiteFile
@@ -158,7 +158,8 @@ async def _suite(order: Order) -> int:
         tiers = {run.settings.sandbox_tier for run in order.runs}
         async with connected(order.where, env_ids, tiers) as (operations, gateway, failed):
             decided = [
-                decisions.decide(run, await look(run, index, operations), order.changed) for run in order.runs
+                decisions.decide(run, await facts_of(run, index, operations), order.changed)
+                for run in order.runs
             ]
             _tell(order, index, decided, console)
             decisions.check_changes(decided, order.changed)

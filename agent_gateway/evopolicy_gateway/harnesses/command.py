@@ -3,7 +3,7 @@
 It may also use the published turn protocol, JSON lines: it receives `{"type": "prompt", "turn": N, "message": …}` on
 stdin and answers each with one object on stdout, until it sends stop or exits. Once the budget is spent, it gets no
 more prompts, and its stdin is closed. `turn`, `text` and `stop` are optional in an answer; an answer that names an
-earlier turn is ignored. A program that never reads its stdin runs until it exits, whatever it prints. An inactive
+earlier turn is ignored. A program that never reads its stdin runs until it exits, with any output. An inactive
 program is ended (`clock.Activity`).
 """
 
@@ -99,10 +99,10 @@ class ReplayHarness(CommandHarness):
     def check(self, env: str) -> None:
         folder = replay.folder_for(self._folder, env)
         try:
-            found = replay.policies_in(folder)
+            policies = replay.policies_in(folder)
         except OSError as error:
             raise ConfigError(f"--agent replay: cannot read {folder}: {error.strerror}") from error
-        if not found:
+        if not policies:
             raise ConfigError(
                 f"--agent replay: {folder} holds no policy; name a folder with policy.py in it, or with folders that"
                 " have one, such as a run's checkpoints"
@@ -176,12 +176,12 @@ async def _message(stage: Stage, turn: int) -> str | None:
         return stage.prompts.begin()
     try:
         info = await stage.info()
-        left = info["state"]["remaining_budget"]
-        if not left or info["state"]["is_finalized"]:
+        remaining = info["state"]["remaining_budget"]
+        if not remaining or info["state"]["is_finalized"]:
             return None
     except (OSError, ValueError, KeyError):
         return "Go on. Ask /info for the budget that is left."
-    return stage.prompts.stopped(left, prompts.NEXT_TURN) + prompts.warned(info.get("last_warning"))
+    return stage.prompts.stopped(remaining, prompts.NEXT_TURN) + prompts.warned(info.get("last_warning"))
 
 
 def _names_earlier(answer: dict[str, Any], turn: int) -> bool:

@@ -9,7 +9,7 @@ from evopolicy_gateway.harnesses.interface.base import Harness, Stage
 from evopolicy_gateway.processes.child_messages import AgentEnded
 from evopolicy_gateway.run_folder.layout import RunFolder
 
-_LOOK_S = 0.5
+_POLL_S = 0.5
 
 
 class RemoteHarness(Harness):
@@ -21,5 +21,5 @@ class RemoteHarness(Harness):
     async def play(self, stage: Stage) -> AgentEnded:
         finish = RunFolder(stage.workspace.parent).finish
         while not finish.exists() and not stage.over.is_set():
-            await stage.sleep(_LOOK_S)
+            await stage.sleep(_POLL_S)
         return AgentEnded(reason="agent_stopped", facts={"settings": {"started_by": "the operator"}})

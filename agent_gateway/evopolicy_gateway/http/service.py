@@ -181,15 +181,15 @@ def _json(status: int, document: dict[str, Any]) -> Response:
 
 
 _STRANGER = Response(
-    orjson.dumps({"error": {"message": "this service wants a bearer token"}}),
+    orjson.dumps({"error": {"message": "this service needs a bearer token"}}),
     status_code=401,
     media_type="application/json",
     headers={"WWW-Authenticate": "Bearer"},
 )
 
 
-_GOES_ON = "the gateway stops; what it has accepted goes on: ask again, with the same Idempotency-Key"
-_STOPPING = _json(503, {"status": "closed", "error": {"message": _GOES_ON}})
+_STOPS = "the gateway stops; accepted submits continue: send the request again, with the same Idempotency-Key"
+_STOPPING = _json(503, {"status": "closed", "error": {"message": _STOPS}})
 
 
 async def _request_error(request: Request, error: Exception) -> Response:

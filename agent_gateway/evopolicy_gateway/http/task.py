@@ -149,7 +149,7 @@ def _limits(run: RunOpened) -> str:
     ]
     if limits.submit_wall_s is not None:
         rows.append(("wall time of a whole submit", f"{limits.submit_wall_s:g} s"))
-    table = "\n".join(f"| {what} | {value} |" for what, value in rows)
+    table = "\n".join(f"| {limit} | {value} |" for limit, value in rows)
     allowed = ", ".join(f"`{name}`" for name in run.allowed_imports) or "none"
     denied = ", ".join(f"`{name}`" for name in run.denied_imports) or "none"
     return f"""## What a policy may do

@@ -66,11 +66,11 @@ class Content(NamedTuple):
 
 def read(skills: Sequence[str], servers: Mapping[str, McpServer], started_in: Path) -> list[Content]:
     """All that is declared. Raises ConfigError that names the entry and its fault."""
-    found = [_skill(path, started_in) for path in skills]
-    names = [each.recorded.name for each in found]
+    contents = [_skill(path, started_in) for path in skills]
+    names = [each.recorded.name for each in contents]
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise ConfigError(f"skills: there are two folders named {twice[0]!r}; rename one")
-    return found + [_server(name, server, started_in) for name, server in servers.items()]
+    return contents + [_server(name, server, started_in) for name, server in servers.items()]
 
 
 def _skill(path: str, started_in: Path) -> Content:
@@ -117,12 +117,12 @@ def _server(name: str, server: McpServer, started_in: Path) -> Content:
 
 def _program(field: str, command: str, started_in: Path) -> str:
     own = started_in / command
-    found = os.path.abspath(own) if "/" in command and own.is_file() else shutil.which(command)
-    if found is None:
+    program = os.path.abspath(own) if "/" in command and own.is_file() else shutil.which(command)
+    if program is None:
         raise ConfigError(
             f"{field}.command: there is no program {command!r}, neither as a file nor on the PATH"
         )
-    return found
+    return program
 
 
 def _executable_digest(program: str) -> str:

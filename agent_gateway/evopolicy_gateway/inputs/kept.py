@@ -51,10 +51,10 @@ class Kept(msgspec.Struct, frozen=True, kw_only=True):
         """Each copy with its place in the jail; `skills_at`: folder in which the agent looks for skills."""
         if self.folder is None or not self:
             return []
-        found = [(str(self.folder / "skills" / name), f"{skills_at}/{name}") for name in self.skills]
+        binds = [(str(self.folder / "skills" / name), f"{skills_at}/{name}") for name in self.skills]
         own = [name for name in self.servers if (self.folder / "mcp" / name).is_dir()]
-        found += [(str(self.folder / "mcp" / name), f"{IN_JAIL}/mcp/{name}") for name in own]
-        return [*found, (str(self.folder / "mcp.json"), MCP_FILE)]
+        binds += [(str(self.folder / "mcp" / name), f"{IN_JAIL}/mcp/{name}") for name in own]
+        return [*binds, (str(self.folder / "mcp.json"), MCP_FILE)]
 
 
 def keep(
@@ -104,14 +104,14 @@ def _check_copy(content: Content, folder: Path) -> None:
     """Raises ConfigError when a copy does not have the content."""
     about = content.recorded
     place = folder / ("skills" if about.kind == "skill" else "mcp") / about.name
-    found = {
+    copies = {
         path.relative_to(place).as_posix(): path
         for path in place.rglob("*")
         if path.is_symlink() or not path.is_dir()
     }
-    same = found.keys() == content.files.keys() and all(
+    same = copies.keys() == content.files.keys() and all(
         not path.is_symlink() and path.is_file() and path.read_bytes() == content.files[name].data
-        for name, path in found.items()
+        for name, path in copies.items()
     )
     if not same:
         raise ConfigError(

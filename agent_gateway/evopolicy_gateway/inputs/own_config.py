@@ -115,13 +115,13 @@ def _copy_file(path: str, source: Path, target: Path) -> None:
 
 def secrets(paths: Sequence[str]) -> list[str]:
     """Keys and tokens in the operator's files (not in folders), which the agent's log must not show."""
-    found: list[str] = []
+    texts: list[str] = []
     for path in paths:
         source = Path(path).expanduser()
         # A folder, or a file in another form: left to the redaction of what looks like a key.
         with contextlib.suppress(OSError, ValueError, RecursionError):
-            found += _secrets_in(_document(source.name, source.read_text()))
-    return [text for text in found if len(text) >= _MIN_SECRET and not any(map(str.isspace, text))]
+            texts += _secrets_in(_document(source.name, source.read_text()))
+    return [text for text in texts if len(text) >= _MIN_SECRET and not any(map(str.isspace, text))]
 
 
 def _document(name: str, text: str) -> Any:

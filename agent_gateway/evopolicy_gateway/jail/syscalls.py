@@ -7,7 +7,7 @@ Rules that this module owns:
   `socket`.
 - Keyrings belong to a login, not to a namespace: none can be read or written.
 - No file gets a set-id bit, capabilities or an access control list: the program outlives the jail, and would run with
-  the operator's rights for whoever reaches it. The sticky bit is harmless.
+  the operator's rights for any user who can execute it. The sticky bit is harmless.
 - Where affinity limits an agent's cores, no program may choose its own.
 - No program may read the kernel's log, measure other processes' performance, or run programs in the kernel.
 """

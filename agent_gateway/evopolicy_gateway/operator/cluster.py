@@ -56,7 +56,7 @@ class Cluster(msgspec.Struct, frozen=True, kw_only=True):
             )
 
     def check_ids(self, env_ids: Iterable[str], split: Split, cases: Sequence[int]) -> None:
-        """Raises ConfigError for cases that a local cluster does not have. How many others have, their files say."""
+        """Raises ConfigError for cases that a local cluster lacks. Other clusters' case files state their numbers."""
         for suite in map(catalogue.suite_of, env_ids) if self._without_data else ():
             n = {"train": suite.n_train, "validation": suite.n_validation, "heldout": suite.n_heldout}[split]
             if cases and max(cases) >= n:

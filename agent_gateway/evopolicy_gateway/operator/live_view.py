@@ -14,7 +14,7 @@ from evopolicy_common.processes.scratch import scratch_folder
 from evopolicy_common.terminal import say
 
 _START_TIMEOUT_S = 60.0
-_LOOK_S = 0.05
+_POLL_S = 0.05
 _GRACE_S = 5.0
 
 
@@ -40,7 +40,7 @@ async def live_view(root: Path, connect: Sequence[str], file: Path | None) -> As
                     while not address.exists():
                         if child.exit_code is not None:
                             raise ConfigError(f"--web: {last_words(log) or 'the view ended at its start'}")
-                        await asyncio.sleep(_LOOK_S)
+                        await asyncio.sleep(_POLL_S)
             except TimeoutError as error:
                 raise ConfigError(
                     f"--web: the view did not start within {_START_TIMEOUT_S:g} s; leave out --web, and start it with"

@@ -144,7 +144,7 @@ class AgentTime(Event, frozen=True, kw_only=True, tag="agent_time"):
 
 
 class AgentUsed(Event, frozen=True, kw_only=True, tag="agent_used"):
-    """What the agent has used of its machine since it was started."""
+    """The agent's use of its machine since it was started."""
 
     resources: AgentResources
 

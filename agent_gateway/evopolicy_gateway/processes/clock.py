@@ -18,8 +18,8 @@ from evopolicy_gateway.processes import trees as processes
 SILENCE_S = 3600.0
 """Default limit of an agent's inactivity, seconds: longer than any pause for thought, far shorter than its wall
 limit."""
-_LOOK_S = 1.0
-_LOOKS = 20
+_POLL_S = 1.0
+_SAMPLES = 20
 """Number of measurements of processor time within the limit of inactivity."""
 _BUSY_SHARE = 0.05
 """Share of one core above which the agent is active; a program that only waits and polls uses less."""
@@ -63,8 +63,8 @@ class AgentClock:
     async def run_out(self) -> None:
         """Returns when the time is up."""
         # Checks repeatedly, as the clock may be paused meanwhile.
-        while (left := self.left_s()) > 0:  # noqa: ASYNC110
-            await asyncio.sleep(min(left, _LOOK_S))
+        while (left_s := self.left_s()) > 0:  # noqa: ASYNC110
+            await asyncio.sleep(min(left_s, _POLL_S))
 
 
 class Activity:
@@ -94,12 +94,12 @@ class Activity:
 
     async def silence(self) -> str:
         """Returns after `limit_s` seconds of inactivity, with a text that describes it."""
-        pause_s = min(self.limit_s / _LOOKS, 3600.0)
+        pause_s = min(self.limit_s / _SAMPLES, 3600.0)
         while True:
-            cpu_s, looked_at = self._cpu_s(), time.monotonic()
+            cpu_s, sampled_at = self._cpu_s(), time.monotonic()
             await asyncio.sleep(pause_s)
             now = time.monotonic()
-            if self._running or self._cpu_s() - cpu_s > _BUSY_SHARE * (now - looked_at):
+            if self._running or self._cpu_s() - cpu_s > _BUSY_SHARE * (now - sampled_at):
                 self._active_at = now
             if now - self._active_at < self.limit_s:
                 continue

@@ -1,9 +1,9 @@
-"""An agent's share of its machine: its limits, by what they are kept, and what its programs have used.
+"""An agent's share of its machine: its limits, the mechanism that keeps each, and the use by its programs.
 
 Cgroups keep the limits where the agent supervisor may make one. Elsewhere a jailed agent has a number of
 cores, by affinity, and a number of processes, by a resource limit that Linux counts in each user namespace
-since 5.14, though never for root. What nothing keeps is recorded as unlimited. No quota keeps the size of
-files: the supervisor measures it, and ends the agent.
+since 5.14, though never for root. A limit that no mechanism keeps is recorded as unlimited. No quota keeps
+the size of files: the supervisor measures it, and ends the agent.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from evopolicy_common.records.run_record import AgentLimits, AgentResources
 from evopolicy_gateway.processes import trees
 from evopolicy_gateway.processes.disk_use import MAX_DEPTH, TooDeepError, used_bytes
 
-_LOOK_S = 1.0
-_LOOK_SHARE = 50
-"""A look at the files is followed by a pause of at least this many times its length."""
+_POLL_S = 1.0
+_PAUSE_FACTOR = 50
+"""A measurement of the files is followed by a pause of at least this many times its length."""
 _QUOTA_US = 100_000
 _COUNTED_BY_NAMESPACE = (5, 14)
 _WORDS = {"cpus": "cores {:g}", "memory_bytes": "memory {:,} bytes", "pids": "processes {:,}"}
@@ -68,14 +68,14 @@ class Resources:
         self._now = AgentResources(limits=limits, kept_by=by)
 
     def words(self) -> str:
-        """For the operator: the limits that were asked for, and by what they are kept; empty without any."""
-        found = []
+        """For the operator: the requested limits and the mechanism that keeps each; empty without any."""
+        parts = []
         for name, form in _WORDS.items():
             if (asked := getattr(self._asked, name)) is not None:
                 kept = getattr(self._now.limits, name)
                 by = self._now.kept_by.get(name, "no cgroup can be made here: unlimited")
-                found.append(f"{form.format(kept or asked)} ({by})")
-        return ", ".join(found)
+                parts.append(f"{form.format(kept or asked)} ({by})")
+        return ", ".join(parts)
 
     def used(self) -> AgentResources:
         """The present state."""
@@ -96,26 +96,26 @@ class Resources:
     def reached(self) -> str:
         """Which limits the kernel has applied so far, for the operator; empty for none."""
         now, limits = self.used(), self._now.limits
-        found = []
+        parts = []
         if now.ended_for_memory and limits.memory_bytes:
-            found.append(
+            parts.append(
                 f"its memory limit of {limits.memory_bytes:,} bytes (--agent-memory): the kernel has ended"
                 f" {now.ended_for_memory} of its processes"
             )
         if now.refused_forks and limits.pids:
-            found.append(f"its limit of {limits.pids:,} processes (--agent-pids)")
-        return "the agent reached " + ", and ".join(found) if found else ""
+            parts.append(f"its limit of {limits.pids:,} processes (--agent-pids)")
+        return "the agent reached " + ", and ".join(parts) if parts else ""
 
     async def too_large(self) -> str:
         """Watches the space that the agent's files take; returns why the agent has to end."""
         before = ""
         while True:
             begun = time.monotonic()
-            found = await asyncio.to_thread(self._measured)
-            if found and before:  # seen twice: files that move meanwhile may count twice
-                return found
-            before = found
-            await asyncio.sleep(max(_LOOK_S, _LOOK_SHARE * (time.monotonic() - begun)))
+            why = await asyncio.to_thread(self._measured)
+            if why and before:  # seen twice: files that move meanwhile may count twice
+                return why
+            before = why
+            await asyncio.sleep(max(_POLL_S, _PAUSE_FACTOR * (time.monotonic() - begun)))
 
     def remove(self) -> None:
         """Call it when all processes of the agent are gone."""

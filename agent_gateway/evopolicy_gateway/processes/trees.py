@@ -15,7 +15,7 @@ _PR_SET_CHILD_SUBREAPER = 36
 _KEYCTL_JOIN_SESSION_KEYRING = 1
 _PAUSE_S = 0.01
 _KILLS = 100
-"""How often children are killed between two looks at all processes."""
+"""How often children are killed between two listings of all processes."""
 KILL_TIMEOUT_S = 10.0
 
 
@@ -85,15 +85,15 @@ def end_orphans(known: Collection[int]) -> list[int]:
 def _left(spare: Collection[int], kept: Collection[int]) -> list[int]:
     """All processes below this one but the dead among `kept`.
 
-    The other dead count. In a chain of processes, each of which forks once and ends, all that were listed may be dead
-    when they are looked at, and the one that lives was not there yet.
+    The other dead count: in a chain of processes, each of which forks once and ends, all listed processes may be dead
+    when they are examined, while the living one was started after the listing.
     """
-    found = proc.family(os.getpid(), spare=spare)[1:]
-    return [each.pid for each in found if not (each.dead and each.pid in kept)]
+    family = proc.family(os.getpid(), spare=spare)[1:]
+    return [each.pid for each in family if not (each.dead and each.pid in kept)]
 
 
 def _kill_children(kept: Collection[int]) -> None:
-    """Kills this process's children, again and again for a moment: it has to be faster than such a chain forks."""
+    """Kills this process's children repeatedly: it has to be faster than such a chain forks."""
     me = os.getpid()
     with contextlib.suppress(OSError, ValueError), open(f"/proc/{me}/task/{me}/children", "rb", 0) as file:
         for _ in range(_KILLS):

@@ -41,7 +41,7 @@ from evopolicy_gateway.submits.pipeline import SubmitPipeline
 from evopolicy_gateway.workspace import staging as workspace
 from evopolicy_gateway.workspace.agents_md import Urls
 
-_LOOK_S = 1.0
+_POLL_S = 1.0
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
@@ -90,13 +90,13 @@ class Gateway:
 
     async def run(self) -> bool:
         """Serves until `tell`; returns whether the run was closed. Raises errors that make serving impossible."""
-        found, known = _load(self._folder, self._connect, self._credentials_file)
+        own, known = _load(self._folder, self._connect, self._credentials_file)
         run = known.run
         async with contextlib.AsyncExitStack() as stack:
             sock, address = await bind(self._folder)
             stack.callback(sock.close)
             journal = stack.enter_context(contextlib.closing(Journal(self._folder.journal)))
-            linked = stack.enter_async_context(transport.connect(found, timeout_s=None))
+            linked = stack.enter_async_context(transport.connect(own, timeout_s=None))
             link = await self._unless(self._stopped.wait(), linked)
             if link is None:
                 return False
@@ -187,13 +187,13 @@ class Gateway:
         ):
             self._on_wait(f"the agent's end; when it has ended: evopolicy finish {self._folder.root}")
             with contextlib.suppress(TimeoutError):
-                await asyncio.wait_for(self._stopped.wait(), _LOOK_S)
+                await asyncio.wait_for(self._stopped.wait(), _POLL_S)
             await pipeline.refresh()
         self._on_wait("")
         return not self._stopped.is_set()
 
     async def _unless(self, order: Any, wanted: Any) -> Any:
-        """Returns what is wanted, or None when the order comes first."""
+        """The result of `wanted`, or None when the order comes first."""
         task, ordered = asyncio.ensure_future(wanted), asyncio.ensure_future(order)
         await asyncio.wait([task, ordered], return_when=asyncio.FIRST_COMPLETED)
         ordered.cancel()
@@ -212,8 +212,8 @@ def _load(
             f"{folder.root} holds no open run ({folder.state.name}/{folder.opened_run.name} is missing);"
             " runs are opened by `evopolicy run`"
         )
-    found = credentials.read(folder.credentials)
+    own = credentials.read(folder.credentials)
     run = saved(folder.opened_run, OpenedRun)
     if file is not None:
-        found = msgspec.structs.replace(credentials.find("gateway", connect, file), token=found.token)
-    return credentials.at(found, connect), run
+        own = msgspec.structs.replace(credentials.find("gateway", connect, file), token=own.token)
+    return credentials.at(own, connect), run

@@ -196,7 +196,7 @@ class RunLifecycle:
         return wanted
 
     async def _withdraw(self, error: BaseException) -> None:
-        """Cancels the run that was asked for, as its folder cannot be had."""
+        """Cancels the requested run, since its folder is not available."""
         if self.run:
             with contextlib.suppress(EvopolicyError):
                 await self._operations.cancel(self.run)
@@ -219,7 +219,7 @@ class RunLifecycle:
             phase = await self._operations.phase(self.run)
             if phase is None:
                 raise ConfigError(f"the cluster no longer knows run {self.run} of {folder.root}")
-            self._note(f"goes on with run {self.run} in {folder.root}")
+            self._note(f"resumes run {self.run} in {folder.root}")
         else:
             save(folder.opened_run, OpenedRun(run=self.run, agents_md=self._plan.texts.agents_md))
             self._note(f"run {self.run} in {folder.root}")
@@ -262,13 +262,13 @@ class RunLifecycle:
         self._record = await record.write(*given)
 
     async def _leave(self, error: BaseException) -> None:
-        """Tells how the open run goes on, or gives it up."""
+        """Prints how the open run can be continued, or gives it up."""
         side = self._side
         assert side is not None
         if side.agent.survivors:
             side.agent.tell_survivors()
             self._note(
-                f"when they are gone, go on with --resume, or say: evopolicy runs agent-gone {self.run}"
+                f"when they are gone, continue with --resume, or run: evopolicy runs agent-gone {self.run}"
             )
         elif self._finished is not None or (side.closed and isinstance(error, Exception)):
             how = f"--resume --exp-id {self._plan.settings.exp_id}, or the suite's command again,"
@@ -288,7 +288,7 @@ class RunLifecycle:
                 await self._write(why)
 
     async def _tell_gone(self) -> None:
-        """Tells the coordinator that an open run's agent is gone; resuming the run needs a new permit."""
+        """Reports to the coordinator that an open run's agent is gone; resuming the run needs a new permit."""
         if self._plan.listener is not None:
             return  # this machine does not know about a remote agent
         with contextlib.suppress(EvopolicyError, TimeoutError):
@@ -307,4 +307,4 @@ PHASES = (
     (RunLifecycle._score, RunLifecycle._leave),
     (RunLifecycle._write, RunLifecycle._leave),
 )
-"""Each phase, which returns at once if its result is durable; and what is called with the error of one."""
+"""Each phase, which returns at once if its result is durable, and the handler of its errors."""

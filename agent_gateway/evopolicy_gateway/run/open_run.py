@@ -1,4 +1,4 @@
-"""What the parts of an open run share: its plan, its times, and the operator's view of it."""
+"""The state that the parts of an open run share: its plan, its times, and the operator's view of it."""
 
 from __future__ import annotations
 

@@ -42,8 +42,7 @@ OWN = {
 
 
 def settings_of(profile: str | None, **given: str | None) -> dict[str, str]:
-    """The settings that a profile decides, and the profile; `given` by name of `RunSettings`, None for what was not
-    given.
+    """The settings that a profile decides, and the profile. `given`: by name of `RunSettings`, None if not given.
 
     ConfigError for a profile that has another value than a given one.
     """
@@ -103,7 +102,7 @@ def run_settings(given: Any, **named: Any) -> RunSettings:
 
 
 def agent_limits(given: Any) -> AgentLimits:
-    """What the agent may take of its machine; `given` as for `run_settings`. Raises ConfigError that names
+    """Limits of the agent's use of its machine; `given` as for `run_settings`. Raises ConfigError that names
     the option."""
     chosen: dict[str, Any] = {}
     for name, (field, least, most) in AGENT_LIMITS.items():
@@ -123,10 +122,10 @@ def default_exp_id() -> str:
 
 def one_environment(env: str) -> str:
     """The suite id that `env` names. ConfigError when it names none or several."""
-    found = catalogue.resolve([env])
-    if len(found) != 1:
-        raise ConfigError(f"--env {env} names {len(found)} environments; this command takes one")
-    return found[0]
+    env_ids = catalogue.resolve([env])
+    if len(env_ids) != 1:
+        raise ConfigError(f"--env {env} names {len(env_ids)} environments; this command takes one")
+    return env_ids[0]
 
 
 def limits_of(texts: Sequence[str]) -> ResourceLimits:
@@ -144,7 +143,7 @@ def limits_of(texts: Sequence[str]) -> ResourceLimits:
 
 
 def limits_from(values: Mapping[str, float], prefix: str) -> ResourceLimits:
-    """Limits by their names over the usual ones. ConfigError for one that cannot be; `prefix`: how an error begins."""
+    """Limits by their names over the usual ones. ConfigError for an impossible one; `prefix` begins the error."""
     usual = ResourceLimits()
     typed: dict[str, float | int] = {}
     for name, number in values.items():
@@ -161,7 +160,7 @@ def limits_from(values: Mapping[str, float], prefix: str) -> ResourceLimits:
 
 def cases_of(text: str) -> tuple[int, ...]:
     """Case ids of a text such as `0-3,7`."""
-    # How many cases there are, the coordinator knows; here only nonsense is kept out.
+    # The coordinator knows the number of cases; these bounds only refuse nonsense.
     bounds = Bounds(n_env_instances=10**6, min_episodes=1, max_episodes=4096, remaining_budget=4096)
     try:
         ids = ids_in(text, bounds)
@@ -182,13 +181,13 @@ def packages_for(policy: Path, requested: Sequence[str] | None) -> tuple[str, ..
     folder = policy.absolute()
     for run in (folder, *list(folder.parents)[:2]):
         with contextlib.suppress(OSError, ProtocolError):
-            found = packages_in(read_record(run).versions.fingerprint)
+            packages = packages_in(read_record(run).versions.fingerprint)
             try:
-                policy_versions(found)
+                policy_versions(packages)
             except ConfigError as error:
                 raise ConfigError(
                     f"{run / 'run.json'} names packages of its policies: {error}; --policy-package names others in"
                     " their place"
                 ) from error
-            return found
+            return packages
     return ()

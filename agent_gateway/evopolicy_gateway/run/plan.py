@@ -134,21 +134,21 @@ class Plan(msgspec.Struct, frozen=True, kw_only=True):
         usual = RunSettings(env="", entry="", model="", exp_id="", attempt=settings.attempt, step_limit=limit)
         unusual = _unusual(msgspec.to_builtins(settings), msgspec.to_builtins(usual))
         unusual.pop("replays", None)  # videos are recorded after the run and do not affect it
-        found = {
+        identity = {
             "agent": self.agent,
             "config": config,
             "settings": unusual,
             "agent_wall_s": self.wall_limit_s,
         }
         if self.silence_s != SILENCE_S:
-            found["agent_silence_s"] = self.silence_s
+            identity["agent_silence_s"] = self.silence_s
         if unusual := _unusual(msgspec.to_builtins(self.limits), msgspec.to_builtins(AgentLimits())):
-            found["agent_limits"] = unusual
+            identity["agent_limits"] = unusual
         # The jail's `read` names the places of programs, which differ from host to host.
         reached = {name: value for name, value in self.jail.chosen().items() if name != "read"}
         if reached or self.jail.mode != JailSettings().mode:
-            found["jail"] = {"mode": self.jail.mode, **reached}
-        return found
+            identity["jail"] = {"mode": self.jail.mode, **reached}
+        return identity
 
     @property
     def digest(self) -> str:
@@ -226,10 +226,10 @@ class Plan(msgspec.Struct, frozen=True, kw_only=True):
 
 def _unusual(values: dict[str, Any], usual: dict[str, Any]) -> dict[str, Any]:
     """Values that differ from the defaults, also within inner tables."""
-    found = {name: value for name, value in values.items() if name not in usual or value != usual[name]}
+    unusual = {name: value for name, value in values.items() if name not in usual or value != usual[name]}
     return {
         name: _unusual(value, usual[name])
         if isinstance(value, dict) and isinstance(usual.get(name), dict)
         else value
-        for name, value in found.items()
+        for name, value in unusual.items()
     }

@@ -3,9 +3,9 @@
 These are `checkpoints/`, `replays/`, `logs/env.log`, the selected policy in `workspace/system/`, and `run.json` last.
 They hold hidden scores, so `write` is called only when the agent and all its children are gone.
 
-The run's result is fixed by then, and no file costs it: one that a bug keeps from being written is left out, with a
-note. A full disk, a lost connection, or a folder of another user ends `write`; `--resume` then writes all files without
-the agent.
+The run's result is fixed by then. A file that a bug keeps from being written is left out, with a note; the
+result stays. A full disk, a lost connection, or a folder of another user ends `write`; `--resume` then writes
+all files without the agent.
 """
 
 from __future__ import annotations
@@ -259,27 +259,27 @@ def _complete(folder: RunFolder, plan: Plan, facts: dict[str, Any]) -> dict[str,
     except EvopolicyError:  # its file or its key has gone meanwhile
         return facts
     state = session.load(folder.session)
-    found = harness.known()
-    found["cli_version"] = state.cli_version
-    found |= {name: value for name, value in facts.items() if value is not None}
-    found |= {name: max(getattr(state, name), int(facts.get(name, 0))) for name in ("turns", "retries")}
-    found["settings"] = {**harness.known().get("settings", {}), **facts.get("settings", {})}
+    known = harness.known()
+    known["cli_version"] = state.cli_version
+    known |= {name: value for name, value in facts.items() if value is not None}
+    known |= {name: max(getattr(state, name), int(facts.get(name, 0))) for name in ("turns", "retries")}
+    known["settings"] = {**harness.known().get("settings", {}), **facts.get("settings", {})}
     if (terms := harness.model) is None:
         if state.used:  # a remote agent's own count, by model
-            found["model_string"] = max(state.used, key=lambda model: state.used[model].total)
-            found |= {"tokens": state.usage.recorded(None), "model_use": ModelUse(metering="agent")}
-        return found
+            known["model_string"] = max(state.used, key=lambda model: state.used[model].total)
+            known |= {"tokens": state.usage.recorded(None), "model_use": ModelUse(metering="agent")}
+        return known
     limits = ModelLimits(**msgspec.structs.asdict(terms.limits))
     own = facts.get("tokens") or (state.usage.recorded(terms.prices) if state.usage.total else None)
     if not folder.model_requests.exists():
-        return found | {"tokens": own, "model_use": ModelUse(metering="agent", limits=limits)}
+        return known | {"tokens": own, "model_use": ModelUse(metering="agent", limits=limits)}
     used = ledger.read(folder.model_requests, terms.model)
     answered = used.requests - used.failed
-    found["model_string"] = found.get("model_string") or max(
+    known["model_string"] = known.get("model_string") or max(
         used.models, key=used.models.__getitem__, default=None
     )
-    found["tokens"] = used.usage.recorded(terms.prices)
-    found["model_use"] = ModelUse(
+    known["tokens"] = used.usage.recorded(terms.prices)
+    known["model_use"] = ModelUse(
         metering="relay",
         limits=limits,
         requests=used.requests,
@@ -294,7 +294,7 @@ def _complete(folder: RunFolder, plan: Plan, facts: dict[str, Any]) -> dict[str,
         record_stopped=model_record.stopped(folder.root),
         reported=None if own is None else msgspec.convert(own, Tokens),
     )
-    return found
+    return known
 
 
 def _agent(plan: Plan, facts: dict[str, Any], times: Times) -> Agent:
@@ -497,7 +497,7 @@ def _put_in_place(system: Path, bundle: Bundle) -> None:
         if system.exists():
             raise ConfigError(
                 f"{system} cannot be removed: another user owns folders in it, such as the root of the agent's"
-                f" container; make them yours (chown -R {os.getuid()} {system.parent}), then go on with --resume"
+                f" container; make them yours (chown -R {os.getuid()} {system.parent}), then continue with --resume"
             )
     else:
         system.unlink(missing_ok=True)

@@ -26,7 +26,7 @@ async def fetch(root: Path, finished: RunFinished, operations: Operations) -> tu
     index = finished.best_submit_index
     if finished.settings.recorded_heldout == "off" or index is None:
         return ()
-    found: list[Replay] = []
+    recordings: list[Replay] = []
     async for outcome in operations.recorded(finished.run, "heldout", index):
         if outcome.video is None:
             continue
@@ -38,7 +38,7 @@ async def fetch(root: Path, finished: RunFinished, operations: Operations) -> tu
             except RefusedError:
                 continue
             await asyncio.to_thread(_write, target, data)
-        found.append(
+        recordings.append(
             Replay(
                 path=path,
                 split="heldout",
@@ -48,7 +48,7 @@ async def fetch(root: Path, finished: RunFinished, operations: Operations) -> tu
                 length=outcome.length,
             )
         )
-    return tuple(sorted(found, key=lambda replay: replay.episode))
+    return tuple(sorted(recordings, key=lambda replay: replay.episode))
 
 
 def _has(path: Path, digest: str) -> bool:

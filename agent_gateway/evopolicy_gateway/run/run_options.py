@@ -164,9 +164,9 @@ class RunOptions(PolicyPart, frozen=True, kw_only=True):
         ConfigError."""
         known = config or harnesses.config_of(self.agent, started_in)
         if self.start_from is not None:
-            found = starts.find(self.start_from, started_in)
-            settings = msgspec.structs.replace(settings, start=found.start)
-            more["start_from"] = found.text
+            origin = starts.find(self.start_from, started_in)
+            settings = msgspec.structs.replace(settings, start=origin.start)
+            more["start_from"] = origin.text
         return Plan(
             settings=settings,
             config=config,

@@ -22,7 +22,7 @@ from evopolicy_common.records.run_files import read_record
 from evopolicy_gateway.run_folder.layout import RunFolder, save, saved
 
 
-class Found(msgspec.Struct, frozen=True, kw_only=True):
+class StartPoint(msgspec.Struct, frozen=True, kw_only=True):
     """A start, and where its files are."""
 
     text: str
@@ -34,7 +34,7 @@ class Found(msgspec.Struct, frozen=True, kw_only=True):
     tree: Tree
 
 
-def find(text: str, started_in: Path) -> Found:
+def find(text: str, started_in: Path) -> StartPoint:
     """The submit that `RUN@submit_NNN` names, RUN relative to `started_in`. ConfigError that names the fault."""
     place, _, submit = text.rpartition("@")
     number = trees.submit_number(submit)
@@ -60,17 +60,19 @@ def find(text: str, started_in: Path) -> Found:
     if not (folder.feedback / submit).is_dir():
         raise ConfigError(f"--start-from {text}: the submit has no feedback yet; wait until it is played")
     start = Start(run=run, submit_index=number, tree=digest)
-    return Found(text=f"{folder.root}@{submit}", start=start, folder=folder.root, submit=submit, tree=tree)
+    return StartPoint(
+        text=f"{folder.root}@{submit}", start=start, folder=folder.root, submit=submit, tree=tree
+    )
 
 
-def stage(found: Found, folder: RunFolder) -> None:
+def stage(start: StartPoint, folder: RunFolder) -> None:
     """Makes the workspace of a new run. StorageError for a missing content, and where the disk refuses."""
     folder.workspace.mkdir()
-    trees.restore(found.folder, found.tree, folder.workspace)
-    source = RunFolder(found.folder)
+    trees.restore(start.folder, start.tree, folder.workspace)
+    source = RunFolder(start.folder)
     history = (source.feedback, source.history)
-    omitted = trees.copy_history(*history, found.start.submit_index, folder.history)
+    omitted = trees.copy_history(*history, start.start.submit_index, folder.history)
     folder.history.mkdir(exist_ok=True)
-    about = {"submit": found.submit, "omitted": omitted}
+    about = {"submit": start.submit, "omitted": omitted}
     (folder.history / "START.json").write_bytes(msgspec.json.format(msgspec.json.encode(about)) + b"\n")
-    save(folder.start, found.start)
+    save(folder.start, start.start)

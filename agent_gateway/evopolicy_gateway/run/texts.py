@@ -46,8 +46,8 @@ def read(
         text = read_text(path)
         check_agents_md(str(path), text)
     if prompts is not None:
-        found = read_prompts(shipped.found(prompts, started_in))
+        chosen = read_prompts(shipped.found(prompts, started_in))
     else:
-        found = (config.prompts if config is not None else None) or Prompts()
+        chosen = (config.prompts if config is not None else None) or Prompts()
     declared = () if config is None else inputs.read(config.skills, config.mcp, started_in)
-    return Texts(agents_md=text, prompts=found, inputs=tuple(each.recorded for each in declared))
+    return Texts(agents_md=text, prompts=chosen, inputs=tuple(each.recorded for each in declared))

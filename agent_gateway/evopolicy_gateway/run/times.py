@@ -32,7 +32,7 @@ class Times(msgspec.Struct, frozen=True, kw_only=True):
     permit_s: float = 0.0
     """The agent's start waited for hidden episodes on its machine; not counted in any other field."""
     resources: AgentResources | None = None
-    """What the agent used of its machine."""
+    """The agent's use of its machine."""
 
 
 class Stopwatch:

@@ -82,8 +82,8 @@ class RunFolder(msgspec.Struct, frozen=True):
             "logs_agent": self.agent_log,
             "logs_env": self.env_log,
         }
-        found = {name: path for name, path in places.items() if path.exists()}
-        return Artifacts(**{name: path.relative_to(self.root).as_posix() for name, path in found.items()})
+        existing = {name: path for name, path in places.items() if path.exists()}
+        return Artifacts(**{name: path.relative_to(self.root).as_posix() for name, path in existing.items()})
 
     state = Place(open_run.STATE)
     """The gateway's own folder, while the run is open."""

@@ -60,11 +60,12 @@ def listener_of(http: str, url: str | None) -> Listener:
     if url is None:
         if _is_wildcard(address):
             raise ConfigError(
-                f"--http {http}: an agent cannot dial every address; name one, or say with --http-url how it is reached"
+                f"--http {http}: an agent cannot connect to a wildcard address; name an address of this machine, or"
+                " give the URL with --http-url"
             )
         return Listener(host=address, port=int(port))
-    found = urlsplit(url)
-    if found.scheme not in ("http", "https") or not found.hostname or found.query or found.fragment:
+    parts = urlsplit(url)
+    if parts.scheme not in ("http", "https") or not parts.hostname or parts.query or parts.fragment:
         raise ConfigError(f"--http-url {url!r}: use the form https://HOST or https://HOST:PORT/PATH")
     if any(not (letter.isalnum() or letter in "-._~:/[]%") for letter in url):
         raise ConfigError(f"--http-url {url!r}: must be a plain URL, without quotes and spaces")

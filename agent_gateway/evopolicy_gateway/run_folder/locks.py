@@ -63,7 +63,8 @@ def _taken(lock: Path, what: Path) -> int:
         fd = os.open(lock, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
         try:
             _lock(fd, what)
-            # The previous holder may have removed the file between the two calls; a lock on that file excludes nobody.
+            # The previous holder may have removed the file between the two calls: a lock on that file excludes no
+            # other process.
             with contextlib.suppress(FileNotFoundError):
                 if os.path.samestat(os.fstat(fd), lock.stat()):
                     return fd

@@ -157,7 +157,7 @@ class CoordinatorClient:
         return await self._ask("results", question, ResultsPage, wait_s=wait_s)
 
     async def fetch(self, ref: BlobRef) -> bytes:
-        """Returns the bytes that `ref` names, verified. Large ones are in a file that nobody else sees, not in
+        """Returns the bytes that `ref` names, verified. Large ones are in an unnamed temporary file, not in
         memory."""
         if ref.inline is not None or ref.size <= LARGE_BYTES:
             return await self._requests.fetch(self._run, self._token, ref)

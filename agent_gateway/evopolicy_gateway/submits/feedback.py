@@ -226,25 +226,25 @@ class Collector:
 
     def _put(self, fetched: list[tuple[EpisodeFeedback, _Fetched]]) -> None:
         """Writes episodes' folders one after another."""
-        for episode, found in fetched:
-            much = not isinstance(found, str) and takes_much(found[0])
+        for episode, content in fetched:
+            much = not isinstance(content, str) and takes_much(content[0])
             with _much if much else contextlib.nullcontext():
-                if files := self._files_of(episode, found):
+                if files := self._files_of(episode, content):
                     self.tree.put_episode(self._name(episode.index), files)
 
     def _name(self, index: int) -> str:
         """The folder's name of the episode with that request index."""
         return episode_name(self.accepted.first_global_episode + index, self.machine.run.episode_budget)
 
-    def _files_of(self, episode: EpisodeFeedback, found: _Fetched) -> dict[str, bytes]:
+    def _files_of(self, episode: EpisodeFeedback, content: _Fetched) -> dict[str, bytes]:
         """An episode's files; without its trajectory if that is missing or has another length or return."""
         run, at = self.machine.run, time.time()
-        if not isinstance(found, str):
+        if not isinstance(content, str):
             try:
                 with self.at_work.on(self.accepted.key, episode.index):
                     return episode_files(
                         episode,
-                        *found,
+                        *content,
                         run.env.obs_storage,
                         at=at,
                         share=episode_share(run.limits, run.episode_budget),
@@ -253,9 +253,9 @@ class Collector:
                     )
             except (ProtocolError, MemoryError, ValueError, TypeError, RecursionError) as error:
                 self._log_error("an episode's files cannot be made", episode, exc_info=error)
-                found = _NOT_WRITTEN
-        self._log_error("episode put aside", episode, why=found)
-        return set_aside_files(episode, found, at=at, texts=shows_texts(run.feedback, run.env.obs_storage))
+                content = _NOT_WRITTEN
+        self._log_error("episode put aside", episode, why=content)
+        return set_aside_files(episode, content, at=at, texts=shows_texts(run.feedback, run.env.obs_storage))
 
     def _log_error(self, event: str, episode: EpisodeFeedback, **facts: object) -> None:
         log.error(event, submit=self.accepted.key, index=episode.index, **facts)

@@ -161,11 +161,11 @@ class SubmitPipeline:
                 case "snapshot":
                     system, published = self._workspace / "system", machine.run.profile != "own"
                     take = partial(snapshots.take, system, self._blobs, published=published)
-                    taken = await self._on_disk(take)
+                    snapshot = await self._on_disk(take)
                     if self._trees is not None:
                         given = (ticket.submit_id, self._trees, self._blobs, self._workspace.parent)
-                        taken = await asyncio.to_thread(snapshots.record_tree, taken, *given)
-                    return machine.took(taken)
+                        snapshot = await asyncio.to_thread(snapshots.record_tree, snapshot, *given)
+                    return machine.snapshotted(snapshot)
                 case "send":
                     return machine.sent(await self._send(ticket.request))
                 case "collect":

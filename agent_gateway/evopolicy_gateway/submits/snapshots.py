@@ -56,17 +56,19 @@ def take(system: Path, blobs: BlobStore, *, published: bool = False) -> Snapshot
     )
 
 
-def record_tree(taken: Snapshot, submit: str, recorder: Recorder, blobs: BlobStore, folder: Path) -> Snapshot:
-    """The snapshot with the tree of the workspace, which is left out where anything keeps it from being recorded: no
-    submit fails for it. `folder`: the run's."""
-    digest = taken.digest or taken.kept
+def record_tree(
+    snapshot: Snapshot, submit: str, recorder: Recorder, blobs: BlobStore, folder: Path
+) -> Snapshot:
+    """The snapshot with the tree of the workspace. When the tree cannot be recorded, it is left out, and the submit
+    continues. `folder`: the run's."""
+    digest = snapshot.digest or snapshot.kept
     try:
         bundle = None if digest is None else bundles.load(blobs.read(digest), digest)
         tree = recorder.record(submit, bundle, read_passed(folder))
     except Exception as error:
         log.error("the workspace is not recorded", submit=submit, exc_info=error)
-        return taken
-    return msgspec.structs.replace(taken, tree=tree)
+        return snapshot
+    return msgspec.structs.replace(snapshot, tree=tree)
 
 
 def _fault_of_source(files: dict[str, bytes]) -> PolicyFailure | None:

@@ -8,7 +8,7 @@ The pipeline performs one effect at a time and passes its outcome to the method 
 
 | the ticket in flight | effect       | outcome                                                        |
 |----------------------|--------------|----------------------------------------------------------------|
-| is new               | "snapshot"   | `took`: the entry `Requested`                                  |
+| is new               | "snapshot"   | `snapshotted`: the entry `Requested`                           |
 | is journalled        | "send"       | `sent`: the entry `Accepted`; `refused`: `Refused`, its end    |
 | is accepted          | "collect"    | `collected`: the entry `Settled`, its end                      |
 | has an entry         | the entry    | `noted`: the effect that its next state needs                  |
@@ -249,8 +249,8 @@ class TicketMachine:
             return open_run.Settled(key=request.key, status=rejected.status, summary="")
         return "collect"
 
-    def took(self, taken: Snapshot) -> Effect:
-        digest, error, kept, tree = taken.digest, taken.error, taken.kept, taken.tree
+    def snapshotted(self, snapshot: Snapshot) -> Effect:
+        digest, error, kept, tree = snapshot.digest, snapshot.error, snapshot.kept, snapshot.tree
         request = self._open.request
         return msgspec.structs.replace(request, bundle=digest, bundle_error=error, kept=kept, tree=tree)
 
@@ -303,8 +303,8 @@ class TicketMachine:
                 ticket = self._open
                 ticket.accepted, ticket.index = entry, entry.submit_index
                 ticket.submit_id = submit_id(ticket.index, self.run.episode_budget)
-                left, n, over = entry.remaining_budget, entry.submit_index + 1, self.state.is_finalized
-                self.state = RunState(remaining_budget=left, n_submits=n, is_finalized=over)
+                remaining, n, over = entry.remaining_budget, entry.submit_index + 1, self.state.is_finalized
+                self.state = RunState(remaining_budget=remaining, n_submits=n, is_finalized=over)
             case open_run.Settled():
                 self._settle(self._open, entry, place)
             case open_run.Refused():

@@ -39,7 +39,7 @@ from evopolicy_gateway.run.operations import Operations
 from evopolicy_gateway.run.plan import Plan
 from evopolicy_gateway.run_folder.layout import RunFolder, saved
 from evopolicy_gateway.suite import suite_index, sweep
-from evopolicy_gateway.suite.decisions import Decision, Found
+from evopolicy_gateway.suite.decisions import Decision, Facts
 from evopolicy_gateway.suite.suite_file import SuiteFile
 from evopolicy_gateway.suite.suite_view import SuiteView
 from evopolicy_gateway.suite.sweep import Sweep
@@ -116,7 +116,7 @@ class ClaimedSweep(Sweep):
         for name, task in self._active.items() if why is not None else ():
             play = self._plays.get(name)
             if self._decided[name].run.config is not None and play is not None and play.agent_at_work:
-                self._end(name, task, f"interrupted: {why}; it goes on where it was once the cap is raised")
+                self._end(name, task, f"interrupted: {why}; it can be resumed once the cap is raised")
 
     def _end(self, name: str, task: asyncio.Task[None], why: str) -> None:
         """Ends a run here and leaves it open; only once, since a second cancellation would abort its shutdown."""
@@ -201,7 +201,7 @@ class ClaimedSweep(Sweep):
         every_s = self._limits.claim_ttl_s / 4
         renewed: dict[str, tuple[str, float]] = {}
         while True:
-            await asyncio.sleep(min(sweep.LOOK_S, every_s))
+            await asyncio.sleep(min(sweep.POLL_S, every_s))
             if self._unsaved:
                 self._save()
             for name, task in list(self._active.items()):
@@ -221,7 +221,7 @@ class ClaimedSweep(Sweep):
     async def _ask(
         self, run: Plan, ttl_s: float | None = None, result: dict[str, Any] | None = None
     ) -> ClaimState:
-        # The digest makes a run with other settings another run, whatever the result of the earlier one.
+        # By its digest, a run with other settings is another run, and an earlier result does not count for it.
         name = f"{run.name}@{run.digest}"
         return await self._operations.claim(
             self._suite.name,
@@ -292,7 +292,7 @@ class ClaimedSweep(Sweep):
         self._save()
 
     def _save(self) -> None:
-        """Runs and claims go on when the disk refuses: the next start reads the index anew from each `run.json`."""
+        """Saves the index. Runs and claims continue when the disk refuses: the next start reads each `run.json`."""
         try:
             suite_index.save(self._root, self._index)
         except (StorageError, OSError) as error:
@@ -312,7 +312,7 @@ def _opened(run: Plan) -> str:
     return ""
 
 
-async def look(run: Plan, index: Index, operations: Operations) -> Found:
+async def facts_of(run: Plan, index: Index, operations: Operations) -> Facts:
     """Collects the known facts about a run."""
     folder = run.folder
     status: str | None = None
@@ -329,7 +329,7 @@ async def look(run: Plan, index: Index, operations: Operations) -> Found:
     entry = index.runs.get(run.name)
     intended = None if status is not None or opened else run.intended()
     settings = msgspec.structs.replace(run.settings, attempt=1 if entry is None else entry.attempt)
-    return Found(
+    return Facts(
         entry=entry,
         status=status,
         opened=opened,

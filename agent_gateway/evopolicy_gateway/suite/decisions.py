@@ -29,13 +29,13 @@ _SHOWN_CHANGES = 4
 _WORDS: dict[Kind, str] = {
     "keep": "kept",
     "new": "new",
-    "resume": "goes on in its session",
+    "resume": "resumed in its session",
     "finish": "only finished",
-    "restart": "begun again as a new attempt",
+    "restart": "restarted as a new attempt",
 }
 
 
-class Found(msgspec.Struct, frozen=True, kw_only=True):
+class Facts(msgspec.Struct, frozen=True, kw_only=True):
     """The known facts about a run."""
 
     entry: Entry | None = None
@@ -64,35 +64,35 @@ class Decision(msgspec.Struct, frozen=True, kw_only=True):
     """Whether the file's settings differ from those that it was played with."""
 
 
-def decide(run: Plan, found: Found, changed: Changed = "refuse") -> Decision:
+def decide(run: Plan, facts: Facts, changed: Changed = "refuse") -> Decision:
     """Returns the decision for a run."""
-    entry = found.entry
+    entry = facts.entry
     attempt = 1 if entry is None else entry.attempt
-    exists = found.status is not None or found.opened or (entry is not None and entry.state != "pending")
+    exists = facts.status is not None or facts.opened or (entry is not None and entry.state != "pending")
     differs = entry is not None and exists and entry.digest != run.digest
     how = "" if entry is None or not differs else _changed(entry.settings, run.defining)
     if differs and changed != "keep":
         return Decision(run=run, kind="restart", attempt=attempt + 1, why=how, changed=True)
     settled = entry is not None and entry.state in FINISHED
     elsewhere = entry is not None and not entry.directory
-    if found.status in FINISHED or (settled and (elsewhere or not found.opened)):
+    if facts.status in FINISHED or (settled and (elsewhere or not facts.opened)):
         return Decision(run=run, kind="keep", attempt=attempt, why=how, changed=differs)
-    if found.status is not None:
+    if facts.status is not None:
         why = (entry.error if entry is not None else None) or "it ended in an error"
         return Decision(run=run, kind="restart", attempt=attempt + 1, why=why)
-    if not found.opened:
-        if found.intended:
+    if not facts.opened:
+        if facts.intended:
             why = "its command ended while it was opened"
             return Decision(run=run, kind="resume", attempt=attempt, why=why)
         if entry is not None and entry.state in ("running", "error", "cancelled"):
             return Decision(run=run, kind="restart", attempt=attempt + 1, why="its folder is gone")
         return Decision(run=run, kind="new", attempt=attempt)
-    if found.phase is None:
+    if facts.phase is None:
         why = "the cluster does not know it any more"
         return Decision(run=run, kind="restart", attempt=attempt + 1, why=why)
-    if found.phase != "open":
+    if facts.phase != "open":
         return Decision(run=run, kind="finish", attempt=attempt)
-    if found.has_session:
+    if facts.has_session:
         return Decision(run=run, kind="resume", attempt=attempt)
     why = "its agent keeps no session that could be continued"
     return Decision(run=run, kind="restart", attempt=attempt + 1, why=why)

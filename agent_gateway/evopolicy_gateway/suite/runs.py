@@ -134,13 +134,15 @@ def _above_random(outcome: Outcome) -> Estimate | None:
     return difference(np.array([returns]), np.array([reference.returns]))
 
 
-def _against_random(found: Estimate) -> str:
+def _against_random(difference: Estimate) -> str:
     """The difference from random actions as a sentence."""
-    if found.low is None or found.high is None:
-        return f"score − random = {number(found.value)}, without an interval: {found.reason}"
-    least, most = (found.low, found.high) if found.value >= 0.0 else (-found.high, -found.low)
-    interval = f"{number(abs(found.value))} (95 % interval {number(least)} to {number(most)})"
-    word = "better" if found.value >= 0.0 else "worse"
+    if difference.low is None or difference.high is None:
+        return f"score − random = {number(difference.value)}, without an interval: {difference.reason}"
+    least, most = (
+        (difference.low, difference.high) if difference.value >= 0.0 else (-difference.high, -difference.low)
+    )
+    interval = f"{number(abs(difference.value))} (95 % interval {number(least)} to {number(most)})"
+    word = "better" if difference.value >= 0.0 else "worse"
     return (
         f"{interval} {word} than random"
         if least > 0.0

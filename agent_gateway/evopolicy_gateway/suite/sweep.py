@@ -26,7 +26,7 @@ from evopolicy_gateway.suite.decisions import Decision, side_by_side
 from evopolicy_gateway.suite.suite_file import Parallel
 from evopolicy_gateway.suite.suite_index import directory_of, waiting
 
-LOOK_S = 1.0
+POLL_S = 1.0
 MAX_SCORED = 256
 """Limit of agent-less runs followed at once, in addition to those with a place: each polls the coordinator."""
 
@@ -74,7 +74,7 @@ class Sweep(ABC):
                 elif self._todo:
                     if self._given_up():
                         return
-                    await asyncio.sleep(LOOK_S)
+                    await asyncio.sleep(POLL_S)
                 for name, task in list(self._active.items()):
                     if task.done():
                         del self._active[name]
@@ -125,9 +125,9 @@ class Sweep(ABC):
     # Internals of the loop.
 
     async def _wait(self, active: list[asyncio.Task[None]]) -> None:
-        """Waits until a run has ended, an agent is gone, or `LOOK_S` has passed."""
+        """Waits until a run has ended, an agent is gone, or `POLL_S` has passed."""
         moved = asyncio.ensure_future(self._moved.wait())
-        await asyncio.wait([*active, moved], timeout=LOOK_S, return_when=asyncio.FIRST_COMPLETED)
+        await asyncio.wait([*active, moved], timeout=POLL_S, return_when=asyncio.FIRST_COMPLETED)
         moved.cancel()
         self._moved.clear()
 

@@ -58,14 +58,14 @@ class Prompts(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     def begin(self) -> str:
         return _filled(self.first, FIRST, None)
 
-    def stopped(self, left: int | None, standard: str = GO_ON) -> str:
-        """Prompt for an agent that stopped with budget left; `left` None: unknown."""
-        return self.resumed(None) if left is None else _filled(self.go_on, standard, left)
+    def stopped(self, n_left: int | None, standard: str = GO_ON) -> str:
+        """Prompt for an agent that stopped with budget left; `n_left` None: unknown."""
+        return self.resumed(None) if n_left is None else _filled(self.go_on, standard, n_left)
 
-    def resumed(self, left: int | None) -> str:
+    def resumed(self, n_left: int | None) -> str:
         """Prompt for an agent whose session resumes after a failure that was not its own."""
-        standard = INTERRUPTED.format(_UNKNOWN if left is None else _LEFT)
-        return _filled(self.interrupted, standard, left)
+        standard = INTERRUPTED.format(_UNKNOWN if n_left is None else _LEFT)
+        return _filled(self.interrupted, standard, n_left)
 
     def check(self, where: str) -> None:
         """Raises ConfigError for an empty text or an unknown placeholder; `where`: how the error begins."""
@@ -81,11 +81,11 @@ def warned(warning: str | None) -> str:
 def read_prompts(path: Path) -> Prompts:
     """The prompts in a TOML file. Raises ConfigError that names the file and the fault."""
     try:
-        found = msgspec.toml.decode(read_text(path), type=Prompts)
+        prompts = msgspec.toml.decode(read_text(path), type=Prompts)
     except DECODE_ERRORS as error:
         raise ConfigError(f"{path}: {error}") from error
-    found.check(str(path))
-    return found
+    prompts.check(str(path))
+    return prompts
 
 
 def read_text(path: Path) -> str:
@@ -111,8 +111,8 @@ def check_text(where: str, text: str, known: tuple[str, ...]) -> None:
         )
 
 
-def _filled(text: str, standard: str, left: int | None) -> str:
-    episodes_left = "unknown" if left is None else str(left)
+def _filled(text: str, standard: str, n_left: int | None) -> str:
+    episodes_left = "unknown" if n_left is None else str(n_left)
     return Template(text).substitute(
         standard=Template(standard).substitute(left=episodes_left), left=episodes_left
     )

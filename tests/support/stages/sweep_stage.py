@@ -25,7 +25,7 @@ from evopolicy_gateway.run.times import Times
 from evopolicy_gateway.run_folder.layout import RunFolder
 from evopolicy_gateway.suite import runs, suite_index, sweep
 from evopolicy_gateway.suite.claimed import ClaimedSweep
-from evopolicy_gateway.suite.decisions import Found, decide
+from evopolicy_gateway.suite.decisions import Facts, decide
 from evopolicy_gateway.suite.suite_file import SuiteFile, expand, read
 from evopolicy_gateway.suite.suite_view import SuiteView
 
@@ -180,7 +180,7 @@ class Stage:
             ),
             self.view,
         )
-        decided = [decide(run, Found(entry=self.index.runs.get(run.name))) for run in self.runs]
+        decided = [decide(run, Facts(entry=self.index.runs.get(run.name))) for run in self.runs]
 
         async def main() -> None:
             async with asyncio.timeout(TIMEOUT_S):

@@ -66,10 +66,10 @@ def find_views(obs_space: Schema, action_space: Schema, runs: list[ViewLog]) -> 
             cells = _source_cells(before[moved], after[moved], _rarity(frames))
             if np.mean(cells >= 0) > MIN_MAPPED_SHARE and not _is_still(cells):
                 maps[action] = cells
-    found = _advance_and_touch(before, actions, changed_cells > 1, maps)
-    if found is None:
+    outputs = _advance_and_touch(before, actions, changed_cells > 1, maps)
+    if outputs is None:
         return None
-    advance, touch = found
+    advance, touch = outputs
     blocked, passed = _barriers(before[:, touch], actions == advance, changed_cells > 1)
     return {
         "key": find_grid(obs_space)[1],

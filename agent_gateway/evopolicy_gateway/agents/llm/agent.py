@@ -21,10 +21,10 @@ class Session:
     def load(self) -> list[Message]:
         """The messages; none when the first turn failed before anything was saved."""
         try:
-            found = json.loads(self._path.read_text())
+            messages = json.loads(self._path.read_text())
         except FileNotFoundError:
             return []
-        return list(found)
+        return list(messages)
 
     def save(self, messages: Sequence[Message]) -> None:
         """Saves them; a program that is killed meanwhile leaves the earlier ones."""

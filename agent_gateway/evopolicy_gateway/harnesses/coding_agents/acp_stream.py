@@ -129,8 +129,8 @@ class AcpReader(TurnReader):
 
     def entries(self) -> list[dict[str, Any]]:
         """Entries for the log since the last call."""
-        found, self._entries = self._entries, []
-        return found
+        entries, self._entries = self._entries, []
+        return entries
 
     def _whole(self) -> None:
         """The text so far is one message."""
@@ -194,7 +194,8 @@ def judges_itself(modes: Choice | None) -> bool:
 
 
 def usage_of(usage: Mapping[str, Any]) -> Usage:
-    """The paper's token counts from the protocol's `usage`. Its total tells what an agent counts into what."""
+    """The paper's token counts from the protocol's `usage`, whose total shows whether the input includes cached
+    tokens."""
     given, output, thought = (count(usage.get(f"{name}Tokens")) for name in ("input", "output", "thought"))
     read, written = count(usage.get("cachedReadTokens")), count(usage.get("cachedWriteTokens"))
     total = count(usage.get("totalTokens"))

@@ -269,16 +269,16 @@ class CliAgent(Harness):
         if not dialect.help_args:
             return
         self._options = await self._ask(stage, dialect.help_args)
-        lacking = [option for option in dialect.required_options() if option not in self._options]
-        if lacking:
+        missing_options = [option for option in dialect.required_options() if option not in self._options]
+        if missing_options:
             raise AgentError(
-                f"{name} {self._version or 'of an unknown version'} has no {', '.join(lacking)};"
+                f"{name} {self._version or 'of an unknown version'} has no {', '.join(missing_options)};"
                 f" known to work: {dialect.tested_version} ({dialect.install}@{dialect.tested_version});"
                 f" its help begins: {first_line(self._options) or '(empty)'}"
             )
         if self._version != dialect.tested_version:
             version = self._version or "of an unknown version"
-            note = f"{name} {version} is used; held against was {dialect.tested_version}"
+            note = f"{name} {version} is used; tested was {dialect.tested_version}"
             log.warning("another version than the tested one", version=version, tested=dialect.tested_version)
             stage.on_doing(AgentDoing(note=note))
 

@@ -54,10 +54,10 @@ class ConfiguredCli(Dialect):
         }
         words: list[str] = []
         for word in template:
-            lacking = [name for name, value in known.items() if name in word and value is None]
-            if lacking:
+            unset = [name for name, value in known.items() if name in word and value is None]
+            if unset:
                 # `--model {model}` is dropped as a pair, `--model={model}` alone.
-                if words and words[-1].startswith("-") and word == lacking[0]:
+                if words and words[-1].startswith("-") and word == unset[0]:
                     words.pop()
                 continue
             # In one pass, so that `{model}` inside a prompt is not replaced.
@@ -96,24 +96,24 @@ class ConfiguredReader(TurnReader):
 
     def _count(self, event: Mapping[str, Any]) -> None:
         paths = self._events.tokens
-        found: dict[str, int | None] = {
+        counts: dict[str, int | None] = {
             name: next(
                 (value for value in values(event, getattr(paths, name)) if isinstance(value, int)), None
             )
             for name in ("input", "cache_read", "cache_creation", "output", "reasoning", "total")
         }
-        if all(value is None for value in found.values()):
+        if all(value is None for value in counts.values()):
             return
-        cached = count(found["cache_read"])
-        output = count(found["output"])
-        if found["total"] is not None:
-            output = max(output, count(found["total"]) - count(found["input"]))
+        cached = count(counts["cache_read"])
+        output = count(counts["output"])
+        if counts["total"] is not None:
+            output = max(output, count(counts["total"]) - count(counts["input"]))
         usage = Usage(
-            input_noncached=max(0, count(found["input"]) - (cached if paths.input_includes_cached else 0)),
+            input_noncached=max(0, count(counts["input"]) - (cached if paths.input_includes_cached else 0)),
             cache_read=cached,
-            cache_creation=count(found["cache_creation"]),
+            cache_creation=count(counts["cache_creation"]),
             output=output,
-            reasoning=None if found["reasoning"] is None else count(found["reasoning"]),
+            reasoning=None if counts["reasoning"] is None else count(counts["reasoning"]),
         )
         self.usage = usage if paths.counts == "session" else self.usage + usage
 

@@ -249,9 +249,9 @@ class AgentConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
 
     @property
     def limits(self) -> Limits:
-        """What the run may use of its model."""
-        found = {name: getattr(self, name) for name in ("max_requests", "max_tokens", "max_cost")}
-        return Limits(**{name: value for name, value in found.items() if value is not None})
+        """Limits of the run's use of its model."""
+        given = {name: getattr(self, name) for name in ("max_requests", "max_tokens", "max_cost")}
+        return Limits(**{name: value for name, value in given.items() if value is not None})
 
     def upstream(self, environment: Mapping[str, str]) -> Upstream | None:
         """The API behind the relay, with its key; None for an agent that cannot use the relay: one with a
@@ -269,13 +269,13 @@ class AgentConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
         if self.harness not in _OWN_APIS or self.user_config:
             return None
         protocol, names = _OWN_APIS[self.harness]
-        found = next((name for name in names if variables.get(name)), None)
+        variable = next((name for name in names if variables.get(name)), None)
         base = variables.get(_VENDORS[protocol][1]) or _VENDORS[protocol][0]
         own = any(word in argument for argument in self.extra_args for word in _OWN_PROVIDER)
-        if found is None or own or not _is_reachable(base):
+        if variable is None or own or not _is_reachable(base):
             return None
-        header = "authorization" if found == "ANTHROPIC_AUTH_TOKEN" else ""
-        return Upstream(protocol=protocol, base_url=base, key=variables[found], key_header=header)
+        header = "authorization" if variable == "ANTHROPIC_AUTH_TOKEN" else ""
+        return Upstream(protocol=protocol, base_url=base, key=variables[variable], key_header=header)
 
     @property
     def provider_name(self) -> str:

@@ -62,7 +62,7 @@ def test_a_resumed_run_waits_for_a_coordinator_that_is_away(tmp_path: Path) -> N
             wait_until(lambda: "no connection to" in running.err)
             assert "within 30 s" in running.err
             coordinator = Coordinator(tmp_path / "state")
-            wait_until(lambda: "goes on with run" in running.text)
+            wait_until(lambda: "resumes run" in running.text)
     finally:
         coordinator.stop()
 
@@ -134,7 +134,7 @@ patient_submit([2, 3], "two")
             exit_code, out, err = again.finish()
         assert exit_code == 0, err
         wait_until(lambda: not running.alive())
-    assert "goes on with run" in out
+    assert "resumes run" in out
     record = record_in(run_dir(tmp_path))
     assert (record.outcome.budget_used, record.outcome.closed_reason) == (4, "agent_stopped")
     before = (run_dir(tmp_path) / "run.json").read_bytes()

@@ -103,7 +103,7 @@ def test_a_sweep_killed_twice_goes_on_where_it_was(tmp_path: Path) -> None:
         assert third.alive() == []
         text = third.text
     assert "1 kept" in text
-    assert "goes on in its session" in text
+    assert "resumed in its session" in text
     assert evolved.stat().st_mtime_ns == written
     for harness, session in zip(("codex", "claude"), kept, strict=True):
         folder = root / f"fake {harness}/toy_line/t-0"
@@ -160,7 +160,7 @@ def test_a_run_without_a_session_restarts_and_keeps_the_old(tmp_path: Path) -> N
     agent.write_text(agent.read_text().replace("3600", "0"))
     with sweep(tmp_path, "--local") as second:
         assert second.wait() == 0, second.text
-        assert "begun again as a new attempt (its agent keeps no session" in second.text
+        assert "restarted as a new attempt (its agent keeps no session" in second.text
     record = decode_run_record((root / "own/toy_line/t-0/run.json").read_bytes())
     assert record.attempt == 2
     assert record.outcome.auxiliary["transitions"]["steps"] > 0
@@ -356,7 +356,7 @@ def test_a_higher_cap_continues_the_interrupted_session(tmp_path: Path, operator
     file.write_text(whole)
     with sweep(tmp_path, *arguments) as second:
         assert second.wait() == 0, second.text
-        assert "goes on in its session" in second.text
+        assert "resumed in its session" in second.text
         assert "used in all: 2,040 tokens" in second.text
     (entry,) = index_in(root).values()
     assert (entry["state"], entry["attempt"], entry["tokens"]["output"]) == ("completed", 1, 40)
@@ -373,7 +373,7 @@ def test_ctrl_c_leaves_runs_open_and_the_exit_code_tells(tmp_path: Path, operato
         assert first.alive() == []
     with sweep(tmp_path, *arguments) as second:
         assert second.wait() == 0, second.text
-        assert "goes on in its session" in second.text
+        assert "resumed in its session" in second.text
 
 
 def test_a_changed_file_is_refused_and_a_scoreless_run_reported(tmp_path: Path, operator_file: Path) -> None:

@@ -226,7 +226,7 @@ def test_versions_are_shown_and_lacking_options_named(tmp_path: Path, harness: s
     tested = ended(played).facts["settings"]["tested_version"]
     assert tested != "99.1.0"
     (note,) = [doing.note for doing in played.doings if doing.note]
-    assert note.endswith(f" 99.1.0 is used; held against was {tested}")
+    assert note.endswith(f" 99.1.0 is used; tested was {tested}")
     with pytest.raises(AgentError, match=r"0\.1\.0 has no .*--"):
         play(tmp_path / "older", settings(harness), "work", 2, FAKE_VERSION="0.1.0", FAKE_HELP="nothing")
 

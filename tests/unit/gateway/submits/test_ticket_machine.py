@@ -129,7 +129,7 @@ class World:
             return machine.failed(KeyError("a bug"))
         if task == "snapshot":
             assert ticket.request not in self.journal
-            return machine.took(Snapshot(digest=f"bundle-{ticket.request.key}", error=None))
+            return machine.snapshotted(Snapshot(digest=f"bundle-{ticket.request.key}", error=None))
         key = ticket.request.key
         assert ticket.request in self.journal
         assert self.sent.setdefault(key, ticket.request) == ticket.request
@@ -255,14 +255,14 @@ BUGS = (
     Bug("two submits at once", "ask", "self.in_flight is not None", "False"),
     Bug("sent before it is journalled", "next", "not self.in_flight.requested", "False"),
     Bug("sent after it is accepted", "next", "self.in_flight.accepted is None", "True"),
-    Bug("journalled without its bundle", "took", "bundle=digest", "bundle=None"),
+    Bug("journalled without its bundle", "snapshotted", "bundle=digest", "bundle=None"),
     Bug(
         "snapshot again after a crash",
         "noted",
         "ticket.requested = entry, True",
         "ticket.requested = entry, False",
     ),
-    Bug("nothing charged", "noted", "remaining_budget=left", "remaining_budget=self.state.remaining_budget"),
+    Bug("nothing charged", "noted", "remaining_budget=remaining", "remaining_budget=self.state.remaining_budget"),
     Bug("a refused submit takes an index", "_end", "self._open.accepted is None", "False"),
     Bug("an accepted submit loses its index", "_end", "self._open.accepted is None", "True"),
     Bug("a crash not counted", "noted", "self.deaths.update", "list"),

@@ -21,7 +21,7 @@ from evopolicy_gateway.run.plan import Plan
 from evopolicy_gateway.suite import suite_index
 from evopolicy_gateway.suite.decisions import (
     Decision,
-    Found,
+    Facts,
     check_changes,
     decide,
     feedback_bytes,
@@ -197,18 +197,18 @@ def test_what_becomes_of_each_run(tmp_path: Path) -> None:
     run = suite_in(tmp_path)[0]
     running = entry(run, state="running")
     cases = [
-        (Found(), "new", 1),
-        (Found(status="completed", entry=entry(run, state="completed")), "keep", 1),
-        (Found(status="no_ok_submit"), "keep", 1),
-        (Found(entry=entry(run, state="completed", host="other")), "keep", 1),
-        (Found(entry=entry(run, state="completed", host="other"), opened=True, phase="finished"), "keep", 1),
-        (Found(status="error", entry=entry(run, state="error", attempt=2)), "restart", 3),
-        (Found(opened=True, phase="open", has_session=True, entry=running), "resume", 1),
-        (Found(opened=True, phase="open", has_session=False, entry=running), "restart", 2),
-        (Found(opened=True, phase="heldout", has_session=False, entry=running), "finish", 1),
-        (Found(opened=True, phase=None, has_session=True, entry=running), "restart", 2),
-        (Found(entry=running), "restart", 2),
-        (Found(entry=running, intended=True), "resume", 1),
+        (Facts(), "new", 1),
+        (Facts(status="completed", entry=entry(run, state="completed")), "keep", 1),
+        (Facts(status="no_ok_submit"), "keep", 1),
+        (Facts(entry=entry(run, state="completed", host="other")), "keep", 1),
+        (Facts(entry=entry(run, state="completed", host="other"), opened=True, phase="finished"), "keep", 1),
+        (Facts(status="error", entry=entry(run, state="error", attempt=2)), "restart", 3),
+        (Facts(opened=True, phase="open", has_session=True, entry=running), "resume", 1),
+        (Facts(opened=True, phase="open", has_session=False, entry=running), "restart", 2),
+        (Facts(opened=True, phase="heldout", has_session=False, entry=running), "finish", 1),
+        (Facts(opened=True, phase=None, has_session=True, entry=running), "restart", 2),
+        (Facts(entry=running), "restart", 2),
+        (Facts(entry=running, intended=True), "resume", 1),
     ]
     for found, kind, attempt in cases:
         decision = decide(run, found)
@@ -217,7 +217,7 @@ def test_what_becomes_of_each_run(tmp_path: Path) -> None:
 
 def test_a_changed_file_is_the_operators_decision(tmp_path: Path) -> None:
     run = suite_in(tmp_path)[0]
-    found = Found(status="completed", entry=entry(run, state="completed", digest="another"))
+    found = Facts(status="completed", entry=entry(run, state="completed", digest="another"))
     refused = [decide(run, found, "refuse")]
     with pytest.raises(ConfigError, match="evolve/toy/line/0 was played: give --changed keep"):
         check_changes(refused, "refuse")
@@ -226,7 +226,7 @@ def test_a_changed_file_is_the_operators_decision(tmp_path: Path) -> None:
     assert (again.kind, again.attempt) == ("restart", 2)
     check_changes([again], "rerun")
     shown = lines([again], ["gone/toy/line/0"])
-    assert shown[0] == "1 runs: 1 begun again as a new attempt"
+    assert shown[0] == "1 runs: 1 restarted as a new attempt"
     assert "the file has other settings" in shown[1]
     assert "no longer in the file" in shown[2]
 
@@ -251,7 +251,7 @@ def test_what_has_changed_in_the_file_is_named(tmp_path: Path) -> None:
     for run in suite_in(tmp_path, text):
         was = before[run.name]
         known = entry(was, state="completed", settings=msgspec.to_builtins(was.defining))
-        decision = decide(run, Found(status="completed", entry=known), "rerun")
+        decision = decide(run, Facts(status="completed", entry=known), "rerun")
         if run.entry == "evolve":
             assert decision.kind == "keep"
             continue
@@ -263,7 +263,7 @@ def test_what_has_changed_in_the_file_is_named(tmp_path: Path) -> None:
     known = entry(
         was := before[only_budget.name], settings=msgspec.to_builtins(was.defining), state="completed"
     )
-    why = decide(only_budget, Found(status="completed", entry=known), "keep").why
+    why = decide(only_budget, Facts(status="completed", entry=known), "keep").why
     assert why == "the file has other settings for it now: budget is 32, was 16"
 
 

@@ -34,7 +34,7 @@ def test_next_agent_begins_while_the_run_before_is_scored(
 ) -> None:
     text = HEAD + "[defaults]\nrepeats = 3\n[parallel]\nmachine = 1\n" + EVOLVE.format("a")
     stage = Stage(tmp_path, text, monkeypatch)
-    monkeypatch.setattr(sweep, "LOOK_S", TIMEOUT_S)
+    monkeypatch.setattr(sweep, "POLL_S", TIMEOUT_S)
 
     async def score(name: str) -> None:
         # No run's score comes before the last agent has begun.
@@ -49,7 +49,7 @@ def test_next_agent_begins_while_the_run_before_is_scored(
 def test_a_paused_sweep_begins_no_further_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     text = HEAD + "[defaults]\nrepeats = 2\n[parallel]\nmachine = 1\n" + EVOLVE.format("a")
     stage = Stage(tmp_path, text, monkeypatch)
-    monkeypatch.setattr(sweep, "LOOK_S", 0.01)
+    monkeypatch.setattr(sweep, "POLL_S", 0.01)
     pause = stage.root / PAUSED
     begun: list[int] = []
 
@@ -107,7 +107,7 @@ def test_an_unavailable_provider_holds_back_its_further_runs(
 ) -> None:
     agents = CODEX.format("a") + EVOLVE.format("c") + CODEX.format("b")
     stage = Stage(tmp_path, HEAD + "[parallel]\nmachine = 2\n" + agents, monkeypatch)
-    monkeypatch.setattr(sweep, "LOOK_S", 0.01)
+    monkeypatch.setattr(sweep, "POLL_S", 0.01)
     seen: list[list[str]] = []
 
     async def act(name: str) -> None:
@@ -132,7 +132,7 @@ def test_a_sweeps_cap_begins_no_further_run(
 ) -> None:
     agents = CODEX.format("a") + EVOLVE.format("c") + EVOLVE.format("d")
     stage = Stage(tmp_path, HEAD + f"[parallel]\nmachine = 2\n[caps]\n{cap}\n" + agents, monkeypatch)
-    monkeypatch.setattr(sweep, "LOOK_S", 0.01)
+    monkeypatch.setattr(sweep, "POLL_S", 0.01)
     ended: list[str] = []
 
     async def act(name: str) -> None:

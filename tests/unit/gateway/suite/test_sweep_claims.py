@@ -15,13 +15,13 @@ from evopolicy_common.records.open_run import OpenedRun
 from evopolicy_common.records.suite_folder import Entry
 from evopolicy_gateway.run_folder.layout import save
 from evopolicy_gateway.suite import claimed, sweep
-from evopolicy_gateway.suite.decisions import Decision, Found, decide
+from evopolicy_gateway.suite.decisions import Decision, Facts, decide
 
 
 def test_an_open_run_is_announced_to_the_cluster(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     text = HEAD + "[parallel]\nclaim_ttl_s = 3600.0\n" + EVOLVE.format("a")
     stage = Stage(tmp_path, text, monkeypatch)
-    monkeypatch.setattr(sweep, "LOOK_S", 0.01)
+    monkeypatch.setattr(sweep, "POLL_S", 0.01)
     name = stage.runs[0].name
 
     async def act(_: str) -> None:
@@ -57,7 +57,7 @@ def test_a_claim_lost_to_another_host_ends_the_run_here(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     stage = Stage(tmp_path, HEAD + "[parallel]\nclaim_ttl_s = 1.0\n" + EVOLVE.format("a"), monkeypatch)
-    monkeypatch.setattr(sweep, "LOOK_S", 0.01)
+    monkeypatch.setattr(sweep, "POLL_S", 0.01)
     monkeypatch.setattr(claimed, "_ASK_AGAIN_S", 0.01)
     run = stage.runs[0]
     theirs = Entry(
@@ -90,7 +90,7 @@ def test_a_claim_lost_to_another_host_ends_the_run_here(
     entry = index.runs[run.name]
     assert (entry.state, entry.score, entry.host, entry.directory) == ("completed", 3.0, "other", "")
     # Started again, with the folder of the run that was ended here still open: nothing is left to do.
-    found = Found(entry=entry, opened=True, phase="finished")
+    found = Facts(entry=entry, opened=True, phase="finished")
     assert decide(run, found) == Decision(run=run, kind="keep", attempt=1)
 
 
