@@ -85,27 +85,22 @@ class Definitions:
     def pin(self, env: str, requested: str, workers: Iterable[Worker]) -> str:
         """Returns the definition that a run or an evaluation of `env` is played in; empty: any accepted one.
 
-        `asked`: the first digits of the digest that the operator named. Raises RefusedError, with similar names and
+        `requested`: the first digits of the digest that the operator named. Raises RefusedError, with similar names and
         the remedy, when no worker offers it or the operator has not approved it.
         """
         if self._trusting and not requested:
             return ""
         workers = tuple(workers)
-        offering = [each.profile for each in workers]
-        offers = {
-            each.fingerprints[env].definition or "unknown": None
-            for each in offering
-            if env in each.descriptions
-        }
+        offers = _offers(env, workers)
         if requested:
-            return self._named(env, requested, list(offers))
+            return self._named(env, requested, offers)
         if catalogue.is_shipped(env) and env in self._shipped:
             return ""
         if not offers:
             if on := failed(workers).get(env):
                 why = "; ".join(f"{name}: {text}" for name, text in on.items())
                 raise RefusedError(Refusal.INVALID_SETTINGS, f"no worker offers {env}; it failed on {why}")
-            known = {name for each in offering for name in each.descriptions}
+            known = {name for each in workers for name in each.profile.descriptions}
             raise RefusedError(
                 Refusal.INVALID_SETTINGS,
                 f"no worker offers {env}{catalogue.near(env, sorted(known))}; install its package on a worker and start"
@@ -119,7 +114,7 @@ class Definitions:
             Refusal.INVALID_SETTINGS,
             f"{env} does not ship with evopolicy, and its definition is not approved; workers offer {named}. Inspect it"
             f" with `evopolicy envs --show {env}`, then give this name to --env, or approve it once: `evopolicy envs"
-            f" approve {env}@{next(iter(offers))}`",
+            f" approve {env}@{offers[0]}`",
         )
 
     def _named(self, env: str, requested: str, offers: list[str]) -> str:
@@ -142,12 +137,7 @@ class Definitions:
 
     def approve(self, env: str, requested: str, workers: Iterable[Worker]) -> None:
         """Approves a definition and stores the approval. Raises RefusedError when no worker offers it."""
-        offers = {
-            each.profile.fingerprints[env].definition: None
-            for each in workers
-            if env in each.profile.descriptions
-        }
-        digest = self._named(env, requested, list(offers))
+        digest = self._named(env, requested, _offers(env, workers))
         kept = [each for each in self.approved.get(env, []) if each != digest]
         self.approved[env] = [*kept, digest]
         if self._file is not None:
@@ -178,6 +168,12 @@ class Definitions:
         if self._trusting:
             return "trusted"
         return "approved" if digest in self.approved.get(env, []) else "by digest only"
+
+
+def _offers(env: str, workers: Iterable[Worker]) -> list[str]:
+    """The distinct definitions of an environment that workers have described."""
+    profiles = [each.profile for each in workers if env in each.profile.descriptions]
+    return list(dict.fromkeys(each.fingerprints[env].definition or "unknown" for each in profiles))
 
 
 def undescribed(workers: Iterable[Worker]) -> dict[str, tuple[str, ...]]:

@@ -115,13 +115,17 @@ class ServiceReader:
         """Sends one chunk of a blob; with `run`, only if this run's train feedback names the blob."""
         self._lane(message.digest).submit(self._answer, lambda: self._get(run, message), answer)
 
-    def recorded(self, message: RecordedRequest, answer: Answer) -> None:
-        """Sends stored outcomes of a finished run."""
-        self._pages.submit(self._answer, lambda: self._recorded(message), answer)
-
-    def published(self, message: JournalRequest | OpeningRequest | SignRequest, answer: Answer) -> None:
-        """Sends the published records of runs whose cases are disclosed, or signs a digest."""
-        work = {JournalRequest: self._journal, OpeningRequest: self._opening, SignRequest: self._sign}
+    def stored(
+        self, message: RecordedRequest | JournalRequest | OpeningRequest | SignRequest, answer: Answer
+    ) -> None:
+        """Sends outcomes of a finished run, or published records of runs whose cases are disclosed, or signs a
+        digest."""
+        work = {
+            RecordedRequest: self._recorded,
+            JournalRequest: self._journal,
+            OpeningRequest: self._opening,
+            SignRequest: self._sign,
+        }
         self._pages.submit(self._answer, lambda: work[type(message)](message), answer)  # type: ignore[operator]
 
     def epochs(self, runs: tuple[str, ...]) -> tuple[str, ...]:

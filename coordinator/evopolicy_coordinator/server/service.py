@@ -187,11 +187,8 @@ class Service:
     def _serve_status(self, core: Core, query: IncomingQuery, parsed: Parsed) -> None:
         query.reply(self._status_bytes(core, parsed.message.max_age_s), lane_of(parsed.asker))
 
-    def _serve_recorded(self, core: Core, query: IncomingQuery, parsed: Parsed) -> None:
-        self._reader.recorded(parsed.message, answer_to(query, parsed.asker))
-
-    def _serve_published(self, core: Core, query: IncomingQuery, parsed: Parsed) -> None:
-        self._reader.published(parsed.message, answer_to(query, parsed.asker))
+    def _serve_stored(self, core: Core, query: IncomingQuery, parsed: Parsed) -> None:
+        self._reader.stored(parsed.message, answer_to(query, parsed.asker))
 
     def _serve_description(self, core: Core, query: IncomingQuery, parsed: Parsed) -> None:
         self._spawn(self._serve_read(query, self._description(core, parsed.message)))
@@ -536,10 +533,10 @@ _ANSWERS: dict[type[Message], Callable[[Service, Core, IncomingQuery, Parsed], N
     BlobGet: Service._serve_get,
     operator.Claim: Service._serve_claim,
     StatusRequest: Service._serve_status,
-    operator.RecordedRequest: Service._serve_recorded,
-    operator.JournalRequest: Service._serve_published,
-    operator.OpeningRequest: Service._serve_published,
-    operator.SignRequest: Service._serve_published,
+    operator.RecordedRequest: Service._serve_stored,
+    operator.JournalRequest: Service._serve_stored,
+    operator.OpeningRequest: Service._serve_stored,
+    operator.SignRequest: Service._serve_stored,
     operator.DescribeEnvironment: Service._serve_description,
     operator.FurtherCasesRequest: Service._serve_further_cases,
     operator.EnvironmentsRequest: Service._serve_environments,
