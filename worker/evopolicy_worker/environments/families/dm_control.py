@@ -64,22 +64,28 @@ class DmControlFamily(MujocoFamily):
         objective, reward = texts["tasks"][task]
         parts = texts["observation"] | texts.get("also", {})
         observed: Any = env.observation_space
+        task_env = cast(_Task, env)
         rows = [
-            f"| `{name}` | {parts[name]} | {template.words(spaces.to_schema(part))} |"
+            f"| `{name}` | {parts[name].replace('{joints}', task_env.joints)} |"
+            f" {template.words(spaces.to_schema(part))} |"
             for name, part in observed.spaces.items()
         ]
-        motors = [f"| `{k}` | {name} |" for k, name in enumerate(cast(_Task, env).actuators)]
+        bounds = zip(task_env.action_space.low, task_env.action_space.high, strict=True)
+        motors = [
+            f"| `{k}` | {name} | {low:g} to {high:g} |"
+            for k, (name, (low, high)) in enumerate(zip(task_env.actuators, bounds, strict=True))
+        ]
         return {
             "": f"{texts['about']} {objective}",
             "Observation": "\n".join(
                 [f"A dict. {_UNITS}", "", "| component | what it is | values |", "|---|---|---|", *rows]
             ),
             "Action": "\n".join(
-                [texts["action"], "", "| number | its name in the model |", "|---|---|", *motors]
+                [texts["action"], "", "| number | its name in the model | range |", "|---|---|---|", *motors]
             ),
             "Reward": f"What each step pays: {reward[0].lower()}{reward[1:]}",
             "Start": f"{texts['start']} The seed of the episode decides.",
-            "End": texts.get("end", "Nothing ends an episode early."),
+            "End": texts.get("end", "Never terminates by itself."),
         }
 
 
@@ -101,6 +107,7 @@ class _Task:
     spec = None
 
     def __init__(self, domain: str, task: str) -> None:
+        import mujoco
         from dm_control import suite
         from gymnasium import spaces
 
@@ -122,6 +129,12 @@ class _Task:
         )
         model = self._physics.model
         self.actuators = [model.id2name(k, "actuator") for k in range(model.nu)]
+        hinges = np.flatnonzero(model.jnt_type == int(mujoco.mjtJoint.mjJNT_HINGE))
+        self.joints = ", ".join(
+            f"{k} {model.id2name(joint, 'joint')} ({low:.2g} to {high:.2g})"
+            for k, (joint, (low, high)) in enumerate(zip(hinges, model.jnt_range[hinges], strict=True))
+        )
+        """The model's hinges with their ranges, in the order in which observations have them."""
 
     @property
     def unwrapped(self) -> Any:

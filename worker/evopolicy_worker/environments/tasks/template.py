@@ -77,17 +77,15 @@ def _in_sections(
     """The sections that are written for the family, its groups of environments, and by it."""
     found = {**_sections(_family_text(entry.family)), **own}
     grouped = _of_groups(entry, own)
-    if grouped:
-        found |= grouped
-        actions, end = "", f"{found.get('End', '')} Truncated after {limit} steps.".strip()
-        success = _success(entry) if entry.success else ""
-        if not success and "uccess" not in end + found.get("Reward", ""):
-            success = " Nothing but the return tells success."
-    else:
-        actions = "\n\n" + _space(action_space)
-        end = "An episode ends when the environment ends it (`terminated`), and is truncated after {limit} steps."
-        end = "\n\n".join(part for part in (found.get("End"), end.format(limit=limit)) if part)
-        success = _success(entry)
+    found |= grouped
+    acted = found.get("Action", "")
+    # A table that a family writes covers a space of one part.
+    listed = "|" in acted and action_space["type"] in ("Box", "Discrete", "MultiBinary")
+    actions = "" if grouped or listed else "\n\n" + _space(action_space)
+    end = f"{found.get('End', '')} Truncated after {limit} steps.".strip()
+    success = _success(entry)
+    if not success and "uccess" not in end + found.get("Reward", ""):
+        success = " Nothing but the return tells success."
     rewards = reward_table(
         components, vector=bool(entry.reward_vector) or hasattr(env.unwrapped, "reward_space")
     )
@@ -95,10 +93,10 @@ def _in_sections(
         f"# {entry.label}",
         "Maximise the sum of the rewards of an episode.",
         found.get("", ""),
-        f"## Observation\n\n{_form(obs_space, grouped)}"
+        f"## Observation\n\n{_form(obs_space) if grouped else ''}"
         + found.get("Observation", _space(obs_space))
         + _maze(env),
-        f"## Action\n\n{_form(action_space, grouped)}" + found.get("Action", "") + actions,
+        f"## Action\n\n{_form(action_space) if grouped or listed else ''}" + acted + actions,
         "## Reward\n\n" + found.get("Reward", rewards if components else _REWARD),
         "## Start\n\n" + found.get("Start", "The start of an episode is drawn from its seed."),
         "## End\n\n" + end + success,
@@ -106,10 +104,8 @@ def _in_sections(
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
-def _form(space: SpaceSchema, grouped: Mapping[str, str]) -> str:
-    """The kind of a space, with shapes and dtypes, for texts of groups."""
-    if not grouped:
-        return ""
+def _form(space: SpaceSchema) -> str:
+    """The kind of a space, with shapes and dtypes."""
     named = [(name, _kind(leaf)) for name, leaf in _leaves(space, "")]
     if space["type"] in ("Dict", "Tuple"):
         return f"`{space['type']}` of {', '.join(f'`{name}` ({kind})' for name, kind in named)}.\n\n"
