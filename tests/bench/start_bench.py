@@ -5,16 +5,15 @@ Rows: the help; `evopolicy local` from its call to the answer of a first one-epi
 next one; `evopolicy try` on one case; a report of 48 runs; a worker that offers all environments installed here, from
 its call to its registration, for which the floor is one that offers Core16 (`--workers-only`: this row alone); a
 thousand requests to a model API on loopback through the relay, for which the floor is the same without it
-(`--relay-only`): the wall time of
-`N_REQUESTS`, so that seconds read as milliseconds a request. Wall time and processor time (of all processes), the best
-of
-`--times`; the floor is the same of bare Pythons, one for each process that the command starts, which import what it
-imports. Prints a table, asserts nothing.
+(`--relay-only`), by their size and by `--record-model`, in turns: seconds read as milliseconds a request. Wall time and
+processor time (of all processes), the best of `--times`; the floor is the same of bare Pythons, one for each process
+that the command starts, which import what it imports. Prints a table, asserts nothing.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import http.client
 import json
 import os
@@ -23,7 +22,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -43,6 +42,9 @@ from evopolicy_worker.environments import registry
 
 HERE = Path(__file__).parent
 N_REQUESTS = 1000
+SIZES = ((1000, 4000), (50, 500_000))
+"""Requests to the relay that are timed at once, and their bytes."""
+TOKEN = "token-of-the-bench"
 ENV, GYMNASIUM_ID = "gym/acrobot", "Acrobot-v1"
 AGENT = """
 import json, os, pathlib, sys, time, urllib.request
@@ -151,7 +153,7 @@ def registered_s(folder: Path, coordinator: Coordinator, env_ids: Sequence[str])
     return took
 
 
-def workers(folder: Path, times: int) -> Row:
+def workers(folder: Path, times: int) -> list[Row]:
     """A worker that offers everything, beside one that offers Core16, in turns. The first start describes Core16."""
     core16, everything = list(catalogue.suites()["core16"].environments), registry.offered()
     coordinator = Coordinator(folder / "worker-state", trust_workers=False)
@@ -171,49 +173,66 @@ def workers(folder: Path, times: int) -> Row:
         coordinator.stop()
     unknown = float("nan")
     name = f"evopolicy-worker, {len(everything):,} environments (floor: {len(core16)})"
-    return Row(name, Cost(min(many), unknown), Cost(min(few), unknown))
+    return [Row(name, Cost(min(many), unknown), Cost(min(few), unknown))]
 
 
-def relay(folder: Path, times: int) -> Row:
-    """Streamed requests one after another, as an agent makes them."""
-    unknown, token = float("nan"), "token-of-the-bench"
-    order = {"token": token, "ledger": str(folder / "ledger.jsonl"), "limits": {"max_requests": 10**9}}
+def relay(folder: Path, times: int) -> list[Row]:
+    """Streamed requests one after another, as an agent makes them: all but the end of each repeats the one before."""
+    unknown, levels, found = float("nan"), ("off", "digests", "full"), []
+    with ModelApi([]) as api, contextlib.ExitStack() as stack:
+        ports = [int(api.base_url.rpartition(":")[2])]
+        ports += [stack.enter_context(relayed(folder / level, level, api)) for level in levels]
+        for n, n_bytes in SIZES:
+            least = [float("inf")] * len(ports)
+            for _ in range(times + 1):  # the first is a warm-up
+                least = [
+                    min(one, asked(api, port, n, n_bytes)) for one, port in zip(least, ports, strict=True)
+                ]
+            floor, *costs = [Cost(each * N_REQUESTS / n, unknown) for each in least]
+            name = f"{N_REQUESTS} model requests of {n_bytes // 1000} kB, record"
+            found += [Row(f"{name} {level}", each, floor) for level, each in zip(levels, costs, strict=True)]
+    return found
+
+
+@contextlib.contextmanager
+def relayed(folder: Path, level: str, api: ModelApi) -> Iterator[int]:
+    """The port of a relay that records so much."""
+    folder.mkdir()
     sock = bound("127.0.0.1", 0)
     sock.listen()
+    order = {"token": TOKEN, "ledger": str(folder / "ledger.jsonl"), "limits": {"max_requests": 10**9}}
+    order |= {"record": level, "folder": str(folder)}
+    order["upstream"] = {"protocol": "openai", "base_url": f"{api.base_url}/v1"}
     program = [sys.executable, "-m", "evopolicy_gateway.relay", str(sock.fileno())]
-    with ModelApi([]) as api:
-        upstream = {"protocol": "openai", "base_url": f"{api.base_url}/v1"}
-        first = StartRelay(order={**order, "upstream": upstream})
-        with subprocess.Popen(
-            program, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, pass_fds=[sock.fileno()]
-        ) as process:
-            assert process.stdin is not None
-            process.stdin.write(line(first))
-            process.stdin.flush()
-            places = (sock.getsockname()[1], int(api.base_url.rpartition(":")[2]))
-            asked(places[0], token, 10)
-            least = [min(asked(port, token, N_REQUESTS) for _ in range(times)) for port in places]
-            process.terminate()
-    return Row(
-        f"{N_REQUESTS} model requests through the relay (floor: without)",
-        *(Cost(each, unknown) for each in least),
-    )
+    with subprocess.Popen(
+        program, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, pass_fds=[sock.fileno()]
+    ) as process:
+        assert process.stdin is not None
+        process.stdin.write(line(StartRelay(order=order)))
+        process.stdin.flush()
+        yield sock.getsockname()[1]
+        process.terminate()
 
 
-def asked(port: int, token: str, n: int) -> float:
-    """Seconds that `n` requests over one connection take."""
-    body = json.dumps(
-        {"model": "m", "stream": True, "stream_options": {"include_usage": True}, "messages": []}
-    )
-    headers = {"authorization": f"Bearer {token}", "content-type": "application/json"}
+def asked(api: ModelApi, port: int, n: int, n_bytes: int) -> float:
+    """Seconds that `n` requests of so many bytes over one connection take."""
+    headers = {"authorization": f"Bearer {TOKEN}", "content-type": "application/json"}
+    document = {"model": "m", "stream": True, "stream_options": {"include_usage": True}}
+    said = [{"role": "user", "content": "a line of some length\n" * 44} for _ in range(n_bytes // 1000)]
+    bodies = [
+        json.dumps(document | {"messages": [*said, {"role": "user", "content": f"{port} {at}"}]})
+        for at in range(n)
+    ]
     connection = http.client.HTTPConnection("127.0.0.1", port)
     started = time.perf_counter()
-    for _ in range(n):
+    for body in bodies:
         connection.request("POST", "/v1/chat/completions", body, headers)
         with connection.getresponse() as answer:
             assert b"[DONE]" in answer.read()
     took = time.perf_counter() - started
     connection.close()
+    api.bodies.clear()
+    api.requests.clear()
     return took
 
 
@@ -240,7 +259,7 @@ def rows(folder: Path, times: int) -> list[Row]:
     found.append(
         Row(f"evopolicy report, {n_runs} runs", cost(lambda: evopolicy(*report), times), floor(REPORT, times))
     )
-    return [*found, workers(folder, times), relay(folder, times)]
+    return [*found, *workers(folder, times), *relay(folder, times)]
 
 
 def main() -> None:
@@ -255,7 +274,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory(prefix="evopolicy-bench-") as name:
         folder = Path(name)
         chosen = [workers] * options.workers_only + [relay] * options.relay_only
-        found = [each(folder, options.times) for each in chosen] or rows(folder, options.times)
+        found = [row for each in chosen for row in each(folder, options.times)] or rows(folder, options.times)
     console = Console()
     console.print(
         f"seconds, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}; over floor: CPU, or wall where there is no"
