@@ -277,7 +277,7 @@ def _print(results: Sequence[TrialResult], as_json: bool, console: Terminal) -> 
         console.print(made)
         console.print(_summary(result), soft_wrap=True)
         if result.folder is not None:
-            console.print(f"trajectories: {result.folder}", soft_wrap=True)
+            console.print(f"trajectories and errors: {result.folder}", soft_wrap=True)
     _tell_of_cases(results, console)
 
 

@@ -38,7 +38,7 @@ def _why(run: Plan, entry: Entry | None) -> str:
         return f"{run.name}: it was not begun"
     reasons = {
         "agent_failed": _AGENT_FAILED.get(entry.closed_reason),
-        "no_ok_submit": "no submit had a working policy",
+        "no_ok_submit": "the agent made no submit, or none had a working policy",
         "cancelled": "it was cancelled",
     }
     why = entry.error or reasons.get(_kind(entry), f"it was left {entry.state}")

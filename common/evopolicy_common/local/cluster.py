@@ -296,7 +296,7 @@ class _Processes:
             code = await child.ended()
             self._running.remove(child)
             deaths = deaths + 1 if time.monotonic() - began < _SOON_S else 1
-            reason = last_words(child.log) or f"see {child.log}"
+            reason = child.last_words() or f"see {child.log}"
             if code == USAGE_ERROR:
                 raise ConfigError(reason)
             if code == FAILURE and reason.startswith(_IN_VAIN):

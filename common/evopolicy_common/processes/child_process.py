@@ -35,9 +35,10 @@ def starting() -> asyncio.Lock:
 class ChildProcess:
     """A running child. Start it on the main thread: its parent-death signal comes when that thread ends."""
 
-    def __init__(self, process: asyncio.subprocess.Process, log: Path) -> None:
+    def __init__(self, process: asyncio.subprocess.Process, log: Path, log_start: int) -> None:
         self._process = process
         self.log = log
+        self._log_start = log_start
 
     @classmethod
     async def start(
@@ -48,6 +49,7 @@ class ChildProcess:
         log.parent.mkdir(parents=True, exist_ok=True)
         pipe = asyncio.subprocess.PIPE if talks else asyncio.subprocess.DEVNULL
         with log.open("ab") as out:
+            log_start = out.tell()
             async with starting():
                 process = await asyncio.create_subprocess_exec(
                     *ending_with_parent(program),
@@ -64,7 +66,7 @@ class ChildProcess:
                     },
                 )
                 live.add(process.pid)
-        return cls(process, log)
+        return cls(process, log, log_start)
 
     @property
     def pid(self) -> int:
@@ -74,6 +76,11 @@ class ChildProcess:
     def exit_code(self) -> int | None:
         """The exit status; None while it runs."""
         return self._process.returncode
+
+    def last_words(self) -> str:
+        """Its error, or else the last line of its log. A process of another command may have written after it, where
+        both use one state folder."""
+        return last_words(self.log, since=self._log_start)
 
     async def ended(self) -> int:
         """Waits for its end and returns the exit status."""
@@ -97,15 +104,17 @@ class ChildProcess:
             self._process.send_signal(number)
 
 
-def last_words(log: Path) -> str:
-    """The last line of a log, to explain why its process ended; empty if there is none."""
+def last_words(log: Path, since: int | None = None) -> str:
+    """The last line of a log, to explain why its process ended; empty if there is none. With `since`, an offset: the
+    last error from there on, if there is one."""
     try:
         with log.open("rb") as file:
-            file.seek(max(0, log.stat().st_size - 4096))
+            file.seek(max(since or 0, log.stat().st_size - 4096))
             lines = file.read().decode("utf-8", "replace").strip().splitlines()
     except OSError:
         return ""
-    return _message_of(lines[-1]) if lines else ""
+    errors = [line for line in lines if line.startswith("error: ")] if since is not None else []
+    return _message_of((errors or lines)[-1]) if lines else ""
 
 
 class _LogLine(msgspec.Struct):

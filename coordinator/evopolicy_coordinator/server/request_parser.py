@@ -448,7 +448,7 @@ class RequestParser:
             raise RefusedError(
                 Refusal.BAD_REQUEST,
                 f"the cases of epoch {cases.epoch} are public, as runs on them were published: stop the coordinator,"
-                " say `evopolicy-coordinator epoch new` with its --state, and start it again, or name other cases with"
+                " run `evopolicy-coordinator epoch new` with its --state, and start it again, or name other cases with"
                 " --data",
             )
         return cases

@@ -14,7 +14,7 @@ import pytest
 
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.local import cluster as local_cluster
-from evopolicy_common.processes.child_process import ChildProcess
+from evopolicy_common.processes.child_process import ChildProcess, last_words
 
 SOON_S = 0.2
 STUBBORN = "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print('up', flush=True); time.sleep(1000)"  # noqa: E501
@@ -263,3 +263,15 @@ def test_workers_are_started_beside_the_coordinator(tmp_path: Path, monkeypatch:
     ready = started["test-coordinator"][started["test-coordinator"].index("--ready-file") + 1]
     assert started["test-worker"][started["test-worker"].index("--ready-file") + 1] == ready
     assert started["test-worker"][-6:] == ["--env", "toy/line", "--need-tier", "bwrap", "--slots", "2"]
+
+
+def test_a_childs_error_is_told_although_another_process_wrote_later(tmp_path: Path) -> None:
+    log = tmp_path / "coordinator.log"
+    log.write_text("error: of an earlier start\n")
+    start = log.stat().st_size
+    with log.open("a") as out:
+        out.write('error: the state folder is in use\n{"event": "stopped; everything is on disk"}\n')
+    assert last_words(log, since=start) == "the state folder is in use"
+    assert last_words(log) == "stopped; everything is on disk"
+    log.write_text("error: of an earlier start\nKilled\n")
+    assert last_words(log, since=start) == "Killed"

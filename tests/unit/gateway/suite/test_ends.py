@@ -206,7 +206,7 @@ def test_exit_codes_and_the_report_tell_how_runs_ended(
         printed = capsys.readouterr().err.splitlines()
         assert [line.partition(":")[0] for line in printed] == [one.name for one in plans[1:]]
     assert printed == [
-        f"b: no submit had a working policy; see {tmp_path}/evolve/b/t",
+        f"b: the agent made no submit, or none had a working policy; see {tmp_path}/evolve/b/t",
         f"c: its agent failed; see {tmp_path}/evolve/c/t",
         f"d: it was cancelled; see {tmp_path}/evolve/d/t",
         f"e: worker lost; see {tmp_path}/evolve/e/t",
