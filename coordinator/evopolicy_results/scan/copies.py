@@ -82,23 +82,28 @@ def _fresh(checkpoints: Sequence[tuple[int, Files]]) -> Iterator[tuple[int, dict
 
 
 def _windows(sequences: Iterable[Sequence[float]]) -> Iterator[Window]:
+    """The windows that vary, and neither repeat with a short period nor have one step: tables of such numbers are
+    everywhere."""
     for numbers in sequences:
-        for start in range(len(numbers) - _WINDOW + 1):
+        n = len(numbers) - _WINDOW + 1
+        if n < 1:
+            continue
+        values = np.array(numbers)
+        varied = _in_each(values[1:] != values[:-1], n) >= _FEWEST_CHANGES
+        for period in range(1, 9):
+            varied &= _in_each(values[period:] == values[:-period], n) < _WINDOW - period
+        steps = np.array([round(other - one, 9) for one, other in itertools.pairwise(numbers)])
+        varied &= _in_each(steps[1:] == steps[:-1], n) < _WINDOW - 2
+        for start in np.flatnonzero(varied):
             window = tuple(numbers[start : start + _WINDOW])
-            changes = sum(one != other for one, other in itertools.pairwise(window))
-            if changes >= _FEWEST_CHANGES and len(set(window)) >= _FEWEST_VALUES and not _is_regular(window):
+            if len(set(window)) >= _FEWEST_VALUES:
                 yield window
 
 
-def _is_regular(window: Sequence[float]) -> bool:
-    """Whether it repeats with a short period, or has one step: tables of such numbers are everywhere."""
-    if any(
-        all(one == other for one, other in zip(window, window[period:], strict=False))
-        for period in range(1, 9)
-    ):
-        return True
-    steps = {round(other - one, 9) for one, other in itertools.pairwise(window)}
-    return len(steps) == 1
+def _in_each(flags: np.ndarray, n: int) -> np.ndarray:
+    """How many flags are true in each of `n` windows that begin one flag apart and cover all flags."""
+    sums = np.concatenate([[0], np.cumsum(flags)])
+    return sums[-n:] - sums[:n]
 
 
 def _flat(actions: Sequence[Any]) -> list[float]:
