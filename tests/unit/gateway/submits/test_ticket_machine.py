@@ -262,7 +262,12 @@ BUGS = (
         "ticket.requested = entry, True",
         "ticket.requested = entry, False",
     ),
-    Bug("nothing charged", "noted", "remaining_budget=remaining", "remaining_budget=self.state.remaining_budget"),
+    Bug(
+        "nothing charged",
+        "noted",
+        "remaining_budget=remaining",
+        "remaining_budget=self.state.remaining_budget",
+    ),
     Bug("a refused submit takes an index", "_end", "self._open.accepted is None", "False"),
     Bug("an accepted submit loses its index", "_end", "self._open.accepted is None", "True"),
     Bug("a crash not counted", "noted", "self.deaths.update", "list"),
