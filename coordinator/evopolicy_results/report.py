@@ -76,7 +76,8 @@ def write_report(
     submits: list[dict[str, Any]] = []
     drawings = drawings_of(study)
     pages = _pages(study, out, look) if traces else []
-    work = [(names_in_runs, each) for each in (*drawings, *pages)]
+    stages: list[partial[Any]] = [*drawings, *pages]
+    work = [(names_in_runs, each) for each in stages]
     for done, made in enumerate(processes.map(_made, work, _lost, at_once=1), start=1):
         if done <= len(drawings):
             plots += [made] if made is not None else []

@@ -129,14 +129,14 @@ def _prefixes(dotted: str, depth: int) -> list[str]:
 
 def _imported(module: Module, is_package: bool) -> set[str]:
     targets: set[str] = set()
-    for node in module.imports:
-        if isinstance(node, ast.Import):
-            targets.update(alias.name for alias in node.names)
+    for statement in module.imports:
+        if isinstance(statement, ast.Import):
+            targets.update(alias.name for alias in statement.names)
         else:
-            base = absolute_import(node, module.name, is_package)
+            base = absolute_import(statement, module.name, is_package)
             if base:
                 targets.add(base)
-            targets.update(f"{base}.{alias.name}" if base else alias.name for alias in node.names)
+            targets.update(f"{base}.{alias.name}" if base else alias.name for alias in statement.names)
     by_call = any(name in module.source for name in (b"import_module", b"__import__"))
     for node in module.nodes if by_call else ():
         if not isinstance(node, ast.Call) or not node.args or not isinstance(node.args[0], ast.Constant):

@@ -15,6 +15,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from evopolicy_common.records.episodes.npz import read_arrays
 from evopolicy_results.code.sources import parsed
@@ -94,15 +95,15 @@ def _windows(sequences: Iterable[Sequence[float]]) -> Iterator[Window]:
             varied &= _in_each(values[period:] == values[:-period], n) < _WINDOW - period
         steps = np.array([round(other - one, 9) for one, other in itertools.pairwise(numbers)])
         varied &= _in_each(steps[1:] == steps[:-1], n) < _WINDOW - 2
-        for start in np.flatnonzero(varied):
+        for start in np.flatnonzero(varied).tolist():
             window = tuple(numbers[start : start + _WINDOW])
             if len(set(window)) >= _FEWEST_VALUES:
                 yield window
 
 
-def _in_each(flags: np.ndarray, n: int) -> np.ndarray:
+def _in_each(flags: NDArray[np.bool_], n: int) -> NDArray[np.int64]:
     """How many flags are true in each of `n` windows that begin one flag apart and cover all flags."""
-    sums = np.concatenate([[0], np.cumsum(flags)])
+    sums: NDArray[np.int64] = np.concatenate([[0], np.cumsum(flags)])
     return sums[-n:] - sums[:n]
 
 
