@@ -126,7 +126,7 @@ bench-start: install
 
 # Peers of another Python: make bench-peers ARGS="--python /path/to/python"
 bench-peers: install
-	@PYTHONPATH=tests/bench $(BIN)/python tests/bench/peers_bench.py $(ARGS)
+	@PYTHONPATH=tests/bench:tests/support $(BIN)/python tests/bench/peers_bench.py $(ARGS)
 
 # Episodes per second through coordinator and Zenoh, beside Dask's no-op tasks.
 bench-throughput: install
