@@ -11,6 +11,7 @@ import pytest
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.operator import RunCreated
 from evopolicy_common.messages.run_settings import RunSettings
+from evopolicy_common.records.open_run import IntendedRun
 from evopolicy_gateway.run.lifecycle import RunLifecycle
 from evopolicy_gateway.run.plan import Plan
 
@@ -22,11 +23,11 @@ class Operations:
         self.open: dict[str, RunSettings] = {}
         self.refuses = False
 
-    async def create(self, settings: RunSettings, key: str) -> RunCreated:
+    async def create(self, wanted: IntendedRun) -> RunCreated:
         if self.refuses:
             raise ConfigError("the cases are public")
-        self.open[key] = settings
-        return RunCreated(run=key, capability="c")
+        self.open[wanted.key] = wanted.settings
+        return RunCreated(run=wanted.key, capability="c")
 
     async def cancel(self, run: str) -> None:
         del self.open[run]
@@ -49,7 +50,8 @@ def ask(folder: Path, operations: Operations, budget: int = 8) -> str:
 
     async def main() -> str:
         nothing: Any = object()
-        return await RunLifecycle(plan, operations, nothing, nothing)._ask()  # type: ignore[arg-type]
+        lifecycle = RunLifecycle(plan, operations, nothing, nothing)  # type: ignore[arg-type]
+        return (await lifecycle._ask(lifecycle._wanted)).key
 
     key = asyncio.run(main())
     assert plan.folder.run_json.read_text() == "earlier"
