@@ -11,6 +11,7 @@
 # make check-envs  plays every environment of every family, and writes the tables in docs/reference/environments/
 # make bench  what an episode costs, beside a bare loop
 # make bench-start        what one waits for before anything is played
+# make bench-replay       how far Codex and Claude Code are replayed, where they are installed
 # make bench-peers        the same episodes through Gymnasium's vectors, Ray and Dask, where they are installed
 # make bench-throughput   episodes per second through the coordinator
 # make bench-scale        CPU of coordinator, gateways and workers' supervisors an episode, with real trajectories
@@ -32,7 +33,7 @@ FAMILIES := $(VENV)/.families
 STAMP := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help install families paper-worker demo test test-system test-families test-long check check-envs docs release bench bench-start bench-peers bench-throughput bench-scale bench-channels bench-report bench-coverage bench-isolation bench-costs bench-web bench-web-live faults sim clean
+.PHONY: help install families paper-worker demo test test-system test-families test-long check check-envs docs release bench bench-start bench-replay bench-peers bench-throughput bench-scale bench-channels bench-report bench-coverage bench-isolation bench-costs bench-web bench-web-live faults sim clean
 
 help:
 	@sed -n 's/^# make/make/p' Makefile
@@ -123,6 +124,10 @@ bench: install
 # Help, the first episode, a trial, a report: each beside a bare Python with the same imports.
 bench-start: install
 	@PYTHONPATH=tests/bench $(BIN)/python tests/bench/start_bench.py $(ARGS)
+
+# Real CLIs: EVOPOLICY_REAL_CLIS=~/clis/node_modules/.bin make bench-replay ARGS="--runs 4 --clis codex"
+bench-replay: install
+	@PYTHONPATH=tests/bench:tests/support $(BIN)/python tests/bench/replay_bench.py $(ARGS)
 
 # Peers of another Python: make bench-peers ARGS="--python /path/to/python"
 bench-peers: install

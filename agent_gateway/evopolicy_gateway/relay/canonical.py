@@ -47,6 +47,18 @@ TEXTS: tuple[tuple[str, re.Pattern[bytes], bytes], ...] = (
     ("durations of a submit", re.compile(rb'(wall_time_seconds\\*":\s*)[0-9.eE+-]+'), rb"\1[seconds]"),
     ("what Codex tells of a command", re.compile(rb"(Wall time: )[0-9a-f.]+"), rb"\1[once]"),
     ("what Codex tells of a command", re.compile(rb"(Chunk ID: )[0-9a-f.]+"), rb"\1[once]"),
+    ("names of Codex's open commands", re.compile(rb"(session ID )\d+"), rb"\1[once]"),
+    (
+        "names of Claude Code's background commands",
+        re.compile(rb"(running in background with ID: )\w+"),
+        rb"\1[once]",
+    ),
+    ("files of their output", re.compile(rb"(/tasks/)\w+(?=\.output)"), rb"\1[once]"),
+    ("files of long output", re.compile(rb"(/tool-results/)\w+(?=\.txt)"), rb"\1[once]"),
+    ("durations of `time`", re.compile(rb"((?:real|user|sys)\\+t)\d+m[0-9.]+s"), rb"\1[seconds]"),
+    ("durations of `unittest`", re.compile(rb"(Ran \d+ tests? in )[0-9.]+s"), rb"\1[seconds]"),
+    ("addresses of Python's objects", re.compile(rb"( at 0x)[0-9a-f]{6,16}(?=>)"), rb"\1[address]"),
+    ("inodes of `stat`", re.compile(rb"(Inode: )\d+ *"), rb"\1[inode] "),
     ("what Codex tells of a command", re.compile(rb'(duration_seconds\\*":\s*)[0-9a-f.]+'), rb"\1[once]"),
 )
 """Patterns in the request's JSON, with what takes their place, after random ids (UUIDs)."""
@@ -85,7 +97,7 @@ def _remove(value: Any, path: list[str]) -> None:
 def difference(recorded: Any, now: Any) -> str:
     """How two canonical requests differ, in lines of a unified diff, at most `MAX_LINES`."""
     ours, theirs = (
-        json.dumps(each, indent=1, ensure_ascii=False).replace("\\n", "\n").split("\n")
+        json.dumps(each, indent=1, ensure_ascii=False, sort_keys=True).replace("\\n", "\n").split("\n")
         for each in (recorded, now)
     )
     lines = list(difflib.unified_diff(ours, theirs, "recorded", "now", n=2, lineterm=""))

@@ -26,9 +26,10 @@ a turn."""
 
 
 class Step:
-    """`command`: run it in the agent's shell. `tool`: call the offered tool whose name ends so, without arguments.
-    `text`: say it and end the turn. `status`: an HTTP error instead. `unknown`: call a tool of this name, which the
-    agent does not offer. `odd`: answer in a way of its own (`odd_answers.py`)."""
+    """`command`: run it in the agent's shell. `tool`: call the offered tool whose name ends so, with the arguments that
+    `given` makes from the request's JSON. `also`: further calls in the same answer, of Codex or Claude Code. `text`:
+    say it and end the turn. `status`: an HTTP error instead. `unknown`: call a tool of this name, which the agent does
+    not offer. `odd`: answer in a way of its own (`odd_answers.py`)."""
 
     def __init__(
         self,
@@ -38,7 +39,11 @@ class Step:
         tool: str | None = None,
         unknown: str = "",
         odd: Callable[[Any, dict[str, Any]], None] | None = None,
+        given: Callable[[str], dict[str, Any]] = lambda request: {},
+        also: Sequence[Step] = (),
     ) -> None:
+        self.given = given
+        self.also = also
         self.unknown = unknown
         self.odd = odd
         self.command = command
@@ -50,12 +55,13 @@ class Step:
     def calls(self) -> bool:
         return self.command is not None or self.tool is not None or bool(self.unknown)
 
-    def call(self, offered: list[str]) -> tuple[str, dict[str, Any]]:
+    def call(self, offered: list[str], request: dict[str, Any]) -> tuple[str, dict[str, Any]]:
         """The tool that it calls, of those that an agent offers, and the arguments."""
         if self.unknown:
             return self.unknown, {"path": "policy.py"}
         if self.tool is not None:
-            return next(name for name in offered if name.endswith(self.tool)), {}
+            name = next(name for name in offered if name.endswith(self.tool))
+            return name, self.given(json.dumps(request))
         return _offered(offered), _shell_arguments(self.command or "")
 
 
@@ -195,7 +201,7 @@ def _chat(step: Step, request: dict[str, Any]) -> Iterator[dict[str, Any]]:
     if found is not None and found not in names and "tool_call" in names:
         name, arguments = "tool_call", {"name": found, "arguments": {}}
     else:
-        name, arguments = step.call(names)
+        name, arguments = step.call(names, request)
     yield from _chat_call(name, arguments, request, f"call_{id(step)}")
 
 
@@ -237,7 +243,7 @@ def _contents(step: Step, request: dict[str, Any]) -> Iterator[dict[str, Any]]:
     part: dict[str, Any] = {"text": step.text}
     if step.calls:
         declared = [one["name"] for tool in request["tools"] for one in tool.get("functionDeclarations", ())]
-        name, arguments = step.call(declared)
+        name, arguments = step.call(declared, request)
         part = {"functionCall": {"name": name, "args": arguments}}
     usage = {
         "promptTokenCount": INPUT,
@@ -260,16 +266,17 @@ def _shell_arguments(command: str) -> dict[str, Any]:
 
 
 def _responses(step: Step, request: dict[str, Any]) -> Iterator[dict[str, Any]]:
-    if not step.calls:
-        content = [{"type": "output_text", "text": step.text, "annotations": []}]
-        item: dict[str, Any] = {"type": "message", "id": "m1", "role": "assistant", "content": content}
-    else:
-        item = {"type": "function_call", "id": "f1", "call_id": f"call_{id(step)}"}
-        item |= _codex_call(step, request)
-    yield from _responses_with(f"resp_{id(step)}", item)
+    content = [{"type": "output_text", "text": step.text, "annotations": []}]
+    items: list[dict[str, Any]] = [{"type": "message", "id": "m1", "role": "assistant", "content": content}]
+    if step.calls:
+        items = [
+            {"type": "function_call", "id": "f1", "call_id": f"call_{id(each)}"} | _codex_call(each, request)
+            for each in (step, *step.also)
+        ]
+    yield from _responses_with(f"resp_{id(step)}", *items)
 
 
-def _responses_with(identity: str, item: dict[str, Any]) -> Iterator[dict[str, Any]]:
+def _responses_with(identity: str, *items: dict[str, Any]) -> Iterator[dict[str, Any]]:
     usage = {
         "input_tokens": INPUT,
         "input_tokens_details": {"cached_tokens": CACHED},
@@ -278,8 +285,9 @@ def _responses_with(identity: str, item: dict[str, Any]) -> Iterator[dict[str, A
         "total_tokens": INPUT + OUTPUT,
     }
     yield {"type": "response.created", "response": {"id": identity}}
-    yield {"type": "response.output_item.done", "output_index": 0, "item": item}
-    yield {"type": "response.completed", "response": {"id": identity, "output": [item], "usage": usage}}
+    for n, item in enumerate(items):
+        yield {"type": "response.output_item.done", "output_index": n, "item": item}
+    yield {"type": "response.completed", "response": {"id": identity, "output": list(items), "usage": usage}}
 
 
 def _codex_call(step: Step, request: dict[str, Any]) -> dict[str, Any]:
@@ -292,7 +300,7 @@ def _codex_call(step: Step, request: dict[str, Any]) -> dict[str, Any]:
     found = _codex_tool(step.tool, request)
     if found is None:
         raise AssertionError(f"no {step.tool} among the offered tools: {request['tools']}")
-    return {**found, "arguments": "{}"}
+    return {**found, "arguments": json.dumps(step.given(json.dumps(request)))}
 
 
 def _codex_tool(name: str, request: dict[str, Any]) -> dict[str, str] | None:
@@ -330,18 +338,20 @@ def _messages(step: Step, request: dict[str, Any]) -> Iterator[dict[str, Any]]:
     message = {"id": f"msg_{id(step)}", "type": "message", "role": "assistant", "model": request["model"]}
     message |= {"content": [], "stop_reason": None, "stop_sequence": None, "usage": usage}
     yield {"type": "message_start", "message": message}
-    if not step.calls:
-        block: dict[str, Any] = {"type": "text", "text": ""}
-        delta = {"type": "text_delta", "text": step.text}
-    else:
-        name, arguments = step.call([tool["name"] for tool in request["tools"]])
-        # Claude Code's shell refuses arguments that it does not know.
-        arguments = {key: value for key, value in arguments.items() if key == "command"}
-        block = {"type": "tool_use", "id": f"toolu_{id(step)}", "name": name, "input": {}}
-        delta = {"type": "input_json_delta", "partial_json": json.dumps(arguments)}
-    yield {"type": "content_block_start", "index": 0, "content_block": block}
-    yield {"type": "content_block_delta", "index": 0, "delta": delta}
-    yield {"type": "content_block_stop", "index": 0}
+    for n, each in enumerate((step, *step.also)):
+        if not each.calls:
+            block: dict[str, Any] = {"type": "text", "text": ""}
+            delta = {"type": "text_delta", "text": each.text}
+        else:
+            name, arguments = each.call([tool["name"] for tool in request["tools"]], request)
+            if each.tool is None:
+                # Claude Code's shell refuses arguments that it does not know.
+                arguments = {key: value for key, value in arguments.items() if key == "command"}
+            block = {"type": "tool_use", "id": f"toolu_{id(each)}", "name": name, "input": {}}
+            delta = {"type": "input_json_delta", "partial_json": json.dumps(arguments)}
+        yield {"type": "content_block_start", "index": n, "content_block": block}
+        yield {"type": "content_block_delta", "index": n, "delta": delta}
+        yield {"type": "content_block_stop", "index": n}
     stop = {"stop_reason": "tool_use" if step.calls else "end_turn", "stop_sequence": None}
     yield {"type": "message_delta", "delta": stop, "usage": {"output_tokens": OUTPUT}}
     yield {"type": "message_stop"}

@@ -39,10 +39,25 @@ SAME = [
         said("Chunk ID: 0a1b2c\nWall time: 0.2 seconds"),
         said("Chunk ID: ffffff\nWall time: 9 seconds"),
     ),
+    ("responses", said("running with session ID 54321"), said("running with session ID 9876")),
+    (
+        "messages",
+        said("Command running in background with ID: bsk6m4i4a. Output: /tmp/c/tasks/bsk6m4i4a.output"),
+        said("Command running in background with ID: b00000000. Output: /tmp/c/tasks/b00000000.output"),
+    ),
+    ("messages", said("saved to: /r/tool-results/bx1.txt"), said("saved to: /r/tool-results/b9z.txt")),
+    ("messages", said("real\t0m0.013s\nuser\t0m1.2s"), said("real\t1m0.011s\nuser\t0m0.9s")),
+    ("messages", said(json.dumps("sys\t0m0.013s")), said(json.dumps("sys\t0m0.011s"))),
+    ("messages", said("Ran 1 test in 0.000s"), said("Ran 1 test in 0.012s")),
+    ("messages", said("<P object at 0x7fb98a3c5d10>"), said("<P object at 0x7f11c2a09d90>")),
+    ("messages", said("Inode: 2360997     Links: 1"), said("Inode: 99          Links: 1")),
 ]
 DIFFERENT = [
     ("chat/completions", said("a", temperature=0), said("a", temperature=1)),
     ("messages", said("mean return 97.62"), said("mean return 97.63")),
+    ("messages", said("Ran 1 test in 0.1s"), said("Ran 2 tests in 0.1s")),
+    ("messages", said("at 0x7fb98a3c5d10 it fails"), said("at 0x7f11c2a09d90 it fails")),
+    ("messages", said("/a/tasks/one.output"), said("/b/tasks/one.output")),
     ("messages", said("a") | {"system": [{"text": "x"}]}, said("a") | {"system": [{"text": "y"}]}),
 ]
 

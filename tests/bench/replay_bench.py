@@ -1,0 +1,239 @@
+"""`make bench-replay`: how far real coding agents are replayed.
+
+Each CLI plays runs in its jail whose model, a script on loopback, edits a policy, submits, reads the feedback and
+uses the CLI's tools; no two scripts are equal. Each run is recorded with `--record-model full` and replayed. It prints
+a line for each run: its steps, its calls, and `identical`, or the first place that differs. Every fifth run prints a
+value that no replay repeats (`CHANCE`). `EVOPOLICY_REAL_CLIS` names the folder of the CLIs, as
+tests/integration/gateway/agents/test_real_clis.py tells. Asserts nothing.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import random
+import re
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from commands import evopolicy
+from coordinator_harness import Coordinator
+from rich.console import Console
+from stages.model_api import ModelApi, Step
+
+from evopolicy_common.records import model_record
+
+CLIS = {
+    "codex": ("codex", "openai", "gpt-5.5"),
+    "claude-code": ("claude", "anthropic", "claude-opus-4-7"),
+    "qwen": ("qwen", "openai", "qwen3-coder-plus"),
+}
+"""Program, protocol, and model of each harness."""
+QWEN = Path(__file__).parents[2] / "examples" / "agents" / "qwen.toml"
+ENVS = ("gym/acrobot", "gymnasium/MiniGrid-Empty-5x5-v0")
+POLICY = "class Policy:\n def __init__(self, *a): pass\n def reset(self, i): pass\n def act(self, obs): return {}\n"
+USUAL = {
+    "error": "python3 system/none.py; cat none; ls /none; exit 3",
+    "traceback": "cd system && python3 -c 'from policy import Policy as P; raise ValueError(P(), P.act)'",
+    "long": "seq 1 30000",
+    "listing": "date; ls -la . system; ls -la --time-style=full-iso feedback; stat system/policy.py; git status",
+    "search": "find . -type f; grep -rn return system; ls -RlU feedback | head -40",
+    "feedback": "cat feedback/*/summary.json; find feedback -type f | head -20 | xargs head -c 600",
+    "timed": "time python3 -c 'print(sum(range(100000)))'",
+    "machine": "uname -a; id; nproc; python3 --version; env | sort; pwd; which python3 git node",
+    "background": "sleep 0.2 & wait; jobs; echo done",
+    "unit test": "printf 'import unittest\\nclass T(unittest.TestCase):\\n def test(self): pass\\n' > t.py;"
+    " python3 -m unittest t; rm -r t.py __pycache__",
+}
+"""Commands of any script."""
+CHANCE = {
+    "a process id": "echo $$; sleep 0.1 & echo $!; wait",
+    "a temporary name": "mktemp -d",
+    "a time of its own": "python3 -c 'import time; print(time.perf_counter())'",
+    "use of memory": "cat /proc/meminfo | head -3; cat /proc/loadavg",
+}
+
+
+def submit(n: int) -> Step:
+    ids = json.dumps({"env_instances": list(range(n))})
+    return Step(command=f"curl -s --noproxy '*' -X POST -d '{ids}' $EVOPOLICYGYM_SUBMIT_URL")
+
+
+def found(pattern: str, name: str, **more: Any) -> Any:
+    """Arguments with the last value in the request that the pattern finds."""
+
+    def given(request: str) -> dict[str, Any]:
+        value = (re.findall(pattern, request) or ["0"])[-1]
+        return {name: int(value) if value.isdecimal() else value, **more}
+
+    return given
+
+
+def own_tools(harness: str, action: int) -> dict[str, list[Step]]:
+    """What only this CLI can do, by name."""
+    slow = "for i in 1 2 3 4; do echo $i; sleep 0.7; done"
+    if harness == "codex":
+        patch = "*** Begin Patch\n*** Update File: system/policy.py\n@@\n class Policy:\n+ # patched\n*** End Patch"
+        return {
+            "edit": [
+                Step(command="cat system/policy.py"),
+                Step(command=f"apply_patch <<'EOF'\n{patch}\nEOF"),
+            ],
+            "slow": [
+                Step(tool="exec_command", given=lambda _: {"cmd": slow, "yield_time_ms": 1000}),
+                Step(tool="write_stdin", given=found(r"session ID (\d+)", "session_id", yield_time_ms=9000)),
+            ],
+        }
+    if harness == "qwen":
+        return {}
+    file = r"(/[^\s\"\\]*/workspace)"
+    return {
+        "edit": [
+            Step(
+                tool="Read", given=lambda text: {"file_path": f"{re.findall(file, text)[0]}/system/policy.py"}
+            ),
+            Step(
+                tool="Edit",
+                given=lambda text: {
+                    "file_path": f"{re.findall(file, text)[0]}/system/policy.py",
+                    "old_string": "class Policy:\n",
+                    "new_string": "class Policy:\n # edited\n",
+                },
+            ),
+        ],
+        "slow": [
+            Step(
+                tool="Bash", given=lambda _: {"command": slow, "run_in_background": True, "description": "s"}
+            ),
+            Step(command="sleep 4"),
+            Step(tool="Read", given=found(r"(/[^\s\"\\]+\.output)", "file_path")),
+        ],
+        "search": [
+            Step(
+                tool="Grep",
+                given=lambda _: {"pattern": "return"},
+                also=[Step(tool="Glob", given=lambda _: {"pattern": "**/*"})],
+            )
+        ],
+    }
+
+
+def script(harness: str, index: int) -> tuple[str, int, list[Step], list[str]]:
+    """Environment, budget, steps, and the steps' names of a run."""
+    rng = random.Random(index)
+    names = rng.sample(sorted(USUAL), 4)
+    own = own_tools(harness, index)
+    parts = {name: [Step(command=USUAL[name])] for name in names}
+    parts |= {f"own {name}": own[name] for name in rng.sample(sorted(own), min(2, len(own)))}
+    first, second = rng.sample(sorted(USUAL), 2)
+    both = [Step(command=USUAL[second])]
+    parts[f"{first} ∥ {second}"] = [Step(command=USUAL[first], also=both)]
+    if index % 5 == 4:
+        name = list(CHANCE)[index // 5 % len(CHANCE)]
+        parts[name] = [Step(command=CHANCE[name])]
+    order = rng.sample(sorted(parts), len(parts))
+    steps, budget, n_submits = [], 0, 2 + index % 3
+    for n in range(n_submits):
+        text = POLICY.format((index + n) % 3)
+        steps += [Step(command=f"cat > system/policy.py <<'EOF'\n{text}EOF"), submit(1 + (index + n) % 2)]
+        budget += 1 + (index + n) % 2
+        for name in order[n::n_submits] if n < n_submits - 1 else ():
+            steps += parts[name]
+        if n == 0:
+            for name in order[n_submits - 1 :: n_submits]:
+                steps += parts[name]
+        if index % 4 == 1 and n == 0:
+            steps.append(Step(text="I am done."))  # and is prompted again
+    return ENVS[index % 2], budget, [*steps, Step(text="done")], order
+
+
+@contextmanager
+def cluster(root: Path) -> Iterator[str]:
+    """The operator's credentials for a cluster with both environments."""
+    coordinator = Coordinator(root / "s")
+    words = [word for env in ENVS for word in ("--env", env)]
+    words += ["--slots", "2", "--grace", "0", "--credentials", coordinator.ready["credentials"]["worker"]]
+    with coordinator.log.open("ab") as log:
+        program = [sys.executable, "-m", "evopolicy_worker.cli", *words]
+        worker = subprocess.Popen(program, stdout=log, stderr=log)
+    try:
+        yield coordinator.ready["credentials"]["operator"]
+    finally:
+        worker.terminate()
+        worker.wait()
+        coordinator.stop()
+
+
+def agent(harness: str, folder: Path, base_url: str) -> None:
+    program, protocol, model = CLIS[harness]
+    path = f"{os.environ['EVOPOLICY_REAL_CLIS']}/{program}"
+    url = base_url if protocol == "anthropic" else f"{base_url}/v1"
+    lines = [f'harness = "{harness}"\nprogram = ["{path}"]\nmodel = "{model}"\nbackoff_s = 0.1\n']
+    lines.append(f'[api]\nprotocol = "{protocol}"\nbase_url = "{url}"\nkey = "MODEL_ACCESS"\n')
+    if harness == "qwen":
+        text = QWEN.read_text()
+        lines.append(text[text.index("[cli]") :])
+    (folder / "agent.toml").write_text("".join(lines))
+
+
+def play(harness: str, index: int, root: Path, operator: str) -> tuple[str, ...]:
+    """A run and its replay, as a row."""
+    env, budget, steps, names = script(harness, index)
+    folder = root / f"{harness}-{index}"
+    folder.mkdir()
+    with ModelApi(steps) as api:
+        agent(harness, folder, api.base_url)
+        arguments = ["--env", env, "--budget", str(budget), "--validation", "1", "--heldout", "1"]
+        done = evopolicy(
+            folder,
+            *("run", *arguments, "--agent", "file:agent.toml", "--exp-id", "t", "--record-model", "full"),
+            *("--credentials", operator),
+        )
+        (folder / "run.log").write_text(done.stdout + done.stderr)
+    runs = list((folder / "runs").glob("*/*/t"))
+    shown = (str(index), env.rpartition("/")[2], ", ".join(names))
+    if done.returncode or not runs:
+        return (*shown, "", f"not recorded: {done.stderr[-200:]}")
+    n_calls = len(model_record.read_calls(runs[0] / model_record.FOLDER))
+    done = evopolicy(folder, "replay", str(runs[0]), "--credentials", operator)
+    (folder / "replay.log").write_text(done.stdout + done.stderr)
+    lines = done.stdout.splitlines() or done.stderr.splitlines()[-1:]
+    differs = [next((line for line in lines[3:] if line.startswith(sign)), "")[:160] for sign in "-+"]
+    return (*shown, f"{api.played} / {n_calls}", " ⏎ ".join(filter(None, (lines[0][:160], *differs))))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--runs", type=int, default=20, help="of each CLI (default: 20)")
+    parser.add_argument("--clis", nargs="+", choices=CLIS, default=["codex", "claude-code"])
+    parser.add_argument("--only", type=int, nargs="*", help="only runs of these numbers")
+    parser.add_argument("--parallel", type=int, default=2, help="runs at once (default: 2)")
+    parser.add_argument("--keep", type=Path, help="keep the runs in this new folder")
+    chosen = parser.parse_args()
+    os.environ["MODEL_ACCESS"] = "key-of-the-bench-0123456789"
+    console = Console(width=200)
+    with tempfile.TemporaryDirectory(prefix="evopolicy-replays-") as name:
+        root = chosen.keep or Path(name)
+        root.mkdir(exist_ok=chosen.keep is None)
+        with cluster(root) as operator, ThreadPoolExecutor(chosen.parallel) as pool:
+            for harness in chosen.clis:
+                numbers = chosen.only or range(chosen.runs)
+                rows = []
+                for row in pool.map(lambda n: play(harness, n, root, operator), numbers):  # noqa: B023
+                    rows.append(row)
+                    console.print(" | ".join((harness, *row)), markup=False, highlight=False)
+                same = sum(row[-1] == "identical" for row in rows)
+                console.print(f"{harness}: {same} of {len(rows)} replays are identical")
+
+
+if __name__ == "__main__":
+    main()
