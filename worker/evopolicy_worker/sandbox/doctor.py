@@ -40,7 +40,7 @@ _UNMASK = (
 )
 
 
-class Check(msgspec.Struct, frozen=True, kw_only=True):
+class Check(msgspec.Struct, frozen=True):
     """The result of one check."""
 
     name: str
@@ -78,20 +78,15 @@ def best_tier(checks: tuple[Check, ...]) -> Tier | None:
 
 
 def _kernel() -> Check:
-    return Check(
-        name="kernel", verdict="note", found=f"{platform.system()} {platform.release()} {platform.machine()}"
-    )
+    return Check("kernel", "note", f"{platform.system()} {platform.release()} {platform.machine()}")
 
 
 def _boot_id() -> Check:
     boot_id = host.boot_id()
     if boot_id:
-        return Check(name="boot id", verdict="ok", found=boot_id)
+        return Check("boot id", "ok", boot_id)
     return Check(
-        name="boot id",
-        verdict="missing",
-        found="unknown, so this worker gets no hidden episodes",
-        advice=host.NO_BOOT_ID,
+        "boot id", "missing", "unknown, so this worker gets no hidden episodes", advice=host.NO_BOOT_ID
     )
 
 
@@ -105,14 +100,14 @@ def _bubblewrap() -> Check:
         ).stdout.strip()
     except (OSError, subprocess.TimeoutExpired) as error:
         return _no_bubblewrap(str(error))
-    return Check(name="bubblewrap", verdict="ok", found=f"{output} ({path})")
+    return Check("bubblewrap", "ok", f"{output} ({path})")
 
 
 def _no_bubblewrap(found: str) -> Check:
     return Check(
-        name="bubblewrap",
-        verdict="missing",
-        found=found,
+        "bubblewrap",
+        "missing",
+        found,
         advice=distribution.install("bubblewrap"),
         without="policies with --tier landlock where the kernel has it, agents with --jail none; reports",
     )
@@ -123,11 +118,11 @@ def _namespace(name: str, flag: int) -> Check:
     flags = flag | (0 if os.geteuid() == 0 else _CLONE_NEWUSER)
     error = _tried(flags)
     if error == 0:
-        return Check(name=f"namespace {name}", verdict="ok", found="can be made")
+        return Check(f"namespace {name}", "ok", "can be made")
     return Check(
-        name=f"namespace {name}",
-        verdict="missing",
-        found=os.strerror(error),
+        f"namespace {name}",
+        "missing",
+        os.strerror(error),
         advice=f"permit user namespaces: {distribution.permit_namespaces()}",
         without="policies with --tier landlock where the kernel has it, agents with --jail none; reports",
     )
@@ -144,11 +139,11 @@ def _tried(flags: int) -> int:
 
 def _seccomp() -> Check:
     if seccomp.supported() and "Seccomp:" in Path("/proc/self/status").read_text():
-        return Check(name="seccomp", verdict="ok", found=f"filter for {platform.machine()}")
+        return Check("seccomp", "ok", f"filter for {platform.machine()}")
     return Check(
-        name="seccomp",
-        verdict="missing",
-        found=f"no filter for {platform.machine()}, or a kernel without seccomp",
+        "seccomp",
+        "missing",
+        f"no filter for {platform.machine()}, or a kernel without seccomp",
         advice="use an x86-64 or 64-bit ARM machine with CONFIG_SECCOMP_FILTER",
     )
 
@@ -156,11 +151,11 @@ def _seccomp() -> Check:
 def _landlock() -> Check:
     version = jail.landlock_version()
     if version:
-        return Check(name="Landlock", verdict="ok", found=f"ABI {version}")
+        return Check("Landlock", "ok", f"ABI {version}")
     return Check(
-        name="Landlock",
-        verdict="missing",
-        found="not in this kernel, or not enabled",
+        "Landlock",
+        "missing",
+        "not in this kernel, or not enabled",
         advice="kernel 5.13 or later with lsm=landlock,…; tier bwrap works without it, tier landlock does not",
     )
 
@@ -173,7 +168,7 @@ def _cgroups() -> Check:
         version = "version 1"
     else:
         version = "none"
-    return Check(name="cgroups", verdict="note", found=f"{version} (limits do not need them)")
+    return Check("cgroups", "note", f"{version} (limits do not need them)")
 
 
 def _pinning() -> Check:
@@ -184,22 +179,20 @@ def _pinning() -> Check:
         os.sched_setaffinity(0, allowed)
     except OSError as error:
         return Check(
-            name="CPU pinning",
-            verdict="missing",
-            found=error.strerror or str(error),
+            "CPU pinning",
+            "missing",
+            error.strerror or str(error),
             advice="allow sched_setaffinity; without it a step costs 100 µs more",
         )
-    return Check(
-        name="CPU pinning", verdict="ok", found=f"{len(allowed)} of {os.cpu_count()} cores may be used"
-    )
+    return Check("CPU pinning", "ok", f"{len(allowed)} of {os.cpu_count()} cores may be used")
 
 
 def _shared_memory() -> Check:
     path = Path("/dev/shm")
     if not path.is_dir():
-        return Check(name="/dev/shm", verdict="note", found="not there (the runtime does not need it)")
+        return Check("/dev/shm", "note", "not there (the runtime does not need it)")
     free = shutil.disk_usage(path).free
-    return Check(name="/dev/shm", verdict="note", found=f"{free >> 20:,} MiB free (not shown to policies)")
+    return Check("/dev/shm", "note", f"{free >> 20:,} MiB free (not shown to policies)")
 
 
 def _clock() -> Check:
@@ -210,31 +203,29 @@ def _clock() -> Check:
     for _ in range(1000):
         time.monotonic()
     each = (time.perf_counter() - start) * 1e6
-    return Check(
-        name="clock", verdict="note", found=f"{name}, {resolution * 1e9:g} ns, {each:.0f} ns to read"
-    )
+    return Check("clock", "note", f"{name}, {resolution * 1e9:g} ns, {each:.0f} ns to read")
 
 
 def _fingerprint() -> list[Check]:
     own = fingerprint()
     packages = ", ".join(f"{name} {version}" for name, version in own.packages.items())
     return [
-        Check(name="worker", verdict="note", found=f"{own.code_version}, Python {own.python}"),
-        Check(name="packages", verdict="note", found=packages),
-        Check(name="CPU", verdict="note", found=own.cpu),
+        Check("worker", "note", f"{own.code_version}, Python {own.python}"),
+        Check("packages", "note", packages),
+        Check("CPU", "note", own.cpu),
     ]
 
 
 def _accelerations() -> Check:
     if not settings.accelerations_on():
-        return Check(name="accelerations", verdict="note", found="all off: EVOPOLICY_ACCELERATIONS is set")
+        return Check("accelerations", "note", "all off: EVOPOLICY_ACCELERATIONS is set")
     with quiet():
         off = accelerations.off()
     texts = [f"{name} off ({why})" for name, why in off.items()]
     return Check(
-        name="accelerations",
-        verdict="note" if off else "ok",
-        found="; ".join(texts) or "all that the installed environments have are on",
+        "accelerations",
+        "note" if off else "ok",
+        "; ".join(texts) or "all that the installed environments have are on",
         advice="install the proved versions: -c constraints.txt" if off else "",
     )
 
@@ -245,11 +236,11 @@ def _tiers(allowed_packages: tuple[str, ...]) -> list[Check]:
     for tier in tiers:
         why = why_not(tier, allowed_packages)
         if why is None:
-            rows.append(Check(name=f"tier {tier}", verdict="ok", found="a sandbox started"))
+            rows.append(Check(f"tier {tier}", "ok", "a sandbox started"))
         else:
             advice = _UNMASK if "proc" in why and "mount" in why else "see the rows above"
-            rows.append(Check(name=f"tier {tier}", verdict="missing", found=why, advice=advice))
+            rows.append(Check(f"tier {tier}", "missing", why, advice=advice))
     return [
         *rows,
-        Check(name="tier none", verdict="note", found="no sandbox; used only by runs that ask for it"),
+        Check("tier none", "note", "no sandbox; used only by runs that ask for it"),
     ]

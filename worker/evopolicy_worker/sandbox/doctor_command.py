@@ -54,9 +54,9 @@ def _next(tier: str | None) -> str:
 
 def _no_worker() -> Check:
     return Check(
-        name="sandbox",
-        verdict="missing",
-        found=f"this is {sys.platform}; the sandbox is made of Linux namespaces",
+        "sandbox",
+        "missing",
+        f"this is {sys.platform}; the sandbox is made of Linux namespaces",
         without="coordinator, agents on another machine's workers, and reports",
         advice="use Linux or WSL2 for workers",
     )

@@ -38,11 +38,11 @@ def examine_machine() -> tuple[Check, ...]:
 def _python() -> Check:
     version = platform.python_version()
     if int(version.split(".")[1]) <= _NEWEST_TRIED:
-        return Check(name="Python", verdict="ok", found=f"{version} ({sys.executable})")
+        return Check("Python", "ok", f"{version} ({sys.executable})")
     return Check(
-        name="Python",
-        verdict="note",
-        found=f"{version}; simulators are tried with 3.11 to 3.13",
+        "Python",
+        "note",
+        f"{version}; simulators are tried with 3.11 to 3.13",
         advice="use one of these where an environment does not install",
     )
 
@@ -54,9 +54,9 @@ def _extras() -> list[Check]:
         missing = [module for module in modules if importlib.util.find_spec(module) is None]
         rows.append(
             Check(
-                name=f"extra {extra}",
-                verdict="missing" if missing else "ok",
-                found=f"no module {', '.join(missing)}" if missing else ", ".join(modules),
+                f"extra {extra}",
+                "missing" if missing else "ok",
+                f"no module {', '.join(missing)}" if missing else ", ".join(modules),
                 without=lost,
                 advice=add_extra(extra) if missing else "",
             )
@@ -67,9 +67,9 @@ def _extras() -> list[Check]:
 def _graphics() -> Check:
     library = find_library("EGL")
     return Check(
-        name="drawing (EGL)",
-        verdict="missing" if library is None else "ok",
-        found=library or "no libEGL",
+        "drawing (EGL)",
+        "missing" if library is None else "ok",
+        library or "no libEGL",
         without="everything but videos and replays of MuJoCo's environments",
         advice="" if library else distribution.install("egl"),
     )
@@ -78,9 +78,9 @@ def _graphics() -> Check:
 def _browser() -> Check:
     lacking = chromium.lacking()
     return Check(
-        name="browser",
-        verdict="note" if lacking else "ok",
-        found="no Chromium" if lacking else chromium.program(),
+        "browser",
+        "note" if lacking else "ok",
+        "no Chromium" if lacking else chromium.program(),
         without="everything but environments that are web pages, and the tests of the report's pages",
         advice=lacking,
     )
@@ -91,13 +91,13 @@ def _scratch() -> Check:
         check_scratch()
     except ConfigError as error:
         return Check(
-            name="temporary folder",
-            verdict="missing",
-            found=str(error),
+            "temporary folder",
+            "missing",
+            str(error),
             without="nothing can be played here; reports work",
             advice="make room, or name another folder with TMPDIR",
         )
-    return Check(name="temporary folder", verdict="ok", found="can be written")
+    return Check("temporary folder", "ok", "can be written")
 
 
 def _disk() -> Check:
@@ -106,11 +106,11 @@ def _disk() -> Check:
     free = shutil.disk_usage(there).free
     free_space = f"{free / 2**30:.1f} GiB free for {folder}"
     if free >= _ROOMY_BYTES:
-        return Check(name="disk", verdict="ok", found=free_space)
+        return Check("disk", "ok", free_space)
     return Check(
-        name="disk",
-        verdict="note",
-        found=free_space,
+        "disk",
+        "note",
+        free_space,
         without="single runs; a sweep may fill it (`evopolicy disk` says how much it takes)",
         advice="make room, or name other folders with --state and --runs",
     )
@@ -121,24 +121,24 @@ def _ports() -> Check:
         check_loopback()
     except ConfigError as error:
         return Check(
-            name="ports",
-            verdict="missing",
-            found=str(error).partition(";")[0],
+            "ports",
+            "missing",
+            str(error).partition(";")[0],
             without="no agent can be played here; workers and reports work",
             advice="bring IPv4 loopback up: ip link set lo up (in a container: give it a network)",
         )
-    return Check(name="ports", verdict="ok", found="a port of 127.0.0.1 can be listened on")
+    return Check("ports", "ok", "a port of 127.0.0.1 can be listened on")
 
 
 def _date() -> Check:
     # With a correct clock, no installed file is newer than the present.
     newest = Path(__file__).stat().st_mtime
     if time.time() >= newest:
-        return Check(name="date", verdict="ok", found=time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime()))
+        return Check("date", "ok", time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime()))
     return Check(
-        name="date",
-        verdict="missing",
-        found=f"{time.strftime('%Y-%m-%d', time.gmtime())}, before this program was installed",
+        "date",
+        "missing",
+        f"{time.strftime('%Y-%m-%d', time.gmtime())}, before this program was installed",
         without="one machine; certificates of other machines are refused when clocks differ by more than an hour",
         advice="set the clock: timedatectl set-ntp true",
     )
@@ -148,12 +148,12 @@ def _files() -> Check:
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     known = str(soft) if soft != resource.RLIM_INFINITY else "no limit"
     if soft == resource.RLIM_INFINITY or soft >= _LEAST_FILES:
-        return Check(name="open files", verdict="ok", found=known)
+        return Check("open files", "ok", known)
     most = "unlimited" if hard == resource.RLIM_INFINITY else str(min(hard, 65536))
     return Check(
-        name="open files",
-        verdict="missing",
-        found=f"{known} at once",
+        "open files",
+        "missing",
+        f"{known} at once",
         without="a few slots and runs at once",
         advice=f"ulimit -n {most}",
     )
