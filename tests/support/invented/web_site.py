@@ -83,17 +83,19 @@ def open_run(
     run: str = "r-open",
     files: dict[str, bytes] | None = None,
     log: list[dict[str, Any]] | None = None,
+    settings: dict[str, Any] | None = None,
 ) -> Path:
     """The folder of a run that is going on, with one committed submit whose code the gateway keeps."""
     folder = runs / entry / env.replace("/", "_") / exp_id
-    settings = RunSettings(env=env, entry=entry, model="m", exp_id=exp_id, budget=128)
+    usual = RunSettings(env=env, entry=entry, model="m", exp_id=exp_id, budget=128)
+    wanted = msgspec.structs.replace(usual, **(settings or {}))
     bundle = pack(
         [BundleFile(path, False, data) for path, data in sorted((files or {"policy.py": b"x = 1\n"}).items())]
     )
     state = folder / ".gateway"
     (state / "bundles" / bundle.digest[:2]).mkdir(parents=True)
     (state / "bundles" / bundle.digest[:2] / bundle.digest).write_bytes(bundle.packed)
-    (state / "intended.json").write_bytes(msgspec.json.encode({"key": "k", "settings": settings}))
+    (state / "intended.json").write_bytes(msgspec.json.encode({"key": "k", "settings": wanted}))
     (state / "run.json").write_text(json.dumps({"run": run}))
     lines = [
         {"what": "requested", "key": "one", "bundle": bundle.digest},

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import msgspec
 
 from evopolicy_common.errors import DECODE_ERRORS, ProtocolError
-from evopolicy_common.messages.run_settings import RunSettings
+from evopolicy_common.messages.run_settings import RunSettings, Start
 from evopolicy_common.messages.status import RunStatus
 from evopolicy_common.records import open_run
 from evopolicy_common.records.open_run import IntendedRun, OpenedRun
@@ -91,6 +91,17 @@ class RunFacts(msgspec.Struct, frozen=True, kw_only=True):
     random: float | None = None
     """Uniform random actions on the same hidden cases."""
     finished: bool = False
+    start: Start | None = None
+    """The submit from which it starts. `parent_scored` is known of a finished run only."""
+    replay_of: str = ""
+    """The cluster's id of the run that it plays again."""
+
+    @property
+    def origin(self) -> str:
+        """The run that it comes from, in words; empty for most runs."""
+        if self.replay_of:
+            return f"replay of {self.replay_of}"
+        return "" if self.start is None else f"from submit {self.start.submit_index} of {self.start.run}"
 
     @property
     def left_s(self) -> float | None:
@@ -117,6 +128,10 @@ class Runs(msgspec.Struct, frozen=True, kw_only=True):
     by_key: Mapping[str, RunFacts] = {}
     shut: frozenset[str] | None = frozenset()
     """Environments of which a related agent may be alive; None: of all."""
+
+    def of(self, name: str) -> RunFacts | None:
+        """The run with this id of the cluster; None if it is not here. A replay has an id of its own."""
+        return next((run for run in self.by_key.values() if run.run == name), None)
 
     def may_show(self, run: RunFacts) -> bool:
         """Whether hidden results of a finished run may be shown now."""
@@ -228,10 +243,11 @@ class Reader:
         status = by_run.get(run)
         submits = self.submits(folder)
         entry_name, env, exp_id = folder.parts[-3], folder.parts[-2].replace("_", "/", 1), folder.name
-        budget, repeat, hidden_cases = None, 0, "shared"
+        budget, repeat, hidden_cases, start, replay_of = None, 0, "shared", None, ""
         if settings is not None:
             entry_name, env, exp_id = settings.entry, settings.env, settings.exp_id
             budget, repeat, hidden_cases = settings.budget, settings.repeat, settings.hidden_cases
+            start, replay_of = settings.start, settings.replay_of
         elif entry is not None:
             entry_name, env, repeat = entry.agent, entry.env, entry.repeat
         if submits and budget is None:
@@ -263,6 +279,8 @@ class Reader:
             agent_alive=alive,
             started_at=_began(folder),
             hidden_cases=hidden_cases,
+            start=start,
+            replay_of=replay_of,
             **({} if entry is None else _of_entry(entry)),
         )
 
@@ -325,6 +343,8 @@ def _of_record(folder: Path, record: RunRecord) -> RunFacts:
         score=outcome.score,
         random=None if outcome.random_reference is None else outcome.random_reference.mean_return,
         finished=True,
+        start=record.start,
+        replay_of=record.replay_of,
     )
 
 

@@ -53,6 +53,12 @@ def run_view(
     reference = ("random, held-out", run.random) if may_show and run.random is not None else None
     parts = {
         "facts": part("facts", facts=_run_facts(run, may_show)),
+        "lineage": part(
+            "lineage",
+            run=run,
+            parent=runs.of(run.start.run) if run.start else None,
+            original=runs.of(run.replay_of),
+        ),
         "notices": part("notices", notices=_one_run_notices(run, may_show)),
         "curve": part(
             "figure",

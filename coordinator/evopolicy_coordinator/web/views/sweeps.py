@@ -44,7 +44,9 @@ def sweeps_view(
     kept = [
         run
         for run in every
-        if matches(words.q, run.entry, run.env, run.exp_id, run.host, state_words(run.state), run.run)
+        if matches(
+            words.q, run.entry, run.env, run.exp_id, run.host, state_words(run.state), run.run, run.origin
+        )
     ]
     kept.sort(key=_order)
     shown, pages = paged(kept, words)
@@ -188,8 +190,7 @@ def _chip(run: RunFacts, may_show: bool) -> dict[str, Any]:
         value = number(run.score)
     elif run.best is not None:
         value = number(run.best)
-    if run.error:
-        facts.append(run.error[:200])
+    facts += [each for each in (run.origin, run.error[:200]) if each]
     return {"key": run.key, "symbol": symbol, "value": value, "kind": _kind(run), "title": "; ".join(facts)}
 
 

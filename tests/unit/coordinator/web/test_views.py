@@ -6,10 +6,12 @@ import json
 import re
 from pathlib import Path
 
+import msgspec
 from invented.policies import Version
 from invented.run_dirs import write_run
 from invented.web_site import client, finished_run, open_run, open_status, site_of, status
 
+from evopolicy_common.messages.run_settings import Start
 from evopolicy_common.messages.status import (
     DiskUse,
     QueuedJobs,
@@ -174,3 +176,44 @@ def test_charts_of_values_from_nought_have_no_negative_axis_and_a_title() -> Non
     assert [
         text for text in re.findall(r'text-anchor="end" class="ink">([^<]*)<', made) if text.startswith("-")
     ] == []
+
+
+def test_a_start_names_its_submit_and_links_to_its_parent(tmp_path: Path) -> None:
+    first = finished_run(tmp_path, exp_id="first", run="r-first")
+    start = Start(run="r-first", submit_index=0, tree="ab" * 32, parent_scored=True)
+    here = finished_run(tmp_path, exp_id="here", run="r-here", start=start)
+    live = open_run(tmp_path, settings={"start": msgspec.structs.replace(start, parent_scored=False)})
+    away = finished_run(
+        tmp_path, exp_id="away", start=Start(run="<b>gone</b>", submit_index=4, tree="ab" * 32)
+    )
+    with client(site_of(tmp_path)) as browser:
+        pages = [browser.get(f"/run/{key(folder)}").text for folder in (first, here, live, away)]
+        submit = browser.get(f"/run/{key(first)}/submit/0")
+        all_runs = browser.get("/").text
+    assert "Starts from" not in pages[0]
+    for page in pages[1:3]:
+        assert f'Starts from <a href="/run/{key(first)}/submit/0">submit 0</a> of run' in page
+        assert f'<a href="/run/{key(first)}">Agent A, first, repeat 0</a>.' in page
+    assert submit.status_code == 200
+    assert "a result may have chosen this submit (<code>parent_scored</code>)." in pages[1]
+    assert "parent_scored" not in pages[2], "the coordinator alone knows it while the run is open"
+    assert "Starts from submit 4 of run <code>&lt;b&gt;gone&lt;/b&gt;</code>, which is not here." in pages[3]
+    assert "no result has chosen this submit" in pages[3]
+    assert ", from submit 0 of r-first</td>" in all_runs
+    assert ", from submit 4 of &lt;b&gt;gone&lt;/b&gt;</td>" in all_runs
+
+
+def test_a_replay_names_its_run_on_the_pages(tmp_path: Path) -> None:
+    first = finished_run(tmp_path, exp_id="first", run="r-first")
+    again = finished_run(tmp_path, exp_id="again", run="r-again")
+    record = json.loads((again / "run.json").read_text())
+    (again / "run.json").write_text(json.dumps(record | {"replay_of": "r-first"}))
+    live = open_run(tmp_path, settings={"replay_of": "<b>gone</b>"})
+    with client(site_of(tmp_path)) as browser:
+        pages = [browser.get(f"/run/{key(folder)}").text for folder in (first, again, live)]
+        found = browser.get("/?q=replay").text
+    assert "Replay of run" not in pages[0]
+    assert f'Replay of run <a href="/run/{key(first)}">Agent A, first, repeat 0</a>' in pages[1]
+    assert "Replay of run <code>&lt;b&gt;gone&lt;/b&gt;</code>, which is not here" in pages[2]
+    assert found.count("<tr id=") == 2
+    assert ", replay of r-first</td>" in found
