@@ -33,7 +33,7 @@ def earlier() -> str:
     return "\n".join(path.read_text("utf-8") for path in sorted(FOLDER.glob("*.md")))
 
 
-def written(suite: catalogue.Suite, results: Path, rows: str) -> str:
+def written(suite: catalogue.Suite, results: Path | None, rows: str) -> str:
     """A family's page; `rows` has the rows of environments that are not in the results."""
     path = FOLDER / f"{suite.name}.md"
     usual = HEAD.format(title=suite.title, name=suite.name, mark=MARK)
@@ -42,7 +42,11 @@ def written(suite: catalogue.Suite, results: Path, rows: str) -> str:
     return f"{text}{MARK}\n\n{page(results, rows, suite.environments)}"
 
 
+def write(results: Path | None, rows: str) -> None:
+    """All pages."""
+    for suite in shown():
+        (FOLDER / f"{suite.name}.md").write_text(written(suite, results, rows), encoding="utf-8")
+
+
 if __name__ == "__main__":
-    pages = {each.name: written(each, Path(sys.argv[1]), earlier()) for each in shown()}
-    for name, text in pages.items():
-        (FOLDER / f"{name}.md").write_text(text, encoding="utf-8")
+    write(Path(sys.argv[1]), earlier())

@@ -6,37 +6,39 @@ original.toml.
 
 from __future__ import annotations
 
-import statistics
 import tomllib
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 from evopolicy_common import catalogue
 from evopolicy_common.catalogue import installs
+from evopolicy_worker.check_env import span, tables
 
 TOP = Path(__file__).parents[2]
 LIST = TOP / "docs" / "reference" / "environments.md"
 DOCUMENTS = (TOP / "README.md", LIST)
 END = "<!-- End of what it writes. -->"
 
-CPU = """*CPU ms a step*: processor time of a step of the library's environment alone, without accelerations, and in a worker's slot
-with its policy and recording; the median of the ids that were measured so far, on idle cores."""  # noqa: E501
+CPU = """*CPU ms*: processor time of a step of the library's environment alone, without accelerations ("bare"), and in a worker's slot
+with its policy and recording: minimum, median, and maximum of the ids that were measured, of which *measured* is the number. `-`:
+none was. `*`: one of them was measured while the machine had more work than cores."""  # noqa: E501
 
 
 def table() -> str:
     """The table of docs/reference/environments.md and the lines beneath it, as Markdown."""
-    original, families, costs = _original(), _families(), _costs()
+    original, families = _original(), _families()
     named, newest = original["paper"]["families"], original["newest"]
     lines = [
         (
-            "| suite | environments | named in the paper | deterministic | played | CPU ms a step: bare, slot | to"
-            " install |"
+            "| suite | environments | named in the paper | deterministic | played | measured | CPU ms, bare | CPU ms,"
+            " slot | to install |"
         ),
-        "|---|--:|---|--:|--:|--:|---|",
+        "|---|--:|---|--:|--:|--:|--:|--:|---|",
     ]
     for suite in families:
         ids = suite.environments
-        deterministic, found = _deterministic(suite), [costs[each] for each in ids if each in costs]
+        deterministic, found = _deterministic(suite), [each for each in ids if each in _tables()[0]]
         family = installs.family_of(ids[0])
         row = installs.installs()[family]
         how = f"`evopolicy-worker setup {family}`" if row.pins or row.apart else f"extra `{row.extra}`"
@@ -46,7 +48,7 @@ def table() -> str:
             named.get(suite.name, "-"),
             "all" if deterministic == len(ids) else f"{deterministic:,}",
             "all" if len(found) == len(ids) else f"{len(found):,}",
-            _cost(suite, costs),
+            *_cost(suite),
             how + (" and Chromium" if row.browser else ""),
         )
         lines.append(f"| {' | '.join(cells)} |")
@@ -76,17 +78,10 @@ def table() -> str:
 
 def short() -> str:
     """The table of README.md, two suites to a row, and the lines beneath it."""
-    original, families, costs = _original(), _families(), _costs()
+    original, families = _original(), _families()
     named = original["paper"]["families"]
-    cells = [
-        f"{f'**`{suite.name}`**' if suite.name in named else f'`{suite.name}`'} | {len(suite.environments):,} |"
-        f" {_cost(suite, costs)}"
-        for suite in families
-    ]
-    half = (len(cells) + 1) // 2
-    rows = zip(cells[:half], [*cells[half:], " |  | "], strict=False)
     total, deterministic = _total(families), sum(map(_deterministic, families))
-    played = sum(each in costs for suite in families for each in suite.environments)
+    played = sum(each in _tables()[0] for suite in families for each in suite.environments)
     every = (
         "All ids are"
         if deterministic == sum(len(suite.environments) for suite in families)
@@ -94,9 +89,13 @@ def short() -> str:
     )
     return "\n".join(
         [
-            "| suite | environments | CPU ms a step | suite | environments | CPU ms a step |",
-            "|---|--:|--:|---|--:|--:|",
-            *(f"| {left} | {right} |" for left, right in rows),
+            "| suite | environments | measured | CPU ms, bare | CPU ms, slot |",
+            "|---|--:|--:|--:|--:|",
+            *(
+                f"| {f'**`{suite.name}`**' if suite.name in named else f'`{suite.name}`'}"
+                f" | {len(suite.environments):,} | {' | '.join(_cost(suite))} |"
+                for suite in families
+            ),
             "",
             (
                 f"The {len(families)} suites hold {total:,} environments; the paper names the families in bold"
@@ -135,26 +134,16 @@ def _total(families: list[catalogue.Suite]) -> int:
     return len({each for suite in families for each in suite.environments})
 
 
-def _cost(suite: catalogue.Suite, costs: dict[str, tuple[str, ...]]) -> str:
-    """Median of the bare time and of the slot's, ms, over the ids that have one."""
-    columns = zip(*(costs[each] for each in suite.environments if each in costs), strict=True)
-    known = [[float(each.strip("*").replace(",", "")) for each in column if each] for column in columns]
-    return ", ".join(f"{statistics.median(column) / 1000:.2g}" if column else "-" for column in known)
+def _cost(suite: catalogue.Suite) -> tuple[str, str, str]:
+    """The number of ids that were measured, and the spans of the bare times and of the slot's, ms."""
+    known = [times for each in suite.environments if any(times := _tables()[1].get(each, ("", "")))]
+    bare, slot = (span([each[column] for each in known], per=1000) for column in (0, 1))
+    return f"{len(known):,}", bare, slot
 
 
-def _costs() -> dict[str, tuple[str, ...]]:
-    """By id, processor time of a step, bare and in a slot, µs, from the tables of played environments; "" is
-    unknown."""
-    found: dict[str, tuple[str, ...]] = {}
-    column = 0
-    pages = sorted(LIST.with_suffix("").glob("*.md"))
-    for line in (line for path in pages for line in path.read_text("utf-8").splitlines()):
-        cells = [each.strip() for each in line.strip("|").split("|")]
-        if cells[0] == "environment" and "CPU µs, bare" in cells:
-            column = cells.index("CPU µs, bare")
-        elif column and cells[0].startswith("`") and len(cells) > column:
-            found[cells[0].strip("`")] = tuple(cells[column : column + 2])
-    return found
+@cache
+def _tables() -> tuple[dict[str, tuple[str, ...]], dict[str, tuple[str, ...]]]:
+    return tables("\n".join(path.read_text("utf-8") for path in sorted(LIST.with_suffix("").glob("*.md"))))
 
 
 def written(document: str) -> str:

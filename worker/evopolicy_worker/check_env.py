@@ -50,6 +50,8 @@ COLUMNS = (
     "MB",
     "verdict",
 )
+TIMES = slice(COLUMNS.index("CPU µs, bare"), COLUMNS.index("bytes a step"))
+"""The cells of processor time, which have a table of their own on a page: few environments are measured."""
 
 
 class InASlot(msgspec.Struct, frozen=True, kw_only=True):
@@ -75,10 +77,7 @@ class InASlot(msgspec.Struct, frozen=True, kw_only=True):
     def times(self) -> tuple[str, str]:
         """Both times as a table has them."""
         mark = "*" if self.busy else ""
-        bare, slot = (
-            f"{us:,.3g}{mark}" if 0 < us < 100 else f"{us:,.0f}{mark}" if us else ""
-            for us in (self.bare_us, self.slot_us)
-        )
+        bare, slot = (f"{_digits(us)}{mark}" if us else "" for us in (self.bare_us, self.slot_us))
         return bare, slot
 
 
@@ -353,19 +352,48 @@ def read(results: Path) -> dict[str, Checked]:
     return by_env
 
 
-def page(results: Path, earlier: str = "", ids: Sequence[str] | None = None) -> str:
+def page(results: Path | None, earlier: str = "", ids: Sequence[str] | None = None) -> str:
     """A Markdown table of the results in a file, with the number of environments played. `earlier`: a text whose rows
     stay where the file has none. `ids`: the environments, in order; by default the catalogue's."""
-    rows = {
-        row[0].strip("`"): row for line in earlier.splitlines() if len(row := _cells(line)) == len(COLUMNS)
-    }
-    rows |= {env: each.cells() for env, each in read(results).items()}
-    head = [f"| {' | '.join(COLUMNS)} |", "|---|--:|--:|---|---|---|--:|--:|--:|--:|---|"]
+    rows, times = tables(earlier)
+    for env, each in (read(results) if results else {}).items():
+        cells = list(each.cells())
+        times[env] = (*cells[TIMES],)
+        del cells[TIMES]
+        rows[env] = (*cells[1:],)
+    columns = list(COLUMNS)
+    del columns[TIMES]
+    head = [f"| {' | '.join(columns)} |", "|---|--:|--:|---|---|---|--:|--:|---|"]
     ids = list(catalogue.entries()) if ids is None else ids
-    body = [f"| `{each}` | {' | '.join(rows[each][1:])} |" for each in ids if each in rows]
-    summary = f"{len(body):,} of {len(ids):,} environments have been played."
-    return "\n".join([summary, "", *head, *body]) + "\n"
+    body = [f"| `{each}` | {' | '.join(rows[each])} |" for each in ids if each in rows]
+    lines = [f"{len(body):,} of {len(ids):,} environments have been played.", "", *head, *body]
+    if measured := [each for each in ids if any(times.get(each, ()))]:
+        lines += ["", f"Processor times of a step were measured for {len(measured):,} of {len(ids):,}:", ""]
+        lines += [f"| environment | {' | '.join(COLUMNS[TIMES])} |", "|---|--:|--:|"]
+        lines += [f"| `{each}` | {' | '.join(times[each])} |" for each in measured]
+        spans = (span(column) for column in zip(*(times[each] for each in measured), strict=True))
+        lines += [f"| minimum, median, maximum | {' | '.join(spans)} |"]
+    return "\n".join(lines) + "\n"
 
 
-def _cells(line: str) -> tuple[str, ...]:
-    return tuple(each.strip() for each in line.strip().removeprefix("|").removesuffix("|").split("|"))
+def tables(text: str) -> tuple[dict[str, tuple[str, ...]], dict[str, tuple[str, ...]]]:
+    """The rows of pages without their ids, by environment id: of what was played, and both processor times, µs."""
+    rows = [line.strip("|").split("|") for line in text.splitlines() if line.startswith("| `")]
+    n_times = TIMES.stop - TIMES.start
+    played, times = (
+        {row[0].strip(" `"): tuple(map(str.strip, row[1:])) for row in rows if len(row) == 1 + n}
+        for n in (len(COLUMNS) - 1 - n_times, n_times)
+    )
+    return played, times
+
+
+def span(times: Sequence[str], per: float = 1.0) -> str:
+    """Minimum, median, and maximum of a column of times, in units of `per` µs, or the only one; `*` if one has it."""
+    known = [float(each.strip("*").replace(",", "")) / per for each in times if each]
+    mark = "*" if any("*" in each for each in times) else ""
+    spread = (min, statistics.median, max) if len(known) > 1 else (max,)
+    return ", ".join(_digits(f(known)) + mark for f in spread) if known else "-"
+
+
+def _digits(value: float) -> str:
+    return f"{value:,.3g}" if value < 100 else f"{value:,.0f}"
