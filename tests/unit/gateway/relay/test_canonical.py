@@ -45,6 +45,9 @@ SAME = [
         said("Command running in background with ID: bsk6m4i4a. Output: /tmp/c/tasks/bsk6m4i4a.output"),
         said("Command running in background with ID: b00000000. Output: /tmp/c/tasks/b00000000.output"),
     ),
+    ("messages", said("<task-id>b5782nkfk</task-id>"), said("<task-id>baijofz2f</task-id>")),
+    ("messages", said("CLAUDE_CODE_MESSAGING_TOKEN=74c8"), said("CLAUDE_CODE_MESSAGING_TOKEN=3a02b")),
+    ("responses", said("Original token count: 180\n"), said("Original token count: 1181\n")),
     ("messages", said("saved to: /r/tool-results/bx1.txt"), said("saved to: /r/tool-results/b9z.txt")),
     ("messages", said("real\t0m0.013s\nuser\t0m1.2s"), said("real\t1m0.011s\nuser\t0m0.9s")),
     ("messages", said(json.dumps("sys\t0m0.013s")), said(json.dumps("sys\t0m0.011s"))),
@@ -57,6 +60,8 @@ DIFFERENT = [
     ("messages", said("mean return 97.62"), said("mean return 97.63")),
     ("messages", said("Ran 1 test in 0.1s"), said("Ran 2 tests in 0.1s")),
     ("messages", said("at 0x7fb98a3c5d10 it fails"), said("at 0x7f11c2a09d90 it fails")),
+    ("messages", said("TOKEN=74c8"), said("TOKEN=3a02")),
+    ("messages", said("<task-id>b5782</task-id> failed"), said("<task-id>b5782</task-id> completed")),
     ("messages", said("/a/tasks/one.output"), said("/b/tasks/one.output")),
     ("messages", said("a") | {"system": [{"text": "x"}]}, said("a") | {"system": [{"text": "y"}]}),
 ]
