@@ -143,11 +143,12 @@ def episode_counts(settings: RunSettings, suite: Suite) -> tuple[int, int, int]:
 
     budget = given(settings.budget, suite.budget)
     least = given(settings.min_episodes_per_submit, suite.min_episodes_per_submit)
-    most = min(given(settings.max_episodes_per_submit, suite.max_episodes_per_submit), budget)
+    wanted = given(settings.max_episodes_per_submit, suite.max_episodes_per_submit)
+    most = min(wanted, budget)
     if not 1 <= least <= most:
         raise ConfigError(
-            f"a budget of {budget} episodes leaves no submit of {least} to {most} episodes; give a budget of at least"
-            f" {max(least, 1)}, or other numbers of episodes in a submit"
+            f"a budget of {budget} episodes and submits of {least} to {wanted} episodes allow no submit; give a budget"
+            f" of at least {max(least, 1)}, or other numbers of episodes in a submit"
         )
     for what, n, limit in (
         ("a budget", budget, MAX_BUDGET),

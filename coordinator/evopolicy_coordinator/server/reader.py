@@ -186,8 +186,10 @@ class ServiceReader:
             raise damaged(error) from error
 
     def replayed(self, run: str) -> RunRow | None:
-        """The finished run that is to be played again; None for an unknown one. Reads the database. Raises RefusedError
-        for an open run, and when the row cannot be read."""
+        """The finished run that is to be played again; None for none and for an unknown one. Reads the database. Raises
+        RefusedError for an open run, and when the row cannot be read."""
+        if not run:
+            return None
         finished = self.finished_run(run)
         try:
             if finished is None and self._reader.run(run) is not None:

@@ -93,7 +93,7 @@ def overlapping() -> bytes:
 
 HOSTILE: dict[str, tuple[bytes, str]] = {
     "empty": (b"", "too short"),
-    "text": (b"hello world, this is no archive at all", "another form"),
+    "text": (b"hello world, this is no archive at all", "no whole file"),
     "zip bomb": (bomb(), "compressed"),
     "link": (link(), "link"),
     "folder": (zipped(lambda archive: archive.writestr(plain("a/", 0o40755), b"")), "not the name"),
@@ -105,7 +105,7 @@ HOSTILE: dict[str, tuple[bytes, str]] = {
     "letters of another alphabet": (named("результат"), "not the name"),
     "long name": (named("a" * 500), "not where it should be|not the name"),
     "duplicate": (named("a", "b").replace(b"b{}", b"a{}").replace(b"bPK", b"aPK"), "twice|headers differ"),
-    "comment": (commented(), "another form"),
+    "comment": (commented(), "no whole file"),
     "extra field": (with_extra(), "extras|not where"),
     "more files than there are": (claims(60_000), "cut off"),
     "too many files": (claims(65_400), "65,000 are allowed"),
@@ -113,8 +113,8 @@ HOSTILE: dict[str, tuple[bytes, str]] = {
     "two headers": (header_of_another(), "headers differ"),
     "overlap": (overlapping(), "overlaps"),
     "bytes before": (b"MZ" + named("a"), "not where it should be"),
-    "bytes between": (named("a")[:31] + b"", "another form|too short"),
-    "cut": (named("a")[:-5], "another form"),
+    "bytes between": (named("a")[:31] + b"", "no whole file|too short"),
+    "cut": (named("a")[:-5], "no whole file"),
 }
 
 

@@ -134,9 +134,9 @@ def test_run_may_ask_for_other_numbers(parser: RequestParser) -> None:
     ("settings", "message"),
     [
         ({"env": "toy/lime"}, "toy/line"),
-        ({"budget": 0}, "budget 0"),
-        ({"budget": -1}, "budget -1"),
-        ({"budget": 4, "min_episodes_per_submit": 5}, "5 to 4"),
+        ({"budget": 0}, "budget of 0"),
+        ({"budget": -1}, "budget of -1"),
+        ({"budget": 4, "min_episodes_per_submit": 5}, "submits of 5 to 128"),
         ({"min_episodes_per_submit": 0}, "0 to 128"),
         ({"n_heldout": 0}, "at least one"),
         ({"budget": 20_001}, "20,000"),
