@@ -17,12 +17,14 @@ from typing import Any
 import msgspec
 
 from evopolicy_common.errors import DECODE_ERRORS, ConfigError
+from evopolicy_common.processes.preflight import LOOPBACK
 from evopolicy_common.records import model_record
 from evopolicy_common.records.blobs import write_atomically
 from evopolicy_common.records.run_difference import differences
 from evopolicy_common.records.secrets import without_keys
 from evopolicy_common.regular_files import read_regular
 from evopolicy_common.wire.credentials import state_home
+from evopolicy_common.wire.http import bound
 from evopolicy_gateway import harnesses
 from evopolicy_gateway.relay.replaying import DIFFERENCE
 from evopolicy_gateway.run.plan import Plan, Replays
@@ -32,6 +34,11 @@ _MAX_BYTES = 4 << 20
 _NO_KEY = "no-key-is-needed-to-replay"
 _OWN = ("run.json: agent.model_use.", "run.json: agent.settings.agent: ")
 """Values of a replay's own."""
+_VERSIONS = tuple(
+    f"run.json: {name}"
+    for name in ("versions.harness:", "versions.env:", "versions.fingerprint", "agent.cli_version:")
+)
+"""They may explain a difference, and are none."""
 
 
 class Recorded(msgspec.Struct, frozen=True, kw_only=True):
@@ -77,6 +84,7 @@ def plan_of(run: Path, runs: Path, *, trusted: bool = False) -> Plan:
         raise ConfigError(f"the record of {run} is not whole, and cannot be replayed: {why}")
     for name in _keys(plan):
         os.environ.setdefault(name, _NO_KEY)
+    _check_free(replays)
     replays = msgspec.structs.replace(replays, folder=folder.model_record)
     settings = msgspec.structs.replace(plan.settings, replay_of=replays.run)
     again = {"overwrite": True, "resume": False, "record_model": "digests"}
@@ -84,18 +92,36 @@ def plan_of(run: Path, runs: Path, *, trusted: bool = False) -> Plan:
 
 
 def outcome(run: Path, plan: Plan) -> str:
-    """The first place in which the replay differs from the run; empty where they are identical."""
-    again = plan.folder
-    try:
+    """The first place in which the replay differs from the run, with versions that differ; empty where they are
+    identical but for these."""
+    found = differences(run, plan.folder.root)
+    first = _different_request(run, plan.folder) or next(
+        (line for line in found if not line.startswith((*_OWN, *_VERSIONS))), ""
+    )
+    explained = [f"other versions: {line}" for line in found if line.startswith(_VERSIONS)]
+    return "\n".join([first, *explained]) if first else ""
+
+
+def _different_request(run: Path, again: RunFolder) -> str:
+    with contextlib.suppress(FileNotFoundError):
         return (again.model_record / DIFFERENCE).read_text().strip()
-    except FileNotFoundError:
-        pass
     left = [call.digest for call in model_record.read_calls(again.model_record)]
     for call in model_record.read_calls(RunFolder(run.absolute()).model_record):
         if call.digest not in left:
             return f"request {call.n} to {call.api} did not come again"
         left.remove(call.digest)
-    return next((line for line in differences(run, again.root) if not line.startswith(_OWN)), "")
+    return ""
+
+
+def _check_free(replays: Replays) -> None:
+    for port in (replays.port, replays.model_port):
+        try:
+            bound(LOOPBACK, port).close()
+        except OSError as error:
+            raise ConfigError(
+                f"port {port} on {LOOPBACK}, at which the recorded agent found a service, cannot be used:"
+                f" {error.strerror}; end what listens there (`ss -ltnp` shows it), then replay again"
+            ) from error
 
 
 def _keys(plan: Plan) -> tuple[str, ...]:
