@@ -32,8 +32,8 @@ from evopolicy_gateway.run_folder.layout import RunFolder
 
 _MAX_BYTES = 4 << 20
 _NO_KEY = "no-key-is-needed-to-replay"
-_OWN = ("run.json: agent.model_use.", "run.json: agent.settings.agent: ")
-"""Values of a replay's own."""
+_OWN = tuple(f"run.json: agent.{name}" for name in ("model_use.", "settings.agent: ", "settings.program: "))
+"""Values of a replay's own, or of its machine."""
 _VERSIONS = tuple(
     f"run.json: {name}"
     for name in ("versions.harness:", "versions.env:", "versions.fingerprint", "agent.cli_version:")
