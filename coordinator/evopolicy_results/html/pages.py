@@ -92,6 +92,7 @@ def index_page(
     views = {table.name: table_view(table) for table in tables}
     suites = [suite.name for suite in study.suites]
     ranked = [suite.name for suite in study.suites if suite.is_ranked]
+    n_started = sum(run.record.start is not None for run in study.runs)
     n_envs = len({env for suite in study.suites for env in suite.table.environments})
     named = {figure.name: figure for figure in figures}
 
@@ -200,6 +201,7 @@ def index_page(
             ("agents", len(study.entries)),
             ("environments", n_envs),
             ("runs", len(study.runs)),
+            *([("of these from a submit", n_started)] if n_started else []),
             ("submits", sum(len(run.submits) for run in study.runs)),
             ("left out", len(study.left_out)),
         ],

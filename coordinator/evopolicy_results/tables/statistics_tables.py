@@ -18,6 +18,7 @@ from evopolicy_results.tables.run_tables import ENTRY, ENV
 from evopolicy_results.tables.table import Column, Table, tabulated
 
 CHECKPOINTS = "With one run a cell this compares the selected checkpoints, not the agents: how an agent's runs vary is not known."  # noqa: E501
+OVER = "What a repetition would draw anew: cases, runs, or runs and cases."
 _SHOWN_TAUS = (0.1, 0.25, 0.5, 0.75, 0.9)
 
 
@@ -42,6 +43,7 @@ def starts_table(groups: Sequence[StartGroup]) -> Table:
             "runs": "{} and {}".format(*pair.n_runs),
             "gap": None if pair.gap is None else pair.gap.value,
             "interval": interval_text(pair.gap) or pair.reason or None,
+            "over": None if pair.gap is None or pair.gap.low is None else pair.gap.over,
             "p_holm": pair.p_holm,
             "told_apart": _told_apart(pair),
             "cases": pair.n_cases or None,
@@ -55,7 +57,10 @@ def starts_table(groups: Sequence[StartGroup]) -> Table:
             "scored": "yes" if group.parent_scored else "no",
         }
         found = [pair_row(pair) for pair in group.pairs]
-        lone = [{"first": label, "runs": str(n)} for label, n in group.variants.items()]
+        lone = [
+            {"first": label, "runs": str(n), "interval": "no other agent or setting"}
+            for label, n in group.variants.items()
+        ]
         rows += [of | row for row in found or lone]
     return Table(
         name="starts",
@@ -63,18 +68,19 @@ def starts_table(groups: Sequence[StartGroup]) -> Table:
         caption=(
             "Runs that start from a submit of an earlier run, compared with those from the same submit: first minus"
             " second, in held-out returns, paired by case, with the 95 % interval and Holm's correction over all pairs"
-            " from one state. They are on no leaderboard and in no other table of scores. Place chosen: the earlier"
-            " run's agent had ended when a run started, so that its result may have chosen the submit; the differences"
-            " between runs from it stay valid, their level is not a score from scratch."
+            " from one state. They are on no leaderboard and in no other table of scores. Parent scored: the agent of"
+            " the earlier run, or of a run before it, had ended when one of these started, so a result may have chosen"
+            " the submit. The differences between runs from it stay valid; their level is not a score from scratch."
         ),
         columns=(
             ENV,
             Column("start", "From"),
-            Column("scored", "Place chosen"),
+            Column("scored", "Parent scored"),
             Column("first", "First"),
             Column("second", "Second"),
             Column("gap", "Difference", "number"),
             Column("interval", "95 % interval"),
+            Column("over", "Over", note=OVER),
             Column("p_holm", "Corrected p", "number", digits=4, below=True),
             Column("told_apart", "Significantly better"),
             Column("runs", "Runs"),
@@ -132,7 +138,7 @@ def _pairs(suite: Suite) -> Table:
             Column(
                 "over",
                 "Over",
-                note="What a repetition would draw anew: cases, runs, or runs and cases.",
+                note=OVER,
                 of=with_interval("over"),
             ),
             Column("method", "Method", of=with_interval("method")),

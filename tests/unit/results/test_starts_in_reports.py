@@ -70,11 +70,14 @@ def test_starts_from_one_state_are_paired_by_case_with_an_interval(found: Study)
         ("A / gym/acrobot / exp, submit 3", "yes"),
         ("A / gym/acrobot / exp, submit 4", "no"),
     ]
+    assert [(row["over"], row["runs"]) for row in rows if row.get("over")] == [("runs and cases", "3 and 3")]
+    assert rows[1]["interval"] == "no other agent or setting"
 
 
 def test_a_report_shows_the_runs_from_one_state(found: Study, tmp_path: Path) -> None:
     page = write_report(found, tmp_path / "report", traces=False).read_text()
     assert "Runs from one state" in page
+    assert "of these from a submit" in page
     assert (tmp_path / "report" / "tables" / "starts.csv").read_text().count("submit 3") == 1
 
 
