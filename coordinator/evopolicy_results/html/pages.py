@@ -198,11 +198,16 @@ def index_page(
         lead="Agents evolve an executable policy under a budget of train episodes; the checkpoint that hidden validation selects is "
         "scored on hidden held-out cases.",
         facts=[
-            ("agents", len(study.entries)),
-            ("environments", n_envs),
-            ("runs", len(study.runs)),
-            *([("of these from a submit", n_started)] if n_started else []),
-            ("submits", sum(len(run.submits) for run in study.runs)),
+            *(
+                (noun if n != 1 else noun.removesuffix("s"), n)
+                for noun, n in (
+                    ("agents", len(study.entries)),
+                    ("environments", n_envs),
+                    ("runs", len(study.runs)),
+                    *([("of these from a submit", n_started)] if n_started else []),
+                    ("submits", sum(len(run.submits) for run in study.runs)),
+                )
+            ),
             ("left out", len(study.left_out)),
         ],
         looks=looks,

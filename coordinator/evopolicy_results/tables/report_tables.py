@@ -365,7 +365,7 @@ def _evolution(study: Study, link_of: LinkOf) -> Table:
         ),
         link=lambda one: link_of(one.run),
         name="evolution",
-        title="Score evolution",
+        title="Score evolution of each run",
         caption=(
             "Best validation mean so far over the budget. Scale of each environment: 0 is the random reference, 1 the"
             " best validation mean of any run. Area: mean of the curve over the budget. To 50 % and 80 %: train"
