@@ -130,14 +130,17 @@ BOARDS: tuple[dict[str, Cheat], ...] = (
     {
         "a1": ("none", nothing),
         "a2": ("held-out returns raised from the start, their recordings removed", invented),
-        "a3": ("another model told after the end", another_model),
+        "a3": ("name of the agent's model in `run.json` changed after the end", another_model),
         "b1": ("agent's working time changed", working_time),
         "b2": ("worse run left out, journal begun anew", begun_anew),
         "b3": ("recorded actions come from elsewhere, not from the policy", from_elsewhere),
     },
     {
-        "a1": ("rewards raised from the start, another processor told", raised_rewards),
-        "a2": ("another processor told after the end", another_processor),
+        "a1": (
+            "rewards raised from the start, and another processor model stated in `run.json`",
+            raised_rewards,
+        ),
+        "a2": ("processor model in `run.json` changed after the end", another_processor),
         "a3": ("a key twice in `run.json`", doubled_key),
         "b1": ("score raised after the end", raised_score),
         "b2": ("worse run left out", nothing),
