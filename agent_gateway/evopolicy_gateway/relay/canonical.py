@@ -44,6 +44,11 @@ TEXTS: tuple[tuple[str, re.Pattern[bytes], bytes], ...] = (
         b"[time]",
     ),
     ("days before these", re.compile(rb"[MTWFS](?:on|ue|ed|hu|ri|at|un) \[time\]"), b"[time]"),
+    (
+        "sizes of files with durations of a submit, in `ls -l`",
+        re.compile(rb"(-r--r--r-- 1 \S+ +\S+ )[ \d]+(?= \[time\] \S*summary\.json)"),
+        rb"\1[size]",
+    ),
     ("durations of a submit", re.compile(rb'(wall_time_seconds\\*":\s*)[0-9.eE+-]+'), rb"\1[seconds]"),
     ("what Codex tells of a command", re.compile(rb"(Wall time: )[0-9a-f.]+"), rb"\1[once]"),
     ("what Codex tells of a command", re.compile(rb"(Chunk ID: )[0-9a-f.]+"), rb"\1[once]"),

@@ -28,6 +28,11 @@ SAME = [
     ),
     ("messages", said("Today's date is 2026-01-02."), said("Today's date is 2027-11-30.")),
     ("messages", said("-rw-r--r-- 1 a a 9 Jan  2 03:04 x"), said("-rw-r--r-- 1 a a 9 Nov 30 11:22 x")),
+    (
+        "responses",
+        said("-r--r--r-- 1 root root  599 Jan  2 03:04 summary.json"),
+        said("-r--r--r-- 1 root root 1600 Nov 30 11:22 summary.json"),
+    ),
     ("messages", said("Fri Nov 27 01:48:51 UTC 2026"), said("Sat Nov 28 02:00:00 UTC 2026")),
     (
         "messages",
@@ -60,6 +65,7 @@ DIFFERENT = [
     ("messages", said("mean return 97.62"), said("mean return 97.63")),
     ("messages", said("Ran 1 test in 0.1s"), said("Ran 2 tests in 0.1s")),
     ("messages", said("at 0x7fb98a3c5d10 it fails"), said("at 0x7f11c2a09d90 it fails")),
+    ("messages", said("-rw-r--r-- 1 a a 9 Jan  2 03:04 x"), said("-rw-r--r-- 1 a a 8 Jan  2 03:04 x")),
     ("messages", said("TOKEN=74c8"), said("TOKEN=3a02")),
     ("messages", said("<task-id>b5782</task-id> failed"), said("<task-id>b5782</task-id> completed")),
     ("messages", said("/a/tasks/one.output"), said("/b/tasks/one.output")),
