@@ -40,10 +40,10 @@ SCRIPT = [
     Step(command=LOOK),
     written("0 if self.step == 1 else 1 if self.step < 13 else 2"),
     Step(command=LOOK),
-    written("1 // 0"),
+    written("2"),
     Step(text="The second policy is the best."),
 ]
-"""Walks into the wall; along the cliff to the goal; and one that fails."""
+"""Walks into the wall; along the cliff to the goal; and into another wall. A policy that fails gets actions from the secret of its coordinator."""
 
 
 def main() -> None:
