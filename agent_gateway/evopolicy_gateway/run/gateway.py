@@ -112,7 +112,8 @@ class Gateway:
                 return True
             workspace.stage(self._folder, opened, address.urls(), known.agents_md)
             blobs = BlobStore(self._folder.blobs)
-            trees = Recorder(self._folder.workspace, self._folder.trees)
+            started = self._folder.start.exists()
+            trees = Recorder(self._folder.workspace, self._folder.trees, started=started)
             pipeline = SubmitPipeline(
                 session, opened, self._folder.workspace, journal, blobs, self._changed.set, trees
             )

@@ -192,9 +192,10 @@ def _write(path: Path, data: bytes, mode: int) -> None:
 class Recorder:
     """Records the workspace of one run. Contents of an earlier process count."""
 
-    def __init__(self, workspace: Path, folder: Path) -> None:
-        """`folder`: the run's `trees/`, outside the agent's reach."""
-        self._workspace, self._folder = workspace, folder
+    def __init__(self, workspace: Path, folder: Path, *, started: bool = False) -> None:
+        """`folder`: the run's `trees/`, outside the agent's reach. `started`: from a submit, so that `history/` is
+        the service's, and no omission."""
+        self._workspace, self._folder, self._started = workspace, folder, started
         self._blobs = BlobStore(folder)
         self._stored = sum(self._blobs.size(digest) for digest in self._blobs.digests())
         self._seen: dict[str, _Seen] = {}
@@ -207,7 +208,7 @@ class Recorder:
         omitted: dict[str, str] = {}
         seen: dict[str, _Seen] = {}
         stored, left = self._stored, MAX_TREE_BYTES
-        if os.path.lexists(self._workspace / HISTORY):
+        if not self._started and os.path.lexists(self._workspace / HISTORY):
             omitted[HISTORY] = "reserved for the history of a run that starts from a submit"
         n_omitted = len(omitted)
         whole = LEFT_OUT if bundle is None else LEFT_OUT | {"system"}

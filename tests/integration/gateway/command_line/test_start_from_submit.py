@@ -95,6 +95,12 @@ def test_a_start_has_the_workspace_of_that_submit(child: Path) -> None:
     assert not [path for path in found if path.startswith("feedback/")]
 
 
+def test_the_history_is_no_part_of_the_tree(child: Path) -> None:
+    tree, _ = trees.read(child, "submit_000")
+    assert [file.path for file in tree.files] == ["notes.md", "seen.json", "system/policy.py"]
+    assert (dict(tree.omitted), tree.n_omitted) == ({}, 0)
+
+
 def test_the_history_is_the_feedback_up_to_that_submit_read_only(parent: Path, child: Path) -> None:
     found = seen(child)["found"]
     for name in ("submit_000", "submit_001"):

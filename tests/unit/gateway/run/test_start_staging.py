@@ -63,6 +63,9 @@ def test_a_start_gets_the_recorded_workspace_and_no_hidden_result(parent: RunFol
     }
     assert (workspace / "system" / "policy.py").read_text() == "submitted"
     assert "`history/`" in (workspace / "AGENTS.md").read_text()
+    recorder = trees.Recorder(workspace, started.folder.trees, started=started.folder.start.exists())
+    unchanged = recorder.record("submit_000", bundles.snapshot(started.folder.system), None)
+    assert unchanged == started.settings.start.tree
 
 
 @pytest.mark.parametrize(
