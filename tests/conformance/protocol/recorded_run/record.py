@@ -43,7 +43,8 @@ SCRIPT = [
     written("2"),
     Step(text="The second policy is the best."),
 ]
-"""Walks into the wall; along the cliff to the goal; and into another wall. A policy that fails gets actions from the secret of its coordinator."""
+"""Walks into the wall; along the cliff to the goal; and into another wall. No policy fails: the actions of such an
+episode come from the secret of its coordinator."""
 
 
 def main() -> None:

@@ -1,5 +1,5 @@
 """Runs whose processes are killed at random instants: what is recorded of the model is what its API has
-counted."""
+counted, and a run that is being replayed does not change."""
 
 from __future__ import annotations
 
@@ -80,6 +80,37 @@ def test_kills_at_random_lose_at_most_the_requests_in_flight(
     assert whole * CACHED <= tokens.cache_read <= n_answered * CACHED
     assert whole * OUTPUT <= tokens.output <= n_answered * OUTPUT
     assert record.agent.model_string == "m-1"
+
+
+@pytest.mark.parametrize("seed", range(int(os.environ.get("EVOPOLICY_KILL_SEEDS", "1"))))
+def test_kills_during_a_replay_leave_the_recorded_run_as_it_was(
+    tmp_path: Path, operator: Path, monkeypatch: pytest.MonkeyPatch, seed: int
+) -> None:
+    chance = random.Random(f"replay {seed}")
+    monkeypatch.setenv("MODEL_ACCESS", "key-of-the-test-0123456789")
+    with ModelApi([Step(command="sleep 0.1; ls"), SUBMIT] * 3) as api:
+        arguments = [*run_arguments(operator, _agent(tmp_path, api)), "--record-model", "full"]
+        with command(tmp_path, *arguments) as running:
+            assert running.wait() == 0, running.text
+    recorded = _content(run_dir(tmp_path))
+    again = ["replay", str(run_dir(tmp_path)), "--credentials", str(operator)]
+    for victim in [*VICTIMS, "command", "everything"]:
+        with command(tmp_path, *again) as running:
+            time.sleep(chance.random() * 3)
+            if victim in VICTIMS:
+                _kill(running, VICTIMS[victim])
+                code, text = running.wait(), running.text
+                assert code in (0, 1), text
+            else:
+                running.kill_all() if victim == "everything" else running.kill()
+        assert running.alive() == []
+        assert _content(run_dir(tmp_path)) == recorded
+        with command(tmp_path, *again) as running:
+            assert running.finish()[:2] == (0, "identical\n"), running.text
+
+
+def _content(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 def _agent(folder: Path, api: ModelApi) -> str:
