@@ -147,9 +147,14 @@ def stays_on_machine(endpoint: str) -> bool:
 
 
 def publish(endpoints: tuple[str, ...], folder: Path) -> None:
-    """Registers `folder` as the place of the credentials of these endpoints, for this user's commands."""
+    """Registers `folder` as the place of the credentials of these endpoints, for this user's commands. Raises
+    ConfigError where the registry cannot be made."""
     registry = registry_dir()
-    registry.mkdir(parents=True, exist_ok=True, mode=0o700)
+    try:
+        registry.mkdir(parents=True, exist_ok=True, mode=0o700)
+    except OSError as error:
+        why = f"cannot make {registry}, where commands find this cluster: {error.strerror}"
+        raise ConfigError(f"{why}; set XDG_STATE_HOME to a folder that you can write") from error
     for endpoint in endpoints:
         write_atomically(_registered(endpoint), str(folder.resolve()).encode(), mode=0o600, durable=False)
 
