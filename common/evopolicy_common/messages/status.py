@@ -96,6 +96,8 @@ class RunStatus(msgspec.Struct, frozen=True, kw_only=True):
     """The last ones since the coordinator started, oldest first."""
     silent_s: Number = 0.0
     """Seconds for which an open run has had no gateway, as far as this coordinator has seen."""
+    origin: Word = ""
+    """The run that it plays again or starts from; empty: none."""
 
     @property
     def abandoned(self) -> bool:

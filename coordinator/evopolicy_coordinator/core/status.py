@@ -140,10 +140,11 @@ def _run(
 ) -> RunStatus:
     waiting = [waits[group] for group in groups if group in waits and not _yields(group, waits[group])]
     progress, waits_at_end = finished.progress(state, run)
+    settings = run.row.settings
     return RunStatus(
         run=run.id,
-        entry=run.row.settings.entry,
-        env=run.row.settings.env,
+        entry=settings.entry,
+        env=settings.env,
         phase=progress.phase,
         budget=run.row.budget,
         remaining_budget=run.ledger.available,
@@ -153,14 +154,15 @@ def _run(
         done=run.ledger.settled + sum(group.done for group in groups),
         waits_for=words(waiting[0] if waiting else waits_at_end),
         agent_host=permits.agents(state, run.id),
-        exp_id=run.row.settings.exp_id,
-        repeat=run.row.settings.repeat,
+        exp_id=settings.exp_id,
+        repeat=settings.repeat,
         best_mean=max(
             (row.mean_return for row in run.submits if row.status == "ok" and row.mean_return is not None),
             default=None,
         ),
         created_at=run.row.created_at,
         retries=tuple(run.retries),
+        origin=settings.replay_of or ("" if settings.start is None else settings.start.run),
     )
 
 

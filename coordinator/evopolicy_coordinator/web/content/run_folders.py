@@ -104,6 +104,11 @@ class RunFacts(msgspec.Struct, frozen=True, kw_only=True):
         return "" if self.start is None else f"from submit {self.start.submit_index} of {self.start.run}"
 
     @property
+    def origin_run(self) -> str:
+        """The cluster's id of the run that it comes from; empty for most runs."""
+        return self.replay_of or ("" if self.start is None else self.start.run)
+
+    @property
     def left_s(self) -> float | None:
         """Seconds until the budget is spent, at the present rate."""
         if self.finished or self.started_at is None or not self.budget or not self.used:
@@ -128,6 +133,8 @@ class Runs(msgspec.Struct, frozen=True, kw_only=True):
     by_key: Mapping[str, RunFacts] = {}
     shut: frozenset[str] | None = frozenset()
     """Environments of which a related agent may be alive; None: of all."""
+    origins: frozenset[str] = frozenset()
+    """Ids of runs that a run whose agent may be alive plays again or comes from."""
 
     def of(self, name: str) -> RunFacts | None:
         """The run with this id of the cluster; None if it is not here. A replay has an id of its own."""
@@ -139,7 +146,9 @@ class Runs(msgspec.Struct, frozen=True, kw_only=True):
             return False
         if self.shut is None:
             return False
-        return run.hidden_cases == "per_run" or run.env not in self.shut
+        if run.hidden_cases == "per_run":
+            return run.run not in self.origins
+        return run.env not in self.shut
 
 
 def key_of(text: str) -> str:
@@ -163,6 +172,7 @@ class Reader:
         by_name = {(status.entry, status.env, status.exp_id): status for status in by_run.values()}
         sweeps: list[Sweep] = []
         alive: set[str] = set()
+        origins = {status.origin for status in by_run.values() if _may_be_alive(status)}
         seen: set[str] = set()
         sweep_folders = _sweep_folders(self.roots)
         for root, index in sweep_folders:
@@ -180,6 +190,7 @@ class Reader:
                 seen.add(facts.run)
                 if facts.agent_alive and not facts.finished:
                     alive.add(facts.env)
+                    origins.add(facts.origin_run)
             listed = {each.name for each in by_folder.values()} | {
                 each.name for each in entries.values() if not each.directory
             }
@@ -201,7 +212,11 @@ class Reader:
         alive |= {status.env for status in by_run.values() if _may_be_alive(status)}
         by_key = {run.key: run for sweep in sweeps for run in sweep.runs}
         self._forget(by_key.values())
-        return Runs(sweeps=tuple(sweeps), by_key=by_key, shut=frozenset(alive) if cluster_is_known else None)
+        before = {run.run: run.origin_run for run in by_key.values()}
+        while further := {before.get(name, "") for name in origins} - origins:
+            origins |= further
+        shut = frozenset(alive) if cluster_is_known else None
+        return Runs(sweeps=tuple(sweeps), by_key=by_key, shut=shut, origins=frozenset(origins - {""}))
 
     def run(self, folder: Path, entry: Entry | None, by_run: Mapping[str, RunStatus]) -> RunFacts:
         """One run with a folder."""

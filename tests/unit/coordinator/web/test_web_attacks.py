@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import datetime as dt
 import fcntl
+import json
 import os
 import resource
 from collections.abc import AsyncIterator, Iterator
@@ -488,6 +489,19 @@ def test_hidden_scores_are_not_shown_while_a_related_agent_is_alive(tmp_path: Pa
 def test_cases_of_a_runs_own_are_related_to_nobody(tmp_path: Path) -> None:
     folder = finished_run(tmp_path, hidden_cases="per_run")
     assert shown(pages_of(site_of(tmp_path, cluster=status(open_status("r-2"))), folder))
+
+
+def test_scores_stay_hidden_while_a_replay_or_start_of_it_lives(tmp_path: Path) -> None:
+    folder = finished_run(tmp_path, hidden_cases="per_run")
+    document = json.loads((folder / "run.json").read_bytes())
+    run = document["run"] = "r-1"
+    (folder / "run.json").write_text(json.dumps(document))
+    assert not shown(pages_of(site_of(tmp_path, cluster=status(open_status("r-2", origin=run))), folder))
+    other = open_run(tmp_path, settings={"replay_of": run})
+    with (other / ".gateway" / "agent.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        assert not shown(pages_of(site_of(tmp_path), folder))
+    assert shown(pages_of(site_of(tmp_path), folder))
 
 
 def test_a_cluster_that_does_not_answer_shows_nothing_hidden(tmp_path: Path) -> None:
