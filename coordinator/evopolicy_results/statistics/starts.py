@@ -27,7 +27,7 @@ class StartGroup(msgspec.Struct, frozen=True, kw_only=True):
 
     start: Start
     parent: str
-    """Name of the earlier run; the coordinator's name of it where it is not among the runs."""
+    """Entry and experiment of the earlier run; the coordinator's name of it where it is not among the runs."""
     env: str
     variants: dict[str, int]
     """Label to number of runs."""
@@ -38,16 +38,16 @@ class StartGroup(msgspec.Struct, frozen=True, kw_only=True):
 
 def grouped(runs: Iterable[Run]) -> dict[tuple[str, int, str], list[Run]]:
     """Runs that start from a submit, by its run, index and tree."""
-    found: dict[tuple[str, int, str], list[Run]] = {}
+    by_state: dict[tuple[str, int, str], list[Run]] = {}
     for run in runs:
         if (start := run.record.start) is not None:
-            found.setdefault((start.run, start.submit_index, start.tree), []).append(run)
-    return found
+            by_state.setdefault((start.run, start.submit_index, start.tree), []).append(run)
+    return by_state
 
 
 def start_groups(runs: Sequence[Run], *, resamples: int = RESAMPLES) -> list[StartGroup]:
     """The groups of the started runs among `runs`."""
-    names = {run.record.run: run.name for run in runs if run.record.run}
+    names = {run.record.run: f"{run.entry} / {run.record.exp_id}" for run in runs if run.record.run}
     out = []
     for (parent, _, _), group in grouped(runs).items():
         by_label: dict[str, list[Run]] = {}

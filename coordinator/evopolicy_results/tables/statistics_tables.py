@@ -64,7 +64,7 @@ def starts_table(groups: Sequence[StartGroup]) -> Table:
         rows += [of | row for row in found or lone]
     return Table(
         name="starts",
-        title="Runs from one state",
+        title="Differences between runs from one state",
         caption=(
             "Runs that start from a submit of an earlier run, compared with those from the same submit: first minus"
             " second, in held-out returns, paired by case, with the 95 % interval and Holm's correction over all pairs"

@@ -67,8 +67,8 @@ def test_starts_from_one_state_are_paired_by_case_with_an_interval(found: Study)
     assert (other.pairs, other.variants) == ((), {"B": 1})
     rows = starts(found).rows
     assert [(row["start"], row["scored"]) for row in rows] == [
-        ("A / gym/acrobot / exp, submit 3", "yes"),
-        ("A / gym/acrobot / exp, submit 4", "no"),
+        ("A / exp, submit 3", "yes"),
+        ("A / exp, submit 4", "no"),
     ]
     assert [(row["over"], row["runs"]) for row in rows if row.get("over")] == [("runs and cases", "3 and 3")]
     assert rows[1]["interval"] == "no other agent or setting"
