@@ -145,7 +145,7 @@ def index_page(
             "Task demand",
             title="Performance by task demand",
             texts=["Synthesis-dominant tasks need machinery (perception, memory, planning); tuning-dominant ones mostly need the "
-                   "right constants. A lens, not a taxonomy."],
+                   "right constants. This is one way to read the results, not a classification of tasks."],
             figures=shown_figures(*(f"normalised_{s}" for s in suites)),
             tables=shown_tables(*(f"normalised_{s}" for s in ranked)),
         ),

@@ -223,9 +223,9 @@ def _resolution(suite: Suite) -> Table:
             "The smallest difference between two agents that these cases and runs resolve: the half width of its 95 %"
             " interval, median over pairs, in returns and as a share of the random-to-best scale. A true difference of"
             " that size is resolved every second time. Repeats: runs of each agent that a difference of that share of"
-            f" the scale would need; `more cases` where more runs do not help (up to {MAX_REPEATS} were tried); a dash"
-            " with one run a cell, which does not show how runs vary. Mean of all: of the normalised scores over the"
-            " environments, which are fixed."
+            f' the scale would need; "more cases" where more runs do not help (up to {MAX_REPEATS} were tried); a'
+            " dash with one run a cell, which does not show how runs vary. Mean of all: of the normalised scores"
+            " over the environments, which are fixed."
         )
         + (
             ""
