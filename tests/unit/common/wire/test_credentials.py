@@ -49,6 +49,15 @@ def test_a_command_finds_the_cluster_that_it_is_pointed_at(tmp_path: Path) -> No
         credentials.find("worker", ("tcp/127.0.0.1:7447",))
 
 
+def test_a_registry_that_cannot_be_made_is_named_with_the_remedy(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "file"))
+    with pytest.raises(ConfigError, match=r"cannot make .*/file/evopolicy/clusters.*set XDG_STATE_HOME"):
+        credentials.publish(("tcp/127.0.0.1:7447",), tmp_path)
+
+
 def test_without_an_endpoint_the_default_state_folder_is_looked_at() -> None:
     path = credentials.default_state_dir() / "credentials" / "worker.json"
     credentials.write(worker(), path)
