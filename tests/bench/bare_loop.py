@@ -30,7 +30,9 @@ def constant(space):
         return {name: constant(each) for name, each in space["spaces"].items()}
     if kind == "Text":
         return "noop()"  # BrowserGym's
-    return 0 if kind == "Discrete" else [0.0] * space["shape"][0]
+    if kind == "Discrete":
+        return 0
+    return [0] * space["n"] if kind == "MultiBinary" else [0.0] * space["shape"][0]
 
 
 class Policy:
@@ -87,9 +89,9 @@ def constant(space: Any) -> Any:
 
     if hasattr(space, "spaces"):
         return {name: constant(each) for name, each in space.spaces.items()}
-    if hasattr(space, "high"):
-        return np.zeros(space.shape, dtype=space.dtype)
-    return "noop()" if hasattr(space, "characters") else 0
+    if hasattr(space, "characters"):
+        return "noop()"
+    return 0 if space.shape == () else np.zeros(space.shape, dtype=space.dtype)
 
 
 def pace(env: Any) -> dict[str, float]:
