@@ -5,15 +5,12 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Mapping
 from functools import cache
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from evopolicy_common.catalogue import Entry
 from evopolicy_worker.environments.interface.gymnasium_adapter import GymnasiumFamily
 from evopolicy_worker.environments.interface.info import plain_info
 from evopolicy_worker.environments.tasks import template
-
-if TYPE_CHECKING:
-    import gymnasium
 
 _OBSERVATION = (
     "The screen: a picture with its rows from the top and its columns from the left, red, green and blue. Score and"
@@ -46,28 +43,24 @@ class AtariFamily(GymnasiumFamily):
         plain.pop("frame_number", None)
         return plain
 
-    def words(self, entry: Entry, env: gymnasium.Env[Any, Any]) -> dict[str, str]:
-        console: Any = env.unwrapped
+    def words(self, entry: Entry, env: Any) -> dict[str, str]:
+        console = env.unwrapped
         settings: dict[str, Any] = {} if console.spec is None else console.spec.kwargs
-        choices = [f"| `{k}` | {_choice(each)} |" for k, each in enumerate(console.get_action_meanings())]
+        choices = ((f"`{k}`", _choice(each)) for k, each in enumerate(console.get_action_meanings()))
         held = settings.get("frameskip", 1)
-        if isinstance(held, int):
-            duration = (
-                "It is held for one frame."
-                if held == 1
-                else f"It is held for {held} frames; you see the last."
-            )
+        if held == 1:
+            duration = "It is held for one frame."
         else:
-            duration = f"It is held for {held[0]} to {held[1] - 1} frames, at random; you see the last."
+            frames = held if isinstance(held, int) else f"{held[0]} to {held[1] - 1}"
+            at_random = "" if isinstance(held, int) else ", at random"
+            duration = f"It is held for {frames} frames{at_random}; you see the last."
         if settings.get("repeat_action_probability"):
             duration += " Now and then, at random, the console goes on with the choice before."
         return {
             "": _games()[settings["game"]],
             "Observation": _OBSERVATION,
-            "Action": (
-                f"What is done with the joystick. {duration}\n\n| choice | joystick |\n|---|---|\n"
-                + "\n".join(choices)
-            ),
+            "Action": f"What is done with the joystick. {duration}\n\n"
+            + template.table(("choice", "joystick"), choices),
             "Reward": _REWARD,
             "Start": (
                 "The game's beginning, the same in every episode. Where something is at random, the episode's seed"

@@ -7,18 +7,16 @@ their place. Its pictures draw from the world's random numbers, so these are put
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from importlib.util import find_spec
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any
 
 import numpy as np
 
 from evopolicy_common.catalogue import Entry
-from evopolicy_worker.environments.interface.gymnasium_adapter import GymnasiumFamily
-
-if TYPE_CHECKING:
-    import gymnasium
+from evopolicy_worker.environments.interface.gymnasium_adapter import Adapted, GymnasiumFamily
+from evopolicy_worker.environments.tasks import template
 
 _SIDE_FOR_PEOPLE = 360
 """Height and width of a frame for people, pixels."""
@@ -46,31 +44,18 @@ class CrafterFamily(GymnasiumFamily):
         if find_spec("numba") is None:
             _hasten()
 
-    def make(self, entry: Entry, *, render: bool) -> gymnasium.Env[Any, Any]:
-        return cast("gymnasium.Env[Any, Any]", _Game())
+    def make(self, entry: Entry, *, render: bool) -> Any:
+        return _Game()
 
-    def words(self, entry: Entry, env: gymnasium.Env[Any, Any]) -> dict[str, str]:
+    def words(self, entry: Entry, env: Any) -> dict[str, str]:
         from crafter import constants
 
-        choices = [f"| `{k}` | {_choice(name)} |" for k, name in enumerate(constants.actions)]
+        choices = ((f"`{k}`", _choice(name)) for k, name in enumerate(constants.actions))
         achievements = ", ".join(f"`{name}`" for name in constants.achievements)
         return {
             "": _ABOUT,
-            "Action": "\n".join(
-                [
-                    "One choice a step.",
-                    "",
-                    "| choice | what it does |",
-                    "|---|---|",
-                    *choices,
-                    "",
-                    "What is needed:",
-                    "",
-                    "| for | of the inventory | where |",
-                    "|---|---|---|",
-                    *_needs(constants),
-                ]
-            ),
+            "Action": f"One choice a step.\n\n{template.table(('choice', 'what it does'), choices)}\n\n"
+            f"What is needed:\n\n{template.table(('for', 'of the inventory', 'where'), _needs(constants))}",
             "Reward": (
                 "1 at a step that unlocks achievements, each for the first time; a tenth for each point of health that"
                 " is won, and the same less for each that is lost. `info['unlocked']` names what the step unlocked,"
@@ -115,22 +100,19 @@ def _choice(name: str) -> str:
     return _WHAT[name]
 
 
-def _needs(constants: Any) -> list[str]:
+def _needs(constants: Any) -> Iterator[tuple[str, str, str]]:
     """Rows of what collecting, placing and making take, from the package's own table."""
-    rows = []
-    for material, recipe in constants.collect.items():
-        rows.append((f"collecting from {material}", recipe["require"], material))
-    for name, recipe in constants.place.items():
-        rows.append((f"placing {name}", recipe["uses"], " or ".join(recipe["where"])))
-    for name, recipe in constants.make.items():
-        rows.append(
-            (f"making {name.replace('_', ' ')}", recipe["uses"], "near " + " and ".join(recipe["nearby"]))
-        )
 
     def listed(items: Mapping[str, int]) -> str:
         return ", ".join(f"{n} {item.replace('_', ' ')}" for item, n in items.items()) or "nothing"
 
-    return [f"| {what} | {listed(items)} | {where} |" for what, items, where in rows]
+    for material, recipe in constants.collect.items():
+        yield f"collecting from {material}", listed(recipe["require"]), material
+    for name, recipe in constants.place.items():
+        yield f"placing {name}", listed(recipe["uses"]), " or ".join(recipe["where"])
+    for name, recipe in constants.make.items():
+        where = "near " + " and ".join(recipe["nearby"])
+        yield f"making {name.replace('_', ' ')}", listed(recipe["uses"]), where
 
 
 class _Ordered(dict[Any, None]):
@@ -143,11 +125,8 @@ class _Ordered(dict[Any, None]):
         del self[each]
 
 
-class _Game:
-    """The game: what the adapter needs of Gymnasium's interface."""
-
-    metadata = {"render_modes": ["rgb_array"]}
-    spec = None
+class _Game(Adapted):
+    """The game."""
 
     def __init__(self) -> None:
         import crafter
@@ -167,10 +146,6 @@ class _Game:
         self.action_space = spaces.Discrete(int(self._game.action_space.n))
         self.observation_space = spaces.Box(0, 255, self._game.observation_space.shape, np.uint8)
 
-    @property
-    def unwrapped(self) -> Any:
-        return self
-
     def reset(self, *, seed: int, options: Any = None) -> tuple[Any, dict[str, Any]]:
         self._game._seed, self._game._episode = seed, 0
         self._unlocked = 0
@@ -181,11 +156,8 @@ class _Game:
         obs, reward, _, game_info = self._game.step(action)
         new = [name for name in game_info["achievements"] if name in self._game._unlocked - before]
         self._unlocked += len(new)
-        info = {
-            "inventory": game_info["inventory"],
-            "achievements": self._unlocked,
-            "unlocked": ", ".join(new),
-        }
+        inventory = game_info["inventory"]
+        info = {"inventory": inventory, "achievements": self._unlocked, "unlocked": ", ".join(new)}
         # Its own end includes its limit, which the adapter keeps.
         return obs, reward, not game_info["discount"], False, info
 
@@ -196,9 +168,6 @@ class _Game:
             return self._game.render((_SIDE_FOR_PEOPLE, _SIDE_FOR_PEOPLE))
         finally:
             random.set_state(state)
-
-    def close(self) -> None:
-        pass
 
 
 FAMILY = CrafterFamily()

@@ -10,17 +10,15 @@ import os
 import tomllib
 from collections.abc import Mapping
 from functools import cache
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any
 
 import numpy as np
 
 from evopolicy_common.catalogue import Entry
 from evopolicy_worker.environments.families.mujoco import MujocoFamily, check_rendering
 from evopolicy_worker.environments.interface import spaces
+from evopolicy_worker.environments.interface.gymnasium_adapter import Adapted
 from evopolicy_worker.environments.tasks import template
-
-if TYPE_CHECKING:
-    import gymnasium
 
 _HEIGHT, _WIDTH = 180, 240
 _SYSTEM_SEED = 0
@@ -54,35 +52,26 @@ class DmControlFamily(MujocoFamily):
             else:
                 os.environ["MUJOCO_GL"] = usual
 
-    def make(self, entry: Entry, *, render: bool) -> gymnasium.Env[Any, Any]:
+    def make(self, entry: Entry, *, render: bool) -> Any:
         check_rendering(entry, render=render)
-        return cast("gymnasium.Env[Any, Any]", _Task(*_names(entry)))
+        return _Task(*_names(entry))
 
-    def words(self, entry: Entry, env: gymnasium.Env[Any, Any]) -> dict[str, str]:
+    def words(self, entry: Entry, env: Any) -> dict[str, str]:
         domain, task = _names(entry)
         texts = _texts()[domain]
         objective, reward = texts["tasks"][task]
         parts = texts["observation"] | texts.get("also", {})
-        observed: Any = env.observation_space
-        task_env = cast(_Task, env)
-        rows = [
-            f"| `{name}` | {parts[name].replace('{joints}', task_env.joints)} |"
-            f" {template.words(spaces.to_schema(part))} |"
-            for name, part in observed.spaces.items()
-        ]
-        bounds = zip(task_env.action_space.low, task_env.action_space.high, strict=True)
-        motors = [
-            f"| `{k}` | {name} | {low:g} to {high:g} |"
-            for k, (name, (low, high)) in enumerate(zip(task_env.actuators, bounds, strict=True))
-        ]
+        rows = (
+            (f"`{name}`", parts[name].replace("{joints}", env.joints), template.words(spaces.to_schema(part)))
+            for name, part in env.observation_space.spaces.items()
+        )
+        bounds = zip(env.actuators, env.action_space.low, env.action_space.high, strict=True)
+        motors = ((f"`{k}`", name, f"{low:g} to {high:g}") for k, (name, low, high) in enumerate(bounds))
+        head = "number", "its name in the model", "range"
         return {
             "": f"{texts['about']} {objective}",
-            "Observation": "\n".join(
-                [f"A dict. {_UNITS}", "", "| component | what it is | values |", "|---|---|---|", *rows]
-            ),
-            "Action": "\n".join(
-                [texts["action"], "", "| number | its name in the model | range |", "|---|---|---|", *motors]
-            ),
+            "Observation": f"A dict. {_UNITS}\n\n{template.table(('component', 'what it is', 'values'), rows)}",
+            "Action": f"{texts['action']}\n\n{template.table(head, motors)}",
             "Reward": f"What each step pays: {reward[0].lower()}{reward[1:]}",
             "Start": f"{texts['start']} The seed of the episode decides.",
             "End": texts.get("end", "Never terminates by itself."),
@@ -100,11 +89,8 @@ def _texts() -> dict[str, Any]:
     return tomllib.loads(template.read("dm_control_tasks.toml"))
 
 
-class _Task:
-    """A task of the suite: what the adapter needs of Gymnasium's interface."""
-
-    metadata = {"render_modes": ["rgb_array"]}
-    spec = None
+class _Task(Adapted):
+    """A task of the suite."""
 
     def __init__(self, domain: str, task: str) -> None:
         import mujoco
@@ -121,11 +107,9 @@ class _Task:
             for each in (spec.minimum, spec.maximum)
         )
         self.action_space = spaces.Box(low.astype(np.float64), high.astype(np.float64), dtype=np.float64)
+        parts = self._task.observation_spec().items()
         self.observation_space = spaces.Dict(
-            [
-                (name, spaces.Box(-np.inf, np.inf, part.shape, np.float64))
-                for name, part in self._task.observation_spec().items()
-            ]
+            [(name, spaces.Box(-np.inf, np.inf, part.shape, np.float64)) for name, part in parts]
         )
         model = self._physics.model
         self.actuators = [model.id2name(k, "actuator") for k in range(model.nu)]
@@ -136,10 +120,6 @@ class _Task:
         )
         """The model's hinges with their ranges, in the order in which observations have them."""
 
-    @property
-    def unwrapped(self) -> Any:
-        return self
-
     def reset(self, *, seed: int, options: Any = None) -> tuple[Any, dict[str, Any]]:
         self._free()
         self._task.task._random = np.random.RandomState(seed)
@@ -147,14 +127,8 @@ class _Task:
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         found = self._task.step(action)
-        ended = found.last()
-        return (
-            found.observation,
-            found.reward,
-            ended and not found.discount,
-            ended and bool(found.discount),
-            {},
-        )
+        ended, truncated = found.last(), bool(found.discount)
+        return found.observation, found.reward, ended and not truncated, ended and truncated, {}
 
     def render(self) -> Any:
         if self._renderer is None:
@@ -163,13 +137,8 @@ class _Task:
             model = self._physics.model.ptr
             # Without a graphics card, shadows take most of a frame's time.
             model.vis.quality.shadowsize = 0
-            self._renderer = MujocoRenderer(
-                model,
-                self._physics.data.ptr,
-                width=_WIDTH,
-                height=_HEIGHT,
-                camera_id=0 if model.ncam else None,
-            )
+            camera, size = 0 if model.ncam else None, {"width": _WIDTH, "height": _HEIGHT}
+            self._renderer = MujocoRenderer(model, self._physics.data.ptr, **size, camera_id=camera)
         return self._renderer.render("rgb_array")
 
     def close(self) -> None:

@@ -9,16 +9,14 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any
 
 import numpy as np
 
 from evopolicy_common.catalogue import Entry
 from evopolicy_worker.environments.families.mujoco import MujocoFamily, check_rendering
+from evopolicy_worker.environments.interface.gymnasium_adapter import Adapted
 from evopolicy_worker.environments.tasks import template
-
-if TYPE_CHECKING:
-    import gymnasium
 
 _CAMERA = "corner"
 _SIDE = 320
@@ -36,23 +34,21 @@ class MetaWorldFamily(MujocoFamily):
     extra = "metaworld"
     components: Mapping[str, Mapping[str, str]] = {}
 
-    def make(self, entry: Entry, *, render: bool) -> gymnasium.Env[Any, Any]:
+    def make(self, entry: Entry, *, render: bool) -> Any:
         check_rendering(entry, render=render)
-        return cast("gymnasium.Env[Any, Any]", _Tasks(_names(entry), render=render))
+        return _Tasks(_names(entry), render=render)
 
-    def words(self, entry: Entry, env: gymnasium.Env[Any, Any]) -> dict[str, str]:
+    def words(self, entry: Entry, env: Any) -> dict[str, str]:
         tasks = tomllib.loads(template.read("metaworld_tasks.toml"))
         names = _names(entry)
         if len(names) == 1:
             return {"": tasks[names[0]]}
-        rows = [f"| `{39 + k}` | {name} | {tasks[name]} |" for k, name in enumerate(names)]
+        rows = ((f"`{39 + k}`", name, tasks[name]) for k, name in enumerate(names))
         head = (
             f"Each episode is one of {len(names)} tasks: the number of the observation that is 1 tells which, the"
             " others are 0."
         )
-        return {
-            "": "\n".join([head, "", "| component | task | what is to be done |", "|---|---|---|", *rows])
-        }
+        return {"": f"{head}\n\n{template.table(('component', 'task', 'what is to be done'), rows)}"}
 
 
 def _names(entry: Entry) -> list[str]:
@@ -65,14 +61,11 @@ def _names(entry: Entry) -> list[str]:
     return list(suite)
 
 
-class _Tasks:
-    """One or several tasks as one environment: what the adapter needs of Gymnasium's interface.
+class _Tasks(Adapted):
+    """One or several tasks as one environment.
 
     The task of the episode before is kept, any other one is made anew: fifty models at once take gigabytes.
     """
-
-    metadata = {"render_modes": ["rgb_array"]}
-    spec = None
 
     def __init__(self, names: list[str], *, render: bool) -> None:
         import gymnasium
@@ -90,13 +83,11 @@ class _Tasks:
             low, high = (np.concatenate([each, np.full(len(names), k)]) for k, each in enumerate((low, high)))
         self.observation_space = gymnasium.spaces.Box(low, high, dtype=np.float64)
 
-    @property
-    def unwrapped(self) -> Any:
-        return self
-
     def reset(self, *, seed: int, options: Any = None) -> tuple[Any, dict[str, Any]]:
-        if len(self._names) > 1:
-            self._choose(int(np.random.default_rng(seed).integers(len(self._names))))
+        index = int(np.random.default_rng(seed).integers(len(self._names))) if len(self._names) > 1 else 0
+        if index != self._index:
+            self._task.close()
+            self._index, self._task = index, _task(self._names[index], render=self._render)
         self._task.seed(seed)
         obs, info = self._task.reset()
         return self._named(obs), info
@@ -117,24 +108,12 @@ class _Tasks:
             return obs
         return np.concatenate([obs, np.arange(len(self._names)) == self._index])
 
-    def _choose(self, index: int) -> None:
-        if index == self._index:
-            return
-        self._task.close()
-        self._index = index
-        self._task = _task(self._names[index], render=self._render)
-
 
 def _task(name: str, *, render: bool) -> Any:
     """A task that draws its start from its own generator, with the goal in its observations."""
     from metaworld.env_dict import ALL_V3_ENVIRONMENTS
 
-    mode: dict[str, Any] = {
-        "render_mode": "rgb_array",
-        "camera_name": _CAMERA,
-        "width": _SIDE,
-        "height": _SIDE,
-    }
+    mode = {"render_mode": "rgb_array", "camera_name": _CAMERA, "width": _SIDE, "height": _SIDE}
     task = ALL_V3_ENVIRONMENTS[name](**(mode if render else {}))
     # Without a graphics card, shadows take most of a frame's time.
     task.model.vis.quality.shadowsize = 0

@@ -6,16 +6,13 @@ import tomllib
 from collections.abc import Callable
 from ctypes.util import find_library
 from functools import cache
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from evopolicy_common.catalogue import Entry
 from evopolicy_common.errors import WorkerError
 from evopolicy_common.processes import distribution
 from evopolicy_worker.environments.interface.gymnasium_adapter import GymnasiumFamily
 from evopolicy_worker.environments.tasks import template
-
-if TYPE_CHECKING:
-    import gymnasium
 
 _PICTURE = (
     "what a camera on the agent sees: a picture with its rows from the top and its columns from the left, red, green"
@@ -62,7 +59,7 @@ class MiniWorldFamily(GymnasiumFamily):
     extra = "miniworld"
     measures = True
 
-    def make(self, entry: Entry, *, render: bool) -> gymnasium.Env[Any, Any]:
+    def make(self, entry: Entry, *, render: bool) -> Any:
         """As others; observations are drawn, so WorkerError where the host has no EGL."""
         if find_library("EGL") is None:
             raise WorkerError(
@@ -74,13 +71,12 @@ class MiniWorldFamily(GymnasiumFamily):
         _root().switch_to()
         # The window for people takes sixty megabytes even when it is not shown.
         width, height = _PICTURE_FOR_PEOPLE if render else (1, 1)
-        env = gymnasium.make(
-            entry.gymnasium_id,
-            disable_env_checker=True,
-            render_mode="rgb_array" if render else None,
-            window_width=width,
-            window_height=height,
-        )
+        mode = {
+            "render_mode": "rgb_array" if render else None,
+            "window_width": width,
+            "window_height": height,
+        }
+        env = gymnasium.make(entry.gymnasium_id, disable_env_checker=True, **mode)
         _in_its_context(env.unwrapped)
         return env
 
@@ -88,18 +84,17 @@ class MiniWorldFamily(GymnasiumFamily):
         """With the OpenGL that draws: other versions draw other pixels."""
         return super().packages(entry) | {"opengl": _opengl()}
 
-    def words(self, entry: Entry, env: gymnasium.Env[Any, Any]) -> dict[str, str]:
+    def words(self, entry: Entry, env: Any) -> dict[str, str]:
         name = str(entry.gymnasium_id).split("-")[1]
-        space: Any = env.action_space
-        meanings = [*_ACTIONS[:3], "end the episode"] if name == "Sign" else _ACTIONS[: int(space.n)]
-        rows = [f"| `{k}` | {meaning} |" for k, meaning in enumerate(meanings)]
+        meanings = (*_ACTIONS[:3], "end the episode") if name == "Sign" else _ACTIONS[: env.action_space.n]
+        choices = ((f"`{k}`", meaning) for k, meaning in enumerate(meanings))
         observation = f"The observation is {_PICTURE}."
         if name == "Sign":
             observation = f"`obs` is {_PICTURE}. `goal` is 0 for a box and 1 for a key."
         return {
             "": _rooms()[name],
             "Observation": observation,
-            "Action": "A small movement each.\n\n| choice | what it does |\n|---|---|\n" + "\n".join(rows),
+            "Action": f"A small movement each.\n\n{template.table(('choice', 'what it does'), choices)}",
             "Reward": _REWARDS.get(name, _GOAL_REWARD),
             "Start": "The seed of the episode decides where the agent starts and, in most rooms, where objects are.",
             "End": _ENDS.get(name, "An episode ends when the goal is reached."),

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, cast
+from functools import partial
+from typing import Any
 
 import numpy as np
 
 from evopolicy_common.catalogue import Entry
 from evopolicy_worker.environments.families.mujoco import MujocoFamily
 from evopolicy_worker.environments.interface import rewards
+from evopolicy_worker.environments.interface.gymnasium_adapter import Adapted
 from evopolicy_worker.environments.tasks import highway, template
-
-if TYPE_CHECKING:
-    import gymnasium
 
 
 class MoGymnasiumFamily(MujocoFamily):
@@ -29,18 +28,14 @@ class MoGymnasiumFamily(MujocoFamily):
         # Made from Box2D, MuJoCo, highway-env and others, of which some do not repeat.
         return True
 
-    def make(self, entry: Entry, *, render: bool) -> gymnasium.Env[Any, Any]:
+    def make(self, entry: Entry, *, render: bool) -> Any:
         """As others. A minecart's mines are drawn while it is made, and its ore in each step, from numpy's global
         generator: it is made for each episode with that generator seeded."""
 
-        def usual() -> gymnasium.Env[Any, Any]:
-            return super(MoGymnasiumFamily, self).make(entry, render=render)
+        usual = partial(super().make, entry, render=render)
+        return _MadeFromSeed(usual) if str(entry.gymnasium_id).startswith("minecart") else usual()
 
-        if not str(entry.gymnasium_id).startswith("minecart"):
-            return usual()
-        return cast("gymnasium.Env[Any, Any]", _MadeFromSeed(usual))
-
-    def words(self, entry: Entry, env: gymnasium.Env[Any, Any]) -> dict[str, str]:
+    def words(self, entry: Entry, env: Any) -> dict[str, str]:
         scalarisation = rewards.Scalarisation.of(entry, env)
         assert scalarisation is not None
         found = highway.words(env.unwrapped) if "highway" in str(entry.gymnasium_id) else {}
@@ -48,11 +43,10 @@ class MoGymnasiumFamily(MujocoFamily):
         return found | {"Reward": template.reward_table(components, vector=True)}
 
 
-class _MadeFromSeed:
-    """An environment that is made anew by each `reset`, with numpy's global generator seeded: what the adapter needs of
-    Gymnasium's interface."""
+class _MadeFromSeed(Adapted):
+    """An environment that is made anew by each `reset`, with numpy's global generator seeded."""
 
-    def __init__(self, make: Callable[[], gymnasium.Env[Any, Any]]) -> None:
+    def __init__(self, make: Callable[[], Any]) -> None:
         self._make = make
         self._env = make()
         self.metadata, self.spec = self._env.metadata, self._env.spec

@@ -14,7 +14,7 @@ import tomllib
 from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,11 +22,8 @@ from numpy.typing import NDArray
 from evopolicy_common.catalogue import Entry, installs
 from evopolicy_worker.environments.interface import spaces
 from evopolicy_worker.environments.interface.adapters import versions
-from evopolicy_worker.environments.interface.gymnasium_adapter import GymnasiumFamily
+from evopolicy_worker.environments.interface.gymnasium_adapter import Adapted, GymnasiumFamily
 from evopolicy_worker.environments.tasks import template
-
-if TYPE_CHECKING:
-    import gymnasium
 
 _BIRTHDAY = 1_600_000_000
 """Start of every game, seconds since 1970: it determines shopkeepers' names and some prices."""
@@ -52,54 +49,48 @@ class NetHackFamily(GymnasiumFamily):
     # Its process is a C program with a folder of files, that takes commands of any kind.
     remembers = True
 
-    def make(self, entry: Entry, *, render: bool) -> gymnasium.Env[Any, Any]:
+    def make(self, entry: Entry, *, render: bool) -> Any:
         import gymnasium
 
         assert entry.gymnasium_id is not None
-        env = gymnasium.make(
-            entry.gymnasium_id, disable_env_checker=True, fix_moon_phase=True, **entry.kwargs
-        )
-        return cast("gymnasium.Env[Any, Any]", _Game(env.unwrapped))
+        options = {"disable_env_checker": True, "fix_moon_phase": True, **entry.kwargs}
+        return _Game(gymnasium.make(entry.gymnasium_id, **options).unwrapped)
 
     def packages(self, entry: Entry) -> dict[str, str]:
-        return versions(("numpy", "gymnasium", *_distributions(entry)))
+        return versions(("numpy", "gymnasium", *self.distributions[: 1 + _is_minihack(entry)]))
 
     def version(self, entry: Entry) -> str:
-        packages = ", ".join(f"{name} {each}" for name, each in versions(_distributions(entry)).items())
-        return f"{entry.gymnasium_id} ({packages})"
+        names = self.distributions[: 1 + _is_minihack(entry)]
+        return (
+            f"{entry.gymnasium_id} ({', '.join(f'{name} {each}' for name, each in versions(names).items())})"
+        )
 
     def needs(self) -> str:
         return f"{super().needs()} and then pip install --no-deps {' '.join(installs.apart((self.extra,)))}"
 
-    def words(self, entry: Entry, env: gymnasium.Env[Any, Any]) -> dict[str, str]:
+    def words(self, entry: Entry, env: Any) -> dict[str, str]:
         common = _words("nethack_words.toml")
-        game = cast(_Game, env)
-        seen = [
-            f"| `{name}` | {common['observation'][name]} | {template.words(spaces.to_schema(space))} |"
-            for name, space in game.observation_space.spaces.items()
-        ]
-        choices = [f"| `{k}` | {_choice(each, common)} |" for k, each in enumerate(game.actions)]
+        seen = (
+            (f"`{name}`", common["observation"][name], template.words(spaces.to_schema(space)))
+            for name, space in env.observation_space.spaces.items()
+        )
+        choices = ((f"`{k}`", _choice(each, common)) for k, each in enumerate(env.actions))
         kind, name = _name(entry)
         rows = _words("nethack_tasks.toml")[kind]
         row = rows[max((key for key in rows if name.startswith(key)), key=len)]
         reward = row.get("reward", common[kind]["reward"])
         return {
             "": row["task"],
-            "Observation": "\n".join(["| component | what it is | form |", "|---|---|---|", *seen]),
-            "Action": "\n".join(
-                [common[kind]["action"], "", "| choice | what it does |", "|---|---|", *choices]
-            ),
+            "Observation": template.table(("component", "what it is", "form"), seen),
+            "Action": f"{common[kind]['action']}\n\n{template.table(('choice', 'what it does'), choices)}",
             "Reward": f"{reward} {common[kind]['penalty']}".strip(),
             "Start": common[kind]["start"],
             "End": row.get("end", common[kind]["end"]),
         }
 
 
-class _Game:
-    """A game as one environment: what the adapter needs of Gymnasium's interface."""
-
-    metadata = {"render_modes": ["rgb_array"]}
-    spec = None
+class _Game(Adapted):
+    """A game as one environment."""
 
     def __init__(self, raw: Any) -> None:
         self._raw = raw
@@ -108,10 +99,6 @@ class _Game:
         self._folder = Path(raw.nethack._vardir)
         self._files = set(os.listdir(self._folder))
         self._max_episode_steps: int = raw._max_episode_steps
-
-    @property
-    def unwrapped(self) -> Any:
-        return self
 
     def reset(self, *, seed: int, options: Any = None) -> tuple[Any, dict[str, Any]]:
         self._forget()
@@ -172,12 +159,8 @@ def _set_birthday(library: str) -> None:
 
 def _name(entry: Entry) -> tuple[str, str]:
     """Which package's task an environment is, and its name without what all have in common."""
-    gymnasium_id = str(entry.gymnasium_id)
-    return (
-        ("minihack", gymnasium_id.removeprefix("MiniHack-"))
-        if _is_minihack(entry)
-        else ("nethack", gymnasium_id.removeprefix("NetHack"))
-    )
+    kind, prefix = ("minihack", "MiniHack-") if _is_minihack(entry) else ("nethack", "NetHack")
+    return kind, str(entry.gymnasium_id).removeprefix(prefix)
 
 
 def _choice(action: Any, common: Mapping[str, Any]) -> str:
@@ -226,10 +209,6 @@ def _letters() -> NDArray[np.bool_]:
         ImageDraw.Draw(cell).text((0, 0), chr(code), fill=255, font=font)
         found.append(np.asarray(cell) > 127)
     return np.stack(found)
-
-
-def _distributions(entry: Entry) -> tuple[str, ...]:
-    return ("nle", "minihack") if _is_minihack(entry) else ("nle",)
 
 
 def _is_minihack(entry: Entry) -> bool:

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any
 
 from evopolicy_common.catalogue import Entry
-from evopolicy_worker.environments.interface.gymnasium_adapter import GymnasiumFamily
-
-if TYPE_CHECKING:
-    import gymnasium
+from evopolicy_worker.environments.interface.gymnasium_adapter import Adapted, GymnasiumFamily
+from evopolicy_worker.environments.tasks import template
 
 _BUTTONS = {
     "LEFT": "go to the left",
@@ -32,20 +30,17 @@ class StableRetroFamily(GymnasiumFamily):
         """Imports the package, which registers nothing."""
         import stable_retro  # noqa: F401
 
-    def make(self, entry: Entry, *, render: bool) -> gymnasium.Env[Any, Any]:
-        return cast("gymnasium.Env[Any, Any]", _Console(str(entry.gymnasium_id)))
+    def make(self, entry: Entry, *, render: bool) -> Any:
+        return _Console(str(entry.gymnasium_id))
 
-    def words(self, entry: Entry, env: gymnasium.Env[Any, Any]) -> dict[str, str]:
-        rows = [
-            f"| `{k}` | {name} | {_BUTTONS.get(name, 'none')} |"
-            for k, name in enumerate(cast(_Console, env).buttons)
-        ]
+    def words(self, entry: Entry, env: Any) -> dict[str, str]:
+        rows = ((f"`{k}`", name, _BUTTONS.get(name, "none")) for k, name in enumerate(env.buttons))
         return {
             "": "A space ship at the lower edge of the screen. Shoot what comes from above, and do not be hit.",
             "Observation": _OBSERVATION,
             "Action": (
                 "Which buttons are pressed for one frame, 1 for each that is. Left and right together have no"
-                " effect.\n\n| component | button | effect |\n|---|---|---|\n" + "\n".join(rows)
+                f" effect.\n\n{template.table(('component', 'button', 'effect'), rows)}"
             ),
             "Reward": "What the game's score has gained in the step. `info['lives']` tells the lives that are left.",
             "Start": "The beginning of the first level, the same in every episode: nothing in this game is at random.",
@@ -53,12 +48,10 @@ class StableRetroFamily(GymnasiumFamily):
         }
 
 
-class _Console:
+class _Console(Adapted):
     """A game in the emulator, of which a process can have only one: the console that begins an episode takes it from
     another."""
 
-    metadata = {"render_modes": ["rgb_array"]}
-    spec = None
     _holding: _Console | None = None
 
     def __init__(self, game: str) -> None:
@@ -67,10 +60,6 @@ class _Console:
         env = self._taken()
         self.observation_space, self.action_space = env.observation_space, env.action_space
         self.buttons = tuple(str(name) for name in env.buttons)
-
-    @property
-    def unwrapped(self) -> Any:
-        return self
 
     def reset(self, *, seed: int, options: Any = None) -> Any:
         return self._taken().reset(seed=seed)

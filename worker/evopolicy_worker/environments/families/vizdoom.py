@@ -15,8 +15,9 @@ import signal
 import tempfile
 import tomllib
 from functools import cache
+from itertools import compress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any
 
 import numpy as np
 
@@ -24,11 +25,8 @@ from evopolicy_common.catalogue import Entry
 from evopolicy_common.errors import WorkerError
 from evopolicy_common.processes.parent_death import ending_with_parent
 from evopolicy_worker.environments.interface import spaces
-from evopolicy_worker.environments.interface.gymnasium_adapter import GymnasiumFamily
+from evopolicy_worker.environments.interface.gymnasium_adapter import Adapted, GymnasiumFamily
 from evopolicy_worker.environments.tasks import template
-
-if TYPE_CHECKING:
-    import gymnasium
 
 MOST_DELTA = 50.0
 """Most that a step may turn or look, degrees, or move to the side, units of the map. The package has the largest
@@ -51,44 +49,34 @@ class VizdoomFamily(GymnasiumFamily):
 
         gymnasium.register_envs(gymnasium_wrapper)
 
-    def make(self, entry: Entry, *, render: bool) -> gymnasium.Env[Any, Any]:
-        return cast("gymnasium.Env[Any, Any]", _Game(super().make(entry, render=False).unwrapped))
+    def make(self, entry: Entry, *, render: bool) -> Any:
+        return _Game(super().make(entry, render=False).unwrapped)
 
     def rebuilds(self, entry: Entry) -> bool:
         # A level goes on with the random numbers of the game before. Scenarios repeat.
         return _scenario(entry) == "Freedoom"
 
-    def words(self, entry: Entry, env: gymnasium.Env[Any, Any]) -> dict[str, str]:
-        game, texts, common = cast(_Game, env), _texts()[_scenario(entry)], _texts()["common"]
-        numbers = [f"`[{k}]` {common['variable'][each]}" for k, each in enumerate(game.variables)]
+    def words(self, entry: Entry, env: Any) -> dict[str, str]:
+        texts, common = _texts()[_scenario(entry)], _texts()["common"]
+        numbers = [f"`[{k}]` {common['variable'][each]}" for k, each in enumerate(env.variables)]
         parts = {**common["observation"], **texts.get("observation", {}), "gamevariables": "; ".join(numbers)}
-        seen = [
-            f"| `{name}` | {parts[name]} | {_form(name, space)} |"
-            for name, space in game.observation_space.spaces.items()
-        ]
+        seen = (
+            (f"`{name}`", parts[name], _form(name, space))
+            for name, space in env.observation_space.spaces.items()
+        )
         return {
             "": f"{texts['about']}{_level(entry)}",
-            "Observation": "\n".join(
-                [
-                    "A dict. The observation after the last step is all zeros.",
-                    "",
-                    "| component | what it is | form |",
-                    "|---|---|---|",
-                    *seen,
-                ]
-            ),
-            "Action": _actions(game, common["button"]),
+            "Observation": "A dict. The observation after the last step is all zeros.\n\n"
+            + template.table(("component", "what it is", "form"), seen),
+            "Action": _actions(env, common["button"]),
             "Reward": texts["reward"],
             "Start": texts.get("start", common["start"]),
             "End": texts["end"],
         }
 
 
-class _Game:
-    """A scenario or level: what the adapter needs of Gymnasium's interface."""
-
-    metadata = {"render_modes": ["rgb_array"]}
-    spec = None
+class _Game(Adapted):
+    """A scenario or level."""
 
     def __init__(self, raw: Any) -> None:
         """`raw`: the package's environment, whose game has not begun."""
@@ -107,10 +95,6 @@ class _Game:
         if self.deltas:
             bounded = spaces.Box(-MOST_DELTA, MOST_DELTA, (len(self.deltas),), np.float32)
             self.action_space = spaces.Dict([("binary", raw.action_space["binary"]), ("continuous", bounded)])
-
-    @property
-    def unwrapped(self) -> Any:
-        return self
 
     def reset(self, *, seed: int, options: Any = None) -> Any:
         if self._raw.game.is_running():
@@ -132,11 +116,8 @@ class _Game:
 
     def render(self) -> Any:
         state = self._raw.state
-        return (
-            np.zeros(self.observation_space["screen"].shape, np.uint8)
-            if state is None
-            else state.screen_buffer
-        )
+        shape = self.observation_space["screen"].shape
+        return np.zeros(shape, np.uint8) if state is None else state.screen_buffer
 
     def close(self) -> None:
         self._raw.close()
@@ -203,23 +184,19 @@ def _actions(game: _Game, effects: dict[str, str]) -> str:
     """The buttons, as the action space has them."""
     binary = [effects[name] for name in game.buttons]
     if game.choices is None:
-        lines = [
-            "For each button, 1 presses it and 0 leaves it.",
-            "",
-            "| component | effect of the button |",
-            "|---|---|",
-        ]
-        lines += [f"| `{k}` | {each} |" for k, each in enumerate(binary)]
+        about, head = "For each button, 1 presses it and 0 leaves it.", ("component", "effect of the button")
     else:
-        lines = ["One choice a step.", "", "| choice | effect |", "|---|---|"]
-        for k, row in enumerate(game.choices):
-            pressed = [each for each, on in zip(binary, row, strict=True) if on]
-            lines.append(f"| `{k}` | {', and '.join(pressed) or 'none'} |")
-    if game.deltas:
-        lines[0] = f"`binary` is for the buttons. {lines[0]}"
-        lines += ["", "`continuous` is for the rest:", "", "| component | effect |", "|---|---|"]
-        lines += [f"| `{k}` | {effects[name]} |" for k, name in enumerate(game.deltas)]
-    return "\n".join(lines)
+        about, head = "One choice a step.", ("choice", "effect")
+        binary = [", and ".join(compress(binary, row)) or "none" for row in game.choices]
+    text = f"{about}\n\n{_numbered(head, binary)}"
+    if not game.deltas:
+        return text
+    rest = _numbered(("component", "effect"), [effects[name] for name in game.deltas])
+    return f"`binary` is for the buttons. {text}\n\n`continuous` is for the rest:\n\n{rest}"
+
+
+def _numbered(head: tuple[str, str], effects: list[str]) -> str:
+    return template.table(head, ((f"`{k}`", each) for k, each in enumerate(effects)))
 
 
 @cache

@@ -159,6 +159,20 @@ class GymnasiumFamily:
         return f"{entry.gymnasium_id} ({versions})"
 
 
+class Adapted:
+    """What the adapter needs of Gymnasium's interface, for an environment that is none of Gymnasium's."""
+
+    metadata = {"render_modes": ["rgb_array"]}
+    spec = None
+
+    @property
+    def unwrapped(self) -> Any:
+        return self
+
+    def close(self) -> None:
+        """Frees what it holds."""
+
+
 class GymnasiumEnvironment(Environment):
     """One Gymnasium environment of a family. Made fresh again for a case where reuse could show."""
 

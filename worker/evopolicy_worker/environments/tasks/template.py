@@ -9,7 +9,7 @@ import inspect
 import math
 import re
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from importlib.resources import files
 from typing import TYPE_CHECKING, Any
@@ -230,15 +230,11 @@ def _documentation(env: gymnasium.Env[Any, Any]) -> str:
 
 
 def _space(space: SpaceSchema) -> str:
-    rows = _rows(space, "")
-    shown = [f"| `{name}` | {what} |" for name, what in rows[:_MAX_ROWS]]
-    if len(rows) > _MAX_ROWS:
-        shown.append(f"| … | {len(rows) - _MAX_ROWS} more; see the space in `/info` |")
-    return "\n".join(["| component | what it is |", "|---|---|", *shown])
-
-
-def _rows(space: SpaceSchema, name: str) -> list[tuple[str, str]]:
-    return [(path or "all", words(leaf)) for path, leaf in _leaves(space, name)]
+    leaves = _leaves(space, "")
+    rows = [(f"`{path or 'all'}`", words(leaf)) for path, leaf in leaves[:_MAX_ROWS]]
+    if len(leaves) > _MAX_ROWS:
+        rows.append(("…", f"{len(leaves) - _MAX_ROWS} more; see the space in `/info`"))
+    return table(("component", "what it is"), rows)
 
 
 def _leaves(space: SpaceSchema, name: str) -> list[tuple[str, SpaceSchema]]:
@@ -308,8 +304,14 @@ def reward_table(components: Mapping[str, str], *, vector: bool) -> str:
     if not components:
         return "As the environment's documentation tells; see it in the feedback of submits."
     what = "A vector, of which the weighted sum counts" if vector else "A number; `info` tells parts of it"
-    rows = [f"| `{name}` | {clean(text)} |" for name, text in components.items()]
-    return "\n".join([f"{what}:", "", "| name | what it is |", "|---|---|", *rows])
+    rows = ((f"`{name}`", clean(text)) for name, text in components.items())
+    return f"{what}:\n\n{table(('name', 'what it is'), rows)}"
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """A Markdown table."""
+    lines = [f"| {' | '.join(map(str, row))} |" for row in (head, *rows)]
+    return "\n".join([lines[0], "|---" * len(head) + "|", *lines[1:]])
 
 
 def _success(entry: Entry) -> str:
