@@ -8,6 +8,8 @@ import platform
 import shutil
 import subprocess
 import time
+import timeit
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Literal
 
@@ -19,7 +21,7 @@ from evopolicy_worker.environments import accelerations
 from evopolicy_worker.environments.interface import settings
 from evopolicy_worker.environments.interface.fingerprint import fingerprint
 from evopolicy_worker.environments.interface.gymnasium_adapter import quiet
-from evopolicy_worker.sandbox import jail, seccomp, why_not
+from evopolicy_worker.sandbox import SANDBOXED, jail, seccomp, why_not
 
 Verdict = Literal["ok", "missing", "note"]
 """`missing` comes with a remedy; `note` is information."""
@@ -32,8 +34,10 @@ _NAMESPACES = {
     "ipc": 0x08000000,
     "uts": 0x04000000,
 }
-_CLONE_NEWUSER = 0x10000000
 _TIMEOUT_S = 10.0
+_WITHOUT_NAMESPACES = (
+    "policies with --tier landlock where the kernel has it, agents with --jail none; reports"
+)
 _UNMASK = (
     "a slot mounts a /proc of its own, which the kernel refuses while parts of this one are covered; in a container:"
     " --security-opt systempaths=unconfined"
@@ -52,79 +56,94 @@ class Check(msgspec.Struct, frozen=True):
     """The functions that work without it."""
 
 
-def examine(allowed_packages: tuple[str, ...] = ("numpy",)) -> tuple[Check, ...]:
+def row(
+    name: str,
+    ok: object,
+    found: str,
+    missing: str,
+    advice: str,
+    without: str = "",
+    otherwise: Verdict = "missing",
+) -> Check:
+    """`found` if it is `ok`, else `missing` with the remedy."""
+    if ok:
+        return Check(name, "ok", found, without=without)
+    return Check(name, otherwise, missing, advice, without)
+
+
+def examine() -> tuple[Check, ...]:
     """All checks, in display order. Starts each sandbox tier once, which takes about a second."""
+    own, machine, version = fingerprint(), platform.machine(), jail.landlock_version()
+    filtered = seccomp.supported() and "Seccomp:" in Path("/proc/self/status").read_text()
+    packages = ", ".join(f"{name} {version}" for name, version in own.packages.items())
     return (
-        _kernel(),
+        Check("kernel", "note", f"{platform.system()} {platform.release()} {machine}"),
         _boot_id(),
         _bubblewrap(),
         *(_namespace(name, flag) for name, flag in _NAMESPACES.items()),
-        _seccomp(),
-        _landlock(),
+        row(
+            "seccomp",
+            filtered,
+            f"filter for {machine}",
+            f"no filter for {machine}, or a kernel without seccomp",
+            "use an x86-64 or 64-bit ARM machine with CONFIG_SECCOMP_FILTER",
+        ),
+        row(
+            "Landlock",
+            version,
+            f"ABI {version}",
+            "not in this kernel, or not enabled",
+            "kernel 5.13 or later with lsm=landlock,…; tier bwrap works without it, tier landlock does not",
+        ),
         _cgroups(),
         _pinning(),
         _shared_memory(),
         _clock(),
-        *_fingerprint(),
+        Check("worker", "note", f"{own.code_version}, Python {own.python}"),
+        Check("packages", "note", packages),
+        Check("CPU", "note", own.cpu),
         _accelerations(),
-        *_tiers(allowed_packages),
+        *map(_tier, SANDBOXED),
+        Check("tier none", "note", "no sandbox; used only by runs that ask for it"),
     )
 
 
-def best_tier(checks: tuple[Check, ...]) -> Tier | None:
+def best_tier(checks: Iterable[Check]) -> Tier | None:
     """The strongest tier that works; None when only `none` does."""
-    working = {check.name.removeprefix("tier ") for check in checks if check.verdict == "ok"}
-    return "bwrap" if "bwrap" in working else "landlock" if "landlock" in working else None
-
-
-def _kernel() -> Check:
-    return Check("kernel", "note", f"{platform.system()} {platform.release()} {platform.machine()}")
+    working = {check.name for check in checks if check.verdict == "ok"}
+    return next((tier for tier in SANDBOXED if f"tier {tier}" in working), None)
 
 
 def _boot_id() -> Check:
     boot_id = host.boot_id()
-    if boot_id:
-        return Check("boot id", "ok", boot_id)
-    return Check(
-        "boot id", "missing", "unknown, so this worker gets no hidden episodes", advice=host.NO_BOOT_ID
+    return row(
+        "boot id", boot_id, boot_id, "unknown, so this worker gets no hidden episodes", advice=host.NO_BOOT_ID
     )
 
 
 def _bubblewrap() -> Check:
-    path = shutil.which("bwrap")
-    if path is None:
-        return _no_bubblewrap("not on the PATH")
-    try:
-        output = subprocess.run(
-            [path, "--version"], capture_output=True, text=True, timeout=_TIMEOUT_S, check=False
-        ).stdout.strip()
-    except (OSError, subprocess.TimeoutExpired) as error:
-        return _no_bubblewrap(str(error))
-    return Check("bubblewrap", "ok", f"{output} ({path})")
-
-
-def _no_bubblewrap(found: str) -> Check:
-    return Check(
-        "bubblewrap",
-        "missing",
-        found,
-        advice=distribution.install("bubblewrap"),
-        without="policies with --tier landlock where the kernel has it, agents with --jail none; reports",
-    )
+    path, why, version = shutil.which("bwrap"), "not on the PATH", ""
+    if path is not None:
+        try:
+            done = subprocess.run(
+                [path, "--version"], capture_output=True, text=True, timeout=_TIMEOUT_S, check=False
+            )
+            why, version = "", f"{done.stdout.strip()} ({path})"
+        except (OSError, subprocess.TimeoutExpired) as error:
+            why = str(error)
+    return row("bubblewrap", not why, version, why, distribution.install("bubblewrap"), _WITHOUT_NAMESPACES)
 
 
 def _namespace(name: str, flag: int) -> Check:
     # An ordinary user can make the other namespaces only inside a user namespace.
-    flags = flag | (0 if os.geteuid() == 0 else _CLONE_NEWUSER)
-    error = _tried(flags)
-    if error == 0:
-        return Check(f"namespace {name}", "ok", "can be made")
-    return Check(
+    error = _tried(flag | (0 if os.geteuid() == 0 else _NAMESPACES["user"]))
+    return row(
         f"namespace {name}",
-        "missing",
+        error == 0,
+        "can be made",
         os.strerror(error),
-        advice=f"permit user namespaces: {distribution.permit_namespaces()}",
-        without="policies with --tier landlock where the kernel has it, agents with --jail none; reports",
+        f"permit user namespaces: {distribution.permit_namespaces()}",
+        _WITHOUT_NAMESPACES,
     )
 
 
@@ -137,54 +156,25 @@ def _tried(flags: int) -> int:
     return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
 
 
-def _seccomp() -> Check:
-    if seccomp.supported() and "Seccomp:" in Path("/proc/self/status").read_text():
-        return Check("seccomp", "ok", f"filter for {platform.machine()}")
-    return Check(
-        "seccomp",
-        "missing",
-        f"no filter for {platform.machine()}, or a kernel without seccomp",
-        advice="use an x86-64 or 64-bit ARM machine with CONFIG_SECCOMP_FILTER",
-    )
-
-
-def _landlock() -> Check:
-    version = jail.landlock_version()
-    if version:
-        return Check("Landlock", "ok", f"ABI {version}")
-    return Check(
-        "Landlock",
-        "missing",
-        "not in this kernel, or not enabled",
-        advice="kernel 5.13 or later with lsm=landlock,…; tier bwrap works without it, tier landlock does not",
-    )
-
-
 def _cgroups() -> Check:
     root = Path("/sys/fs/cgroup")
     if (root / "cgroup.controllers").is_file():
         version = f"version 2: {(root / 'cgroup.controllers').read_text().strip() or 'no controllers'}"
-    elif root.is_dir() and any(root.iterdir()):
-        version = "version 1"
     else:
-        version = "none"
+        version = "version 1" if root.is_dir() and any(root.iterdir()) else "none"
     return Check("cgroups", "note", f"{version} (limits do not need them)")
 
 
 def _pinning() -> Check:
-    allowed = os.sched_getaffinity(0)
-    core = min(allowed)
+    allowed, why = os.sched_getaffinity(0), ""
     try:
-        os.sched_setaffinity(0, {core})
+        os.sched_setaffinity(0, {min(allowed)})
         os.sched_setaffinity(0, allowed)
     except OSError as error:
-        return Check(
-            "CPU pinning",
-            "missing",
-            error.strerror or str(error),
-            advice="allow sched_setaffinity; without it a step costs 100 µs more",
-        )
-    return Check("CPU pinning", "ok", f"{len(allowed)} of {os.cpu_count()} cores may be used")
+        why = error.strerror or str(error)
+    cores = f"{len(allowed)} of {os.cpu_count()} cores may be used"
+    advice = "allow sched_setaffinity; without it a step costs 100 µs more"
+    return row("CPU pinning", not why, cores, why, advice)
 
 
 def _shared_memory() -> Check:
@@ -199,21 +189,8 @@ def _clock() -> Check:
     resolution = time.get_clock_info("monotonic").resolution
     source = Path("/sys/devices/system/clocksource/clocksource0/current_clocksource")
     name = source.read_text().strip() if source.is_file() else "unknown source"
-    start = time.perf_counter()
-    for _ in range(1000):
-        time.monotonic()
-    each = (time.perf_counter() - start) * 1e6
+    each = timeit.timeit(time.monotonic, number=1000) * 1e6
     return Check("clock", "note", f"{name}, {resolution * 1e9:g} ns, {each:.0f} ns to read")
-
-
-def _fingerprint() -> list[Check]:
-    own = fingerprint()
-    packages = ", ".join(f"{name} {version}" for name, version in own.packages.items())
-    return [
-        Check("worker", "note", f"{own.code_version}, Python {own.python}"),
-        Check("packages", "note", packages),
-        Check("CPU", "note", own.cpu),
-    ]
 
 
 def _accelerations() -> Check:
@@ -221,26 +198,17 @@ def _accelerations() -> Check:
         return Check("accelerations", "note", "all off: EVOPOLICY_ACCELERATIONS is set")
     with quiet():
         off = accelerations.off()
-    texts = [f"{name} off ({why})" for name, why in off.items()]
-    return Check(
+    return row(
         "accelerations",
-        "note" if off else "ok",
-        "; ".join(texts) or "all that the installed environments have are on",
-        advice="install the proved versions: -c constraints.txt" if off else "",
+        not off,
+        "all that the installed environments have are on",
+        "; ".join(f"{name} off ({why})" for name, why in off.items()),
+        "install the proved versions: -c constraints.txt",
+        otherwise="note",
     )
 
 
-def _tiers(allowed_packages: tuple[str, ...]) -> list[Check]:
-    rows = []
-    tiers: tuple[Tier, ...] = ("bwrap", "landlock")
-    for tier in tiers:
-        why = why_not(tier, allowed_packages)
-        if why is None:
-            rows.append(Check(f"tier {tier}", "ok", "a sandbox started"))
-        else:
-            advice = _UNMASK if "proc" in why and "mount" in why else "see the rows above"
-            rows.append(Check(f"tier {tier}", "missing", why, advice=advice))
-    return [
-        *rows,
-        Check("tier none", "note", "no sandbox; used only by runs that ask for it"),
-    ]
+def _tier(tier: Tier) -> Check:
+    why = why_not(tier) or ""
+    advice = _UNMASK if "proc" in why and "mount" in why else "see the rows above"
+    return row(f"tier {tier}", not why, "a sandbox started", why, advice)

@@ -8,6 +8,7 @@ import resource
 import shutil
 import sys
 import time
+from collections.abc import Callable, Iterator
 from ctypes.util import find_library
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from evopolicy_common.processes import distribution
 from evopolicy_common.processes.preflight import EXTRAS, check_loopback, check_scratch
 from evopolicy_common.wire.credentials import local_state_dir
 from evopolicy_worker.environments.browser import chromium
-from evopolicy_worker.sandbox.doctor import Check
+from evopolicy_worker.sandbox.doctor import Check, row
 
 _LEAST_FILES = 1024
 _NEWEST_TRIED = 13
@@ -37,67 +38,63 @@ def examine_machine() -> tuple[Check, ...]:
 
 def _python() -> Check:
     version = platform.python_version()
-    if int(version.split(".")[1]) <= _NEWEST_TRIED:
-        return Check("Python", "ok", f"{version} ({sys.executable})")
-    return Check(
+    return row(
         "Python",
-        "note",
+        int(version.split(".")[1]) <= _NEWEST_TRIED,
+        f"{version} ({sys.executable})",
         f"{version}; simulators are tried with 3.11 to 3.13",
-        advice="use one of these where an environment does not install",
+        "use one of these where an environment does not install",
+        otherwise="note",
     )
 
 
-def _extras() -> list[Check]:
-    rows = []
+def _extras() -> Iterator[Check]:
     for extra, lost in _PLAYS.items():
         modules = [module for module, its in EXTRAS.items() if its == extra]
         missing = [module for module in modules if importlib.util.find_spec(module) is None]
-        rows.append(
-            Check(
-                f"extra {extra}",
-                "missing" if missing else "ok",
-                f"no module {', '.join(missing)}" if missing else ", ".join(modules),
-                without=lost,
-                advice=add_extra(extra) if missing else "",
-            )
-        )
-    return rows
+        absent = f"no module {', '.join(missing)}"
+        yield row(f"extra {extra}", not missing, ", ".join(modules), absent, add_extra(extra), lost)
 
 
 def _graphics() -> Check:
     library = find_library("EGL")
-    return Check(
+    return row(
         "drawing (EGL)",
-        "missing" if library is None else "ok",
-        library or "no libEGL",
-        without="everything but videos and replays of MuJoCo's environments",
-        advice="" if library else distribution.install("egl"),
+        library,
+        str(library),
+        "no libEGL",
+        distribution.install("egl"),
+        "everything but videos and replays of MuJoCo's environments",
     )
 
 
 def _browser() -> Check:
     lacking = chromium.lacking()
-    return Check(
+    return row(
         "browser",
-        "note" if lacking else "ok",
-        "no Chromium" if lacking else chromium.program(),
-        without="everything but environments that are web pages, and the tests of the report's pages",
-        advice=lacking,
+        not lacking,
+        "" if lacking else chromium.program(),
+        "no Chromium",
+        lacking,
+        "everything but environments that are web pages, and the tests of the report's pages",
+        otherwise="note",
     )
 
 
-def _scratch() -> Check:
+def _fault_of(check: Callable[[], object]) -> str:
+    """The ConfigError that a check raises, as text; empty if it passes."""
     try:
-        check_scratch()
+        check()
     except ConfigError as error:
-        return Check(
-            "temporary folder",
-            "missing",
-            str(error),
-            without="nothing can be played here; reports work",
-            advice="make room, or name another folder with TMPDIR",
-        )
-    return Check("temporary folder", "ok", "can be written")
+        return str(error)
+    return ""
+
+
+def _scratch() -> Check:
+    why = _fault_of(check_scratch)
+    advice = "make room, or name another folder with TMPDIR"
+    without = "nothing can be played here; reports work"
+    return row("temporary folder", not why, "can be written", why, advice, without)
 
 
 def _disk() -> Check:
@@ -105,55 +102,46 @@ def _disk() -> Check:
     there = next(path for path in (folder, *folder.parents) if path.exists())
     free = shutil.disk_usage(there).free
     free_space = f"{free / 2**30:.1f} GiB free for {folder}"
-    if free >= _ROOMY_BYTES:
-        return Check("disk", "ok", free_space)
-    return Check(
+    return row(
         "disk",
-        "note",
+        free >= _ROOMY_BYTES,
         free_space,
-        without="single runs; a sweep may fill it (`evopolicy disk` says how much it takes)",
-        advice="make room, or name other folders with --state and --runs",
+        free_space,
+        "make room, or name other folders with --state and --runs",
+        "single runs; a sweep may fill it (`evopolicy disk` says how much it takes)",
+        otherwise="note",
     )
 
 
 def _ports() -> Check:
-    try:
-        check_loopback()
-    except ConfigError as error:
-        return Check(
-            "ports",
-            "missing",
-            str(error).partition(";")[0],
-            without="no agent can be played here; workers and reports work",
-            advice="bring IPv4 loopback up: ip link set lo up (in a container: give it a network)",
-        )
-    return Check("ports", "ok", "a port of 127.0.0.1 can be listened on")
+    why = _fault_of(check_loopback)
+    return row(
+        "ports",
+        not why,
+        "a port of 127.0.0.1 can be listened on",
+        why.partition(";")[0],
+        "bring IPv4 loopback up: ip link set lo up (in a container: give it a network)",
+        "no agent can be played here; workers and reports work",
+    )
 
 
 def _date() -> Check:
     # With a correct clock, no installed file is newer than the present.
-    newest = Path(__file__).stat().st_mtime
-    if time.time() >= newest:
-        return Check("date", "ok", time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime()))
-    return Check(
+    return row(
         "date",
-        "missing",
+        time.time() >= Path(__file__).stat().st_mtime,
+        time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime()),
         f"{time.strftime('%Y-%m-%d', time.gmtime())}, before this program was installed",
-        without="one machine; certificates of other machines are refused when clocks differ by more than an hour",
-        advice="set the clock: timedatectl set-ntp true",
+        "set the clock: timedatectl set-ntp true",
+        "one machine; certificates of other machines are refused when clocks differ by more than an hour",
     )
 
 
 def _files() -> Check:
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    known = str(soft) if soft != resource.RLIM_INFINITY else "no limit"
-    if soft == resource.RLIM_INFINITY or soft >= _LEAST_FILES:
-        return Check("open files", "ok", known)
+    no_limit = soft == resource.RLIM_INFINITY
+    known = "no limit" if no_limit else str(soft)
     most = "unlimited" if hard == resource.RLIM_INFINITY else str(min(hard, 65536))
-    return Check(
-        "open files",
-        "missing",
-        f"{known} at once",
-        without="a few slots and runs at once",
-        advice=f"ulimit -n {most}",
-    )
+    enough = no_limit or soft >= _LEAST_FILES
+    without = "a few slots and runs at once"
+    return row("open files", enough, known, f"{known} at once", f"ulimit -n {most}", without)

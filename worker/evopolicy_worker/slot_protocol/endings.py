@@ -61,8 +61,8 @@ class Row(NamedTuple):
     """A kind of ending and its verdict. None in a condition matches anything."""
 
     what: str
-    first: frozenset[First]
-    how: frozenset[How] | None
+    first: First
+    how: tuple[How, ...] | None
     verdict: FailureCategory | Literal["limit", "outside"]
     """The policy's failure; `limit`: the category of that limit. `outside`: an infrastructure failure, to be played
     again."""
@@ -74,7 +74,7 @@ class Row(NamedTuple):
     def fits(self, ending: Ending) -> bool:
         """Whether an ending is of this kind."""
         return (
-            ending.first in self.first
+            ending.first == self.first
             and (self.how is None or ending.how in self.how)
             and self.limit in (None, ending.limit is not None)
             and self.began in (None, ending.began)
@@ -83,72 +83,45 @@ class Row(NamedTuple):
         )
 
 
-def _set(*names: First) -> frozenset[First]:
-    return frozenset(names)
-
-
-def _how(*names: How) -> frozenset[How]:
-    return frozenset(names)
-
-
+_CODE: dict[str, bool] = {"limit": False, "began": True}
+"""Of a policy whose code has begun, where no limit explains the ending."""
+_KILLED: tuple[How, ...] = ("SIGKILL", "stop")
+_CRASH: tuple[How, ...] = ("exit", "fault")
 TABLE: tuple[Row, ...] = (
-    Row("a policy's process before the bundle's code", _set("policy"), None, "outside", began=False),
-    Row("a limit was passed", _set("policy"), None, "limit", limit=True, began=True),
-    Row("it exited", _set("policy"), _how("exit"), "killed", limit=False, began=True),
-    Row("it crashed", _set("policy"), _how("fault"), "killed", limit=False, began=True),
-    Row(
-        "a signal that it can send itself", _set("policy"), _how("signal"), "killed", limit=False, began=True
-    ),
-    Row("it closed its pipe", _set("policy"), _how("pipe"), "killed", limit=False, began=True),
-    Row("it broke the pipes' rules", _set("policy"), _how("frame"), "killed", limit=False, began=True),
-    Row(
-        "killed or stopped where it can signal itself",
-        _set("policy"),
-        _how("SIGKILL", "stop"),
-        "killed",
-        limit=False,
-        began=True,
-        held=False,
-    ),
+    Row("a policy's process before the bundle's code", "policy", None, "outside", began=False),
+    Row("a limit was passed", "policy", None, "limit", limit=True, began=True),
+    Row("it exited", "policy", ("exit",), "killed", **_CODE),
+    Row("it crashed", "policy", ("fault",), "killed", **_CODE),
+    Row("a signal that it can send itself", "policy", ("signal",), "killed", **_CODE),
+    Row("it closed its pipe", "policy", ("pipe",), "killed", **_CODE),
+    Row("it broke the pipes' rules", "policy", ("frame",), "killed", **_CODE),
+    Row("killed or stopped where it can signal itself", "policy", _KILLED, "killed", **_CODE, held=False),
     Row(
         "killed or stopped, sealed, and no limit explains it",
-        _set("policy"),
-        _how("SIGKILL", "stop"),
+        "policy",
+        _KILLED,
         "outside",
-        limit=False,
-        began=True,
+        **_CODE,
         held=True,
     ),
-    Row("bubblewrap or the zygote", _set("sandbox"), None, "outside"),
-    Row(
-        "the environment crashed on its actions",
-        _set("environment"),
-        _how("exit", "fault"),
-        "killed",
-        began=True,
-    ),
-    Row(
-        "the environment crashed before any",
-        _set("environment"),
-        _how("exit", "fault"),
-        "outside",
-        began=False,
-    ),
+    Row("bubblewrap or the zygote", "sandbox", None, "outside"),
+    Row("the environment crashed on its actions", "environment", _CRASH, "killed", began=True),
+    Row("the environment crashed before any", "environment", _CRASH, "outside", began=False),
     Row(
         "the environment overran on its actions, as in earlier attempts",
-        _set("environment"),
-        _how("overrun"),
+        "environment",
+        ("overrun",),
         "killed",
         again=True,
     ),
-    Row("the environment overran", _set("environment"), _how("overrun"), "outside", again=False),
+    Row("the environment overran", "environment", ("overrun",), "outside", again=False),
     Row(
         "the environment was killed or stopped",
-        _set("environment"),
-        _how("signal", "SIGKILL", "stop", "pipe", "frame"),
+        "environment",
+        (*_KILLED, "signal", "pipe", "frame"),
         "outside",
     ),
-    Row("the worker", _set("supervisor"), None, "outside"),
+    Row("the worker", "supervisor", None, "outside"),
 )
 """Every ending fits exactly one row."""
 
