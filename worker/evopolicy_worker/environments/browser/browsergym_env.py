@@ -8,6 +8,7 @@ has a `screenshot` and a `dom_object` only on request; time is the episode's clo
 from __future__ import annotations
 
 import json
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import msgspec
@@ -16,7 +17,7 @@ from gymnasium import spaces
 
 from evopolicy_worker.environments.browser import keys
 from evopolicy_worker.environments.browser.browsergym_calls import calls
-from evopolicy_worker.environments.browser.page import ORIGIN
+from evopolicy_worker.environments.browser.page import CLICK, DOUBLE_CLICK, ORIGIN
 from evopolicy_worker.environments.browser.page_env import PageEnv, script
 
 MAX_ACTION = 4096
@@ -27,7 +28,6 @@ MAX_JSON = 1 << 22
 MAX_WAIT_MS = 10_000
 """Of the episode's clock that one `noop` lets pass."""
 _EPISODE_MS = 1_000_000
-_MOVE, _PRESS, _RELEASE = "mouseMoved", "mousePressed", "mouseReleased"
 _GREETING = "Hi! I am your UI assistant, I can perform web tasks for you. What can I help you with?"
 
 
@@ -73,7 +73,7 @@ class BrowserGymEnv(PageEnv):
         self._over = False
         try:
             for name, arguments in calls(action):
-                getattr(self, f"_{name}")(**arguments)
+                _ACTIONS[name](self, **arguments)
         except ValueError as wrong:
             error = f"{type(wrong).__name__}: {wrong}"[:MAX_TEXT]
         self._last = action, error
@@ -111,21 +111,11 @@ class BrowserGymEnv(PageEnv):
             observed["screenshot"] = self.picture(*self._size[:2])
         return observed
 
-    # The actions, by their names. Raises ValueError with a text for an action that is not possible.
+    # Parts of actions. They raise ValueError with a text for what is not possible.
 
-    def _noop(self, wait_ms: float) -> None:
-        self.page.run(f"__evopolicy.pass({min(max(0.0, float(wait_ms)), MAX_WAIT_MS)})")
-
-    def _send_msg_to_user(self, text: str) -> None:
-        self._messages.append(_message("assistant", text, self._now()))
-
-    def _report_infeasible(self, reason: str) -> None:
-        self._messages.append(_message("infeasible", reason, self._now()))
-        self._over = True
-
-    def _scroll(self, delta_x: float, delta_y: float) -> None:
-        x, y = self.page.mouse_at
-        self.page.wheel(x, y, delta_x, delta_y)
+    def _say(self, role: str, text: str) -> None:
+        self._messages.append(_message(role, text, float(self.page.run("__evopolicy.clock.now")) / 1000))
+        self._over = self._over or role == "infeasible"
 
     def _fill(self, bid: str, value: str) -> None:
         if self._do("fill", bid, value)["filled"]:
@@ -135,97 +125,37 @@ class BrowserGymEnv(PageEnv):
         else:
             self.page.press(keys.NAMED["Delete"])
 
-    def _clear(self, bid: str) -> None:
-        self._fill(bid, "")
-
-    def _select_option(self, bid: str, options: str | list[str]) -> None:
-        self._do("choose", bid, [options] if isinstance(options, str) else [str(each) for each in options])
-
-    def _check(self, bid: str) -> None:
-        self._set_checked(bid, True)
-
-    def _uncheck(self, bid: str) -> None:
-        self._set_checked(bid, False)
-
     def _set_checked(self, bid: str, wanted: bool) -> None:
         if self._do("checked", bid)["checked"] != wanted:
-            self._click(bid, "left", [])
+            self._mouse(self._place(bid), *CLICK, modifiers=0)
             if self._do("checked", bid)["checked"] != wanted:
                 raise ValueError("Clicking the checkbox did not change its state")
 
-    def _click(self, bid: str, button: Any, modifiers: list[Any], times: int = 1) -> None:
+    def _place(self, bid: str) -> tuple[float, float]:
         place = self._do("place", bid)
-        self._presses(place["x"], place["y"], button, times, modifiers=_modifiers(modifiers))
+        return place["x"], place["y"]
 
-    def _dblclick(self, bid: str, button: Any, modifiers: list[Any]) -> None:
-        self._click(bid, button, modifiers, 2)
+    def _mouse(
+        self,
+        at: tuple[float, float],
+        *events: tuple[str, int],
+        button: Any = "left",
+        modifiers: int | None = None,
+    ) -> None:
+        """`modifiers`: by default the keys that are held."""
+        if button not in ("left", "middle", "right"):
+            raise ValueError(f"button is {button!r}: left, middle or right")
+        held = self._held if modifiers is None else modifiers
+        self.page.point(*at, *events, button=button, modifiers=held)
 
-    def _hover(self, bid: str) -> None:
-        place = self._do("place", bid)
-        self._mouse((_MOVE, place["x"], place["y"], "left", 0))
+    def _key(self, kind: Any, name: str) -> None:
+        key, modifiers = _key(name)
+        bit = keys.MODIFIERS.get(key.key, 0)
+        self._held = self._held | bit if kind == "down" else self._held & ~bit
+        self.page.keys((kind, key, modifiers | self._held))
 
-    def _press(self, bid: str, key_comb: str) -> None:
-        self._do("focus", bid)
-        self._keyboard_press(key_comb)
-
-    def _focus(self, bid: str) -> None:
-        self._do("focus", bid)
-
-    def _drag_and_drop(self, from_bid: str, to_bid: str) -> None:
-        start = self._do("place", from_bid)
-        self._mouse_down(start["x"], start["y"], "left")
-        end = self._do("place", to_bid)
-        self._mouse_up(end["x"], end["y"], "left")
-
-    def _mouse_move(self, x: float, y: float) -> None:
-        self._mouse((_MOVE, x, y, "left", 0))
-
-    def _mouse_down(self, x: float, y: float, button: Any) -> None:
-        self._mouse((_MOVE, x, y, "left", 0), (_PRESS, x, y, _button(button), 1))
-
-    def _mouse_up(self, x: float, y: float, button: Any) -> None:
-        self._mouse((_MOVE, x, y, "left", 0), (_RELEASE, x, y, _button(button), 1))
-
-    def _mouse_click(self, x: float, y: float, button: Any) -> None:
-        self._presses(x, y, button, 1, modifiers=self._held)
-
-    def _mouse_dblclick(self, x: float, y: float, button: Any) -> None:
-        self._presses(x, y, button, 2, modifiers=self._held)
-
-    def _mouse_drag_and_drop(self, from_x: float, from_y: float, to_x: float, to_y: float) -> None:
-        self._mouse_down(from_x, from_y, "left")
-        self._mouse_up(to_x, to_y, "left")
-
-    def _mouse(self, *events: tuple[str, float, float, Any, int]) -> None:
-        self.page.mouse(*events, modifiers=self._held)
-
-    def _presses(self, x: float, y: float, button: Any, times: int, *, modifiers: int) -> None:
-        which = _button(button)
-        clicks = [(kind, x, y, which, k) for k in range(1, times + 1) for kind in (_PRESS, _RELEASE)]
-        self.page.mouse((_MOVE, x, y, which, 0), *clicks, modifiers=modifiers)
-
-    def _keyboard_down(self, key: str) -> None:
-        found, modifiers = _key(key)
-        self._held |= keys.MODIFIERS.get(found.key, 0)
-        self.page.keys(("down", found, modifiers | self._held))
-
-    def _keyboard_up(self, key: str) -> None:
-        found, modifiers = _key(key)
-        self._held &= ~keys.MODIFIERS.get(found.key, 0)
-        self.page.keys(("up", found, modifiers | self._held))
-
-    def _keyboard_press(self, key: str) -> None:
-        found, modifiers = _key(key)
-        self.page.press(found, modifiers, self._held)
-
-    def _keyboard_type(self, text: str) -> None:
-        self.page.type(text)
-
-    def _keyboard_insert_text(self, text: str) -> None:
-        self.page.insert(text)
-
-    def _now(self) -> float:
-        return float(self.page.run("__evopolicy.clock.now")) / 1000
+    def _press(self, name: str) -> None:
+        self.page.press(*_key(name), self._held)
 
     def _do(self, what: str, *arguments: Any) -> dict[str, Any]:
         found: dict[str, Any] = self.page.run(
@@ -269,12 +199,6 @@ def _message(role: str, text: str, at_s: float) -> dict[str, Any]:
     return {"role": role, "timestamp": np.array((at_s,), dtype=np.float64), "message": text}
 
 
-def _button(name: Any) -> Any:
-    if name not in ("left", "middle", "right"):
-        raise ValueError(f"button is {name!r}: left, middle or right")
-    return name
-
-
 def _modifiers(names: list[Any]) -> int:
     """The modifiers of a click."""
     found = 0
@@ -284,6 +208,65 @@ def _modifiers(names: list[Any]) -> int:
             raise ValueError(f"modifiers has {name!r}: {', '.join(keys.MODIFIERS)}, ControlOrMeta")
         found |= keys.MODIFIERS[key]
     return found
+
+
+def _clicked(env: BrowserGymEnv, bid: str, button: Any, names: list[Any], *events: tuple[str, int]) -> None:
+    env._mouse(env._place(bid), *events, button=button, modifiers=_modifiers(names))
+
+
+def _dragged(
+    env: BrowserGymEnv, start: Callable[[], tuple[float, float]], end: Callable[[], tuple[float, float]]
+) -> None:
+    env._mouse(start(), CLICK[0])
+    env._mouse(end(), CLICK[1])
+
+
+def _wait(env: BrowserGymEnv, wait_ms: float) -> None:
+    env.page.run(f"__evopolicy.pass({min(max(0.0, float(wait_ms)), MAX_WAIT_MS)})")
+
+
+def _choose(env: BrowserGymEnv, bid: str, options: str | list[Any]) -> None:
+    env._do("choose", bid, [options] if isinstance(options, str) else [str(each) for each in options])
+
+
+def _focus_and_press(env: BrowserGymEnv, bid: str, key_comb: str) -> None:
+    env._do("focus", bid)
+    env._press(key_comb)
+
+
+_ACTIONS: Mapping[str, Callable[..., object]] = {
+    "noop": _wait,
+    "send_msg_to_user": lambda env, text: env._say("assistant", text),
+    "report_infeasible": lambda env, reason: env._say("infeasible", reason),
+    "scroll": lambda env, delta_x, delta_y: env.page.wheel(*env.page.mouse_at, delta_x, delta_y),
+    "fill": BrowserGymEnv._fill,
+    "clear": lambda env, bid: env._fill(bid, ""),
+    "select_option": _choose,
+    "check": lambda env, bid: env._set_checked(bid, True),
+    "uncheck": lambda env, bid: env._set_checked(bid, False),
+    "click": lambda env, bid, button, modifiers: _clicked(env, bid, button, modifiers, *CLICK),
+    "dblclick": lambda env, bid, button, modifiers: _clicked(env, bid, button, modifiers, *DOUBLE_CLICK),
+    "hover": lambda env, bid: env._mouse(env._place(bid)),
+    "press": _focus_and_press,
+    "focus": lambda env, bid: env._do("focus", bid),
+    "drag_and_drop": lambda env, from_bid, to_bid: _dragged(
+        env, lambda: env._place(from_bid), lambda: env._place(to_bid)
+    ),
+    "mouse_move": lambda env, x, y: env._mouse((x, y)),
+    "mouse_down": lambda env, x, y, button: env._mouse((x, y), CLICK[0], button=button),
+    "mouse_up": lambda env, x, y, button: env._mouse((x, y), CLICK[1], button=button),
+    "mouse_click": lambda env, x, y, button: env._mouse((x, y), *CLICK, button=button),
+    "mouse_dblclick": lambda env, x, y, button: env._mouse((x, y), *DOUBLE_CLICK, button=button),
+    "mouse_drag_and_drop": lambda env, from_x, from_y, to_x, to_y: _dragged(
+        env, lambda: (from_x, from_y), lambda: (to_x, to_y)
+    ),
+    "keyboard_down": lambda env, key: env._key("down", key),
+    "keyboard_up": lambda env, key: env._key("up", key),
+    "keyboard_press": lambda env, key: env._press(key),
+    "keyboard_type": lambda env, text: env.page.type(text),
+    "keyboard_insert_text": lambda env, text: env.page.insert(text),
+}
+"""By the name of an action."""
 
 
 def _key(name: str) -> tuple[keys.Key, int]:

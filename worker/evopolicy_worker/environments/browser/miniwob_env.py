@@ -6,12 +6,14 @@ an observation has a `screenshot` only on request.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 
 from evopolicy_worker.environments.browser import keys, miniwob_pages
+from evopolicy_worker.environments.browser.page import CLICK, DOUBLE_CLICK
 from evopolicy_worker.environments.browser.page_env import PageEnv
 
 MAX_TEXT = 256
@@ -52,7 +54,14 @@ KEYS = (
 )
 """The keys that `key` of an action indexes."""
 _PRESSED = tuple(filter(None, map(keys.miniwob, KEYS)))
-_FLAGS = np.int8
+_POINTED = {
+    "MOVE_COORDS": (),
+    "CLICK_COORDS": CLICK,
+    "DBLCLICK_COORDS": DOUBLE_CLICK,
+    "MOUSEDOWN_COORDS": CLICK[:1],
+    "MOUSEUP_COORDS": CLICK[1:],
+}
+"""What happens at the place to which the mouse moves."""
 
 
 class MiniWoBEnv(PageEnv):
@@ -96,25 +105,13 @@ class MiniWoBEnv(PageEnv):
         kind = ACTIONS[action["action_type"]]
         page = self.page
         x, y = map(float, action["coords"])
-        if kind.endswith("_COORDS"):
-            if kind.startswith("SCROLL"):
-                page.wheel(x, y, 0.0, SCROLL if "DOWN" in kind else -SCROLL)
-                return
-            move, press, release = "mouseMoved", "mousePressed", "mouseReleased"
-            events = {
-                "MOVE_COORDS": ((move, 0),),
-                "CLICK_COORDS": ((move, 0), (press, 1), (release, 1)),
-                "DBLCLICK_COORDS": ((move, 0), (press, 1), (release, 1), (press, 2), (release, 2)),
-                "MOUSEDOWN_COORDS": ((move, 0), (press, 1)),
-                "MOUSEUP_COORDS": ((move, 0), (release, 1)),
-            }[kind]
-            page.mouse(*((event, x, y, "left", clicks) for event, clicks in events))
-            return
-        if kind == "PRESS_KEY":
-            key, modifiers = _PRESSED[action["key"]]
-            page.press(key, modifiers)
-            return
-        if kind in ("CLICK_ELEMENT", "FOCUS_ELEMENT_AND_TYPE_TEXT", "FOCUS_ELEMENT_AND_TYPE_FIELD"):
+        if kind in _POINTED:
+            page.point(x, y, *_POINTED[kind])
+        elif kind.startswith("SCROLL"):
+            page.wheel(x, y, 0.0, SCROLL if "DOWN" in kind else -SCROLL)
+        elif kind == "PRESS_KEY":
+            page.press(*_PRESSED[action["key"]])
+        elif kind in ("CLICK_ELEMENT", "FOCUS_ELEMENT_AND_TYPE_TEXT", "FOCUS_ELEMENT_AND_TYPE_FIELD"):
             page.run(f"core.elementClick({int(action['ref'])})")
         if kind.endswith("TYPE_TEXT"):
             page.type(action["text"])
@@ -170,24 +167,19 @@ def _observed(width: int, height: int, *, screenshot: bool) -> dict[str, Any]:
     return observed
 
 
+_ELEMENT: Mapping[str, type[np.generic] | None] = {
+    **dict.fromkeys(("ref", "parent")),
+    **dict.fromkeys(("left", "top", "width", "height"), np.float32),
+    **dict.fromkeys(("tag", "text", "value", "id", "classes")),
+    **dict.fromkeys(("bg_color", "fg_color"), np.float32),
+    "flags": np.int8,
+}
+"""Parts of an element as `miniwob.js` tells them, in order, and the types of those that are arrays."""
+
+
 def _element(row: list[Any]) -> dict[str, Any]:
-    """An element as the space has it, from what `miniwob.js` tells of it."""
-    ref, parent, left, top, width, height, tag, text, value, name, classes, background, foreground, flags = (
-        row
-    )
+    """An element as the space has it."""
     return {
-        "ref": ref,
-        "parent": parent,
-        "left": np.array((left,), np.float32),
-        "top": np.array((top,), np.float32),
-        "width": np.array((width,), np.float32),
-        "height": np.array((height,), np.float32),
-        "tag": tag,
-        "text": text,
-        "value": value,
-        "id": name,
-        "classes": classes,
-        "bg_color": np.array(background, np.float32),
-        "fg_color": np.array(foreground, np.float32),
-        "flags": np.array(flags, _FLAGS),
+        name: part if dtype is None else np.array(part if isinstance(part, list) else (part,), dtype)
+        for (name, dtype), part in zip(_ELEMENT.items(), row, strict=True)
     }

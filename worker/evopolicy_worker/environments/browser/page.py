@@ -16,7 +16,7 @@ import json
 import math
 import mimetypes
 import re
-from collections.abc import Sequence
+from functools import cache
 from importlib.resources import files
 from pathlib import Path
 from typing import Any, Literal
@@ -32,7 +32,7 @@ ORIGIN = "http://pages.invalid"
 CALL_S = 10.0
 """A page that takes longer over one command hangs."""
 LOAD_S = 30.0
-_LOOK_EVERY = 64
+_CHECK_EVERY = 64
 """Number of episodes between two checks of the browser's memory."""
 _MARGIN = 20
 """Distance of the resting mouse from the window's right and lower edge, CSS pixels: more than a scrollbar is wide."""
@@ -56,6 +56,9 @@ _MEASURE = r"""
 """  # noqa: E501
 
 Button = Literal["left", "middle", "right"]
+MOVE, PRESS, RELEASE = "mouseMoved", "mousePressed", "mouseReleased"
+CLICK = ((PRESS, 1), (RELEASE, 1))
+DOUBLE_CLICK = (*CLICK, (PRESS, 2), (RELEASE, 2))
 
 
 class Address(msgspec.Struct, frozen=True):
@@ -85,7 +88,7 @@ class Page:
         self._context = ""
         self._session = ""
         self._loaded = False
-        self._bodies: dict[Path, tuple[str, str] | None] = {}
+        self._bodies: dict[Path, tuple[str, str]] = {}
         self._episodes = 0
         self._script = ""
         self._identity: dict[str, str] | None = None
@@ -134,30 +137,25 @@ class Page:
     def _begin_context(self) -> None:
         """An empty page in a new context. BrowserLostError, which names the program and the remedy, when there is
         none."""
+        self.opened, self._script = None, ""
+        self._buttons, self._held, self._down = 0, "none", {}
         try:
-            self._open_context()
+            devtools = self.browser.devtools
+            if self._context:
+                devtools.send("Target.disposeBrowserContext", wanted=False, browserContextId=self._context)
+                self._context = self._session = ""
+            made = devtools.call("Target.createBrowserContext", timeout_s=CALL_S)
+            self._context = str(made["browserContextId"])
+            own = {"browserContextId": self._context}
+            devtools.send("Browser.setDownloadBehavior", wanted=False, behavior="deny", **own)
+            target = devtools.call("Target.createTarget", timeout_s=CALL_S, url="about:blank", **own)[
+                "targetId"
+            ]
+            attached = devtools.call("Target.attachToTarget", timeout_s=CALL_S, targetId=target, flatten=True)
+            self._session = str(attached["sessionId"])
         except BrowserLostError as error:
             self.lose()
             raise BrowserLostError(f"{program()} opens no page: {error}; {REMEDY}") from error
-
-    def _open_context(self) -> None:
-        self.opened = None
-        self._script = ""
-        self._buttons, self._held, self._down = 0, "none", {}
-        devtools = self.browser.devtools
-        if self._context:
-            devtools.send("Target.disposeBrowserContext", wanted=False, browserContextId=self._context)
-            self._context = self._session = ""
-        made = devtools.call("Target.createBrowserContext", timeout_s=CALL_S)
-        self._context = str(made["browserContextId"])
-        devtools.send(
-            "Browser.setDownloadBehavior", wanted=False, behavior="deny", browserContextId=self._context
-        )
-        target = devtools.call(
-            "Target.createTarget", timeout_s=CALL_S, url="about:blank", browserContextId=self._context
-        )["targetId"]
-        attached = devtools.call("Target.attachToTarget", timeout_s=CALL_S, targetId=target, flatten=True)
-        self._session = str(attached["sessionId"])
 
     def identity(self) -> dict[str, str]:
         """The browser's version, and a digest of how wide it sets text: what decides where elements are."""
@@ -195,57 +193,52 @@ class Page:
         """One command of the DevTools protocol to the page, and its result."""
         return self.browser.devtools.result(self._send(method, **params), CALL_S)
 
-    def mouse(self, *events: tuple[str, float, float, Button, int], modifiers: int = 0) -> None:
-        """Mouse events in order, each a type (`mouseMoved`, `mousePressed`, `mouseReleased`), a place in CSS pixels, a
-        button and the number of clicks. `modifiers`: the keys held meanwhile. A press on a scrollbar is left out."""
+    def mouse(
+        self, *events: tuple[str, float, float, Button, int], modifiers: int = 0, resting: bool = False
+    ) -> None:
+        """Mouse events in order, each a type (`MOVE`, `PRESS`, `RELEASE`), a place in CSS pixels, a button and the
+        number of clicks. `modifiers`: the keys held meanwhile. A press on a scrollbar is left out, unless `resting`,
+        where there is none."""
         # Whole pixels, as the page is told: from parts of one the browser selects other characters from time to time.
-        events = tuple(
-            (kind, math.floor(x), math.floor(y), button, clicks) for kind, x, y, button, clicks in events
-        )
-        pressed = dict.fromkeys((x, y) for kind, x, y, _, _ in events if kind == "mousePressed")
+        events = tuple((kind, math.floor(x), math.floor(y), *rest) for kind, x, y, *rest in events)
+        pressed = dict.fromkeys((x, y) for kind, x, y, _, _ in events if kind == PRESS and not resting)
         # Asked before the first event: to wait for a mouse that moves is to wait for the next frame.
         bars = [place for place in pressed if self.run("__evopolicy.bar({}, {})".format(*place))]
-        self._point(events, modifiers, bars)
-
-    def _point(
-        self,
-        events: Sequence[tuple[str, float, float, Button, int]],
-        modifiers: int = 0,
-        bars: Sequence[tuple[float, float]] = (),
-    ) -> None:
-        """`bars`: where a press is left out."""
         self._touched = True
         numbers: list[int] = []
-        shown: str
         for kind, x, y, button, clicks in events:
             self.mouse_at = x, y
-            if kind == "mouseMoved":
-                shown = self._held
+            event: dict[str, Any] = {"type": kind, "x": x, "y": y, "button": button, "clickCount": clicks}
+            if kind == MOVE:
+                event["button"] = self._held
+            elif kind == PRESS and (x, y) in bars:
+                continue
             else:
-                shown = button
                 bit = _BITS[button]
-                if kind == "mousePressed":
-                    if (x, y) in bars:
-                        continue
-                    self._buttons |= bit
-                else:
-                    self._buttons &= ~bit
+                self._buttons = self._buttons | bit if kind == PRESS else self._buttons & ~bit
                 self._held = button if self._buttons else "none"
-            event: dict[str, Any] = {
-                "type": kind,
-                "x": x,
-                "y": y,
-                "button": shown,
-                "buttons": self._buttons,
-                "clickCount": clicks,
-            }
+            event["buttons"] = self._buttons
             # The time tells the page's script that it is an action's.
             numbers.append(self._send("Input.dispatchMouseEvent", **event, modifiers=modifiers, timestamp=1))
-            if kind == "mouseMoved" and self._held != "none":
+            if kind == MOVE and self._held != "none":
                 self._await(numbers)
                 numbers.clear()
                 self.run("__evopolicy.moved()")
         self._await(numbers)
+
+    def point(
+        self,
+        x: float,
+        y: float,
+        *events: tuple[str, int],
+        button: Button = "left",
+        modifiers: int = 0,
+        resting: bool = False,
+    ) -> None:
+        """Moves the mouse to a place, CSS pixels, and then presses and releases its button there: types of events, each
+        with the number of clicks. The rest is as for `mouse`."""
+        there = [(kind, x, y, button, clicks) for kind, clicks in ((MOVE, 0), *events)]
+        self.mouse(*there, modifiers=modifiers, resting=resting)
 
     def wheel(self, x: float, y: float, delta_x: float, delta_y: float) -> None:
         """Turns the mouse's wheel at a place, CSS pixels."""
@@ -331,7 +324,7 @@ class Page:
         """Lets go of keys and of the mouse's buttons."""
         self.keys(*(("up", key, 0) for key in tuple(self._down.values())))
         held = [button for button, bit in _BITS.items() if self._buttons & bit]
-        self.mouse(*(("mouseReleased", *self.mouse_at, button, 1) for button in held))
+        self.mouse(*((RELEASE, *self.mouse_at, button, 1) for button in held))
 
     def rest(self) -> None:
         """Clicks where there is neither a task nor a scrollbar: the page keeps nothing of earlier places of mouse and
@@ -342,24 +335,14 @@ class Page:
         self.release()
         self.keys_ms += 2000
         self.run("__evopolicy.rest()")
-        x, y = float(self.opened.width - _MARGIN), float(self.opened.height - _MARGIN)
-        self._point(
-            (
-                ("mouseMoved", x, y, "left", 0),
-                ("mousePressed", x, y, "left", 1),
-                ("mouseReleased", x, y, "left", 1),
-            )
-        )
+        self.point(self.opened.width - _MARGIN, self.opened.height - _MARGIN, *CLICK, resting=True)
         self._touched = False
 
     def keep_small(self) -> None:
-        """Between episodes: ends a browser that has grown too large. It is looked at now and then."""
+        """Between episodes: ends a browser that has grown too large."""
         self._episodes += 1
-        if (
-            self._episodes % _LOOK_EVERY == 0
-            and self._browser is not None
-            and self._browser.megabytes() > MAX_MB
-        ):
+        due = self._browser is not None and self._episodes % _CHECK_EVERY == 0
+        if due and self.browser.megabytes() > MAX_MB:
             self.lose()
 
     def lose(self) -> None:
@@ -385,15 +368,12 @@ class Page:
             return
         if method == "Fetch.requestPaused":
             self._serve(params, session)
-        elif method == "Target.attachedToTarget" and params["targetInfo"]["type"] != "page":
-            # Another frame's process, or a worker: a page has neither.
-            browser.devtools.send(
-                "Target.closeTarget", wanted=False, targetId=params["targetInfo"]["targetId"]
-            )
-        elif method == "Target.targetCreated" and params["targetInfo"].get("openerId"):
-            browser.devtools.send(
-                "Target.closeTarget", wanted=False, targetId=params["targetInfo"]["targetId"]
-            )
+        elif (method == "Target.attachedToTarget" and params["targetInfo"]["type"] != "page") or (
+            method == "Target.targetCreated" and params["targetInfo"].get("openerId")
+        ):
+            # Another frame's process, a worker, or another window: a page has none of them.
+            target = params["targetInfo"]["targetId"]
+            browser.devtools.send("Target.closeTarget", wanted=False, targetId=target)
         elif session != self._session:
             return
         elif method == "Page.loadEventFired":
@@ -404,28 +384,16 @@ class Page:
             browser.devtools.send("Page.handleJavaScriptDialog", session, wanted=False, accept=False)
 
     def _serve(self, params: dict[str, Any], session: str) -> None:
-        devtools = self.browser.devtools
+        answer: dict[str, Any] = {"requestId": params["requestId"]}
         found = self._body(params["request"]["url"])
-        request = params["requestId"]
         if found is None:
-            devtools.send(
-                "Fetch.failRequest", session, wanted=False, requestId=request, errorReason=_NO_REASON
-            )
-            return
-        kind, body = found
-        headers = [
-            {"name": "Content-Type", "value": kind},
-            {"name": "Cache-Control", "value": "max-age=31536000, immutable"},
-        ]
-        devtools.send(
-            "Fetch.fulfillRequest",
-            session,
-            wanted=False,
-            requestId=request,
-            responseCode=200,
-            responseHeaders=headers,
-            body=body,
-        )
+            method, answer["errorReason"] = "Fetch.failRequest", _NO_REASON
+        else:
+            headers = {"Content-Type": found[0], "Cache-Control": "max-age=31536000, immutable"}
+            listed = [{"name": name, "value": value} for name, value in headers.items()]
+            method = "Fetch.fulfillRequest"
+            answer |= {"responseCode": 200, "responseHeaders": listed, "body": found[1]}
+        self.browser.devtools.send(method, session, wanted=False, **answer)
 
     def _body(self, url: str) -> tuple[str, str] | None:
         """Media type and base64 of the file that an address names; None for every other address."""
@@ -435,10 +403,9 @@ class Page:
         root = self.opened.root
         try:
             file = (root / name).resolve()
-            found = file in self._bodies or (file.is_relative_to(root.resolve()) and file.is_file())
+            if file not in self._bodies and not (file.is_relative_to(root.resolve()) and file.is_file()):
+                return None
         except (OSError, ValueError):  # too long a name, or none that a file can have
-            return None
-        if not found:
             return None
         if file not in self._bodies:
             kind = mimetypes.guess_type(file.name)[0] or "application/octet-stream"
@@ -475,12 +442,7 @@ def _script(seed: str, *, virtual: bool) -> str:
     return text.replace("SEED)", f"{json.dumps(seed)})").replace("VIRTUAL)", f"{json.dumps(virtual)})")
 
 
-_shared: Page | None = None
-
-
+@cache
 def shared() -> Page:
     """This process's page."""
-    global _shared
-    if _shared is None:
-        _shared = Page()
-    return _shared
+    return Page()
