@@ -28,65 +28,36 @@ class Key(msgspec.Struct, frozen=True):
 
 
 def _named() -> dict[str, Key]:
-    found = {
-        name: Key(name, name, number, text)
-        for name, number, text in (
-            ("Backspace", 8, ""),
-            ("Tab", 9, ""),
-            ("Enter", 13, "\r"),
-            ("Escape", 27, ""),
-            ("PageUp", 33, ""),
-            ("PageDown", 34, ""),
-            ("End", 35, ""),
-            ("Home", 36, ""),
-            ("ArrowLeft", 37, ""),
-            ("ArrowUp", 38, ""),
-            ("ArrowRight", 39, ""),
-            ("ArrowDown", 40, ""),
-            ("Insert", 45, ""),
-            ("Delete", 46, ""),
-            *((f"F{k}", 111 + k, "") for k in range(1, 13)),
-        )
-    }
+    moving = ("PageUp", "PageDown", "End", "Home", "ArrowLeft", "ArrowUp", "ArrowRight", "ArrowDown")
+    numbers = {"Backspace": 8, "Tab": 9, "Enter": 13, "Escape": 27, "Insert": 45, "Delete": 46}
+    numbers |= {name: 33 + k for k, name in enumerate(moving)} | {f"F{k}": 111 + k for k in range(1, 13)}
+    found = {name: Key(name, name, n, "\r" if name == "Enter" else "") for name, n in numbers.items()}
     found["Space"] = Key(" ", "Space", 32, " ")
-    for name, number in (("Shift", 16), ("Control", 17), ("Alt", 18), ("Meta", 91)):
+    for name, number in {"Shift": 16, "Control": 17, "Alt": 18, "Meta": 91}.items():
         found[name] = Key(name, f"{name}Left", number, location=1)
-    for name, number, text in (
-        *((str(k), 96 + k, str(k)) for k in range(10)),
-        ("Multiply", 106, "*"),
-        ("Add", 107, "+"),
-        ("Subtract", 109, "-"),
-        ("Decimal", 110, "."),
-        ("Divide", 111, "/"),
-    ):
+    pad = {"Multiply": "*", "Add": "+", "Subtract": "-", "Decimal": ".", "Divide": "/"}
+    numbers = {"Multiply": 106, "Add": 107, "Subtract": 109, "Decimal": 110, "Divide": 111}
+    for name, number in {**{str(k): 96 + k for k in range(10)}, **numbers}.items():
+        text = pad.get(name, name)
         found[f"Numpad{name}"] = Key(text, f"Numpad{name}", number, text, location=3)
     found["NumpadEnter"] = Key("Enter", "NumpadEnter", 13, "\r", location=3)
     return found
 
 
 def _printable() -> dict[str, Key]:
+    pairs = [
+        *((each, each.upper(), f"Key{each.upper()}", ord(each.upper())) for each in string.ascii_lowercase),
+        *(
+            (digit, above, f"Digit{digit}", ord(digit))
+            for digit, above in zip("1234567890", "!@#$%^&*()", strict=True)
+        ),
+        *(("-", "_", "Minus", 189), ("=", "+", "Equal", 187), ("[", "{", "BracketLeft", 219)),
+        *(("]", "}", "BracketRight", 221), ("\\", "|", "Backslash", 220), (";", ":", "Semicolon", 186)),
+        *(("'", '"', "Quote", 222), ("`", "~", "Backquote", 192), (",", "<", "Comma", 188)),
+        *((".", ">", "Period", 190), ("/", "?", "Slash", 191)),
+    ]
     found = {" ": Key(" ", "Space", 32, " ")}
-    for k, lower in enumerate(string.ascii_lowercase):
-        code, number = f"Key{lower.upper()}", 65 + k
-        found[lower] = Key(lower, code, number, lower)
-        found[lower.upper()] = Key(lower.upper(), code, number, lower.upper(), shift=True)
-    for digit, shifted in zip("1234567890", "!@#$%^&*()", strict=True):
-        number = ord(digit)
-        found[digit] = Key(digit, f"Digit{digit}", number, digit)
-        found[shifted] = Key(shifted, f"Digit{digit}", number, shifted, shift=True)
-    for plain, shifted, code, number in (
-        ("-", "_", "Minus", 189),
-        ("=", "+", "Equal", 187),
-        ("[", "{", "BracketLeft", 219),
-        ("]", "}", "BracketRight", 221),
-        ("\\", "|", "Backslash", 220),
-        (";", ":", "Semicolon", 186),
-        ("'", '"', "Quote", 222),
-        ("`", "~", "Backquote", 192),
-        (",", "<", "Comma", 188),
-        (".", ">", "Period", 190),
-        ("/", "?", "Slash", 191),
-    ):
+    for plain, shifted, code, number in pairs:
         found[plain] = Key(plain, code, number, plain)
         found[shifted] = Key(shifted, code, number, shifted, shift=True)
     return found
