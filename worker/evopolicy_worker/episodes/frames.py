@@ -2,7 +2,7 @@
 
 Rules: a request is written in one piece, and the reply is exactly one frame. Replies are hostile: they are bounded,
 parsed as plain values and arrays, and never executed; any other bytes raise BadReplyError. The other end,
-`sandbox/inside/player.py`, defines the same numbers.
+`sandbox/inside/player.py`, defines the numbers.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import datetime
 import json
 import math
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from typing import Annotated, Any
 
 import msgspec
@@ -21,20 +21,25 @@ from numpy.typing import NDArray
 from evopolicy_common.errors import DECODE_ERRORS, WorkerError
 from evopolicy_common.messages.environment import SpaceSchema
 from evopolicy_worker.environments.interface.actions import MAX_ITEMS
+from evopolicy_worker.environments.interface.spaces import VARYING, array_of, parts
+from evopolicy_worker.sandbox.inside.player import (
+    ARRAY,
+    FLOAT,
+    FLOATS,
+    GENERIC,
+    INIT,
+    INT,
+    MAX_AXES,
+    MAX_USED,
+    NONE,
+    REQUEST_HEADER,
+    numbers_of,
+)
 
-INIT, LOAD, RESET, ACT, FLUSH, END, COMPILE = 1, 2, 3, 4, 5, 6, 7
-OK, INT, FLOAT, ARRAY, FLOATS, GENERIC, FAILED, FAULT = 0, 1, 2, 3, 4, 5, 6, 7
-REQUEST_HEADER = struct.Struct("<IBxxxq")
-REPLY_HEADER = struct.Struct("<IBxxx")
 MAX_REPLY_BYTES = (1 << 20) + (1 << 16)
 MAX_DEPTH = 24
-MAX_AXES = 16
-"""Axes of an array in an action."""
-MAX_USED = 1 << 53
-"""No process has more bytes than this; a float still counts them one by one."""
-VALUE_BYTES = 16
-"""Bytes of an action's limit per value that it may contain, since Python's objects take more memory than their
-bytes."""
+_MOST_DIGITS = 1300
+"""Of an integer of more than 64 bits."""
 
 Writer = Callable[[Any], list[Any]]
 """From an observation to the buffers of its payload, in order."""
@@ -44,8 +49,6 @@ Step = Callable[[Any, list[Any]], None]
 
 _INT = struct.Struct("<q")
 _COUNT = struct.Struct("<I")
-_NONE = 0xFFFFFFFF
-"""In place of a number of edges: there are none, and no links."""
 _FLOAT = struct.Struct("<d")
 _EXT_ARRAY, _EXT_INT = 1, 2
 _DTYPES = {
@@ -90,92 +93,73 @@ def compile_writer(space: SpaceSchema) -> Writer:
             return [obs]
 
         return write_array
-    fixed: list[Callable[[Any, list[Any]], None]] = []
-    texts: list[Callable[[Any, list[Any]], None]] = []
-    _collect(space, (), fixed, texts)
-    steps = [*fixed, *texts]
+    leaves = sorted(_leaves(space), key=lambda leaf: leaf[1]["type"] in ("Text", *VARYING))
+    steps = [(path, _step(part, padded=True)) for path, part in leaves]
 
     def write(obs: Any) -> list[Any]:
         out: list[Any] = []
-        for step in steps:
-            step(obs, out)
+        for path, step in steps:
+            value = obs
+            for key in path:
+                value = value[key]
+            step(value, out)
         return out
 
     return write
 
 
-def _collect(space: SpaceSchema, path: tuple[Any, ...], fixed: list[Any], texts: list[Any]) -> None:
-    kind = space["type"]
-    if kind == "Dict":
-        for key, part in space["spaces"].items():
-            _collect(part, (*path, key), fixed, texts)
-    elif kind == "Tuple":
-        for index, part in enumerate(space["spaces"]):
-            _collect(part, (*path, index), fixed, texts)
-    elif kind == "Text":
-        texts.append(_text_step(path))
-    elif kind in ("Sequence", "Graph", "OneOf"):
-        texts.append(_varying_step(path, _spelled(space)))
-    elif kind == "Discrete":
-        fixed.append(_int_step(path))
+def _leaves(space: SpaceSchema, path: tuple[Any, ...] = ()) -> Iterator[tuple[tuple[Any, ...], SpaceSchema]]:
+    if space["type"] in ("Dict", "Tuple"):
+        for key, part in _named(space):
+            yield from _leaves(part, (*path, key))
     else:
-        widths = {"MultiDiscrete": 8, "MultiBinary": 1}
-        shape, size = _shape(space), widths.get(kind) or np.dtype(space["dtype"]).itemsize
-        fixed.append(_array_step(path, shape, -(int(np.prod(shape, dtype=np.int64)) * size) % 8))
+        yield path, space
 
 
-def _at(obs: Any, path: tuple[Any, ...]) -> Any:
-    for key in path:
-        obs = obs[key]
-    return obs
+def _named(space: SpaceSchema) -> Iterable[tuple[Any, SpaceSchema]]:
+    inner = space["spaces"]
+    return inner.items() if isinstance(inner, dict) else enumerate(inner)
 
 
-def _array_step(
-    path: tuple[Any, ...], shape: tuple[int, ...], padding: int
-) -> Callable[[Any, list[Any]], None]:
-    pad = bytes(padding)
+def _array_step(space: SpaceSchema, *, padded: bool) -> Step:
+    shape, dtype = array_of(space)
+    pad = bytes(-(math.prod(shape) * dtype.itemsize) % 8) if padded else b""
 
-    def step(obs: Any, out: list[Any]) -> None:
-        leaf = _at(obs, path)
-        if leaf.shape != shape:
-            raise WorkerError(f"the environment gave {path} of shape {leaf.shape}, not {shape}")
-        out.append(leaf)
+    def step(value: Any, out: list[Any]) -> None:
+        if value.shape != shape:
+            raise WorkerError(f"the environment gave an array of shape {value.shape}, not {shape}")
+        out.append(value)
         if pad:
             out.append(pad)
 
     return step
 
 
-def _int_step(path: tuple[Any, ...]) -> Callable[[Any, list[Any]], None]:
-    def step(obs: Any, out: list[Any]) -> None:
-        out.append(_INT.pack(_at(obs, path)))
-
-    return step
+def _text_step(text: Any, out: list[Any]) -> None:
+    data = text.encode("utf-8", "surrogatepass")
+    out.append(_COUNT.pack(len(data)) + data)
 
 
-def _text_step(path: tuple[Any, ...]) -> Callable[[Any, list[Any]], None]:
-    def step(obs: Any, out: list[Any]) -> None:
-        text = _at(obs, path).encode("utf-8", "surrogatepass")
-        out.append(struct.pack("<I", len(text)) + text)
-
-    return step
+def _graph_step(value: Any, out: list[Any]) -> None:
+    nodes, edges, links = value["nodes"], value["edges"], value["edge_links"]
+    out += [_COUNT.pack(len(nodes)), _COUNT.pack(NONE if edges is None else len(edges)), nodes]
+    out += [] if edges is None else [edges, links]
 
 
-def _varying_step(path: tuple[Any, ...], spell: Callable[[Any, list[Any]], None]) -> Step:
-    def step(obs: Any, out: list[Any]) -> None:
-        spell(_at(obs, path), out)
-
-    return step
-
-
-def _spelled(space: SpaceSchema) -> Step:
-    """How a value is laid out whose form the space leaves open: counts before what they count, nothing on a multiple of
-    8."""
+def _step(space: SpaceSchema, *, padded: bool = False) -> Step:
+    """`padded`: in the fixed part, where arrays end on a multiple of 8 bytes. In a value whose form the space leaves
+    open, counts stand before what they count."""
     kind = space["type"]
+    if kind == "Text":
+        return _text_step
+    if kind == "Discrete":
+        return lambda value, out: out.append(_INT.pack(value))
+    if kind == "Graph":
+        return _graph_step
     if kind == "Sequence":
-        item = _spelled(space["space"])
         if space["stacked"]:
             return lambda value, out: out.extend((_COUNT.pack(len(value)), value))
+        item = _step(space["space"])
 
         def sequence(value: Any, out: list[Any]) -> None:
             out.append(_COUNT.pack(len(value)))
@@ -183,47 +167,19 @@ def _spelled(space: SpaceSchema) -> Step:
                 item(each, out)
 
         return sequence
-    if kind == "OneOf":
-        choices = [_spelled(part) for part in space["spaces"]]
-
-        def one_of(value: Any, out: list[Any]) -> None:
-            out.append(_COUNT.pack(value[0]))
-            choices[value[0]](value[1], out)
-
-        return one_of
-    if kind == "Graph":
-
-        def graph(value: Any, out: list[Any]) -> None:
-            nodes, edges, links = value["nodes"], value["edges"], value["edge_links"]
-            out += [_COUNT.pack(len(nodes)), _COUNT.pack(_NONE if edges is None else len(edges)), nodes]
-            out += [] if edges is None else [edges, links]
-
-        return graph
-    if kind in ("Dict", "Tuple"):
-        named = list(space["spaces"].items() if kind == "Dict" else enumerate(space["spaces"]))
-        parts = [(key, _spelled(part)) for key, part in named]
+    if kind in ("OneOf", "Dict", "Tuple"):
+        steps = {key: _step(part) for key, part in _named(space)}
 
         def compound(value: Any, out: list[Any]) -> None:
-            for key, part in parts:
-                part(value[key], out)
+            if kind == "OneOf":
+                out.append(_COUNT.pack(value[0]))
+                steps[value[0]](value[1], out)
+                return
+            for key, step in steps.items():
+                step(value[key], out)
 
         return compound
-    return (
-        _text_step(())
-        if kind == "Text"
-        else _int_step(())
-        if kind == "Discrete"
-        else _array_step((), _shape(space), 0)
-    )
-
-
-def _shape(space: SpaceSchema) -> tuple[int, ...]:
-    """Of the array that a value of this space is."""
-    if "shape" in space:
-        return tuple(space["shape"])
-    if space["type"] == "MultiDiscrete":
-        return np.shape(space["nvec"])
-    return (space["n"],) if isinstance(space["n"], int) else tuple(space["n"])
+    return _array_step(space, padded=padded)
 
 
 def elements(space: SpaceSchema) -> int:
@@ -235,19 +191,9 @@ def elements(space: SpaceSchema) -> int:
     if space["type"] == "Graph":
         edge = 0 if space["edge_space"] is None else 2 + elements(space["edge_space"])
         return MAX_ITEMS * (elements(space["node_space"]) + edge)
-    if space["type"] == "Dict":
-        return sum(map(elements, space["spaces"].values()))
-    if space["type"] == "Tuple":
-        return sum(map(elements, space["spaces"]))
-    if space["type"] == "Text":
-        return int(space["max_length"])
-    if space["type"] == "Discrete":
-        return 1
-    if space["type"] == "MultiDiscrete":
-        return int(np.size(space["nvec"]))
-    if space["type"] == "MultiBinary":
-        return int(np.prod(space["n"], dtype=np.int64))
-    return int(np.prod(space["shape"], dtype=np.int64))
+    if space["type"] in ("Dict", "Tuple"):
+        return sum(map(elements, parts(space)))
+    return int(space["max_length"]) if space["type"] == "Text" else math.prod(array_of(space)[0])
 
 
 def init_frame(init: dict[str, Any], files: bytes) -> list[bytes]:
@@ -267,8 +213,8 @@ def action(tag: int, payload: bytes, max_values: int = 1024) -> Any:
     try:
         if tag == ARRAY:
             array = _array(payload)
-            if array.size > max_values or (not array.size and _numbers(array) > max_values):
-                raise ValueError(f"it holds {_numbers(array):,} values; {max_values:,} are the limit")
+            if array.size > max_values or (not array.size and numbers_of(array) > max_values):
+                raise ValueError(f"it holds {numbers_of(array):,} values; {max_values:,} are the limit")
             return array
         if tag == INT:
             return _INT.unpack(payload)[0]
@@ -305,16 +251,10 @@ def _array(data: bytes | memoryview) -> NDArray[Any]:
     return np.frombuffer(data, dtype, offset=8 + 4 * ndim).reshape(shape)
 
 
-def _numbers(array: NDArray[Any]) -> int:
-    """How many numbers an array is written as, or innermost lists where it holds none: (4000000000, 0) takes no
-    byte."""
-    return array.size or math.prod(max(1, n) for n in array.shape)
-
-
 def _ext_hook(code: int, data: memoryview) -> Any:
     if code == _EXT_ARRAY:
         return _array(bytes(data))
-    if code == _EXT_INT and len(data) <= 1300:
+    if code == _EXT_INT and len(data) <= _MOST_DIGITS:
         return int(bytes(data))
     raise ValueError(f"extension {code} of {len(data)} bytes")
 
@@ -325,13 +265,13 @@ _decoder = msgspec.msgpack.Decoder(ext_hook=_ext_hook)
 _COUNTED = (dict, list, np.ndarray, datetime.datetime)
 
 
-def _values(value: Any, left: int) -> int:
+def _values(value: Any, depth: int) -> int:
     """How many values it is made of.
 
-    ValueError when it nests deeper than `left`, or holds what the shim never sends: timestamps, and keys that are not
+    ValueError when it nests deeper than `depth`, or holds what the shim never sends: timestamps, and keys that are not
     texts.
     """
-    if left < 0:
+    if depth < 0:
         raise ValueError(f"it nests deeper than {MAX_DEPTH}")
     n = 1
     if isinstance(value, dict):
@@ -340,11 +280,11 @@ def _values(value: Any, left: int) -> int:
         n += len(value)
         value = value.values()
     elif isinstance(value, np.ndarray):
-        return _numbers(value)
+        return numbers_of(value)
     elif isinstance(value, datetime.datetime):
         raise ValueError("a timestamp")
     elif not isinstance(value, list):
         return n
     for item in value:
-        n += _values(item, left - 1) if isinstance(item, _COUNTED) else 1
+        n += _values(item, depth - 1) if isinstance(item, _COUNTED) else 1
     return n

@@ -25,6 +25,7 @@ from evopolicy_common.simulators import SIMULATORS
 from evopolicy_worker.episodes import frames
 from evopolicy_worker.episodes.monitor import STOPPED_S, Monitor, Verdict, Watch
 from evopolicy_worker.sandbox import zygote as zygotes
+from evopolicy_worker.sandbox.inside import player
 from evopolicy_worker.sandbox.jail import Jail
 from evopolicy_worker.sandbox.zygote import Child, Exit, Zygote, wait_dead
 from evopolicy_worker.slot_protocol import endings
@@ -160,7 +161,7 @@ class PolicyProcess:
         self.seal(BundleFiles([("policy.py", False, len(source))], source), bytes(16), env_meta, "arrays")
         try:
             return self._expect_ok(
-                [frames.REQUEST_HEADER.pack(0, frames.COMPILE, 0)], "init", self._limits.init_wall_s
+                [player.REQUEST_HEADER.pack(0, player.COMPILE, 0)], "init", self._limits.init_wall_s
             )
         except PolicyFailedError:
             # As the process that plays will find again, and report.
@@ -171,7 +172,7 @@ class PolicyProcess:
 
         Raises PolicyFailedError with a category of NO_POLICY.
         """
-        frame = [frames.REQUEST_HEADER.pack(len(code), frames.LOAD, 0), code]
+        frame = [player.REQUEST_HEADER.pack(len(code), player.LOAD, 0), code]
         self._watch.spent_s = 0.0
         self._expect_ok(frame, "init", self._limits.init_wall_s)
 
@@ -225,7 +226,7 @@ class PolicyProcess:
     def reset(self, episode_index: int) -> None:
         """Raises PolicyFailedError."""
         self._surplus_bytes = 0
-        frame = [frames.REQUEST_HEADER.pack(0, frames.RESET, episode_index)]
+        frame = [player.REQUEST_HEADER.pack(0, player.RESET, episode_index)]
         self._expect_ok(frame, "reset", self._limits.act_wall_s)
 
     def prepare_acts(self) -> None:
@@ -240,16 +241,16 @@ class PolicyProcess:
         for part in parts:
             length += part.nbytes if type(part) is not bytes else len(part)
         tag, payload = self._exchange(
-            [frames.REQUEST_HEADER.pack(length, frames.ACT, 0), *parts], 16 + length
+            [player.REQUEST_HEADER.pack(length, player.ACT, 0), *parts], 16 + length
         )
-        if tag <= frames.GENERIC:
+        if tag <= player.GENERIC:
             if len(payload) > self._action_bytes + _ARRAY_HEAD_BYTES:
                 how = f"it sent an action of {len(payload):,} bytes; {self._action_bytes:,} are the limit"
                 raise self._broken(how, self._action_bytes, len(payload))
             if len(payload) > self._usual_bytes:
                 self._count_surplus(len(payload) - self._usual_bytes)
             try:
-                return frames.action(tag, payload, self._action_bytes // frames.VALUE_BYTES)
+                return frames.action(tag, payload, self._action_bytes // player.VALUE_BYTES)
             except frames.BadReplyError as error:
                 raise self._broken(str(error)) from None
         raise self._reported_failure(tag, payload, "act")
@@ -276,7 +277,7 @@ class PolicyProcess:
         """
         if not self.dead:
             with contextlib.suppress(PolicyFailedError):
-                self._expect_ok([frames.REQUEST_HEADER.pack(0, frames.FLUSH, 0)], "act", _GRACE_S)
+                self._expect_ok([player.REQUEST_HEADER.pack(0, player.FLUSH, 0)], "act", _GRACE_S)
         if self.dead:
             return self.end()
         # Under the monitor's lock, so no other thread reads.
@@ -292,7 +293,7 @@ class PolicyProcess:
         if self._finished is None:
             if not self.dead:
                 with contextlib.suppress(PolicyFailedError, EndedFromOutsideError):
-                    self._expect_ok([frames.REQUEST_HEADER.pack(0, frames.END, 0)], "act", _GRACE_S)
+                    self._expect_ok([player.REQUEST_HEADER.pack(0, player.END, 0)], "act", _GRACE_S)
             watch = self._watch
             cpu_s = self._cpu_of_episode() if self.dead else max(0.0, watch.cpu_s() - watch.cpu_start_s)
             self._monitor.watch(None)
@@ -318,7 +319,7 @@ class PolicyProcess:
         self._watch.what = what
         self._watch.answer_limit_s = limit_s
         tag, payload = self._exchange(parts, sum(map(len, parts)))
-        if tag != frames.OK:
+        if tag != player.OK:
             raise self._reported_failure(tag, payload, what)
         return payload
 
@@ -335,7 +336,7 @@ class PolicyProcess:
             data = b""
         if len(data) < 8:
             data = self._read_more(data, 8)
-        length, tag = frames.REPLY_HEADER.unpack_from(data)
+        length, tag = player.REPLY_HEADER.unpack_from(data)
         if len(data) != 8 + length:
             if length > frames.MAX_REPLY_BYTES:
                 raise self._broken(
@@ -378,7 +379,7 @@ class PolicyProcess:
             raise SandboxError(
                 f"a policy's process could not seal itself: {payload.decode('utf-8', 'replace')}"
             )
-        if tag != frames.FAILED:
+        if tag != player.FAILED:
             return self._broken(f"it answered {what} with frame {tag}")
         try:
             report = frames.report(payload)

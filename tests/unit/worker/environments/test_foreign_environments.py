@@ -23,7 +23,7 @@ from evopolicy_gateway.workspace.initial_policy import constant_action
 from evopolicy_worker.environments import Environment, compile_actions, define, describe, make, registry
 from evopolicy_worker.environments.interface.gymnasium_adapter import GymnasiumFamily
 from evopolicy_worker.environments.interface.opaque import Opaque
-from evopolicy_worker.environments.interface.spaces import outside
+from evopolicy_worker.environments.interface.spaces import compile_checker
 from evopolicy_worker.environments.interface.trial import solved
 from evopolicy_worker.episodes.frames import compile_writer
 from evopolicy_worker.sandbox.inside import player
@@ -177,6 +177,15 @@ def test_what_cannot_be_made_is_reported_with_the_field_to_correct(more: dict[st
         describe("acme/Glider")
 
 
+def test_a_modules_syntax_error_is_shown_with_its_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "unfinished.py").write_text("x = 1\ndef f(:\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    with pytest.raises(WorkerError, match=r'unfinished.py", line 2: def f\(:$'):
+        describe("unfinished:Thing-v0")
+
+
 def test_a_package_that_is_missing_is_named_with_what_to_install() -> None:
     with pytest.raises(WorkerError, match="no_such_pkg:X-v0 needs the package with the module 'no_such_pkg'"):
         make("no_such_pkg:X-v0")
@@ -269,7 +278,7 @@ def plain(value: Any) -> Any:
 @pytest.mark.parametrize("seed", range(8))
 def test_observations_of_every_space_reach_the_policy_as_they_are(everything: Environment, seed: int) -> None:
     obs = everything.reset(Case(seed=seed))
-    assert outside(obs, everything.description.obs_space) == ""
+    assert compile_checker(everything.description.obs_space)(obs) == ""
     assert same(received(everything, obs, as_lists=False), obs)
     assert received(everything, obs, as_lists=True) == plain(obs)
 

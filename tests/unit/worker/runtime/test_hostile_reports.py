@@ -31,6 +31,7 @@ from evopolicy_worker.episodes.monitor import Monitor
 from evopolicy_worker.episodes.policy_process import BundleFiles, PolicyProcess
 from evopolicy_worker.episodes.progress import Progress
 from evopolicy_worker.sandbox import jail
+from evopolicy_worker.sandbox.inside import player as shim
 from evopolicy_worker.sandbox.zygote import Zygote
 from evopolicy_worker.slot_protocol import slot_messages as messages
 from evopolicy_worker.slots.slot import bundle_files
@@ -80,11 +81,9 @@ PAYLOADS = st.one_of(
 
 
 def _packed(value: Any) -> bytes:
-    from evopolicy_worker.sandbox.inside import player
-
     out = bytearray()
     try:
-        player.pack(value, out, 0)
+        shim.pack(value, out, 0)
     except ValueError:
         return b"\xc0"
     return bytes(out)
@@ -157,7 +156,7 @@ def test_whatever_comes_as_a_report_is_a_bounded_failure(
     policy: PolicyProcess, report: dict[str, Any], what: str
 ) -> None:
     error = policy._reported_failure(
-        frames.FAILED, json.dumps(plain(report)).encode("utf-8", "surrogatepass"), what
+        shim.FAILED, json.dumps(plain(report)).encode("utf-8", "surrogatepass"), what
     )
     failure = error.failure
     assert len(failure.message) <= 2000

@@ -123,7 +123,11 @@ def test_a_time_limit_is_reported_with_value_and_use(
     ("source", "category", "words"),
     [
         ({"other.py": ""}, "missing_policy", "no policy.py"),
-        ({"policy.py": "def f(:"}, "import_error", "SyntaxError"),
+        (
+            {"policy.py": "import os\ndef f(:"},
+            "import_error",
+            "SyntaxError: invalid syntax (policy.py, line 2)",
+        ),
         ({"policy.py": "1 / 0"}, "import_error", "ZeroDivisionError"),
         ({"policy.py": "import numpi"}, "import_error", "No module named 'numpi'"),
         ({"policy.py": "policy = 3"}, "import_error", "no top-level class named Policy"),

@@ -210,7 +210,7 @@ def _no_pickles(played: CheckResult) -> Iterator[None]:
 
 def _look(played: CheckResult, schema: Any, obs: Any, n: int) -> None:
     if len(played.faults) < 3:
-        if fault := spaces.outside(obs, schema):
+        if fault := spaces.compile_checker(schema)(obs):
             played.faults.append(f"step {n}: the observation is outside its space: {fault}")
         if {float(each) for each in SEEDS} & _numbers(obs):
             played.faults.append(f"step {n}: the observation names the seed")

@@ -147,10 +147,14 @@ def traced(error: BaseException | None) -> str:
     none."""
     if error is None:
         return ""
-    lines = _own(
+    frames = [
         (each.filename, f'File "{each.filename}", line {each.lineno}, in {each.name}: {each.line}')
         for each in traceback.extract_tb(error.__traceback__)
-    )
+    ]
+    if isinstance(error, SyntaxError) and error.filename is not None:  # in a line that no frame has run
+        line = f'File "{error.filename}", line {error.lineno}: {(error.text or "").strip()}'
+        frames.append((error.filename, line))
+    lines = _own(frames)
     # Without any: raised by Gymnasium for an error of theirs.
     return "".join(f"; {line}" for line in lines) or traced(error.__cause__)
 

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from evopolicy_common.messages.environment import SpaceSchema
+from evopolicy_worker.environments.interface.spaces import array_of
 
 Converter = Callable[[Any], Any]
 
@@ -21,12 +22,8 @@ Converter = Callable[[Any], Any]
 def compile_observation(schema: SpaceSchema) -> Converter:
     """A function from the simulator's observation to the plain one of this space. TypeError for an unknown space."""
     kind = schema["type"]
-    if kind in ("Box", "Image"):
-        return _array(np.dtype(schema["dtype"]))
-    if kind == "MultiDiscrete":
-        return _array(np.dtype(np.int64))
-    if kind == "MultiBinary":
-        return _array(np.dtype(np.int8))
+    if kind in ("Box", "Image", "MultiDiscrete", "MultiBinary"):
+        return _array(array_of(schema)[1])
     if kind == "Discrete":
         return int
     if kind == "Text":
@@ -71,15 +68,9 @@ def _tuple(converters: list[Converter]) -> Converter:
 
 
 def _sequence(schema: SpaceSchema) -> Converter:
-    inner = schema["space"]
     if schema["stacked"]:
-        shape, dtype = tuple(inner["shape"]), np.dtype(inner["dtype"])
-
-        def stacked(raw: Any) -> Any:
-            return np.array(raw, dtype=dtype, order="C").reshape(-1, *shape)
-
-        return stacked
-    convert = compile_observation(inner)
+        return _rows(schema["space"])
+    convert = compile_observation(schema["space"])
 
     def each(raw: Any) -> Any:
         return tuple(map(convert, raw))
@@ -87,31 +78,22 @@ def _sequence(schema: SpaceSchema) -> Converter:
     return each
 
 
-def graph_dtypes(
-    schema: SpaceSchema,
-) -> tuple[np.dtype[Any], tuple[int, ...], np.dtype[Any], tuple[int, ...]]:
-    """Dtype and shape of one node and of one edge of a Graph."""
-    found: list[Any] = []
-    for name in ("node_space", "edge_space"):
-        part = schema[name]
-        boxed = part is not None and part["type"] in ("Box", "Image")
-        found += [np.dtype(part["dtype"]), tuple(part["shape"])] if boxed else [np.dtype(np.int64), ()]
-    return found[0], found[1], found[2], found[3]
+def _rows(schema: SpaceSchema) -> Converter:
+    """Any number of values of a space as one array."""
+    shape, dtype = array_of(schema)
+    return lambda raw: np.array(raw, dtype=dtype, order="C").reshape(-1, *shape)
 
 
 def _graph(schema: SpaceSchema) -> Converter:
-    node_dtype, node_shape, edge_dtype, edge_shape = graph_dtypes(schema)
+    nodes, edges = _rows(schema["node_space"]), _rows(schema["edge_space"] or {"type": "Discrete"})
+    links = _rows({"type": "MultiDiscrete", "nvec": [0, 0]})
 
     def convert(raw: Any) -> Any:
         bare = raw.edges is None or raw.edge_links is None
         return {
-            "nodes": np.array(raw.nodes, dtype=node_dtype, order="C").reshape(-1, *node_shape),
-            "edges": None
-            if bare
-            else np.array(raw.edges, dtype=edge_dtype, order="C").reshape(-1, *edge_shape),
-            "edge_links": None
-            if bare
-            else np.array(raw.edge_links, dtype=np.int64, order="C").reshape(-1, 2),
+            "nodes": nodes(raw.nodes),
+            "edges": None if bare else edges(raw.edges),
+            "edge_links": None if bare else links(raw.edge_links),
         }
 
     return convert

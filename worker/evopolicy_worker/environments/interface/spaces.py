@@ -66,10 +66,7 @@ def to_schema(space: gymnasium.Space[Any]) -> SpaceSchema:
         for key in space.spaces:
             if not isinstance(key, str):
                 raise TypeError(f"key {key!r:.80} of a Dict has no form here; its keys have to be texts")
-        return {
-            "type": "Dict",
-            "spaces": {key: to_schema(part) for key, part in space.spaces.items()},
-        }
+        return {"type": "Dict", "spaces": {key: to_schema(part) for key, part in space.spaces.items()}}
     if isinstance(space, spaces.Text):
         schema = {"type": "Text", "min_length": int(space.min_length), "max_length": int(space.max_length)}
         if (characters := frozenset(space.characters)) != USUAL_CHARACTERS:
@@ -82,11 +79,8 @@ def to_schema(space: gymnasium.Space[Any]) -> SpaceSchema:
                 f"a stacked Sequence of {inner['type']} has no form here; give it without stack=True, or stack within"
                 f" the {inner['type']}"
             )
-        return {
-            "type": "Sequence",
-            "space": inner,
-            "stacked": bool(space.stack) and inner["type"] in ("Box", "Image"),
-        }
+        stacked = bool(space.stack) and inner["type"] in ("Box", "Image")
+        return {"type": "Sequence", "space": inner, "stacked": stacked}
     if isinstance(space, spaces.Graph):
         edges = None if space.edge_space is None else to_schema(space.edge_space)
         return {"type": "Graph", "node_space": to_schema(space.node_space), "edge_space": edges}
@@ -120,6 +114,15 @@ def parts(schema: SpaceSchema) -> list[SpaceSchema]:
     return list(inner.values()) if isinstance(inner, dict) else list(inner)
 
 
+def array_of(schema: SpaceSchema) -> tuple[tuple[int, ...], np.dtype[Any]]:
+    """Shape and dtype of a value of a space without parts, as an array; () and int64 for Discrete."""
+    if schema["type"] in ("Box", "Image"):
+        return tuple(schema["shape"]), np.dtype(schema["dtype"])
+    if schema["type"] == "MultiBinary":
+        return tuple(np.atleast_1d(schema["n"]).tolist()), np.dtype(np.int8)
+    return np.shape(schema.get("nvec", 0)), np.dtype(np.int64)
+
+
 def bounds(schema: SpaceSchema) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Lowest and highest value of every element of a Box or Image, float64 arrays of its shape.
 
@@ -137,13 +140,8 @@ Checker = Callable[[Any], str]
 """How a plain observation is not in its space, in words; empty where it is in it."""
 
 
-def outside(value: Any, schema: SpaceSchema) -> str:
-    """How a plain observation is not in its space, in words; empty where it is in it."""
-    return compile_checker(schema)(value)
-
-
 def compile_checker(schema: SpaceSchema) -> Checker:
-    """`outside` for many values of one space."""
+    """The checker of a space."""
     kind = schema["type"]
     if kind in ("Dict", "Tuple"):
         named = schema["spaces"].items() if kind == "Dict" else enumerate(schema["spaces"])
@@ -192,8 +190,7 @@ def _array_checker(schema: SpaceSchema) -> Checker:
         low = np.broadcast_to(np.array(schema.get("start", 0)), np.shape(schema["nvec"]))
         high = low + np.array(schema["nvec"]) - 1
     else:
-        shape = tuple(np.atleast_1d(schema["n"]).tolist())
-        low, high = np.zeros(shape), np.ones(shape)
+        low, high = np.zeros(array_of(schema)[0]), np.ones(array_of(schema)[0])
     whole_byte = kind == "Image" or (
         schema.get("dtype") == "uint8" and not low.any() and bool((high == 255).all())
     )
@@ -220,12 +217,9 @@ def _has_image(schema: SpaceSchema) -> bool:
 
 def _bytes(schema: SpaceSchema) -> int:
     """Size of the arrays of one observation, bytes."""
-    if "shape" in schema:
-        return math.prod(schema["shape"]) * np.dtype(schema["dtype"]).itemsize
-    if schema["type"] in ("MultiDiscrete", "MultiBinary"):
-        width = 8 if schema["type"] == "MultiDiscrete" else 1
-        size = np.size(schema["nvec"]) if "nvec" in schema else math.prod(np.atleast_1d(schema["n"]).tolist())
-        return int(size) * width
+    if schema["type"] in ("Box", "Image", "MultiDiscrete", "MultiBinary"):
+        shape, dtype = array_of(schema)
+        return math.prod(shape) * dtype.itemsize
     return sum(map(_bytes, parts(schema)))
 
 
@@ -245,18 +239,12 @@ def _box(shape: tuple[int, ...], dtype: Any, low: NDArray[Any], high: NDArray[An
             "value_range": [0, 255],
             "storage": "external",
         }
-    return {
-        "type": "Box",
-        "shape": list(shape),
-        "dtype": name,
-        "low": _bound(low),
-        "high": _bound(high),
-    }
+    return {"type": "Box", "shape": list(shape), "dtype": name, "low": _bound(low), "high": _bound(high)}
 
 
 def _bound(values: NDArray[Any]) -> Any:
     shared = values.size > MAX_LISTED_BOUNDS and bool((values == values.flat[0]).all())
-    return _number(values.flat[0]) if shared else _numbers(values.tolist())
+    return _plain(values.flat[0].item() if shared else values.tolist())
 
 
 def _mission(space: Any) -> SpaceSchema:
@@ -266,15 +254,12 @@ def _mission(space: Any) -> SpaceSchema:
     return {"type": "Text", "min_length": min(lengths), "max_length": max(lengths)}
 
 
-def _number(value: Any) -> int | float | str:
-    plain: int | float = value.item() if isinstance(value, np.generic) else value
-    if isinstance(plain, float) and math.isinf(plain):
-        return "inf" if plain > 0 else "-inf"
-    return plain + 0  # no negative zero
-
-
-def _numbers(value: Any) -> Any:
-    return [_numbers(item) for item in value] if isinstance(value, list) else _number(value)
+def _plain(value: Any) -> Any:
+    if isinstance(value, list):
+        return [_plain(item) for item in value]
+    if isinstance(value, float) and math.isinf(value):
+        return "inf" if value > 0 else "-inf"
+    return value + 0  # no negative zero
 
 
 def _floats(value: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:

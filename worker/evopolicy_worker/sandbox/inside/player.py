@@ -61,7 +61,6 @@ numpy_key = 0
 PYTHON_KEY = object.__basicsize__ + 4
 """Of Python's generator: where its words begin, after their place."""
 
-VARYING = ("Sequence", "Graph", "OneOf")
 NONE = 0xFFFFFFFF
 """In place of a number of edges: there are none, and no links."""
 
@@ -175,15 +174,9 @@ def rehearse() -> None:
     act = REQUEST_HEADER.pack(16, ACT, 0) + bytes(16)
     for action in (0, 0.0, [0.0, 0.0], np.zeros(2), np.float32(0.0), np.int64(0)):
         seed_generators(bytes(range(16)))
-        exec(
-            compile(
-                "class Policy:\n    def reset(self, episode_index):\n        pass\n", "policy.py", "exec"
-            ),
-            {},
-        )
-        questions = iter(
-            (REQUEST_HEADER.pack(0, RESET, 0), *[act] * _REHEARSED, REQUEST_HEADER.pack(0, END, 0))
-        )
+        exec(compile("class Policy:\n    def reset(self, n):\n        pass\n", "policy.py", "exec"), {})
+        begin, end = REQUEST_HEADER.pack(0, RESET, 0), REQUEST_HEADER.pack(0, END, 0)
+        questions = iter((begin, *[act] * _REHEARSED, end))
 
         def ask(answer: Any = action, questions: Any = questions) -> Any:
             os.write(pipes[0][1], next(questions))
@@ -249,7 +242,8 @@ def answer(policy: Any, reader: tuple[Callable[[], Any], Reader]) -> None:
         if not n:
             os._exit(0)
         if n < 16:
-            n += read_more(memoryview(header)[n:])
+            read_exactly(memoryview(header)[n:])
+            n = 16
         length, kind, argument = unpack(header)
         if n < 16 + length:
             body = complete(body, n - 16, length)
@@ -285,12 +279,6 @@ def read_exactly(buffer: bytearray | memoryview) -> None:
         view = view[n:]
 
 
-def read_more(view: memoryview) -> int:
-    n = len(view)
-    read_exactly(view)
-    return n
-
-
 def complete(body: Any, have: int, length: int) -> Any:
     """`body` with the rest of a payload of which `have` bytes are in it; a larger buffer when it does not fit."""
     raw = memoryview(body if isinstance(body, bytearray) else body.reshape(-1).view(np.uint8))
@@ -313,7 +301,7 @@ def observation_reader(space: dict[str, Any], as_lists: bool) -> tuple[Callable[
         empty = np.empty
         return (lambda: empty(shape, dtype)), (lambda body, length: body)
     fixed = [0]
-    build = leaf_reader(space, fixed, as_lists)
+    build = part_reader(space, fixed, as_lists)
     start = fixed[0]
 
     def observation(body: Any, length: int) -> Any:
@@ -322,26 +310,44 @@ def observation_reader(space: dict[str, Any], as_lists: bool) -> tuple[Callable[
     return (lambda: bytearray(start + 512)), observation
 
 
-def leaf_reader(space: dict[str, Any], fixed: list[int], as_lists: bool) -> Reader:
+def part_reader(space: dict[str, Any], fixed: list[int] | None, as_lists: bool) -> Reader:
+    """`fixed`: the bytes of the fixed arrays and ints so far; None inside a value whose form the space leaves open,
+    where counts stand before what they count, and nothing is padded."""
     kind = space["type"]
-    if kind in ("Dict", "Tuple"):
-        parts = space["spaces"]
-        if kind == "Dict":
-            readers = {key: leaf_reader(part, fixed, as_lists) for key, part in parts.items()}
-            return lambda body, at: {key: read(body, at) for key, read in readers.items()}
-        row = [leaf_reader(part, fixed, as_lists) for part in parts]
-        return lambda body, at: (list if as_lists else tuple)(read(body, at) for read in row)
+    row = list if as_lists else tuple
+    if kind == "Dict":
+        named = {key: part_reader(part, fixed, as_lists) for key, part in space["spaces"].items()}
+        return lambda body, at: {key: read(body, at) for key, read in named.items()}
+    if kind == "Tuple":
+        parts = [part_reader(part, fixed, as_lists) for part in space["spaces"]]
+        return lambda body, at: row([read(body, at) for read in parts])
     if kind == "Text":
         return read_text
-    if kind in VARYING:
-        return varying_reader(space, as_lists)
-    offset = fixed[0]
-    if kind == "Discrete":
-        fixed[0] += 8
-        return lambda body, at: int.from_bytes(body[offset : offset + 8], "little", signed=True)
+    if kind == "Sequence":
+        if space["stacked"]:
+            shape, dtype = array_of(space["space"])
+            return lambda body, at: take_array(body, at, (take_count(body, at), *shape), dtype, as_lists)
+        item = part_reader(space["space"], None, as_lists)
+        return lambda body, at: row([item(body, at) for _ in range(take_count(body, at))])
+    if kind == "OneOf":
+        choices = [part_reader(part, None, as_lists) for part in space["spaces"]]
+
+        def one_of(body: Any, at: Any) -> Any:
+            index = take_count(body, at)
+            return row((index, choices[index](body, at)))
+
+        return one_of
+    if kind == "Graph":
+        return graph_reader(space, as_lists)
     shape, dtype = array_of(space)
-    count = int(np.prod(shape, dtype=np.int64))
+    if fixed is None:
+        # Of one number, `tolist` makes a number of Python.
+        return lambda body, at: take_array(body, at, shape, dtype, as_lists or kind == "Discrete")
+    offset = fixed[0]
+    count = math.prod(shape)
     fixed[0] += -(-count * dtype.itemsize // 8) * 8
+    if kind == "Discrete":
+        return lambda body, at: int.from_bytes(body[offset : offset + 8], "little", signed=True)
     frombuffer = np.frombuffer
     if as_lists:
         return lambda body, at: frombuffer(body, dtype, count, offset).reshape(shape).tolist()
@@ -353,60 +359,25 @@ def array_of(space: dict[str, Any]) -> tuple[tuple[int, ...], Any]:
     kind = space["type"]
     if kind in ("Box", "Image"):
         return tuple(space["shape"]), np.dtype(space["dtype"])
-    if kind == "MultiDiscrete":
-        return np.shape(space["nvec"]), np.dtype(np.int64)
-    if kind == "Discrete":
-        return (), np.dtype(np.int64)
-    n = space["n"]
-    return (n,) if isinstance(n, int) else tuple(n), np.dtype(np.int8)
+    if kind == "MultiBinary":
+        return tuple(np.atleast_1d(space["n"]).tolist()), np.dtype(np.int8)
+    return np.shape(space.get("nvec", 0)), np.dtype(np.int64)
 
 
-def varying_reader(space: dict[str, Any], as_lists: bool) -> Reader:
-    """For a value whose form the space leaves open: counts stand before what they count, and nothing is padded."""
-    kind = space["type"]
-    if kind == "Sequence":
-        if space["stacked"]:
-            shape, dtype = array_of(space["space"])
-            return lambda body, at: take_array(body, at, (take_count(body, at), *shape), dtype, as_lists)
-        item = varying_reader(space["space"], as_lists)
-        row = list if as_lists else tuple
-        return lambda body, at: row([item(body, at) for _ in range(take_count(body, at))])
-    if kind == "OneOf":
-        choices = [varying_reader(part, as_lists) for part in space["spaces"]]
+def graph_reader(space: dict[str, Any], as_lists: bool) -> Reader:
+    node_shape, node_dtype = array_of(space["node_space"])
+    edge_shape, edge_dtype = array_of(space["edge_space"] or space["node_space"])
 
-        def one_of(body: Any, at: Any) -> Any:
-            index = take_count(body, at)
-            found = index, choices[index](body, at)
-            return list(found) if as_lists else found
+    def graph(body: Any, at: Any) -> Any:
+        n, m = take_count(body, at), take_count(body, at)
+        nodes = take_array(body, at, (n, *node_shape), node_dtype, as_lists)
+        if m == NONE:
+            return {"nodes": nodes, "edges": None, "edge_links": None}
+        edges = take_array(body, at, (m, *edge_shape), edge_dtype, as_lists)
+        links = take_array(body, at, (m, 2), np.dtype(np.int64), as_lists)
+        return {"nodes": nodes, "edges": edges, "edge_links": links}
 
-        return one_of
-    if kind == "Graph":
-        node_shape, node_dtype = array_of(space["node_space"])
-        edge_shape, edge_dtype = array_of(space["edge_space"] or space["node_space"])
-
-        def graph(body: Any, at: Any) -> Any:
-            n, m = take_count(body, at), take_count(body, at)
-            nodes = take_array(body, at, (n, *node_shape), node_dtype, as_lists)
-            if m == NONE:
-                return {"nodes": nodes, "edges": None, "edge_links": None}
-            edges = take_array(body, at, (m, *edge_shape), edge_dtype, as_lists)
-            links = take_array(body, at, (m, 2), np.dtype(np.int64), as_lists)
-            return {"nodes": nodes, "edges": edges, "edge_links": links}
-
-        return graph
-    if kind == "Dict":
-        named = {key: varying_reader(part, as_lists) for key, part in space["spaces"].items()}
-        return lambda body, at: {key: read(body, at) for key, read in named.items()}
-    if kind == "Tuple":
-        parts = [varying_reader(part, as_lists) for part in space["spaces"]]
-        row = list if as_lists else tuple
-        return lambda body, at: row([read(body, at) for read in parts])
-    if kind == "Text":
-        return read_text
-    shape, dtype = array_of(space)
-    if kind == "Discrete":
-        return lambda body, at: int(take_array(body, at, (), dtype, False))
-    return lambda body, at: take_array(body, at, shape, dtype, as_lists)
+    return graph
 
 
 def take_count(body: Any, at: Any) -> int:
@@ -463,10 +434,8 @@ def encoded(action: Any) -> bytes:
         return struct.pack("<IBxxxq", 8, INT, int(action))
     if kind is float:
         return struct.pack("<IBxxxd", 8, FLOAT, action)
-    if kind is list and 0 < len(action) <= action_bytes // VALUE_BYTES:
-        kinds = set(map(type, action))
-        if kinds == {float}:
-            return struct.pack(f"<IBxxx{len(action)}d", 8 * len(action), FLOATS, *action)
+    if kind is list and len(action) <= action_bytes // VALUE_BYTES and set(map(type, action)) == {float}:
+        return struct.pack(f"<IBxxx{len(action)}d", 8 * len(action), FLOATS, *action)
     out = bytearray()
     n = pack(action, out, 0)
     if len(out) > action_bytes:
@@ -573,11 +542,13 @@ def reply_failure(stage: str, error: BaseException) -> None:
     # A hostile exception may raise when it is read; then the parts read so far are reported.
     with contextlib.suppress(BaseException):
         frames = error.__traceback__
-        own = (__file__, programs.__file__)
-        while frames is not None and frames.tb_frame.f_code.co_filename in own:
+        while frames is not None and frames.tb_frame.f_code.co_filename in (__file__, programs.__file__):
             frames = frames.tb_next
         kind = kind_of(error)
         message = "".join(traceback.format_exception_only(type(error), error)).strip().rpartition("\n")[2]
+        if isinstance(error, SyntaxError):
+            # Python shows its line above that one.
+            message = f"{type(error).__name__}: {error}"
         text = "".join(traceback.format_exception(type(error), error, frames))
         missing = error.name if isinstance(error, ModuleNotFoundError) else None
     report = {
