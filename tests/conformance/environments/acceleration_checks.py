@@ -100,7 +100,7 @@ def compare_car_pictures(seed: int, count: int) -> None:
     rng = np.random.default_rng(seed)
     accelerated.reset(Case(seed=seed))
     plain.reset(Case(seed=seed))
-    simulators: list[Any] = [environment._env.unwrapped for environment in (accelerated, plain)]  # type: ignore[attr-defined]
+    simulators: list[Any] = [environment.bare.unwrapped for environment in (accelerated, plain)]  # type: ignore[attr-defined]
     for index in range(count):
         tile = simulators[1].track[rng.integers(len(simulators[1].track))]
         near = np.array(tile[2:4]) + rng.normal(0, 12, size=2)
@@ -128,7 +128,7 @@ def compare_car_pictures(seed: int, count: int) -> None:
 
 def _state(environment: Any) -> list[Any]:
     """What moves in the simulator, in its own precision: observations are rounded."""
-    simulator = environment._env.unwrapped
+    simulator = environment.bare.unwrapped
     if hasattr(simulator, "road") and hasattr(simulator.road, "vehicles"):
         return [
             (vehicle.position, float(vehicle.heading), float(vehicle.speed), repr(vehicle.lane_index))

@@ -34,7 +34,7 @@ def random_driver(environment: Environment, seed: int) -> Driver:
 
 def competent_driver(environment: Environment, seed: int) -> Driver:
     rng = np.random.default_rng(seed)
-    simulator: Any = environment._env.unwrapped  # type: ignore[attr-defined]
+    simulator: Any = environment.bare.unwrapped  # type: ignore[attr-defined]
     env_id = environment.description.env
     if env_id == "gym/racing":
         return lambda obs: _race(simulator, rng)

@@ -171,7 +171,7 @@ def test_random_actions_are_those_of_the_gymnasium_space(env_id: str, warm: Warm
     import gymnasium
 
     environment = warm(env_id)
-    space: gymnasium.Space[Any] = environment._env.action_space  # type: ignore[attr-defined]
+    space: gymnasium.Space[Any] = environment.bare.action_space  # type: ignore[attr-defined]
     space.seed(7)
     rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence(7)))
     for _ in range(20):

@@ -130,7 +130,7 @@ def test_a_racing_step_costs_a_tenth_and_a_first_tile_pays(warm: Warm) -> None:
 def test_the_minigrid_view_lies_as_the_text_says(env_id: str, warm: Warm) -> None:
     environment = warm(env_id)
     environment.reset(Case(seed=2))
-    grid: Any = environment._env.unwrapped  # type: ignore[attr-defined]
+    grid: Any = environment.bare.unwrapped  # type: ignore[attr-defined]
     rng = np.random.default_rng(0)
     compared = 0
     for _ in range(60):

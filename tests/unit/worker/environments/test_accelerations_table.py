@@ -76,12 +76,12 @@ def test_a_slot_process_inherits_the_switch(monkeypatch: pytest.MonkeyPatch) -> 
 def test_the_librarys_own_class_stays_as_it_is() -> None:
     accelerated: Any = make(MAZE, accelerations=True)
     plain: Any = make(MAZE, accelerations=False)
-    kind = type(plain._env)
-    assert isinstance(accelerated._env, kind)
-    assert type(accelerated._env).__name__ == kind.__name__
+    kind = type(plain.bare)
+    assert isinstance(accelerated.bare, kind)
+    assert type(accelerated.bare).__name__ == kind.__name__
     assert "gen_obs" not in kind.__dict__
     accelerated.reset(Case(seed=1))
-    assert type(make(MAZE, accelerations=False)._env) is kind  # type: ignore[attr-defined]
+    assert type(make(MAZE, accelerations=False).bare) is kind  # type: ignore[attr-defined]
 
 
 def test_rows_pass_visibility_on_as_the_librarys_mask_does() -> None:

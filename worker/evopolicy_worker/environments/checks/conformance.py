@@ -120,7 +120,7 @@ def _play(played: CheckResult, steps: int) -> None:
     description = environment.description
     played.limit = description.max_episode_steps
     played.observation, played.action = description.obs_space["type"], description.action_space["type"]
-    played.rebuilt = bool(getattr(environment, "rebuilds", False))
+    played.rebuilt = environment.rebuilds
     with _no_pickles(played):
         first = digest_of(_looked_at(played, environment, steps))
     played.digest = first

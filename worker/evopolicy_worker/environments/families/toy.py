@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections import deque
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -30,23 +31,19 @@ def make(entry: Entry, *, render: bool) -> Environment:
 class _Toy(Environment):
     """The shared part of both environments: their description, and images only on request."""
 
-    def __init__(
-        self,
-        entry: Entry,
-        *,
-        render: bool,
-        obs_space: SpaceSchema,
-        action_space: SpaceSchema,
-        reward_components: dict[str, str],
-    ) -> None:
+    components: Mapping[str, str] = {}
+    """Parts of the reward, with what each stands for."""
+
+    def __init__(self, entry: Entry, *, render: bool) -> None:
+        obs_space, action_space = self.spaces(entry)
         self.description = EnvironmentDescription(
             env=entry.id,
             env_version=f"{entry.id} (evopolicy, version 1)",
             obs_space=obs_space,
             action_space=action_space,
             max_episode_steps=entry.max_episode_steps,
-            reward_components=tuple(reward_components),
-            reward_texts=reward_components,
+            reward_components=tuple(self.components),
+            reward_texts=dict(self.components),
             task_text=written(entry.id) or "",
             renders=True,
             adapter=adapter(type(self), 1, ""),
@@ -59,6 +56,10 @@ class _Toy(Environment):
 
     def render(self) -> Frame:
         return self._draw() if self._renders else super().render()
+
+    @abstractmethod
+    def spaces(self, entry: Entry) -> tuple[SpaceSchema, SpaceSchema]:
+        """Of observations and of actions."""
 
     @abstractmethod
     def _draw(self) -> Frame:
@@ -82,24 +83,15 @@ class Line(_Toy):
     TARGET_RATE = 0.1
     EFFORT_COST = 0.01
 
-    def __init__(self, entry: Entry, *, render: bool) -> None:
-        limits = [2.0, 1.0, 1.5]
-        super().__init__(
-            entry,
-            render=render,
-            obs_space={
-                "type": "Box",
-                "shape": [3],
-                "dtype": "float32",
-                "low": [-limit for limit in limits],
-                "high": limits,
-            },
-            action_space={"type": "Box", "shape": [1], "dtype": "float32", "low": [-1.0], "high": [1.0]},
-            reward_components={
-                "reward_distance": "cost of the distance from the target",
-                "reward_effort": "cost of pushing",
-            },
-        )
+    components = {
+        "reward_distance": "cost of the distance from the target",
+        "reward_effort": "cost of pushing",
+    }
+
+    def spaces(self, entry: Entry) -> tuple[SpaceSchema, SpaceSchema]:
+        high, box = [2.0, 1.0, 1.5], {"type": "Box", "dtype": "float32"}
+        seen = {**box, "shape": [3], "low": [-each for each in high], "high": high}
+        return seen, {**box, "shape": [1], "low": [-1.0], "high": [1.0]}
 
     def reset(self, case: Case) -> Observation:
         rng = np.random.default_rng(case.seed)
@@ -120,13 +112,8 @@ class Line(_Toy):
         self._steps += 1
         distance = -abs(self._x - self._target())
         effort = -self.EFFORT_COST * push * push
-        return Step(
-            self._observe(),
-            distance + effort,
-            False,
-            self._steps >= self._limit,
-            {"reward_distance": distance, "reward_effort": effort, "steps": self._steps},
-        )
+        info = {"reward_distance": distance, "reward_effort": effort, "steps": self._steps}
+        return Step(self._observe(), distance + effort, False, self._steps >= self._limit, info)
 
     def _target(self) -> float:
         return self._centre + self.TARGET_SWING * math.sin(self._phase + self.TARGET_RATE * self._steps)
@@ -153,29 +140,16 @@ class Maze(_Toy):
     MIN_PATH = 4
     """Shortest way from start to exit, in steps, at least."""
 
-    def __init__(self, entry: Entry, *, render: bool) -> None:
-        super().__init__(
-            entry,
-            render=render,
-            obs_space={
-                "type": "Dict",
-                "spaces": {
-                    "blocked": {"type": "MultiBinary", "n": 4},
-                    "compass": {"type": "Text", "min_length": 4, "max_length": 9},
-                    "position": {"type": "MultiDiscrete", "nvec": [self.SIZE, self.SIZE]},
-                    "steps": {"type": "Discrete", "n": entry.max_episode_steps + 1},
-                    "view": {
-                        "type": "Box",
-                        "shape": [5, 5],
-                        "dtype": "uint8",
-                        "low": [[0] * 5] * 5,
-                        "high": [[2] * 5] * 5,
-                    },
-                },
-            },
-            action_space={"type": "Discrete", "n": 4},
-            reward_components={},
-        )
+    def spaces(self, entry: Entry) -> tuple[SpaceSchema, SpaceSchema]:
+        bounds = {"low": [[0] * 5] * 5, "high": [[2] * 5] * 5}
+        parts: SpaceSchema = {
+            "blocked": {"type": "MultiBinary", "n": 4},
+            "compass": {"type": "Text", "min_length": 4, "max_length": 9},
+            "position": {"type": "MultiDiscrete", "nvec": [self.SIZE, self.SIZE]},
+            "steps": {"type": "Discrete", "n": entry.max_episode_steps + 1},
+            "view": {"type": "Box", "shape": [5, 5], "dtype": "uint8", **bounds},
+        }
+        return {"type": "Dict", "spaces": parts}, {"type": "Discrete", "n": 4}
 
     def reset(self, case: Case) -> Observation:
         rng = np.random.default_rng(case.seed)
@@ -202,13 +176,8 @@ class Maze(_Toy):
             self._column += right
         self._steps += 1
         reached = (self._row, self._column) == self._exit
-        return Step(
-            self._observe(),
-            -1.0,
-            reached,
-            self._steps >= self._limit,
-            {"bumped": bool(bumped), "steps": self._steps},
-        )
+        info = {"bumped": bool(bumped), "steps": self._steps}
+        return Step(self._observe(), -1.0, reached, self._steps >= self._limit, info)
 
     @classmethod
     def _path(cls, grid: np.ndarray[Any, Any], start: tuple[int, int], end: tuple[int, int]) -> int:
@@ -232,14 +201,9 @@ class Maze(_Toy):
         vertical = "north" if down < 0 else "south" if down > 0 else ""
         horizontal = "west" if right < 0 else "east" if right > 0 else ""
         grid = self._grid
+        around = [grid[row + step_down, column + step_right] for step_down, step_right in self.MOVES]
         return {
-            "blocked": np.array(
-                [
-                    grid[row + step_down, column + step_right] == self.WALL
-                    for step_down, step_right in self.MOVES
-                ],
-                dtype=np.int8,
-            ),
+            "blocked": np.array([each == self.WALL for each in around], dtype=np.int8),
             "compass": vertical + horizontal or "here",
             "position": np.array((row - 1, column - 1), dtype=np.int64),
             "steps": self._steps,

@@ -18,6 +18,7 @@ Works from the schema of the action space alone, compiled once: `repair` runs on
 from __future__ import annotations
 
 import string
+from collections.abc import Mapping
 from typing import Any, Protocol
 
 import numpy as np
@@ -67,7 +68,7 @@ def compile_actions(schema: SpaceSchema) -> ActionCodec:
     if kind == "Dict":
         return _Dict({key: compile_actions(part) for key, part in schema["spaces"].items()})
     if kind == "Tuple":
-        return _Tuple([compile_actions(part) for part in schema["spaces"]])
+        return _Tuple(dict(enumerate(map(compile_actions, schema["spaces"]))))
     if kind == "Sequence":
         return _Sequence(compile_actions(schema["space"]), stacked=schema["stacked"])
     if kind == "OneOf":
@@ -116,7 +117,7 @@ class _Box:
         self._rounded_low = self._clip_low - _float32_spacing(self._clip_low)
         self._rounded_high = self._clip_high + _float32_spacing(self._clip_high)
         self._neutral: NDArray[np.float64] = np.clip(np.zeros(self._shape), self._low, self._high)
-        self._limits = tuple(
+        self._limits = list(
             zip(self._clip_low.ravel().tolist(), self._clip_high.ravel().tolist(), strict=True)
         )
         self._fast = self._is_float and len(self._shape) == 1 and len(self._limits) <= _FAST_ELEMENTS
@@ -140,8 +141,7 @@ class _Box:
             return self._repair_any(raw)
 
     def _repair_any(self, raw: object) -> tuple[NDArray[Any], bool]:
-        numbers = _numbers(raw)
-        shaped, invalid = _shaped(numbers, self._shape) if numbers is not None else (None, True)
+        shaped, invalid = _shaped(_numbers(raw), self._shape)
         if shaped is None:
             return self.neutral(), True
         values = shaped.astype(np.float64)
@@ -189,8 +189,7 @@ class _MultiDiscrete:
         self._high = self._low + self._n - 1
 
     def repair(self, raw: object) -> tuple[NDArray[Any], bool]:
-        numbers = _numbers(raw)
-        shaped, invalid = _shaped(numbers, self._n.shape) if numbers is not None else (None, True)
+        shaped, invalid = _shaped(_numbers(raw), self._n.shape)
         if shaped is None:
             return self.neutral(), True
         if shaped.dtype.kind == "f":
@@ -209,19 +208,12 @@ class _MultiDiscrete:
         return self._low.astype(self._dtype)
 
 
-class _MultiBinary:
+class _MultiBinary(_MultiDiscrete):
     def __init__(self, n: int | list[int]) -> None:
-        self._shape = (n,) if isinstance(n, int) else tuple(n)
-        self._codec = _MultiDiscrete(np.full(self._shape, 2), 0, "int8")
-
-    def repair(self, raw: object) -> tuple[NDArray[np.int8], bool]:
-        return self._codec.repair(raw)
+        super().__init__(np.full(n, 2), 0, "int8")
 
     def sample(self, rng: np.random.Generator) -> NDArray[np.int8]:
-        return rng.integers(low=0, high=2, size=self._shape, dtype=np.int8)
-
-    def neutral(self) -> NDArray[np.int8]:
-        return np.zeros(self._shape, dtype=np.int8)
+        return rng.integers(low=0, high=2, size=self._n.shape, dtype=np.int8)
 
 
 class _Text:
@@ -249,10 +241,10 @@ class _Text:
 
 
 class _Dict:
-    def __init__(self, parts: dict[str, ActionCodec]) -> None:
+    def __init__(self, parts: Mapping[Any, ActionCodec]) -> None:
         self._parts = parts
 
-    def repair(self, raw: object) -> tuple[dict[str, Any], bool]:
+    def repair(self, raw: object) -> tuple[Any, bool]:
         if not isinstance(raw, dict):
             return self.neutral(), True
         invalid = raw.keys() != self._parts.keys()
@@ -260,38 +252,28 @@ class _Dict:
         for key, part in self._parts.items():
             action[key], changed = part.repair(raw.get(key))
             invalid = invalid or changed
-        return action, invalid
+        return self._made(action), invalid
 
-    def sample(self, rng: np.random.Generator) -> dict[str, Any]:
-        return {key: part.sample(rng) for key, part in self._parts.items()}
+    def sample(self, rng: np.random.Generator) -> Any:
+        return self._made({key: part.sample(rng) for key, part in self._parts.items()})
 
-    def neutral(self) -> dict[str, Any]:
-        return {key: part.neutral() for key, part in self._parts.items()}
+    def neutral(self) -> Any:
+        return self._made({key: part.neutral() for key, part in self._parts.items()})
+
+    def _made(self, action: dict[Any, Any]) -> Any:
+        return action
 
 
-class _Tuple:
-    def __init__(self, parts: list[ActionCodec]) -> None:
-        self._parts = parts
+class _Tuple(_Dict):
+    """Its parts by position."""
 
-    def repair(self, raw: object) -> tuple[tuple[Any, ...], bool]:
-        if isinstance(raw, np.ndarray) and raw.ndim:
-            raw = list(raw[: len(self._parts) + 1])
-        if not isinstance(raw, list | tuple):
-            return self.neutral(), True
-        invalid = len(raw) != len(self._parts)
-        given = [*raw[: len(self._parts)], *[None] * (len(self._parts) - len(raw))]
-        action = []
-        for part, value in zip(self._parts, given, strict=True):
-            repaired, changed = part.repair(value)
-            action.append(repaired)
-            invalid = invalid or changed
-        return tuple(action), invalid
+    def repair(self, raw: object) -> tuple[Any, bool]:
+        if isinstance(raw, list | tuple) or (isinstance(raw, np.ndarray) and raw.ndim):
+            return super().repair(dict(enumerate(raw[: len(self._parts) + 1])))
+        return self.neutral(), True
 
-    def sample(self, rng: np.random.Generator) -> tuple[Any, ...]:
-        return tuple(part.sample(rng) for part in self._parts)
-
-    def neutral(self) -> tuple[Any, ...]:
-        return tuple(part.neutral() for part in self._parts)
+    def _made(self, action: dict[Any, Any]) -> Any:
+        return tuple(action.values())
 
 
 class _Sequence:
@@ -302,9 +284,7 @@ class _Sequence:
         self._stacked = stacked
 
     def repair(self, raw: object) -> tuple[Any, bool]:
-        if isinstance(raw, np.ndarray) and raw.ndim:
-            raw = list(raw[: MAX_ITEMS + 1])
-        if not isinstance(raw, list | tuple):
+        if not (isinstance(raw, list | tuple) or (isinstance(raw, np.ndarray) and raw.ndim)):
             return self.neutral(), True
         invalid = len(raw) > MAX_ITEMS
         items = []
@@ -315,7 +295,12 @@ class _Sequence:
         return self._made(items), invalid
 
     def sample(self, rng: np.random.Generator) -> Any:
-        return self._made([self._item.sample(rng) for _ in range(_random_length(rng))])
+        # As many as Gymnasium draws.
+        return self.drawn(rng, min(int(rng.geometric(0.25)), MAX_ITEMS))
+
+    def drawn(self, rng: np.random.Generator, n: int) -> Any:
+        """`n` random items."""
+        return self._made([self._item.sample(rng) for _ in range(n)])
 
     def neutral(self) -> Any:
         return self._made([])
@@ -376,13 +361,11 @@ class _Graph:
         return self._made(nodes, edges, links.astype(np.int32)), invalid or changed
 
     def sample(self, rng: np.random.Generator) -> Any:
-        nodes, _ = self._nodes.repair(
-            [self._nodes._item.sample(rng) for _ in range(1 + int(rng.integers(10)))]
-        )
+        nodes = self._nodes.drawn(rng, 1 + int(rng.integers(10)))
         n = int(rng.integers(len(nodes) + 1)) if self._edges is not None else 0
         if self._edges is None or not n:
             return self._made(nodes, None, None)
-        edges, _ = self._edges.repair([self._edges._item.sample(rng) for _ in range(n)])
+        edges = self._edges.drawn(rng, n)
         return self._made(nodes, edges, rng.integers(len(nodes), size=(n, 2)).astype(np.int32))
 
     def neutral(self) -> Any:
@@ -394,11 +377,6 @@ class _Graph:
         from gymnasium.spaces import GraphInstance
 
         return GraphInstance(nodes, edges, links)
-
-
-def _random_length(rng: np.random.Generator) -> int:
-    """As Gymnasium's Sequence draws it."""
-    return min(int(rng.geometric(0.25)), MAX_ITEMS)
 
 
 def _integer(raw: object) -> int | None:
@@ -432,9 +410,9 @@ def _numbers(raw: object) -> NDArray[Any] | None:
     return array if array.dtype.kind in "iuf" else None
 
 
-def _shaped(array: NDArray[Any], shape: tuple[int, ...]) -> tuple[NDArray[Any] | None, bool]:
+def _shaped(array: NDArray[Any] | None, shape: tuple[int, ...]) -> tuple[NDArray[Any] | None, bool]:
     """`array` in that shape and whether its meaning changed; None when it cannot be brought there."""
-    if array.shape == shape:
+    if array is None or array.shape == shape:
         return array, False
     if [n for n in array.shape if n != 1] == [n for n in shape if n != 1]:
         return array.reshape(shape), False

@@ -51,6 +51,8 @@ class Environment(ABC):
     """Key of `info` that reports at the last step whether the task was solved, where the definition names none. Not
     part of the definition, so that runs of earlier versions stay comparable."""
 
+    rebuilds: bool = False
+    """Whether each episode gets an environment made anew."""
     parameters: tuple[str, ...] = ()
     """Names of the simulator's parameters that `alter` knows."""
 

@@ -95,15 +95,15 @@ class GymnasiumFamily:
         assert entry.gymnasium_id is not None
         # Passed only when needed: not every environment accepts a render mode.
         mode: dict[str, Any] = {"render_mode": "rgb_array"} if render else {}
+        options = {"disable_env_checker": True, **entry.kwargs}
         try:
-            return gymnasium.make(entry.gymnasium_id, disable_env_checker=True, **mode, **entry.kwargs)
+            return gymnasium.make(entry.gymnasium_id, **mode, **options)
         except TypeError as error:
             if not render or "unexpected keyword argument 'render_mode'" not in str(error):
                 raise
         # It renders, but its constructor does not take the mode (HighwayEnv's lane-keeping-v0): the attribute is all
-        # that
-        # `Env.render` reads.
-        env = gymnasium.make(entry.gymnasium_id, disable_env_checker=True, **entry.kwargs)
+        # that `Env.render` reads.
+        env = gymnasium.make(entry.gymnasium_id, **options)
         env.unwrapped.render_mode = "rgb_array"
         return env
 
@@ -117,13 +117,6 @@ class GymnasiumFamily:
     def rebuilds(self, entry: Entry) -> bool:
         """True when a reused environment may play another episode than a fresh one of the same case."""
         return False
-
-    def deterministic(self, entry: Entry) -> bool:
-        """False when even a fresh environment may play another episode of the same case and actions.
-
-        An environment whose registration says so itself is marked in any case.
-        """
-        return True
 
     def parameters(self, env: gymnasium.Env[Any, Any]) -> Mapping[str, Sequence[Quantity]]:
         """The quantities of a new environment's simulator that worlds alter, by name of a parameter."""
@@ -190,28 +183,29 @@ class GymnasiumEnvironment(Environment):
         with quiet():
             family.load()
         call.begin(entry.id, "make")
-        self._rebuilds = family.rebuilds(entry)
+        self.bare: gymnasium.Env[Any, Any]
+        """The environment of the current episode, without the adapter."""
+        self.rebuilds = family.rebuilds(entry)
         self._used = False
         self._options_used = False
         self._steps = 0
         self._build()
-        self.parameters = tuple(sorted(family.parameters(self._env)))
+        self.parameters = tuple(sorted(family.parameters(self.bare)))
         obs_schema = self._schema("observation_space")
         action_schema = self._schema("action_space")
         self._observe = compile_observation(obs_schema)
-        self._encode = converter(self._env.observation_space, family.encoding, back=False)
-        self._decode = converter(self._env.action_space, family.encoding, back=True)
-        self._promises = (
-            None
-            if is_shipped(entry.id)
-            else trial.Promises(obs_schema, action_schema, self._schema, entry.success)
-        )
+        self._encode = converter(self.bare.observation_space, family.encoding, back=False)
+        self._decode = converter(self.bare.action_space, family.encoding, back=True)
+        self._promises: trial.Promises | None = None
+        if not is_shipped(entry.id):
+            self._promises = trial.Promises(obs_schema, action_schema, self._schema, entry.success)
         self._plain = family.info
         self.action_codec = compile_actions(action_schema)
         components = entry.reward_components or family.components.get(entry.gymnasium_id or "", {})
-        self._rewards = rewards.Scalarisation.of(entry, self._env)
+        self._rewards = rewards.Scalarisation.of(entry, self.bare)
         if self._rewards is not None:
             components = self._rewards.texts(components)
+        spec, own_words = self.bare.spec, family.words(entry, self.bare)
         self.solved_by = family.solved_by.get(entry.gymnasium_id or "", "")
         self.description = EnvironmentDescription(
             env=entry.id,
@@ -229,45 +223,27 @@ class GymnasiumEnvironment(Environment):
             reward_components=tuple(components),
             reward_texts=dict(components),
             task_text=task_text(
-                entry,
-                self._env,
-                obs_schema,
-                action_schema,
-                components,
-                self._limit,
-                family.words(entry, self._env),
+                entry, self.bare, obs_schema, action_schema, components, self._limit, own_words
             ),
-            deterministic=entry.deterministic
-            and family.deterministic(entry)
-            and not (self._env.spec is not None and self._env.spec.nondeterministic),
-            renders="rgb_array" in ((self._env.metadata or {}).get("render_modes") or ()),
+            deterministic=entry.deterministic and not (spec is not None and spec.nondeterministic),
+            renders="rgb_array" in ((self.bare.metadata or {}).get("render_modes") or ()),
             adapter=adapter(type(family), family.revision, entry.gymnasium_id or ""),
             packages=family.packages(entry),
         )
         call.done()
 
-    @property
-    def rebuilds(self) -> bool:
-        """Whether each episode gets an environment made anew."""
-        return self._rebuilds
-
     def alter(self, factors: dict[str, float]) -> None:
         if factors != self._factors:
             self._factors = factors
-            self._env.close()
+            self.bare.close()
             self._build()
-
-    @property
-    def bare(self) -> gymnasium.Env[Any, Any]:
-        """The environment of the current episode, without the adapter."""
-        return self._env
 
     def reset(self, case: Case) -> Observation:
         # `reset(options=…)` may reconfigure an environment for good (highway-env does), so none is reused after it.
         env_id = self._entry.id
-        if self._used and (self._rebuilds or self._options_used):
+        if self._used and (self.rebuilds or self._options_used):
             call.begin(env_id, "close")
-            self._env.close()
+            self.bare.close()
             call.begin(env_id, "make")
             self._build()
         self._family.begin()
@@ -275,7 +251,7 @@ class GymnasiumEnvironment(Environment):
         self._options_used = case.options is not None
         self._steps = 0
         call.begin(env_id, "reset")
-        returned = self._env.reset(seed=case.seed, options=case.options)
+        returned = self.bare.reset(seed=case.seed, options=case.options)
         if self._promises is not None:
             self._promises.after_reset(returned)
         obs, _ = returned
@@ -295,7 +271,7 @@ class GymnasiumEnvironment(Environment):
         call.what = "step"
         if self._decode is not None:
             action = self._decode(action)
-        returned = self._env.step(action)
+        returned = self.bare.step(action)
         self._steps += 1
         try:
             obs, reward, terminated, truncated, info = returned
@@ -305,13 +281,8 @@ class GymnasiumEnvironment(Environment):
             plain["steps"] = self._steps
             if self._rewards is not None:
                 reward = self._rewards.scalar(reward, plain)
-            step = Step(
-                self._observe(obs),
-                float(reward),
-                bool(terminated),
-                bool(truncated) or self._steps >= self._limit,
-                plain,
-            )
+            truncated = bool(truncated) or self._steps >= self._limit
+            step = Step(self._observe(obs), float(reward), bool(terminated), truncated, plain)
         except _MISSHAPEN as error:
             fault = trial.misshapen(returned, error, vector=self._rewards is not None)
             raise WorkerError(f"{call}, {fault}") from error
@@ -326,14 +297,14 @@ class GymnasiumEnvironment(Environment):
     def render(self) -> Frame:
         if not self._render:
             return super().render()
-        frame = np.asarray(self._family.render(self._env))
+        frame = np.asarray(self._family.render(self.bare))
         if frame.ndim != 3 or frame.shape[2] != 3 or frame.dtype != np.uint8:
             raise WorkerError(f"{self._entry.id} rendered {frame.dtype} {frame.shape}, not uint8 H x W x 3")
         return np.array(frame, order="C")
 
     def close(self) -> None:
         call.begin(self._entry.id, "close")
-        self._env.close()
+        self.bare.close()
         call.done()
 
     def _build(self) -> None:
@@ -361,7 +332,7 @@ class GymnasiumEnvironment(Environment):
             self.accelerations = tuple(accelerate(str(entry.gymnasium_id), env))
         for wrapper in entry.wrappers:
             env = wrapped(entry.id, env, wrapper)
-        self._env = env
+        self.bare = env
 
     def _multiply(self, env: gymnasium.Env[Any, Any]) -> None:
         for name, quantities in self._family.parameters(env).items():
@@ -376,7 +347,7 @@ class GymnasiumEnvironment(Environment):
 
     def _schema(self, name: str) -> SpaceSchema:
         try:
-            return spaces.to_schema(visible(getattr(self._env, name), self._family.encoding))
+            return spaces.to_schema(visible(getattr(self.bare, name), self._family.encoding))
         except (TypeError, ValueError) as error:
             raise WorkerError(f"environment {self._entry.id}, {name}: {error}") from error
 

@@ -41,7 +41,7 @@ class World(Environment):
         )
         self.action_codec = base.action_codec
         self.solved_by = base.solved_by
-        self.rebuilds = bool(getattr(base, "rebuilds", False))
+        self.rebuilds = base.rebuilds
         self._rules: tuple[str, Rules] | None = None
 
     def reset(self, case: Case) -> Observation:
