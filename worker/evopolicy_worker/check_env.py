@@ -8,9 +8,9 @@ import os
 import statistics
 import subprocess
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import IO, Annotated
 
 import msgspec
 import typer
@@ -60,8 +60,7 @@ class InASlot(msgspec.Struct, frozen=True, kw_only=True):
 
     bare_us: float = 0.0
     """Processor time of a step of the library's environment without the adapter, and without accelerations, µs; the
-    median of
-    `TURNS`. 0: not measured, as of an episode of one step."""
+    median of `TURNS`. 0: not measured, as of an episode of one step."""
     slot_us: float = 0.0
     """Processor time of the same steps in the slot, with its policy, recording and accelerations, in turns, µs; 0: not
     measured, as where they take less than `LEAST_S` together."""
@@ -90,9 +89,11 @@ class Checked(msgspec.Struct, frozen=True):
 
     @property
     def verdict(self) -> str:
-        wrong = [self.here.verdict(self.there), self.slot.fault]
-        if self.slot.memory_mb > MOST_MEMORY_MB:
-            wrong.append(f"its slot needs {self.slot.memory_mb:,} MB; {MOST_MEMORY_MB} are the limit")
+        memory = self.slot.memory_mb
+        large = (
+            f"its slot needs {memory:,} MB; {MOST_MEMORY_MB} are the limit" if memory > MOST_MEMORY_MB else ""
+        )
+        wrong = (self.here.verdict(self.there), self.slot.fault, large)
         return "; ".join(each for each in wrong if each not in ("", "ok")) or "ok"
 
     def cells(self) -> tuple[str, ...]:
@@ -117,43 +118,47 @@ def check(env_ids: Sequence[str], steps: int, definitions: Iterable[Entry]) -> I
     """Yields each environment when both processes and a slot have played it. Raises WorkerError when one of the
     processes ends too early."""
     definitions = tuple(definitions)
-    encoded = msgspec.json.encode(definitions)
-    processes = []
-    with scratch_folder("check") as scratch:
-        for seed in HASH_SEEDS:
-            program = [
-                sys.executable,
-                "-P",
-                "-m",
-                "evopolicy_worker.environments.checks.conformance",
-                str(steps),
-            ]
-            # In a folder that is removed even if this process is killed.
-            variables = {"PYTHONHASHSEED": seed, "TMPDIR": str(scratch)}
-            started = subprocess.Popen(
-                [*program, *env_ids],
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                env=os.environ | environments.process_environment(render=True) | variables,
+    variables = environments.process_environment(render=True)
+    with contextlib.ExitStack() as stack:
+        processes = [
+            stack.enter_context(
+                _program(
+                    "conformance", str(steps), *env_ids, definitions=definitions, variables=variables | hashes
+                )
             )
-            assert started.stdin is not None
-            started.stdin.write(encoded)
-            started.stdin.close()
-            processes.append(started)
+            for hashes in ({"PYTHONHASHSEED": seed} for seed in HASH_SEEDS)
+        ]
+        bare = stack.enter_context(bare_loop(definitions))
+        for env_id in env_ids:
+            here, there = (_next(answers, env_id) for _, answers in processes)
+            own = tuple(each for each in definitions if each.id == env_id)
+            slot = InASlot() if here.faults else asyncio.run(in_a_slot(env_id, own, bare))
+            yield Checked(here, there, slot)
+
+
+@contextlib.contextmanager
+def _program(
+    name: str, *arguments: str, definitions: Sequence[Entry], variables: Mapping[str, str]
+) -> Iterator[tuple[IO[bytes], IO[bytes]]]:
+    """A running program of `environments.checks`: its standard input, which has got the definitions, and its standard
+    output."""
+    command = [sys.executable, "-P", "-m", f"evopolicy_worker.environments.checks.{name}", *arguments]
+    # In a folder that is removed even if the process is killed.
+    with scratch_folder("check") as scratch:
+        environment = os.environ | variables | {"TMPDIR": str(scratch)}
+        process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment)
+        assert process.stdin is not None
+        assert process.stdout is not None
         try:
-            with bare_loop(definitions) as bare:
-                for env_id in env_ids:
-                    here, there = (_next(started, env_id) for started in processes)
-                    own = tuple(each for each in definitions if each.id == env_id)
-                    yield Checked(
-                        here, there, InASlot() if here.faults else asyncio.run(in_a_slot(env_id, own, bare))
-                    )
+            process.stdin.write(msgspec.json.encode(definitions) + b"\n")
+            process.stdin.flush()
+            yield process.stdin, process.stdout
         finally:
-            for started in processes:
-                started.kill()
-                started.wait()
-                assert started.stdout is not None
-                started.stdout.close()
+            process.kill()
+            process.wait()
+            process.stdout.close()
+            with contextlib.suppress(BrokenPipeError):  # what was not read is still held
+                process.stdin.close()
 
 
 TURNS = 3
@@ -171,36 +176,18 @@ ACTIONS = """
 @contextlib.contextmanager
 def bare_loop(definitions: tuple[Entry, ...]) -> Iterator[Callable[[str], Stretch]]:
     """A process that plays the stretch of an environment without a slot, at each call; see `costs`."""
-    program = [sys.executable, "-P", "-m", "evopolicy_worker.environments.checks.costs"]
     variables = environments.process_environment(accelerations=False)
-    with (
-        scratch_folder("check") as scratch,
-        subprocess.Popen(
-            program,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            env=os.environ | variables | {"TMPDIR": str(scratch)},
-        ) as process,
-    ):
-        asked, answered = process.stdin, process.stdout
-        assert asked is not None
-        assert answered is not None
-        asked.write(msgspec.json.encode(definitions) + b"\n")
+    with _program("costs", definitions=definitions, variables=variables) as (asked, answers):
 
         def play(env_id: str) -> Stretch:
             # An environment that has ended the process costs later ones their bare times, not their checks.
             with contextlib.suppress(BrokenPipeError):
                 asked.write(f"{env_id}\n".encode())
                 asked.flush()
-            line = answered.readline()
+            line = answers.readline()
             return msgspec.json.decode(line, type=Stretch) if line else Stretch(fault="its process ended")
 
-        try:
-            yield play
-        finally:
-            process.kill()
-            with contextlib.suppress(BrokenPipeError):  # what was not read is still held
-                asked.close()
+        yield play
 
 
 async def in_a_slot(env_id: str, definitions: tuple[Entry, ...], bare: Callable[[str], Stretch]) -> InASlot:
@@ -256,23 +243,14 @@ def _job(description: EnvironmentDescription, tier: Tier, steps: int) -> Job:
         "max_episode_steps": description.max_episode_steps,
     }
     spec = EpisodeSpec(index=0, episode_index=0, case=Case(seed=SEEDS[0]), policy_seed=bytes(16))
-    return Job(
-        job_id="check",
-        env=description.env,
-        bundle="check",
-        episodes=(spec,),
-        env_meta=meta,
-        render=True,
-        tier=tier,
-        max_steps=steps,
-    )
+    plan = {"job_id": "check", "env": description.env, "bundle": "check", "render": True}
+    return Job(**plan, episodes=(spec,), env_meta=meta, tier=tier, max_steps=steps)
 
 
-def _next(process: subprocess.Popen[bytes], env_id: str) -> CheckResult:
-    assert process.stdout is not None
-    line = process.stdout.readline()
+def _next(answers: IO[bytes], env_id: str) -> CheckResult:
+    line = answers.readline()
     if not line:
-        raise WorkerError(f"the process that plays {env_id} has ended with status {process.wait()}")
+        raise WorkerError(f"the process that plays {env_id} has ended")
     return msgspec.json.decode(line, type=CheckResult)
 
 
@@ -324,12 +302,10 @@ def command(
                 kept = results or scratch / "results.jsonl"
                 program = [python, "-P", "-m", "evopolicy_worker.cli", "check-env", "--results", str(kept)]
                 program += ["--steps", str(steps), *elsewhere]
-                done_there = subprocess.run(program, stdout=subprocess.DEVNULL, check=False)
+                status = subprocess.run(program, stdout=subprocess.DEVNULL, check=False).returncode
                 known |= read(kept)
-                if lost := [each for each in elsewhere if each not in known]:
-                    raise WorkerError(
-                        f"{python} has ended with status {done_there.returncode} before {lost[0]}"
-                    )
+            if lost := [each for each in elsewhere if each not in known]:
+                raise WorkerError(f"{python} has ended with status {status} before {lost[0]}")
         shown = table(*COLUMNS)
         for each in wanted:
             shown.add_row(*known[each].cells())

@@ -313,7 +313,7 @@ def _try(made: Made, family: str) -> None:
         return
     module = "evopolicy_worker.environments.checks.conformance"
     program = [made.python, "-P", "-m", module, str(_TRIAL_STEPS), env_id]
-    done = subprocess.run(program, capture_output=True, input=b"[]", check=False)
+    done = subprocess.run(program, capture_output=True, input=b"[]\n", check=False)
     why = last_line(done.stderr.decode(errors="replace"))
     if done.returncode == 0:
         why = msgspec.json.decode(done.stdout.splitlines()[-1], type=CheckResult).verdict(None)

@@ -121,7 +121,7 @@ def test_an_idle_or_busy_environment_is_ended_with_its_processes(
     play: Callable[[], object], limit_s: float, told: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(conformance, "TIMEOUT_S", limit_s)
-    monkeypatch.setattr(conformance, "_LOOK_S", 0.05)
+    monkeypatch.setattr(conformance, "_POLL_S", 0.05)
     monkeypatch.setattr(conformance, "_WORKS_S", 0.0)
     monkeypatch.setattr(conformance, "play", lambda env_id, steps: play())
     monkeypatch.setattr(conformance.registry, "load", lambda env_id: None)

@@ -9,7 +9,6 @@ environment.
 from __future__ import annotations
 
 import contextlib
-import io
 import os
 import pickle
 import resource
@@ -32,6 +31,7 @@ from evopolicy_common.messages.environment import Case
 from evopolicy_common.processes import proc
 from evopolicy_common.processes.parent_death import end_with_parent
 from evopolicy_common.processes.scratch import remove_tree
+from evopolicy_common.records.episodes.npz import MAX_BYTES, read_arrays
 from evopolicy_common.records.episodes.rendered import Renderer, decode
 from evopolicy_worker.environments import registry
 from evopolicy_worker.environments.checks.episodes import digest, digest_of, rollout
@@ -46,9 +46,9 @@ none, seconds. A short limit on time alone would also count what else the machin
 LONGEST_S = 3600.0
 """Longest time for one environment, seconds: one that polls for what never comes uses a little processor time for
 days."""
-_LOOK_S = 1.0
+_POLL_S = 1.0
 _WORKS_S = 0.05
-"""A process that has used so much more processor time since the last look has not hung, seconds."""
+"""A process that has used so much more processor time since the last check has not hung, seconds."""
 _REMOVALS, _REMOVAL_S = 20, 0.1
 """How often the removal of a process's temporary files is tried, and the pause between, seconds."""
 _RENDERED_STEPS = 30
@@ -82,11 +82,6 @@ class CheckResult(msgspec.Struct, kw_only=True):
     rendered: str = ""
     """`same`: an episode that is drawn is the same. `none`: it is never drawn. Empty: not tried, as in older results,
     or where this machine cannot draw."""
-    seconds: float = 0.0
-    observation: str = ""
-    action: str = ""
-    success: list[str] = []
-    """Keys of its info that contain "success"."""
 
     def verdict(self, other: CheckResult | None) -> str:
         """`ok`, or all violations. `other`: the result in another process."""
@@ -101,7 +96,6 @@ class CheckResult(msgspec.Struct, kw_only=True):
 
 def play(env_id: str, steps: int) -> CheckResult:
     """Plays an environment in this process, at most `steps` steps per episode. Exceptions become faults."""
-    began = time.monotonic()
     played = CheckResult(env=env_id)
     try:
         _play(played, steps)
@@ -111,7 +105,6 @@ def play(env_id: str, steps: int) -> CheckResult:
         played.faults.append(f"it raised {type(error).__name__}: {error}")
     played.faults = [" ".join(each.split())[:300] for each in played.faults]
     played.memory_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss >> 10
-    played.seconds = round(time.monotonic() - began, 2)
     return played
 
 
@@ -119,10 +112,9 @@ def _play(played: CheckResult, steps: int) -> None:
     environment = registry.make(played.env)
     description = environment.description
     played.limit = description.max_episode_steps
-    played.observation, played.action = description.obs_space["type"], description.action_space["type"]
     played.rebuilt = environment.rebuilds
     with _no_pickles(played):
-        first = digest_of(_looked_at(played, environment, steps))
+        first = digest_of(_checked(played, environment, steps))
     played.digest = first
     digest(environment, SEEDS[1], steps)
     played.reused = digest(environment, SEEDS[0], steps) == first
@@ -147,24 +139,27 @@ def _rendered(played: CheckResult, plain: Environment, steps: int) -> str:
     return "differs"
 
 
-def _looked_at(played: CheckResult, environment: Environment, steps: int) -> Iterator[tuple[Any, Step]]:
+def _checked(played: CheckResult, environment: Environment, steps: int) -> Iterator[tuple[Any, Step]]:
     """Plays an episode, and checks everything in it."""
     description, seed = environment.description, SEEDS[0]
     recorder = Renderer("arrays", description.obs_storage)
     obs: Any = None
-    success: dict[str, None] = {}
+    check = spaces.compile_checker(description.obs_space)
     for n, (action, step) in enumerate(rollout(environment, seed, steps)):
         if n:
             recorder.append(obs, action, step.reward, step.terminated, step.truncated, step.info)
-            success |= dict.fromkeys(key for key in step.info if "success" in key)
             if not np.isfinite(step.reward):
                 played.faults.append(f"step {n}: the reward is {step.reward}")
             if seed in _numbers(step.info) or any("seed" in key for key in step.info):
                 played.faults.append(f"step {n}: info names the seed")
         obs = step.obs
-        _look(played, description.obs_space, obs, n)
+        if len(played.faults) < 3:
+            if fault := check(obs):
+                played.faults.append(f"step {n}: the observation is outside its space: {fault}")
+            if {float(each) for each in SEEDS} & _numbers(obs):
+                played.faults.append(f"step {n}: the observation names the seed")
         yield action, step
-    played.steps, played.success = n, list(success)
+    played.steps = n
     played.ended = "terminated" if step.terminated else "truncated" if step.truncated else "going on"
     limit = description.max_episode_steps
     if (played.ended == "truncated" and n > limit) or (played.ended == "going on" and n >= limit):
@@ -172,17 +167,11 @@ def _looked_at(played: CheckResult, environment: Environment, steps: int) -> Ite
     files = decode(recorder.finish()).files
     played.step_bytes = round(sum(map(len, files.values())) / n)
     for name, data in files.items():
-        if name.endswith((".npy", ".npz")):
-            _loaded_without_pickle(played, name, data)
-
-
-def _loaded_without_pickle(played: CheckResult, name: str, data: bytes) -> None:
-    try:
-        found = np.load(io.BytesIO(data), allow_pickle=False)
-        for part in found.values() if name.endswith(".npz") else (found,):
-            np.asarray(part)
-    except ValueError as error:
-        played.faults.append(f"{name} cannot be read without pickle: {error}")
+        try:
+            if name.endswith(".npz"):
+                read_arrays(data, MAX_BYTES)
+        except ValueError as error:
+            played.faults.append(f"{name} cannot be read without pickle: {error}")
 
 
 @contextlib.contextmanager
@@ -206,14 +195,6 @@ def _no_pickles(played: CheckResult) -> Iterator[None]:
     finally:
         for name, function in kept.items():
             setattr(pickle, name, function)
-
-
-def _look(played: CheckResult, schema: Any, obs: Any, n: int) -> None:
-    if len(played.faults) < 3:
-        if fault := spaces.compile_checker(schema)(obs):
-            played.faults.append(f"step {n}: the observation is outside its space: {fault}")
-        if {float(each) for each in SEEDS} & _numbers(obs):
-            played.faults.append(f"step {n}: the observation names the seed")
 
 
 def _nonsense(environment: Environment) -> None:
@@ -247,18 +228,6 @@ def play_all(env_ids: list[str], steps: int) -> Iterator[CheckResult]:
 
 def _in_child(env_id: str, steps: int) -> CheckResult:
     temporary = Path(tempfile.mkdtemp(prefix="check-"))
-    try:
-        return _in_child_with(temporary, env_id, steps)
-    finally:
-        # The process never gets to tidy up, and a program that it has started may write until it has ended.
-        for _ in range(_REMOVALS):
-            remove_tree(temporary)
-            if not temporary.exists():
-                break
-            time.sleep(_REMOVAL_S)
-
-
-def _in_child_with(temporary: Path, env_id: str, steps: int) -> CheckResult:
     reading, writing = os.pipe()
     pid = os.fork()
     if pid == 0:
@@ -278,18 +247,25 @@ def _in_child_with(temporary: Path, env_id: str, steps: int) -> CheckResult:
                 os._exit(0)
     os.close(writing)
     data, why, limit = b"", "", _Limit(pid)
-    with os.fdopen(reading, "rb") as answer:
-        while not (why := limit.passed()):
-            if select.select([answer], [], [], _LOOK_S)[0]:
-                part = os.read(answer.fileno(), 1 << 16)
-                if not part:
-                    break
-                data += part
-    if why:
-        _kill([each.pid for each in proc.family(pid)])
-        data = b""
-    status = os.waitpid(pid, 0)[1]
-    if data:
+    try:
+        with os.fdopen(reading, "rb") as answer:
+            while not (why := limit.passed()):
+                if select.select([answer], [], [], _POLL_S)[0]:
+                    part = os.read(answer.fileno(), 1 << 16)
+                    if not part:
+                        break
+                    data += part
+        if why:
+            _kill([each.pid for each in proc.family(pid)])
+        status = os.waitpid(pid, 0)[1]
+    finally:
+        # The process never gets to tidy up, and a program that it has started may write until it has ended.
+        for _ in range(_REMOVALS):
+            remove_tree(temporary)
+            if not temporary.exists():
+                break
+            time.sleep(_REMOVAL_S)
+    if data and not why:
         return msgspec.json.decode(data, type=CheckResult)
     return CheckResult(env=env_id, faults=[why or f"its process ended with status {status}"])
 
@@ -331,9 +307,9 @@ def _kill(pids: list[int]) -> None:
 
 
 def main() -> None:
-    """The program. Reads definitions of environments that do not ship from standard input, as JSON."""
+    """The program. Reads a line of JSON, the definitions of environments that do not ship, from standard input."""
     end_with_parent(signal.SIGKILL)
-    registry.define(msgspec.json.decode(sys.stdin.buffer.read() or b"[]", type=list[Entry]))
+    registry.define(msgspec.json.decode(sys.stdin.buffer.readline() or b"[]", type=list[Entry]))
     for played in play_all(sys.argv[2:], int(sys.argv[1])):
         sys.stdout.buffer.write(msgspec.json.encode(played) + b"\n")
         sys.stdout.buffer.flush()
