@@ -11,15 +11,12 @@ from evopolicy_common.errors import EvopolicyError, RefusedError
 from evopolicy_common.logs import structlog
 from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_common.messages.episode import Tier
+from evopolicy_common.messages.worker import REASON_CHARACTERS
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
 RETRY_PAUSE_S, LONGEST_RETRY_PAUSE_S = 30.0, 600.0
 """Pause before what does not work is tried again; it doubles each time."""
-MAX_TIER_REASON = 500
-"""Characters of the reason why a tier does not work."""
-MAX_REASON, MAX_REASONS = 2000, 60_000
-"""Characters of the reason why an environment failed, and of all such reasons; the log has them whole."""
 
 Probe = Callable[[Tier], Awaitable[None]]
 """Starts a sandbox of a tier and ends it. Raises EvopolicyError or OSError when it does not start."""
@@ -47,7 +44,7 @@ class Capabilities:
         self._tiers = set(tiers)
         self._missing_tiers = dict(missing_tiers or {})
         self._described = {each.env: each for each in environments}
-        self._undescribed = dict.fromkeys(undescribed)
+        self._undescribed = list(undescribed)
         self._failed = dict(failed_environments or {})
         self._probe = probe
         self._describe = describe
@@ -61,7 +58,7 @@ class Capabilities:
     @property
     def missing_tiers(self) -> dict[str, str]:
         """The tiers that should work and do not, with reasons as long as the coordinator accepts."""
-        return {tier: why[:MAX_TIER_REASON] for tier, why in self._missing_tiers.items()}
+        return {tier: why[: REASON_CHARACTERS["tier"]] for tier, why in self._missing_tiers.items()}
 
     @property
     def environments(self) -> tuple[EnvironmentDescription, ...]:
@@ -75,10 +72,10 @@ class Capabilities:
 
     @property
     def failed_environments(self) -> dict[str, str]:
-        """All environments that failed, with reasons as long as the coordinator accepts."""
-        remaining, reasons = MAX_REASONS, {}
+        """All environments that failed, with reasons as long as the coordinator accepts; the log has them whole."""
+        remaining, reasons = REASON_CHARACTERS["environments"], {}
         for env, why in self._failed.items():
-            reasons[env] = why[: min(MAX_REASON, remaining)]
+            reasons[env] = why[: min(REASON_CHARACTERS["environment"], remaining)]
             remaining -= len(reasons[env])
         return reasons
 
@@ -119,8 +116,7 @@ class Capabilities:
         before = self._failed
         self._failed = {env: why for env, why in before.items() if env not in env_ids} | failed
         self._described |= {each.env: each for each in descriptions}
-        for env_id in env_ids:
-            self._undescribed.pop(env_id, None)
+        self._undescribed = [each for each in self._undescribed if each not in env_ids]
         if descriptions or self._failed != before:
             await self._announce()
 

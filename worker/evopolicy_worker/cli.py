@@ -10,7 +10,8 @@ import secrets
 import signal
 import socket
 import sys
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import AsyncIterator, Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Annotated, cast
 
@@ -159,20 +160,9 @@ def work(
         signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
         check_scratch()
 
-        # Wrong credentials are reported at once. With --ready-file they do not exist yet; `joined` waits for them
-        # later.
-        def named() -> credentials.Credentials:
-            return credentials.find("worker", tuple(connect or ()), credentials_file)
-
-        found = None if ready_file else named()
-
-        async def joined() -> credentials.Credentials:
-            if found is not None:
-                return found
-            assert ready_file is not None
-            ready = await read_ready(ready_file, asyncio.get_running_loop().create_future())
-            return credentials.find("worker", (), Path(ready.credentials["worker"]))
-
+        find = partial(credentials.find, "worker", tuple(connect or ()), credentials_file)
+        # Wrong credentials are reported at once. With --ready-file they do not exist yet.
+        found = None if ready_file else find()
         needed = cast("tuple[Tier, ...]", tuple(need_tier or ()))
         if len(needed) == 1 and needed[0] in SANDBOXED:
             # The first slot tests the tier when it starts.
@@ -189,23 +179,11 @@ def work(
         for tier in needed:
             if tier not in tiers:
                 raise _refused(tier, missing.get(tier), unsandboxed=unsandboxed)
+        limits = Limits(call_s=env_timeout, memory_bytes=env_memory << 20)
         with scratch_folder("worker") as scratch:
+            made = _Slots(scratch, slots, packages, wanted, limits)
             try:
-                asyncio.run(
-                    _run(
-                        joined,
-                        None if ready_file else named,
-                        name,
-                        wanted,
-                        slots,
-                        tiers,
-                        missing,
-                        scratch,
-                        packages,
-                        grace,
-                        Limits(call_s=env_timeout, memory_bytes=env_memory << 20),
-                    )
-                )
+                asyncio.run(_run(found, find, ready_file, name, wanted, tiers, missing, made, grace))
             except SandboxError as error:
                 if not needed:
                     raise
@@ -273,64 +251,70 @@ def default_name(found: credentials.Credentials) -> str:
     return certified
 
 
-def foreign(env_ids: list[str]) -> tuple[catalogue.Entry, ...]:
-    """Definitions of the environments that do not ship, for the processes that play them."""
-    return tuple(catalogue.entry(env_id) for env_id in env_ids if not catalogue.is_shipped(env_id))
+class _Slots:
+    """Makes the slots of this worker, each on a core."""
+
+    def __init__(
+        self, scratch: Path, n: int | None, packages: tuple[str, ...], env_ids: list[str], limits: Limits
+    ) -> None:
+        """`packages`: those that policies may import besides numpy. Environments that do not ship are defined in the
+        processes that play them."""
+        self.cores = Cores()
+        notify_of_many_slots(n or 0)
+        self.scratch = scratch
+        self.taken = [self.cores.take() for _ in range(n or self.cores.count)]
+        self.importable = policy_versions(packages)
+        foreign = tuple(catalogue.entry(env_id) for env_id in env_ids if not catalogue.is_shipped(env_id))
+        self._slot = partial(Slot, allowed_packages=("numpy", *packages), definitions=foreign, limits=limits)
+
+    def make(self, index: int, tier: Tier) -> Slot:
+        return self._slot(self.taken[index], tier, self.scratch / f"slot-{index}")
+
+    @contextlib.asynccontextmanager
+    async def spare(self, name: str, tier: Tier) -> AsyncIterator[Slot]:
+        """A slot for a while, on any core."""
+        slot = self._slot(None, tier, self.scratch / f"slot-{name}")
+        try:
+            yield slot
+        finally:
+            await slot.close()
 
 
 async def _run(
-    joined: Callable[[], Awaitable[credentials.Credentials]],
-    read_again: Callable[[], credentials.Credentials] | None,
+    found: credentials.Credentials | None,
+    find: Callable[[], credentials.Credentials],
+    ready_file: Path | None,
     name: str | None,
     env_ids: list[str],
-    slots: int | None,
     tiers: tuple[Tier, ...],
     missing: dict[Tier, str],
-    scratch: Path,
-    allowed_packages: tuple[str, ...],
+    slots: _Slots,
     grace_s: float,
-    limits: Limits,
 ) -> None:
-    cores = Cores()
-    notify_of_many_slots(slots or 0)
-    taken = [cores.take() for _ in range(slots or cores.count)]
-    packages, definitions = ("numpy", *allowed_packages), foreign(env_ids)
-    importable = policy_versions(allowed_packages)
-
-    def new_slot(index: int, tier: Tier) -> Slot:
-        folder = scratch / f"slot-{index}"
-        return Slot(taken[index], tier, folder, packages, definitions=definitions, limits=limits)
-
-    first = new_slot(0, tiers[0])
+    first = slots.make(0, tiers[0])
     kept = [first]
 
     def make_slot(index: int, tier: Tier) -> Slot:
-        return kept.pop() if kept and (index, tier) == (0, tiers[0]) else new_slot(index, tier)
+        return kept.pop() if kept and (index, tier) == (0, tiers[0]) else slots.make(index, tier)
 
-    own, cache = fingerprint(), descriptions.Cache(fingerprint().code_version)
-    own = msgspec.structs.replace(own, packages={**own.packages, **importable})
+    own = fingerprint()
+    cache = descriptions.Cache(own.code_version)
+    own = msgspec.structs.replace(own, packages={**own.packages, **slots.importable})
 
     def importing(found: Sequence[EnvironmentDescription]) -> tuple[EnvironmentDescription, ...]:
         """With the packages that policies may import, on which their results depend in every environment."""
         return tuple(
-            msgspec.structs.replace(each, packages={**each.packages, **importable}) for each in found
+            msgspec.structs.replace(each, packages={**each.packages, **slots.importable}) for each in found
         )
 
     async def describe(wanted: Sequence[str]) -> tuple[tuple[EnvironmentDescription, ...], dict[str, str]]:
-        folder = scratch / "slot-descriptions"
-        slot = Slot(None, tiers[0], folder, packages, definitions=definitions, limits=limits)
-        try:
-            found, failed = await descriptions.describe_all(wanted, slot, cache)
-            return importing(found), failed
-        finally:
-            await slot.close()
+        async with slots.spare("descriptions", tiers[0]) as slot:
+            made, failed = await descriptions.describe_all(wanted, slot, cache)
+        return importing(made), failed
 
     async def probe(tier: Tier) -> None:
-        slot = Slot(None, tier, scratch / "slot-probe", packages, limits=limits)
-        try:
+        async with slots.spare("probe", tier) as slot:
             await slot.start()
-        finally:
-            await slot.close()
 
     try:
         known, now, later = descriptions.sorted_out(env_ids, cache)
@@ -338,7 +322,10 @@ async def _run(
         known += made
         if len(env_ids) > MAX_PREPARED:
             await first.close()
-        found = await joined()
+        if found is None:
+            assert ready_file is not None
+            ready = await read_ready(ready_file, asyncio.get_running_loop().create_future())
+            found = credentials.find("worker", (), Path(ready.credentials["worker"]))
         capabilities = Capabilities(
             tiers,
             importing(sorted(known, key=lambda each: env_ids.index(each.env))),
@@ -350,30 +337,28 @@ async def _run(
         )
         options = Options(
             name=name or default_name(found),
-            slots=len(taken),
+            slots=len(slots.taken),
             fingerprint=own,
             host=socket.gethostname(),
             boot_id=host.boot_id(),
-            scratch=scratch,
+            scratch=slots.scratch,
             grace_s=grace_s,
         )
         if not options.boot_id:
             log.warning("this worker gets no hidden episodes", why=host.NO_BOOT_ID)
         log.info("waiting for the coordinator", endpoints=found.endpoints)
+        link = transport.connect(found, timeout_s=None, read_again=None if ready_file else find)
         with contextlib.suppress(asyncio.CancelledError):
-            await _serve(found, read_again, options, capabilities, make_slot)
+            await _serve(link, lambda link: Supervisor(link, options, capabilities, make_slot))
     finally:
         for slot in kept:
             await slot.close()
-        cores.close()
+        slots.cores.close()
 
 
 async def _serve(
-    found: credentials.Credentials,
-    read_again: Callable[[], credentials.Credentials] | None,
-    options: Options,
-    capabilities: Capabilities,
-    make_slot: Callable[[int, Tier], Slot],
+    connecting: contextlib.AbstractAsyncContextManager[transport.Link],
+    supervise: Callable[[transport.Link], Supervisor],
 ) -> None:
     loop = asyncio.get_running_loop()
     main = asyncio.current_task()
@@ -390,8 +375,8 @@ async def _serve(
 
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, stop)
-    async with transport.connect(found, timeout_s=None, read_again=read_again) as link:
-        supervisor = Supervisor(link, options, capabilities, make_slot)
+    async with connecting as link:
+        supervisor = supervise(link)
         await supervisor.run()
         log.info("stopped", jobs_done=supervisor.jobs_done)
 

@@ -19,7 +19,6 @@ import os
 import platform
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Protocol
 
 import msgspec
 
@@ -30,6 +29,7 @@ from evopolicy_common.messages import bounds
 from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_common.records.blobs import write_atomically
 from evopolicy_worker.environments import registry
+from evopolicy_worker.slots.slot import Slot
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
@@ -38,14 +38,6 @@ MAX_BYTES = 1 << 20
 """Largest description; one message has those of all environments that a worker offers."""
 TRIES = 5
 PAUSE_S = 0.5
-
-
-class Describes(Protocol):
-    """The methods of a slot that are used here."""
-
-    async def start(self) -> None: ...
-
-    async def describe(self, env_ids: Sequence[str]) -> tuple[EnvironmentDescription, ...]: ...
 
 
 class Cache:
@@ -106,22 +98,17 @@ def sorted_out(
     env_ids: Iterable[str], cache: Cache
 ) -> tuple[list[EnvironmentDescription], list[str], list[str]]:
     """The descriptions in the cache, the environments to describe now, and those to describe on first use."""
-    known: list[EnvironmentDescription] = []
-    shipped: list[str] = []
-    others: list[str] = []
-    for env_id in env_ids:
-        cached = cache.get(env_id)
-        if cached is not None:
-            known.append(cached)
-        else:
-            (shipped if catalogue.is_shipped(env_id) else others).append(env_id)
-    if len(shipped) <= AT_ONCE:
-        return known, [*shipped, *others], []
-    return known, others, shipped
+    cached = {env_id: cache.get(env_id) for env_id in env_ids}
+    known = [each for each in cached.values() if each is not None]
+    unknown = [env_id for env_id, each in cached.items() if each is None]
+    shipped, others = (
+        [env_id for env_id in unknown if catalogue.is_shipped(env_id) == ships] for ships in (True, False)
+    )
+    return (known, [*shipped, *others], []) if len(shipped) <= AT_ONCE else (known, others, shipped)
 
 
 async def describe_all(
-    env_ids: Sequence[str], slot: Describes, cache: Cache | None = None
+    env_ids: Sequence[str], slot: Slot, cache: Cache | None = None
 ) -> tuple[tuple[EnvironmentDescription, ...], dict[str, str]]:
     """Descriptions of environments, and by id the reasons why others have none. They are made in the slot, as this
     process must not import simulators. It stays started.
@@ -146,7 +133,7 @@ async def describe_all(
     return tuple(descriptions), failed
 
 
-async def _described(env_id: str, slot: Describes) -> EnvironmentDescription:
+async def _described(env_id: str, slot: Slot) -> EnvironmentDescription:
     for tries_left in reversed(range(TRIES)):
         try:
             return _announceable(env_id, await slot.describe([env_id]))
@@ -185,7 +172,7 @@ def _announceable(env_id: str, found: Sequence[EnvironmentDescription]) -> Envir
     return description
 
 
-async def _started(slot: Describes) -> None:
+async def _started(slot: Slot) -> None:
     for tries_left in reversed(range(TRIES)):
         try:
             return await slot.start()

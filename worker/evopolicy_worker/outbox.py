@@ -23,7 +23,13 @@ import msgspec
 from evopolicy_common.errors import ProtocolError, RefusedError
 from evopolicy_common.logs import structlog
 from evopolicy_common.messages.episode import BlobRef
-from evopolicy_common.messages.worker import JobResult, ReportResults, ResultsReported, WorkerReply
+from evopolicy_common.messages.worker import (
+    REASON_CHARACTERS,
+    JobResult,
+    ReportResults,
+    ResultsReported,
+    WorkerReply,
+)
 from evopolicy_common.records.blobs import digest_of
 from evopolicy_common.refusals import NOT_NOW, Refusal
 from evopolicy_common.wire import codec
@@ -222,7 +228,7 @@ class Outbox:
             job_id=result.job_id,
             attempt=result.attempt,
             kind="failed",
-            error=f"its result was refused: {why}"[:2000],
+            error=f"its result was refused: {why}"[: REASON_CHARACTERS["result"]],
         )
         if result.kind == "failed" and not result.episodes:
             self._on_settled(result)
@@ -245,14 +251,8 @@ class Outbox:
 
 def _n_bytes(result: JobResult) -> int:
     """Approximate size of a result in bytes: its bulky parts, and 1000 for the rest."""
-    begun = 0 if result.begun is None else result.begun.size
-    return (
-        1000
-        + begun
-        + sum(
-            len(outcome.stdout)
-            + len(outcome.stderr)
-            + sum(len(ref.inline or b"") for ref in (outcome.trajectory, outcome.video) if ref is not None)
-            for outcome in result.episodes
-        )
-    )
+    size = 1000 + (0 if result.begun is None else result.begun.size)
+    for outcome in result.episodes:
+        size += len(outcome.stdout) + len(outcome.stderr)
+        size += sum(len(ref.inline or b"") for ref in (outcome.trajectory, outcome.video) if ref is not None)
+    return size

@@ -18,9 +18,8 @@ import asyncio
 import contextlib
 import time
 from collections import OrderedDict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
-from typing import Protocol
 
 import msgspec
 
@@ -35,6 +34,7 @@ from evopolicy_common.errors import (
 from evopolicy_common.logs import structlog
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome, Job, Tier
 from evopolicy_common.messages.worker import (
+    REASON_CHARACTERS,
     Fingerprint,
     HeartbeatReply,
     HeldLease,
@@ -58,6 +58,7 @@ from evopolicy_worker.capabilities import Capabilities
 from evopolicy_worker.heartbeat import HeartbeatThread, HeldLeases
 from evopolicy_worker.outbox import Outbox
 from evopolicy_worker.slot_protocol.begun import HandedBack
+from evopolicy_worker.slots.slot import Slot
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
@@ -67,28 +68,9 @@ LONGEST_RESTART_PAUSE_S = 30.0
 CANCEL_TIMEOUT_S = 2.0
 """How long the worker waits, when it exits, for slots to stop their cancelled jobs."""
 WITHDRAW_TIMEOUT_S = 1.0
-SILENCE_LOOK_S = 0.5
+SILENCE_CHECK_S = 0.5
 MAX_PREPARED = 4
 """A worker that offers at most this many environments has its slots import all their simulators before work arrives."""
-
-
-class SlotLike(Protocol):
-    """The slot interface that the supervisor uses, implemented by `slot.Slot`."""
-
-    @property
-    def begun(self) -> HandedBack | None: ...
-
-    async def start(self) -> None: ...
-
-    async def prepare(self, env_ids: Sequence[str]) -> None: ...
-
-    async def play(
-        self, job: Job, bundle: Path | None, on_progress: Callable[[int, int], None]
-    ) -> tuple[EpisodeOutcome, ...]: ...
-
-    async def cancel(self) -> None: ...
-
-    async def close(self) -> None: ...
 
 
 class Options(msgspec.Struct, frozen=True, kw_only=True):
@@ -113,7 +95,7 @@ class Supervisor:
         link: Link,
         options: Options,
         capabilities: Capabilities,
-        make_slot: Callable[[int, Tier], SlotLike],
+        make_slot: Callable[[int, Tier], Slot],
     ) -> None:
         self._link = link
         self._options = options
@@ -133,7 +115,7 @@ class Supervisor:
             self._on_heartbeat_reply,
             lambda error: self._fail("the heartbeat", error),
         )
-        self._bundles = BundleCache(options.scratch / "bundles", self._fetch_bundle)
+        self._bundles = BundleCache(options.scratch / "bundles", self._fetch)
         self._queue: OrderedDict[str, Lease] = OrderedDict()
         self._work_arrived = asyncio.Event()
         self._capacity_freed = asyncio.Event()
@@ -145,7 +127,7 @@ class Supervisor:
             self._settled,
             more_follow=lambda: bool(self._queue),
         )
-        self._running: dict[str, SlotLike] = {}
+        self._running: dict[str, Slot] = {}
         self._cancelled: set[str] = set()
         self._session = self._token = ""
         self._lease_ttl_s = 0.0
@@ -165,9 +147,8 @@ class Supervisor:
         await self._register()
         self._link.declare_alive(keys.liveliness_key(self._link.credentials.cluster, self._options.name))
         # The reporting task outlives the others, so that finished results are reported before the worker exits.
-        report_results = asyncio.create_task(self._outbox.run())
-        report_results.add_done_callback(self._report_ended)
-        working = asyncio.create_task(self._work_and_report())
+        report_results = asyncio.create_task(self._report())
+        working = asyncio.create_task(self._work())
         trying = asyncio.create_task(self._capabilities.keep_trying(self._register))
         try:
             await asyncio.wait([working, self._failed], return_when=asyncio.FIRST_COMPLETED)
@@ -182,14 +163,10 @@ class Supervisor:
             await asyncio.gather(*tasks, return_exceptions=True)
             self._failed.cancel()
 
-    async def _work_and_report(self) -> None:
-        await self._work()
-        with contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(self._outbox.wait_empty(), self._options.grace_s)
-
-    def _report_ended(self, task: asyncio.Task[None]) -> None:
-        error = None if task.cancelled() else task.exception()
-        if error is not None:
+    async def _report(self) -> None:
+        try:
+            await self._outbox.run()
+        except Exception as error:
             self._fail("reporting", error)
 
     def _fail(self, part: str, error: BaseException) -> None:
@@ -198,8 +175,8 @@ class Supervisor:
             self._failed.set_exception(PartFailedError(f"{part} failed: {type(error).__name__}: {error}"))
 
     async def _work(self) -> None:
-        """Leases and plays until drained. A refusal by the coordinator stops all running jobs, as their results are
-        worthless."""
+        """Leases and plays until drained, and waits until the results are reported. A refusal by the coordinator stops
+        all running jobs, as their results are worthless."""
         refused: BaseException | None = None
         try:
             async with asyncio.TaskGroup() as group:
@@ -214,6 +191,8 @@ class Supervisor:
             refused = refused.exceptions[0]
         if refused is not None:
             raise refused
+        with contextlib.suppress(TimeoutError):
+            await asyncio.wait_for(self._outbox.wait_empty(), self._options.grace_s)
 
     def drain(self) -> None:
         """Stops requesting leases; `run` returns when the running jobs are done or the grace time is over."""
@@ -360,7 +339,7 @@ class Supervisor:
             if slot is not None:
                 await _close_slot(slot)
 
-    async def _prepared(self, index: int) -> SlotLike | None:
+    async def _prepared(self, index: int) -> Slot | None:
         """Starts a slot of the safest tier and imports its simulators before work arrives, so that the first submit
         need not wait.
 
@@ -386,33 +365,32 @@ class Supervisor:
         return None
 
     async def _next_lease(self) -> Lease | None:
-        while True:
-            if self._queue and not self._draining.is_set():
+        while not self._draining.is_set():
+            if self._queue:
                 _, lease = self._queue.popitem(last=False)
                 self._hurry_at_the_end()
                 return lease
-            if self._draining.is_set():
-                return None
             self._work_arrived.clear()
             await self._work_arrived.wait()
+        return None
 
     def _hurry_at_the_end(self) -> None:
         if not self._queue:
             self._outbox.hurry()
 
-    async def _start_slot(self, index: int, lease: Lease) -> SlotLike | None:
+    async def _start_slot(self, index: int, lease: Lease) -> Slot | None:
         """A slot for the lease's tier. None when it does not start; the lease is then reported as failed."""
         slot = self._make_slot(index, lease.job.tier)
         try:
             await slot.start()
+            return slot
         except (EvopolicyError, OSError) as error:
             log.error("slot failed to start", slot=index, tier=lease.job.tier, error=str(error))
             await _close_slot(slot)
             self._put_result(lease, "failed", error=f"slot does not start: {error}")
             return None
-        return slot
 
-    async def _play(self, slot: SlotLike, lease: Lease) -> bool:
+    async def _play(self, slot: Slot, lease: Lease) -> bool:
         """Plays one leased job and puts its result into the outbox. Returns False when the slot must be replaced."""
         job = lease.job
         self._running[lease.lease_id] = slot
@@ -429,15 +407,12 @@ class Supervisor:
 
         healthy, playing = True, False
         try:
-            async with contextlib.AsyncExitStack() as stack:
-                folder = (
-                    await stack.enter_async_context(self._bundles.use(job.bundle)) if job.bundle else None
-                )
+            bundle = self._bundles.use(job.bundle) if job.bundle else contextlib.nullcontext()
+            async with bundle as folder:
                 self._capacity_freed.set()
                 job = await self._with_recordings(job)
-                if (
-                    lease.lease_id in self._cancelled
-                ):  # cancelled while its files were fetched, before the slot had anything to stop
+                # Cancelled while its files were fetched, before the slot had anything to stop.
+                if lease.lease_id in self._cancelled:
                     self._put_result(lease, "returned")
                     return healthy
                 playing = True
@@ -469,21 +444,20 @@ class Supervisor:
 
     async def _with_recordings(self, job: Job) -> Job:
         """The job with the recordings that it replays or resumes from downloaded inline."""
-        if job.begun is not None and job.begun.inline is None:
-            data = await self._ask.download(self._options.name, self._session, job.begun.digest)
-            job = msgspec.structs.replace(job, begun=msgspec.structs.replace(job.begun, inline=data))
-        if all(spec.replay is None or spec.replay.inline is not None for spec in job.episodes):
-            return job
-        specs = []
-        for spec in job.episodes:
-            ref = spec.replay
-            if ref is not None and ref.inline is None:
-                data = await self._ask.download(self._options.name, self._session, ref.digest)
-                spec = msgspec.structs.replace(spec, replay=msgspec.structs.replace(ref, inline=data))
-            specs.append(spec)
-        return msgspec.structs.replace(job, episodes=tuple(specs))
+        episodes = [
+            msgspec.structs.replace(spec, replay=await self._inline(spec.replay)) if spec.replay else spec
+            for spec in job.episodes
+        ]
+        begun = await self._inline(job.begun)
+        return msgspec.structs.replace(job, begun=begun, episodes=tuple(episodes))
 
-    async def _fetch_bundle(self, digest: str) -> bytes:
+    async def _inline(self, ref: BlobRef | None) -> BlobRef | None:
+        """The blob with its bytes, downloaded where it lacks them."""
+        if ref is None or ref.inline is not None:
+            return ref
+        return msgspec.structs.replace(ref, inline=await self._fetch(ref.digest))
+
+    async def _fetch(self, digest: str) -> bytes:
         return await self._ask.download(self._options.name, self._session, digest)
 
     # Reporting results.
@@ -505,7 +479,7 @@ class Supervisor:
                 attempt=lease.attempt,
                 kind=kind,
                 episodes=episodes,
-                error=error[:2000],
+                error=error[: REASON_CHARACTERS["result"]],
                 begun=BlobRef(digest=digest_of(data), size=len(data), inline=data) if data else None,
                 limit_verdict=begun is not None and begun.limit_verdict,
                 environment_fault=environment_fault,
@@ -518,7 +492,7 @@ class Supervisor:
 
     async def _stop_in_silence(self) -> None:
         while True:
-            await asyncio.sleep(SILENCE_LOOK_S)
+            await asyncio.sleep(SILENCE_CHECK_S)
             if self._heartbeat.silent_s <= self._lease_ttl_s:
                 continue
             for lease in (*self._queue.values(), *self._leased.values()):
@@ -564,14 +538,11 @@ def _held(lease: Lease, *, running: bool, episodes_done: int = 0, steps: int = 0
 
 
 def _log_failure(task: asyncio.Task[None]) -> None:
-    if (
-        not task.cancelled()
-        and (error := task.exception()) is not None
-        and not isinstance(error, TransportError)
-    ):
+    error = None if task.cancelled() else task.exception()
+    if error is not None and not isinstance(error, TransportError):
         log.error("cancelling a job failed", error=str(error))
 
 
-async def _close_slot(slot: SlotLike) -> None:
+async def _close_slot(slot: Slot) -> None:
     with contextlib.suppress(EvopolicyError, OSError):
         await slot.close()

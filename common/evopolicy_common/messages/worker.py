@@ -78,6 +78,11 @@ class Fingerprint(msgspec.Struct, frozen=True, kw_only=True):
         return {**self.versions(), "cpu": self.cpu}
 
 
+REASON_CHARACTERS = {"tier": 500, "environment": 2000, "environments": 60_000, "result": 2000}
+"""Most characters of a worker's reasons: why a tier does not work, why an environment failed, why all of these failed,
+and why a job did."""
+
+
 class Register(Message, frozen=True, kw_only=True, tag="register"):
     """A worker's first request; repeated whenever the coordinator does not know its session."""
 

@@ -27,11 +27,8 @@ MAX_FINGERPRINT_BYTES = 64 << 10
 """Every finished run's message has one."""
 MAX_ENVIRONMENTS = 10_000
 """Of one worker. The status for operators lists them."""
-MAX_FAILURES = 64 << 10
-"""Characters of the reasons why one worker's environments failed. The status lists them."""
 _MAX_WAIT_S = 60.0
 _MAX_NAME = 200
-_MAX_WHY = 1000
 
 
 def finite_wait(seconds: float) -> float:
@@ -127,17 +124,18 @@ def check_registration(message: worker.Register) -> None:
             Refusal.BAD_MESSAGE, f"{n:,} environments; {MAX_ENVIRONMENTS:,} with valid ids are the limit"
         )
     size = sum(map(len, failed.values()))
-    if size > MAX_FAILURES:
+    most = worker.REASON_CHARACTERS
+    if size > most["environments"]:
         raise RefusedError(
             Refusal.BAD_MESSAGE,
-            f"the reasons of failed environments have {size:,} characters; {MAX_FAILURES:,} are the limit",
+            f"the reasons of failed environments have {size:,} characters; {most['environments']:,} are the limit",
         )
     tiers = message.missing_tiers
-    if not tiers.keys() <= set(get_args(Tier)) or any(len(why) > _MAX_WHY for why in tiers.values()):
+    if not tiers.keys() <= set(get_args(Tier)) or any(len(why) > most["tier"] for why in tiers.values()):
         raise RefusedError(
             Refusal.BAD_MESSAGE,
             f"missing tiers {str(list(tiers))[:64]}: tiers are {', '.join(get_args(Tier))}, a reason has at most"
-            f" {_MAX_WHY} characters",
+            f" {most['tier']} characters",
         )
     check_place(message.boot_id, message.host, message.installation)
 
