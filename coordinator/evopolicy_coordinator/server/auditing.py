@@ -102,7 +102,7 @@ def outcome_difference(ours: EpisodeOutcome, theirs: EpisodeOutcome, blobs: Blob
 def _actions(recorded: Trajectory) -> bytes:
     """The recorded actions by themselves. Raises ProtocolError when they cannot be written again."""
     try:
-        return compare.recorded_actions(recorded)
+        return compare.action_log(recorded.actions)
     except Exception as error:
         raise ProtocolError(f"its actions: {type(error).__name__}: {error}") from error
 

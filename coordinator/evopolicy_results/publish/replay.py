@@ -261,7 +261,7 @@ async def _play(evaluations: Evaluations, files: Files, part: Chosen) -> tuple[i
         if data is None:
             continue
         try:
-            actions = compare.recorded_actions(recording_of(data))
+            actions = compare.action_log(recording_of(data).actions)
         except ProtocolError:
             continue
         refs.append(await evaluations.uploaded(actions))

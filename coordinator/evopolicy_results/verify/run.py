@@ -234,7 +234,7 @@ class Verifier:
             stored: bytes | None = None
             if outcome is not None and outcome.trajectory is not None:
                 stored = await self._evaluations.ask.fetch(outcome.trajectory)
-                actions = verify_compare.recorded_actions(decode(stored))
+                actions = verify_compare.action_log(decode(stored).actions)
             elif rows is not None:
                 try:
                     actions = verify_compare.action_log(verify_compare.actions_of(rows))

@@ -35,18 +35,14 @@ def pack(values: list[Any]) -> list[Any]:
     n = len(values)
     first = values[0]
     kind = type(first)
+    if any(type(value) is not kind for value in values):
+        return ["values", values]
     if kind is np.ndarray:
-        if all(
-            type(value) is np.ndarray and value.dtype == first.dtype and value.shape == first.shape
-            for value in values
-        ):
+        if all(value.dtype == first.dtype and value.shape == first.shape for value in values):
             _check_shape(first.shape)
             joined = b"".join([value.tobytes() for value in values])
             return ["array", n, first.dtype.str, list(first.shape), joined]
-        return ["values", values]
-    if any(type(value) is not kind for value in values):
-        return ["values", values]
-    if kind is int:
+    elif kind is int:
         if all(-(2**63) <= value < 2**63 for value in values):
             return ["scalar", "<i8", np.array(values, dtype="<i8").tobytes()]
     elif kind is float:
@@ -144,40 +140,28 @@ class Values(Column):
         return self._items
 
 
-class Dicts(Column):
-    """Rows that are dicts of the same keys, with one column per key."""
+class Parts(Column):
+    """Rows that are dicts of the same keys, or tuples of one length, whose keys are positions: a column for each
+    key."""
 
-    def __init__(self, parts: dict[str, Column], n: int) -> None:
+    def __init__(self, parts: dict[Any, Column], n: int, *, named: bool) -> None:
         self.parts = parts
+        self.named = named
         self._n = n
-        _require_equal(n, list(parts.values()))
+        if any(len(part) != n for part in parts.values()):
+            raise ValueError(f"columns of {n} rows have {[len(part) for part in parts.values()]}")
 
     def __len__(self) -> int:
         return self._n
 
     def row(self, t: int) -> Any:
-        return {key: part.row(t) for key, part in self.parts.items()}
+        return self._joined({key: part.row(t) for key, part in self.parts.items()})
 
     def values(self) -> Any:
-        return {key: part.values() for key, part in self.parts.items()}
+        return self._joined({key: part.values() for key, part in self.parts.items()})
 
-
-class Tuples(Column):
-    """Rows that are tuples of one length, with one column per position."""
-
-    def __init__(self, parts: list[Column], n: int) -> None:
-        self.parts = parts
-        self._n = n
-        _require_equal(n, parts)
-
-    def __len__(self) -> int:
-        return self._n
-
-    def row(self, t: int) -> Any:
-        return tuple(part.row(t) for part in self.parts)
-
-    def values(self) -> Any:
-        return tuple(part.values() for part in self.parts)
+    def _joined(self, found: dict[Any, Any]) -> Any:
+        return found if self.named else tuple(found.values())
 
 
 def leaves(values: Any, path: str = "") -> Iterator[tuple[str, Any]]:
@@ -190,11 +174,6 @@ def leaves(values: Any, path: str = "") -> Iterator[tuple[str, Any]]:
             yield from leaves(item, f"{path}/{index}" if path else str(index))
     else:
         yield path, values
-
-
-def _require_equal(n: int, parts: list[Column]) -> None:
-    if any(len(part) != n for part in parts):
-        raise ValueError(f"columns of {n} rows have {[len(part) for part in parts]}")
 
 
 def unpack(packed: list[Any], *, pictures: bool = False) -> Column:
@@ -217,9 +196,9 @@ def unpack(packed: list[Any], *, pictures: bool = False) -> Column:
         return Values([packed[1][index] for index in _array("<u4", packed[2])])
     if kind == "dict":
         _, n, keys, parts = packed
-        return Dicts(dict(zip(keys, map(unpack, parts), strict=True)), n)
+        return Parts(dict(zip(keys, map(unpack, parts), strict=True)), n, named=True)
     if kind == "tuple":
-        return Tuples([unpack(part) for part in packed[2]], packed[1])
+        return Parts(dict(enumerate(map(unpack, packed[2]))), packed[1], named=False)
     if kind == "values":
         return Values(packed[1])
     raise ValueError(f"unknown kind of column {kind!r}")
@@ -237,14 +216,10 @@ def join(columns: list[Column]) -> Column:
         for column in columns
     ):
         return Arrays(np.concatenate([column.values() for column in columns]), scalar=first.scalar)
-    n = sum(map(len, columns))
-    dicts = [column for column in columns if isinstance(column, Dicts)]
-    if len(dicts) == len(columns) and all(list(column.parts) == list(dicts[0].parts) for column in dicts):
-        return Dicts({key: join([column.parts[key] for column in dicts]) for key in dicts[0].parts}, n)
-    tuples = [column for column in columns if isinstance(column, Tuples)]
-    if len(tuples) == len(columns) and all(len(column.parts) == len(tuples[0].parts) for column in tuples):
-        width = len(tuples[0].parts)
-        return Tuples([join([column.parts[k] for column in tuples]) for k in range(width)], n)
+    compound = [column for column in columns if isinstance(column, Parts)]
+    if len(compound) == len(columns) and len({(each.named, *each.parts) for each in compound}) == 1:
+        joined = {key: join([column.parts[key] for column in compound]) for key in compound[0].parts}
+        return Parts(joined, sum(map(len, columns)), named=compound[0].named)
     return Values([item for column in columns for item in column.rows()])
 
 
@@ -276,12 +251,13 @@ def count_values(packed: bytes, most: int) -> int:
 
 _SIZES = [(0, 0)] * 256
 """By a value's first byte: the number of bytes after it, and the width of a length field that counts further ones."""
-for _head, _fixed in zip(range(0xCA, 0xD4), (4, 8, 1, 2, 4, 8, 1, 2, 4, 8), strict=True):
-    _SIZES[_head] = _fixed, 0
-for _head, _fixed in zip(range(0xD4, 0xD9), (2, 3, 5, 9, 17), strict=True):
-    _SIZES[_head] = _fixed, 0
-for _head, _fixed in zip(range(0xDC, 0xE0), (2, 4, 2, 4), strict=True):  # lists and maps: their items follow
-    _SIZES[_head] = _fixed, 0
+for _first, _widths in (
+    (0xCA, (4, 8, 1, 2, 4, 8, 1, 2, 4, 8)),
+    (0xD4, (2, 3, 5, 9, 17)),
+    (0xDC, (2, 4, 2, 4)),  # lists and maps: their items follow
+):
+    for _k, _fixed in enumerate(_widths):
+        _SIZES[_first + _k] = _fixed, 0
 for _first, _extra in ((0xC4, 0), (0xC7, 1), (0xD9, 0)):
     for _k, _counted in enumerate((1, 2, 4)):
         _SIZES[_first + _k] = _extra, _counted
@@ -353,11 +329,7 @@ def _portable(value: Any) -> Any:
     if isinstance(value, int) and not -(2**63) <= value < 2**63:
         return msgspec.msgpack.Ext(_EXT_INT, str(value).encode())
     if isinstance(value, dict):
-        return {_portable_key(key): _portable(item) for key, item in value.items()}
+        return {_portable(str(key)): _portable(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
         return [_portable(item) for item in value]
     return value
-
-
-def _portable_key(key: Any) -> Any:
-    return _portable(key) if isinstance(key, str) else str(key)

@@ -36,17 +36,13 @@ from evopolicy_common.regular_files import read_regular
 
 _NAMES = {"NaN": float("nan"), "Inf": float("inf"), "-Inf": float("-inf")}
 _MARKS = frozenset({"policy_failed"})
+_NUMBERS = ("t", "reward", "terminated", "truncated")
 _HEADER_BYTES = 1 << 16
 """More than the header of an array in a file takes."""
 
 
-def recorded_actions(recording: Trajectory) -> bytes:
-    """The actions of a recording without their results, for a replay of the episode."""
-    return action_log(recording.actions)
-
-
 def action_log(actions: Iterable[Any]) -> bytes:
-    """A trajectory's bytes with these actions and nothing else."""
+    """A trajectory's bytes with these actions and nothing else, for a replay of the episode."""
     recorder = Recorder("actions")
     for action in actions:
         kept = np.asarray(action) if isinstance(action, np.generic) else action
@@ -72,13 +68,10 @@ def first_difference(recorded: Trajectory, replayed: Trajectory) -> str | None:
     rendered = bool(recorded.files or replayed.files)
     full = whole and not rendered
     for t in range(min(recorded.n, replayed.n)):
-        for what, ours, theirs in (
-            ("reward", float(recorded.rewards[t]), float(replayed.rewards[t])),
-            ("terminated", bool(recorded.terminated[t]), bool(replayed.terminated[t])),
-            ("truncated", bool(recorded.truncated[t]), bool(replayed.truncated[t])),
-        ):
+        for name in ("rewards", "terminated", "truncated"):
+            ours, theirs = (getattr(each, name)[t].item() for each in (recorded, replayed))
             if not same(ours, theirs):
-                return f"step {t}: {what} {ours!r} and {theirs!r}"
+                return f"step {t}: {name.removesuffix('s')} {ours!r} and {theirs!r}"
         if full and not same(recorded.obs_at(t), replayed.obs_at(t)):
             return f"step {t}: the observations differ"
         if full and not same(*_comparable(recorded.infos[t], replayed.infos[t])):
@@ -186,22 +179,14 @@ def files_difference(
     if episode.files:
         return _written_difference(folder, rows, episode, actions=actions, pictures=pictures)
     for t, (written, row) in enumerate(zip(rows, episode.rows(), strict=False)):
-        pairs: list[tuple[str, Any]] = [
-            ("t", row.t),
-            ("reward", row.reward),
-            ("terminated", row.terminated),
-            ("truncated", row.truncated),
-        ]
-        if actions:
-            pairs.append(("action", row.action))
-        if written.get("obs") is not None:
-            pairs.append(("obs", row.obs))
-        for name, value in pairs:
+        names = [*_NUMBERS, *(("action",) if actions else ())]
+        for name in [*names, "obs"] if written.get("obs") is not None else names:
+            value = getattr(row, name)
             if not reads_as(written.get(name), value):
-                shown = (
+                numbers = (
                     f" {written.get(name)!r} and {value!r}" if isinstance(value, float | bool | int) else ""
                 )
-                return f"step {t}: {name} differs{shown}"
+                return f"step {t}: {name} differs{numbers}"
         if not reads_as(*_comparable(written.get("info") or {}, row.info)):
             return f"step {t}: info differs"
     if len(rows) != episode.n:
@@ -217,7 +202,7 @@ def _written_difference(
     if read_regular(folder / ROWS, MAX_ROWS_BYTES) != episode.files[ROWS]:
         for t, (written, line) in enumerate(zip(rows, lines, strict=False)):
             ours = json.loads(line)
-            for name in ("t", "reward", "terminated", "truncated", *(("action",) if actions else ()), "obs"):
+            for name in (*_NUMBERS, *(("action",) if actions else ()), "obs"):
                 if not same(written.get(name), ours[name]):
                     return f"step {t}: {name} differs"
             if not same(*_comparable(written.get("info") or {}, ours["info"])):
@@ -238,15 +223,11 @@ def _written_difference(
 
 
 def reads_as(text: Any, value: Any) -> bool:
-    """Whether the JSON value `told` is the spelling of `value` in feedback files."""
-    if isinstance(value, np.ndarray) and value.ndim:
-        return (
-            isinstance(text, list)
-            and len(text) == len(value)
-            and all(reads_as(item, part) for item, part in zip(text, value, strict=True))
-        )
-    if isinstance(value, np.ndarray):
+    """Whether the JSON value `text` is the spelling of `value` in feedback files."""
+    if isinstance(value, np.ndarray) and not value.ndim:
         value = value[()]
+    if isinstance(value, np.ndarray | list | tuple):
+        return isinstance(text, list) and len(text) == len(value) and all(map(reads_as, text, value))
     if isinstance(value, np.bool_):
         return text is bool(value)
     if isinstance(value, float | np.floating):
@@ -265,12 +246,6 @@ def reads_as(text: Any, value: Any) -> bool:
             isinstance(text, dict)
             and text.keys() == {str(key) for key in value}
             and all(reads_as(text[str(key)], item) for key, item in value.items())
-        )
-    if isinstance(value, list | tuple):
-        return (
-            isinstance(text, list)
-            and len(text) == len(value)
-            and all(reads_as(item, part) for item, part in zip(text, value, strict=True))
         )
     if isinstance(value, bytes):
         value = value.decode("utf-8", "backslashreplace")

@@ -47,6 +47,7 @@ _UNCOUNTED_BYTES = 4 << 20
 _LENGTH = struct.Struct("<I")
 TERMINATED, TRUNCATED = 1, 2
 """Bit flags of a row."""
+_FORM = (msgspec.DecodeError, ValueError, TypeError, LookupError, OverflowError, RecursionError)
 _QUICK_BYTES = 256 << 10
 """Larger blocks, in bytes, are compressed at level 1: they hold pictures, for which speed matters more."""
 
@@ -92,9 +93,8 @@ class Trajectory(msgspec.Struct, frozen=True, kw_only=True):
 
     def rows(self) -> Iterator[Row]:
         """The steps in order."""
-        arrays = isinstance(
-            self.actions, np.ndarray
-        )  # indexing such an array without axes per action yields scalars
+        # Indexing such an array without axes per action yields scalars.
+        arrays = isinstance(self.actions, np.ndarray)
         for t in range(self.n):
             yield Row(
                 t,
@@ -160,9 +160,8 @@ class Recorder:
         size = max(1, _size(obs))
         is_picture = isinstance(obs, np.ndarray) and size >= PICTURE_BYTES
         self._pictures = columns.Pictures(obs) if is_picture else None
-        self._block_rows = max(
-            1, min(BLOCK_ROWS, (PICTURES_BLOCK_BYTES if is_picture else BLOCK_BYTES) // size)
-        )
+        n_bytes = PICTURES_BLOCK_BYTES if is_picture else BLOCK_BYTES
+        self._block_rows = max(1, min(BLOCK_ROWS, n_bytes // size))
 
     def _clear(self) -> None:
         self._pictures = None
@@ -199,30 +198,15 @@ class Recorder:
         return packed
 
     def _pack_observations(self) -> list[Any]:
-        return (
-            self._pictures.packed()
-            if isinstance(self._pictures, columns.Pictures)
-            else columns.pack(self._obs)
-        )
+        pictures = self._pictures
+        return pictures.packed() if isinstance(pictures, columns.Pictures) else columns.pack(self._obs)
 
 
 def decode(data: bytes, max_bytes: int = MAX_BYTES) -> Trajectory:
     """The episode in `data`. Raises ProtocolError when it is not a trajectory, or larger than `max_bytes` unpacked."""
     try:
         return _decode(data, max_bytes)
-    except (
-        msgspec.DecodeError,
-        zstandard.ZstdError,
-        struct.error,
-        ValueError,
-        TypeError,
-        AttributeError,
-        KeyError,
-        IndexError,
-        OverflowError,
-        RecursionError,
-        MemoryError,
-    ) as error:
+    except (*_FORM, zstandard.ZstdError, struct.error, AttributeError, MemoryError) as error:
         raise ProtocolError(f"{len(data)} bytes are not a trajectory: {error}") from error
 
 
@@ -234,18 +218,17 @@ def _decode(data: bytes, max_bytes: int) -> Trajectory:
     full = header["record"] == "full"
     blocks = _blocks(frames, full, max_bytes)
     lists = header["observations"] == "lists"
-    observed = (
-        columns.join([block.obs for block in blocks if block.obs is not None]) if full and blocks else None
-    )
+    seen = [block.obs for block in blocks if block.obs is not None]
+    observed = columns.join(seen) if seen else None
     acted = columns.join([block.actions for block in blocks]) if blocks else columns.Values([])
     flags = np.frombuffer(b"".join(block.flags for block in blocks), dtype=np.uint8)
     rewards = np.frombuffer(b"".join(block.rewards for block in blocks), dtype="<f8").astype(np.float64)
     infos = [info for block in blocks for info in block.infos]
     n = len(rewards)
-    form = as_lists if lists else _same
 
     def obs_at(t: int) -> Any:
-        return None if observed is None else form(observed.row(t))
+        row = None if observed is None else observed.row(t)
+        return as_lists(row) if lists else row
 
     return Trajectory(
         n=n,
@@ -302,12 +285,8 @@ def _blocks(frames: Iterator[bytes], full: bool, max_bytes: int) -> list[_Block]
         infos = block["infos"]
         if isinstance(infos, int):
             infos = [{} for _ in range(n)] if infos == n else []
-        lengths = {
-            len(actions),
-            len(block["flags"]),
-            len(infos) if full else n,
-            n if obs is None else len(obs),
-        }
+        parts = (actions, block["flags"], *(() if obs is None else (obs, infos)))
+        lengths = {*map(len, parts)}
         if lengths != {n}:
             raise ValueError(f"columns of {n} rows have {sorted(lengths)}")
         blocks.append(_Block(obs, actions, block["rewards"], block["flags"], infos))
@@ -338,7 +317,3 @@ def _size(obs: Any) -> int:
     if isinstance(obs, tuple):
         return sum(map(_size, obs))
     return len(obs) if isinstance(obs, str) else 8
-
-
-def _same(value: Any) -> Any:
-    return value

@@ -10,10 +10,10 @@ import pytest
 
 from evopolicy_common.messages.environment import ObsStorage
 from evopolicy_common.records.episodes.compare import (
+    action_log,
     files_difference,
     first_difference,
     read_rows,
-    recorded_actions,
 )
 from evopolicy_common.records.episodes.rendered import OBSERVATIONS, ROWS, Renderer, decode
 from evopolicy_common.records.episodes.trajectory import Recorder, Trajectory
@@ -44,7 +44,7 @@ def test_a_rendered_episode_and_its_replay_are_the_same(kind: str) -> None:
     assert first_difference(recorded, replayed) is None
     assert first_difference(replayed, recorded) is None
     assert first_difference(recorded, recorded) is None
-    assert recorded_actions(recorded) == recorded_actions(replayed)
+    assert action_log(recorded.actions) == action_log(replayed.actions)
 
 
 @pytest.mark.parametrize("kind", KINDS)
