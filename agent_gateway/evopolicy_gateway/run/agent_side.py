@@ -140,7 +140,7 @@ class AgentSide:
 
     async def _on_progress(self, progress: Progress) -> None:
         stopwatch = self._run.stopwatch
-        stopwatch.gateway_reported(progress.in_flight_s, progress.feedback_s)
+        stopwatch.reported("gateway", in_flight_s=progress.in_flight_s, feedback_s=progress.feedback_s)
         self._run.watch.progress(self._run.plan.name, progress)
         before, held_s = stopwatch.times.held_s, stopwatch.held_reported(progress.held_s)
         if held_s > before:

@@ -48,18 +48,12 @@ class GatewayProcess:
     async def keep(self) -> None:
         """Runs the gateway until it has closed the run. Raises RunError when it cannot serve."""
         run, log = self._run, self._run.folder.harness_log
-        program = [
-            sys.executable,
-            "-P",
-            "-m",
-            "evopolicy_gateway.cli.serve",
-            str(run.folder.root),
-            "--controlled",
-        ]
+        module = "evopolicy_gateway.cli.serve"
+        program = [sys.executable, "-P", "-m", module, str(run.folder.root), "--controlled"]
         quick_deaths = 0
         while not self.closed.is_set():
             started = time.monotonic()
-            run.stopwatch.gateway_begins()
+            run.stopwatch.begins("gateway")
             self._child = await Child.start(program, log, talks=True)
             async for event in self._child.events():
                 await self._on_event(event)

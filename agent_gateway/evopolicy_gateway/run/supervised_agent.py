@@ -86,7 +86,7 @@ class SupervisedAgent:
     async def _keep_once(self, ready: Ready, relay: ModelRelay | None) -> AgentEnded | None:
         """Returns how the agent ended; None when its supervisor died."""
         run, plan = self._run, self._run.plan
-        run.stopwatch.agent_begins()
+        run.stopwatch.begins("agent")
         self._held_before = run.stopwatch.times.held_s
         program = [sys.executable, "-P", "-m", "evopolicy_gateway.agent_supervisor.supervisor"]
         self._child = await Child.start(program, run.folder.harness_log, talks=True)
@@ -102,9 +102,9 @@ class SupervisedAgent:
                         event = msgspec.structs.replace(event, tokens=None)  # the relay's count is the run's
                     run.watch.doing(plan.name, event)
                 case child_messages.AgentTime():
-                    run.stopwatch.agent_reported(event.used_s)
+                    run.stopwatch.reported("agent", agent_s=event.used_s)
                 case child_messages.AgentUsed() if plan.listener is None:
-                    run.stopwatch.agent_used(event.resources)
+                    run.stopwatch.reported("agent", resources=event.resources)
                 case child_messages.AgentSurvives():
                     self.survivors = list(event.pids)
                     self.tell_survivors()

@@ -5,9 +5,11 @@ The agent's wall limit and the phases in `run.json` cover the whole run, so inte
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any, Literal
 
 import msgspec
 
@@ -35,29 +37,38 @@ class Times(msgspec.Struct, frozen=True, kw_only=True):
     """The agent's use of its machine."""
 
 
+Process = Literal["agent", "gateway"]
+_COUNTED_BY: dict[Process, tuple[str, ...]] = {
+    "agent": ("agent_s", "resources"),
+    "gateway": ("in_flight_s", "feedback_s"),
+}
+"""Fields that processes count from zero."""
+
+
 class Stopwatch:
-    """Adds up the reports of a run's processes, each of which counts from zero."""
+    """Adds up the reports of a run's processes."""
 
     def __init__(self, path: Path, now: Callable[[], float] = time.monotonic) -> None:
         """`path`: file with the times of earlier commands; may be missing."""
         self._path = path
         self._now = now
-        self._base = _load(path)
-        self._agent_s = self._in_flight_s = self._feedback_s = 0.0
-        self._resources: AgentResources | None = None
+        self._base = Times()
+        with contextlib.suppress(OSError, *DECODE_ERRORS):
+            self._base = msgspec.json.decode(path.read_bytes(), type=Times)
+        self._reported = Times()
+        """The reports of the present processes."""
         self._opened: float | None = None
 
     @property
     def times(self) -> Times:
-        base = self._base
-        return Times(
-            agent_s=base.agent_s + self._agent_s,
+        base, more = self._base, self._reported
+        return msgspec.structs.replace(
+            base,
+            agent_s=base.agent_s + more.agent_s,
             open_s=base.open_s + (0.0 if self._opened is None else self._now() - self._opened),
-            in_flight_s=base.in_flight_s + self._in_flight_s,
-            feedback_s=base.feedback_s + self._feedback_s,
-            held_s=base.held_s,
-            permit_s=base.permit_s,
-            resources=self._resources.after(base.resources) if self._resources else base.resources,
+            in_flight_s=base.in_flight_s + more.in_flight_s,
+            feedback_s=base.feedback_s + more.feedback_s,
+            resources=more.resources.after(base.resources) if more.resources else base.resources,
         )
 
     def opened(self) -> None:
@@ -66,38 +77,21 @@ class Stopwatch:
 
     def closed(self) -> None:
         """The agent's side is closed from now on."""
-        self._base, self._opened = self.times, None
-        self._agent_s = self._in_flight_s = self._feedback_s = 0.0
-        self._resources = None
+        self._base, self._opened, self._reported = self.times, None, Times()
         self.keep()
 
-    def agent_begins(self) -> None:
-        """A new agent supervisor starts: its agent's clock counts from zero."""
-        now = self.times
-        self._base = msgspec.structs.replace(self._base, agent_s=now.agent_s, resources=now.resources)
-        self._agent_s, self._resources = 0.0, None
+    def begins(self, process: Process) -> None:
+        """A new process starts, which counts from zero."""
+        whole, none, fields = self.times, Times(), _COUNTED_BY[process]
+        self._base = msgspec.structs.replace(self._base, **{name: getattr(whole, name) for name in fields})
+        zero = {name: getattr(none, name) for name in fields}
+        self._reported = msgspec.structs.replace(self._reported, **zero)
 
-    def agent_reported(self, seconds: float) -> None:
-        """Sets the clock of the current agent, seconds."""
-        self._agent_s = seconds
-        self.keep()
-
-    def agent_used(self, resources: AgentResources) -> None:
-        """Sets what the current agent has used."""
-        self._resources = resources
-        self.keep()
-
-    def gateway_begins(self) -> None:
-        """A new gateway starts: its counts begin at zero."""
-        now = self.times
-        self._base = msgspec.structs.replace(
-            self._base, in_flight_s=now.in_flight_s, feedback_s=now.feedback_s
-        )
-        self._in_flight_s = self._feedback_s = 0.0
-
-    def gateway_reported(self, in_flight_s: float, feedback_s: float) -> None:
-        """Sets the counts of the current gateway, seconds."""
-        self._in_flight_s, self._feedback_s = in_flight_s, feedback_s
+    def reported(self, process: Process, **counts: Any) -> None:
+        """Sets counts of a present process; saves those of an agent."""
+        self._reported = msgspec.structs.replace(self._reported, **counts)
+        if process == "agent":
+            self.keep()
 
     def held_reported(self, seconds: float) -> float:
         """Sets the run's `held_s` as counted by the coordinator; returns the stored value, which never decreases."""
@@ -110,14 +104,5 @@ class Stopwatch:
 
     def keep(self) -> None:
         """Saves the times. Ignores a disk error, since other, more important writes report it."""
-        try:
+        with contextlib.suppress(StorageError, OSError):
             save(self._path, self.times)
-        except (StorageError, OSError):
-            return
-
-
-def _load(path: Path) -> Times:
-    try:
-        return msgspec.json.decode(path.read_bytes(), type=Times)
-    except (OSError, *DECODE_ERRORS):
-        return Times()

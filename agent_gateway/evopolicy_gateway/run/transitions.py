@@ -13,7 +13,6 @@ from evopolicy_common.regular_files import open_regular
 
 MAX_READ_BYTES = 8 << 30
 """Larger feedback is not counted: an agent without a jail may leave sparse files of any size."""
-_CHUNK_BYTES = 1 << 22
 _INVALID = b'"action_invalid":true'
 """As written by `json_text.rows_text`. Quotes within a text are escaped there, so no text contains these bytes."""
 
@@ -48,12 +47,9 @@ def count_transitions(feedback: Path) -> Transitions | None:
 
 def _count(path: Path) -> tuple[int, int]:
     steps = invalid = 0
-    # The file may have become a link or a pipe since it was found.
+    # The file may have become a link or a pipe since it was listed.
     with open_regular(path) as file:
-        rest = b""
-        while chunk := file.read(_CHUNK_BYTES):
-            lines = (rest + chunk).split(b"\n")
-            rest = lines.pop()
-            steps += len(lines)
-            invalid += sum(_INVALID in line for line in lines)
+        for line in file:
+            steps += line.endswith(b"\n")
+            invalid += _INVALID in line
     return steps, invalid

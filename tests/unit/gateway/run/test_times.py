@@ -13,25 +13,25 @@ def test_what_processes_tell_adds_up_over_their_deaths_and_over_commands(tmp_pat
     path = tmp_path / "times.json"
     first = Stopwatch(path, lambda: now[0])
     first.opened()
-    first.gateway_begins()
-    first.agent_begins()
-    first.gateway_reported(2.0, 0.5)
-    first.agent_reported(5.0)
+    first.begins("gateway")
+    first.begins("agent")
+    first.reported("gateway", in_flight_s=2.0, feedback_s=0.5)
+    first.reported("agent", agent_s=5.0)
     # The second agent supervisor and the second gateway tell more than the first did, and still do not take its place.
-    first.agent_begins()
-    first.agent_reported(6.0)
-    first.gateway_begins()
-    first.gateway_reported(3.0, 0.75)
+    first.begins("agent")
+    first.reported("agent", agent_s=6.0)
+    first.begins("gateway")
+    first.reported("gateway", in_flight_s=3.0, feedback_s=0.75)
     now[0] = 120.0
-    first.agent_reported(7.0)
+    first.reported("agent", agent_s=7.0)
     whole = Times(agent_s=12.0, open_s=20.0, in_flight_s=5.0, feedback_s=1.25)
     assert first.times == whole
     # This command is killed here; what it told last is on disk.
     second = Stopwatch(path, lambda: now[0])
     assert second.times == whole
     second.opened()
-    second.agent_begins()
-    second.agent_reported(1.0)
+    second.begins("agent")
+    second.reported("agent", agent_s=1.0)
     now[0] = 121.0
     second.closed()
     now[0] = 500.0
@@ -63,15 +63,18 @@ def test_what_killed_and_resumed_agents_used_is_added_up(tmp_path: Path) -> None
     first = Stopwatch(path)
     limits = AgentLimits(pids=9)
     for cpu_s, peak in ((1.0, 50), (2.0, 70)):
-        first.agent_begins()
-        first.agent_used(AgentResources(limits=limits, cpu_s=cpu_s / 2))
-        first.agent_used(
-            AgentResources(limits=limits, cpu_s=cpu_s, memory_peak_bytes=peak, disk_bytes=100 - peak)
+        first.begins("agent")
+        first.reported("agent", resources=AgentResources(limits=limits, cpu_s=cpu_s / 2))
+        first.reported(
+            "agent",
+            resources=AgentResources(
+                limits=limits, cpu_s=cpu_s, memory_peak_bytes=peak, disk_bytes=100 - peak
+            ),
         )
-    first.agent_reported(1.0)
+    first.reported("agent", agent_s=1.0)
     second = Stopwatch(path)  # the command is killed here
-    second.agent_begins()
-    second.agent_used(AgentResources(limits=limits, cpu_s=0.5, refused_forks=3))
+    second.begins("agent")
+    second.reported("agent", resources=AgentResources(limits=limits, cpu_s=0.5, refused_forks=3))
     second.closed()
     whole = AgentResources(limits=limits, cpu_s=3.5, memory_peak_bytes=70, disk_bytes=50, refused_forks=3)
     assert second.times.resources == Stopwatch(path).times.resources == whole

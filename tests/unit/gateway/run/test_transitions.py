@@ -5,8 +5,6 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-import pytest
-
 from evopolicy_common.records.json_text import rows_text
 from evopolicy_gateway.run import transitions
 from evopolicy_gateway.run.transitions import Transitions, count_transitions
@@ -24,13 +22,9 @@ def write(feedback: Path, submit: int, episode: int, *infos: dict[str, object]) 
     return folder
 
 
-def test_steps_and_repaired_ones_are_counted_over_all_submits(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_steps_and_repaired_ones_are_counted_over_all_submits(tmp_path: Path) -> None:
     write(tmp_path, 0, 0, {"steps": 1}, {"steps": 2, "action_invalid": True})
     write(tmp_path, 1, 1, {"action_invalid": True}, {"said": TEXT}, {"action_invalid": False})
-    assert count_transitions(tmp_path) == Transitions(steps=5, action_invalid=2)
-    monkeypatch.setattr(transitions, "_CHUNK_BYTES", 7)
     assert count_transitions(tmp_path) == Transitions(steps=5, action_invalid=2)
 
 
