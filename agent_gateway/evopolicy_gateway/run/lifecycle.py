@@ -48,7 +48,7 @@ from evopolicy_gateway.run.open_run import OpenRun
 from evopolicy_gateway.run.operations import Operations
 from evopolicy_gateway.run.plan import Plan
 from evopolicy_gateway.run.times import Stopwatch
-from evopolicy_gateway.run.watch import RunObserver
+from evopolicy_gateway.run.watch import View
 from evopolicy_gateway.run_folder.layout import save, saved
 from evopolicy_gateway.run_folder.listener import agent_place
 from evopolicy_gateway.run_folder.locks import alone
@@ -65,7 +65,7 @@ class RunLifecycle:
         plan: Plan,
         operations: Operations,
         gateway: Credentials,
-        watch: RunObserver,
+        watch: View,
         *,
         stays_open: bool = False,
         on_agent_gone: Callable[[], None] = lambda: None,

@@ -7,7 +7,7 @@ import msgspec
 from evopolicy_common.errors import EvopolicyError
 from evopolicy_gateway.run.plan import Plan
 from evopolicy_gateway.run.times import Stopwatch
-from evopolicy_gateway.run.watch import RunObserver
+from evopolicy_gateway.run.watch import View
 from evopolicy_gateway.run_folder.layout import RunFolder
 
 
@@ -22,7 +22,7 @@ class OpenRun(msgspec.Struct, frozen=True, kw_only=True):
     run: str
     """Its id at the cluster."""
     stopwatch: Stopwatch
-    watch: RunObserver
+    watch: View
 
     @property
     def folder(self) -> RunFolder:

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import contextlib
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
-from typing import Any, Generic, Protocol, Self, TypeVar
+from collections.abc import Iterator
+from typing import Any, Self
 
 from rich.console import RenderableType
 from rich.live import Live
@@ -18,6 +18,7 @@ from rich.text import Text
 
 from evopolicy_common.console import NarrowTable, Terminal
 from evopolicy_common.messages.operator import RunProgress
+from evopolicy_common.records.suite_folder import Entry
 from evopolicy_common.records.words import in_words
 from evopolicy_common.terminal import harmless
 from evopolicy_gateway.processes.child_messages import AgentDoing, Progress
@@ -31,28 +32,6 @@ PHASES = {
 }
 
 
-class RunObserver(Protocol):
-    """Receives the reports of runs; `run` is a run's short name."""
-
-    def held(self, run: str, what: str) -> None:
-        """The run may not start, or may not be closed, before `what`; empty: it may now."""
-
-    def note(self, run: str, text: str) -> None:
-        """Something worth a line."""
-
-    def progress(self, run: str, progress: Progress) -> None:
-        """The train side has progressed."""
-
-    def turn(self, run: str, turn: int, text: str) -> None:
-        """The agent has sent a message."""
-
-    def doing(self, run: str, doing: AgentDoing) -> None:
-        """The agent's activity changed, or it used more tokens."""
-
-    def phase(self, run: str, progress: RunProgress) -> None:
-        """The finalisation has progressed."""
-
-
 class Row:
     """The known state of one run."""
 
@@ -63,15 +42,15 @@ class Row:
         self.held = ""
         """The reason why it waits to start or to close; also in `waits_for`."""
         self.waits_for = ""
+        self.state = "waiting"
+        """In a sweep: a state of its index, or `on HOST`; so are the next two."""
+        self.tokens: dict[str, Any] | None = None
+        self.entry: Entry | None = None
 
 
-R = TypeVar("R", bound=Row)
+class View(ABC):
+    """Receives the reports of runs, by their short names, and shows a row for each."""
 
-
-class View(ABC, Generic[R]):
-    """A `RunObserver` with one row per run."""
-
-    new_row: Callable[[], R]
     no_news: tuple[str, ...] = ("",)
     """Reasons for waiting that produce no event."""
     above: tuple[str, ...]
@@ -79,7 +58,7 @@ class View(ABC, Generic[R]):
 
     def __init__(self, console: Terminal | None) -> None:
         """`console` None: prints nothing."""
-        self.rows: dict[str, R] = {}
+        self.rows: dict[str, Row] = {}
         self._console = console
         self._drawn = console is not None and console.is_terminal
         self._last: dict[str, object] = {}
@@ -87,16 +66,11 @@ class View(ABC, Generic[R]):
     @contextlib.contextmanager
     def shown(self) -> Iterator[Self]:
         """Shows the table inside the `with` if the console is a terminal."""
-        with contextlib.ExitStack() as stack:
-            if self._drawn:
-                stack.enter_context(
-                    Live(
-                        console=self._console,
-                        get_renderable=self.render,
-                        refresh_per_second=4,
-                        transient=True,
-                    )
-                )
+        shown: contextlib.AbstractContextManager[object] = contextlib.nullcontext()
+        if self._drawn:
+            render = self.render
+            shown = Live(console=self._console, get_renderable=render, refresh_per_second=4, transient=True)
+        with shown:
             yield self
 
     @abstractmethod
@@ -123,32 +97,32 @@ class View(ABC, Generic[R]):
     # Reports of a run.
 
     def note(self, run: str, text: str) -> None:
+        """Something worth a line."""
         self.row(run)
         self.event("note", run, text=text)
 
     def progress(self, run: str, progress: Progress) -> None:
+        """The train side has progressed."""
         self.row(run).progress = progress
-        if progress.last_submit_id is not None and self.is_new(run, "submit", progress.last_submit_id):
-            self.event(
-                "submit",
-                run,
-                submit=progress.last_submit_id,
-                status=progress.last_status,
-                mean=progress.last_mean,
-                best=progress.best_mean,
-                budget_left=progress.remaining_budget,
-            )
+        last = progress.last_submit_id
+        if last is not None and self.is_new(run, "submit", last):
+            means = {"mean": progress.last_mean, "best": progress.best_mean}
+            known = {"submit": last, "status": progress.last_status, **means}
+            self.event("submit", run, **known, budget_left=progress.remaining_budget)
         self.waits_for(run, progress.waits_for)
 
     def held(self, run: str, what: str) -> None:
+        """The run may not start, or may not be closed, before `what`; empty: it may now."""
         self.row(run).held = what
         self.waits_for(run, what, "held")
 
     def turn(self, run: str, turn: int, text: str) -> None:
+        """The agent has sent a message."""
         self.row(run).action = first_line(text)
         self.event("turn", run, turn=turn, text=first_line(text))
 
     def doing(self, run: str, doing: AgentDoing) -> None:
+        """The agent's activity changed, or it used more tokens."""
         row = self.row(run)
         row.action = first_line(doing.action) or row.action
         if doing.note:
@@ -158,6 +132,7 @@ class View(ABC, Generic[R]):
             self.event("paused", run, provider=doing.provider, seconds=seconds, why=why)
 
     def phase(self, run: str, progress: RunProgress) -> None:
+        """The finalisation has progressed."""
         self.row(run).phase = progress
         if self.is_new(run, "phase", progress.phase):
             self.event("phase", run, phase=progress.phase)
@@ -169,10 +144,8 @@ class View(ABC, Generic[R]):
         if what not in self.no_news and self.is_new(run, "waits", what):
             self.event(kind, run, what=what)
 
-    def row(self, run: str) -> R:
-        if run not in self.rows:
-            self.rows[run] = self.new_row()
-        return self.rows[run]
+    def row(self, run: str) -> Row:
+        return self.rows.setdefault(run, Row())
 
     def is_new(self, run: str, kind: str, value: object) -> bool:
         """Whether the last value of that kind for the run differs from `value`."""
@@ -187,10 +160,9 @@ class View(ABC, Generic[R]):
             self._console.print(text, soft_wrap=True)
 
 
-class RunView(View[Row]):
+class RunView(View):
     """The view of `evopolicy run` and `evopolicy local`."""
 
-    new_row = Row
     above = ("note", "held", "submit")
 
     def words(self, kind: str, run: str, details: dict[str, Any]) -> str:

@@ -20,7 +20,7 @@ from evopolicy_common.wire.credentials import Credentials
 from evopolicy_gateway.operator.cluster import Cluster, connected
 from evopolicy_gateway.run.operations import Operations
 from evopolicy_gateway.run.plan import Plan
-from evopolicy_gateway.run.watch import RunObserver, RunView
+from evopolicy_gateway.run.watch import RunView, View
 from evopolicy_gateway.suite.decisions import Decision
 from evopolicy_gateway.suite.ends import next_step
 from evopolicy_gateway.suite.suite_file import Parallel
@@ -52,7 +52,7 @@ class _Runs(Sweep):
         parallel: int,
         operations: Operations,
         gateway: Credentials,
-        watch: RunObserver,
+        watch: View,
     ) -> None:
         super().__init__(Parallel(machine=parallel), played.index, operations, gateway, watch)
         self._results = played

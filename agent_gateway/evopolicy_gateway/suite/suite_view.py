@@ -6,6 +6,7 @@ All three receive the same reports and store them by run.
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
@@ -28,35 +29,25 @@ _TITLES = ("run", *_WIDTHS)
 _ORDER = ("state", "budget", "best mean", "last action", "submits", "tokens")
 """Columns beside the name, the most important first."""
 _LEAST_NAME, _LEAST_STATE, _GAP = 16, 14, 2
+_CUT: dict[str, Any] = {"no_wrap": True, "overflow": "ellipsis"}
+_ENDED_OTHERWISE = {"error": "failed", "cancelled": "cancelled"}
 _STYLES = ("bold", "red", "dim", "dim", "")
 """Styles of rows by `_order`: running, failed, on another host, waiting, ended."""
-
-
-class SuiteRow(Row):
-    """The known state of one run of a sweep."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.state = "waiting"
-        self.attempt = 1
-        self.tokens: dict[str, Any] | None = None
-        self.entry: Entry | None = None
 
 
 def _ignore(_: str, __: AgentDoing) -> None:
     pass
 
 
-class SuiteView(View[SuiteRow]):
+class SuiteView(View):
     """The view of a sweep's runs: a table with the running ones and the last ended ones."""
 
-    new_row = SuiteRow
     no_news = ("", FREE_SLOT)
     above = ("finished", "note", "paused", "waits", "elsewhere")
 
     def __init__(self, names: list[str], parallel: int, console: Terminal | None = None) -> None:
         super().__init__(console)
-        self.rows = {name: SuiteRow() for name in names}
+        self.rows = {name: Row() for name in names}
         self.on_doing: Callable[[str, AgentDoing], None] = _ignore
         self._parallel = parallel
 
@@ -64,21 +55,20 @@ class SuiteView(View[SuiteRow]):
 
     def kept(self, name: str, entry: Entry | None) -> None:
         """The run is finished already."""
-        self.rows[name].state = "completed" if entry is None else entry.state
-        self.rows[name].entry = entry
-        self.rows[name].tokens = None if entry is None else entry.tokens
+        row = self.rows[name]
+        row.state, row.entry = "completed" if entry is None else entry.state, entry
+        row.tokens = None if entry is None else entry.tokens
 
     def started(self, name: str, attempt: int) -> None:
-        self.rows[name].state, self.rows[name].attempt = "running", attempt
+        self.rows[name].state = "running"
         self.event("started", name, attempt=attempt)
 
     def finished(self, name: str, entry: Entry) -> None:
         row = self.rows[name]
         row.state, row.entry, row.action = entry.state, entry, ""
         row.tokens = entry.tokens or row.tokens
-        self.event(
-            "finished", name, state=entry.state, score=entry.score, random=entry.random, error=entry.error
-        )
+        known = {"state": entry.state, "score": entry.score, "random": entry.random}
+        self.event("finished", name, **known, error=entry.error)
 
     def elsewhere(self, name: str, host: str) -> None:
         """Another host plays it."""
@@ -113,18 +103,13 @@ class SuiteView(View[SuiteRow]):
     def totals(self) -> str:
         """The sweep's progress in one line."""
         rows = self.rows.values()
-        done = [row for row in rows if row.state in FINISHED]
-        running = [row for row in rows if row.state == "running"]
-        failed = [row for row in rows if row.state == "error"]
-        parts = [f"{len(done)} of {len(self.rows)} runs done", f"{len(running)} running"]
-        if failed:
-            parts.append(f"{len(failed)} failed")
-        if cancelled := sum(row.state == "cancelled" for row in rows):
-            parts.append(f"{cancelled} cancelled")
+        count = Counter(row.state for row in rows)
+        parts = [f"{sum(count[state] for state in FINISHED)} of {len(self.rows)} runs done"]
+        parts.append(f"{count['running']} running")
+        parts += [f"{count[state]} {word}" for state, word in _ENDED_OTHERWISE.items() if count[state]]
         if tokens := sum(tokens_in(row.tokens) for row in rows):
             parts.append(f"{_short(tokens)} tokens")
-        cost = sum(float((row.tokens or {}).get("cost") or 0.0) for row in rows)
-        if cost:
+        if cost := sum(float((row.tokens or {}).get("cost") or 0.0) for row in rows):
             parts.append(f"${cost:.2f}")
         eta = self._eta()
         return ", ".join(parts) + ("" if eta is None else f", about {_duration(eta)} left")
@@ -132,12 +117,9 @@ class SuiteView(View[SuiteRow]):
     def _eta(self) -> float | None:
         """Estimated seconds left, from the durations of finished runs; None before the first."""
         rows = self.rows.values()
-        walls = [
-            row.entry.wall_s
-            for row in rows
-            if row.entry is not None and row.entry.state in FINISHED and row.entry.wall_s
-        ]
-        n_open = sum(row.state not in FINISHED and row.state not in ("error", "cancelled") for row in rows)
+        ended = [row.entry for row in rows if row.entry is not None and row.entry.state in FINISHED]
+        walls = [entry.wall_s for entry in ended if entry.wall_s]
+        n_open = sum(row.state not in (*FINISHED, *_ENDED_OTHERWISE) for row in rows)
         if not walls or not n_open:
             return None
         return sum(walls) / len(walls) * n_open / min(self._parallel, n_open)
@@ -167,20 +149,16 @@ class SuiteView(View[SuiteRow]):
         assert self._console is not None
         table = Table(box=None, pad_edge=False, padding=(0, _GAP, 0, 0))
         # The runs that ended last come first among the ended ones.
-        newest = sorted(self.rows, key=lambda name: _ended(self.rows[name]), reverse=True)
+        newest = sorted(
+            self.rows, key=lambda name: getattr(self.rows[name].entry, "finished_at", ""), reverse=True
+        )
         names = sorted(newest, key=lambda name: _order(self.rows[name]))
         longest = max((len(name) for name in names[:_SHOWN_ROWS]), default=0)
         columns = _columns(self._console.width, longest)
         for title, width in columns.items():
             # A run's name is never cut: `--only` takes it.
-            whole = title == "run"
-            table.add_column(
-                title,
-                no_wrap=not whole,
-                overflow="fold" if whole else "ellipsis",
-                justify="left",
-                width=width,
-            )
+            how: dict[str, Any] = {"overflow": "fold"} if title == "run" else _CUT
+            table.add_column(title, width=width, **how)
         for name in names[:_SHOWN_ROWS]:
             style = _STYLES[_order(self.rows[name])]
             cells = dict(zip(_TITLES, (name, *_cells(self.rows[name])), strict=True))
@@ -246,16 +224,12 @@ def _columns(width: int, longest: int) -> dict[str, int]:
     return {title: widths[title] for title in _TITLES if title in widths}
 
 
-def _order(row: SuiteRow) -> int:
+def _order(row: Row) -> int:
     kinds = {"running": 0, "error": 1, "cancelled": 1, "waiting": 3}
     return kinds.get(row.state, 2 if row.state.startswith("on ") else 4)
 
 
-def _ended(row: SuiteRow) -> str:
-    return "" if row.entry is None else row.entry.finished_at
-
-
-def _cells(row: SuiteRow) -> tuple[str, ...]:
+def _cells(row: Row) -> tuple[str, ...]:
     progress, tokens = row.progress, tokens_in(row.tokens)
     state = in_words(row.state)
     if row.state == "running" and row.phase is not None:
@@ -281,13 +255,9 @@ def _cells(row: SuiteRow) -> tuple[str, ...]:
 
 
 def _short(number: int) -> str:
-    return (
-        f"{number / 1e6:.2f}M"
-        if number >= 1_000_000
-        else f"{number / 1e3:.1f}k"
-        if number >= 1000
-        else str(number)
-    )
+    if number >= 1_000_000:
+        return f"{number / 1e6:.2f}M"
+    return f"{number / 1e3:.1f}k" if number >= 1000 else str(number)
 
 
 def _duration(seconds: float) -> str:

@@ -21,7 +21,7 @@ from evopolicy_gateway.run.lifecycle import RunLifecycle
 from evopolicy_gateway.run.operations import Operations
 from evopolicy_gateway.run.plan import Plan
 from evopolicy_gateway.run.record import why_failed
-from evopolicy_gateway.run.watch import RunObserver
+from evopolicy_gateway.run.watch import View
 from evopolicy_gateway.suite.decisions import Decision, side_by_side
 from evopolicy_gateway.suite.suite_file import Parallel
 from evopolicy_gateway.suite.suite_index import directory_of, waiting
@@ -43,7 +43,7 @@ class Sweep(ABC):
     """Whether cancelling this leaves its runs open, to be resumed."""
 
     def __init__(
-        self, limits: Parallel, index: Index, operations: Operations, gateway: Credentials, watch: RunObserver
+        self, limits: Parallel, index: Index, operations: Operations, gateway: Credentials, watch: View
     ) -> None:
         self._limits = limits
         self._index = index
