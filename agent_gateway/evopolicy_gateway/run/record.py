@@ -29,6 +29,7 @@ from evopolicy_common.messages.operator import RunFinished, SubmitRecord
 from evopolicy_common.processes.preflight import foreseen
 from evopolicy_common.processes.scratch import remove_tree
 from evopolicy_common.records import model_record
+from evopolicy_common.records import run_record as schema
 from evopolicy_common.records.aggregates import mean, std
 from evopolicy_common.records.blobs import BlobStore, write_atomically
 from evopolicy_common.records.code_metrics import TREND, CodeMetrics
@@ -37,25 +38,7 @@ from evopolicy_common.records.open_run import Accepted, AnyEntry, Rejected, Requ
 from evopolicy_common.records.policies import bundles, checkpoints
 from evopolicy_common.records.policies.bundles import Bundle
 from evopolicy_common.records.policies.checkpoints import CheckpointMeta
-from evopolicy_common.records.run_record import (
-    PUBLISHED_SETTINGS,
-    Agent,
-    Artifacts,
-    ExperimentDimensions,
-    ModelLimits,
-    ModelUse,
-    Outcome,
-    ReferenceScore,
-    RejectedStatus,
-    RejectedSubmit,
-    Replay,
-    RunRecord,
-    Timing,
-    Tokens,
-    Versions,
-    encode_run_record,
-    sha256_text,
-)
+from evopolicy_common.records.run_record import RunRecord, encode_run_record, sha256_text
 from evopolicy_common.records.secrets import without_keys
 from evopolicy_common.records.summary import utc_text
 from evopolicy_gateway.harnesses.coding_agents import session
@@ -134,29 +117,27 @@ async def write(
     for submit in finished.submits:
         code[submit.submit_index] = None
         with parts.part(f"checkpoint {submit_id(submit.submit_index, finished.episode_budget)}"):
-            bundle: Bundle | None
-            if submit.bundle is not None:
-                bundle = await _bundle(folder, submit.bundle, operations)
-            else:
-                bundle = await asyncio.to_thread(_own_bundle, folder, _kept(entries).get(submit.submit_index))
+            digest = submit.bundle or _kept(entries).get(submit.submit_index)
+            bundle = await asyncio.to_thread(_own_bundle, folder, digest)
+            if bundle is None and submit.bundle is not None:
+                bundle = bundles.load(await operations.download(submit.bundle), submit.bundle)
             if submit.submit_index == finished.best_submit_index:
                 selected = bundle
             code[submit.submit_index] = await asyncio.to_thread(
                 _write_checkpoint, folder, finished, submit, bundle, parts
             )
     if selected is not None:
-        files = checkpoints.without_metadata(selected.files)
         with parts.part("the selected policy in workspace/system"):
+            files = checkpoints.without_metadata(selected.files)
             await asyncio.to_thread(_put_in_place, folder.system, files)
     if error is not None and finished.status == "cancelled":
         finished = msgspec.structs.replace(finished, status="error", error=error)
-    recorded: tuple[Replay, ...] = ()
+    recorded: tuple[schema.Replay, ...] = ()
     with parts.part("the recordings of held-out episodes"):
         recorded = await replays.fetch(folder.root, finished, operations)
     rejected = [entry for entry in entries if isinstance(entry, Rejected)]
-    done = await asyncio.to_thread(
-        _write_record, folder, plan, finished, times, recorded, code, rejected, parts
-    )
+    made = (finished, times, recorded, code, rejected, parts)
+    done = await asyncio.to_thread(_write_record, folder, plan, *made)
     for text in parts.left_out:
         note(text)
     return done
@@ -168,9 +149,9 @@ def run_record(
     staged: Staged | None,
     rejected: Sequence[Rejected],
     times: Times,
-    recorded: tuple[Replay, ...] = (),
+    recorded: tuple[schema.Replay, ...] = (),
     code: Mapping[int, CodeMetrics | None] | None = None,
-    artifacts: Artifacts | None = None,
+    artifacts: schema.Artifacts | None = None,
     transitions: Transitions | None = None,
 ) -> RunRecord:
     """The record of a finished run; pure. `staged` None: the run ended before it had a workspace. `code`: by submit."""
@@ -191,7 +172,7 @@ def run_record(
         sandbox_tier=settings.sandbox_tier,
         jail=plan.jail.recorded,
         hidden_isolation=finished.hidden_isolation,
-        experiment_dimensions=ExperimentDimensions(
+        experiment_dimensions=schema.ExperimentDimensions(
             episode_budget=finished.episode_budget,
             min_episodes_per_submit=staged.min_episodes_per_submit if staged else 0,
             max_episodes_per_submit=staged.max_episodes_per_submit if staged else 0,
@@ -203,7 +184,7 @@ def run_record(
             agents_md=sha256_text(settings.agents_md) if settings.agents_md else "",
             **dimensions,
         ),
-        timing=Timing(
+        timing=schema.Timing(
             start_time=utc_text(finished.created_at),
             end_time=utc_text(finished.finished_at),
             wall_time_seconds=round(finished.finished_at - finished.created_at, 3),
@@ -217,16 +198,16 @@ def run_record(
         ),
         outcome=_outcome(finished, code or {}, transitions),
         rejected_submits=tuple(
-            RejectedSubmit(
-                status=cast(RejectedStatus, one.status),
+            schema.RejectedSubmit(
+                status=cast(schema.RejectedStatus, one.status),
                 message=one.message,
                 at=utc_text(one.at),
                 after_submits=one.after_submits,
             )
             for one in rejected
-            if one.status in get_args(RejectedStatus)
+            if one.status in get_args(schema.RejectedStatus)
         ),
-        artifacts=artifacts or Artifacts(),
+        artifacts=artifacts or schema.Artifacts(),
         replays=recorded,
         versions=_versions(finished, staged),
         audit=finished.audit,
@@ -240,7 +221,7 @@ def run_record(
 def told_at_close(folder: RunFolder, plan: Plan, facts: dict[str, Any], times: Times) -> dict[str, Any]:
     """The `GATEWAY_SIDE` of `run.json`, which the coordinator commits to when the run ends."""
     agent = msgspec.to_builtins(_agent(plan, _complete(folder, plan, facts), times))
-    settings = {name: value for name, value in agent["settings"].items() if name in PUBLISHED_SETTINGS}
+    settings = {name: value for name, value in agent["settings"].items() if name in schema.PUBLISHED_SETTINGS}
     told = {f"agent.{name}": value for name, value in agent.items()}
     told |= {"jail": plan.jail.recorded, "agent.settings": settings}
     if folder.staged.exists():
@@ -267,19 +248,19 @@ def _complete(folder: RunFolder, plan: Plan, facts: dict[str, Any]) -> dict[str,
     if (terms := harness.model) is None:
         if state.used:  # a remote agent's own count, by model
             known["model_string"] = max(state.used, key=lambda model: state.used[model].total)
-            known |= {"tokens": state.usage.recorded(None), "model_use": ModelUse(metering="agent")}
+            known |= {"tokens": state.usage.recorded(None), "model_use": schema.ModelUse(metering="agent")}
         return known
-    limits = ModelLimits(**msgspec.structs.asdict(terms.limits))
+    limits = schema.ModelLimits(**msgspec.structs.asdict(terms.limits))
     own = facts.get("tokens") or (state.usage.recorded(terms.prices) if state.usage.total else None)
     if not folder.model_requests.exists():
-        return known | {"tokens": own, "model_use": ModelUse(metering="agent", limits=limits)}
+        return known | {"tokens": own, "model_use": schema.ModelUse(metering="agent", limits=limits)}
     used = ledger.read(folder.model_requests, terms.model)
     answered = used.requests - used.failed
     known["model_string"] = known.get("model_string") or max(
         used.models, key=used.models.__getitem__, default=None
     )
     known["tokens"] = used.usage.recorded(terms.prices)
-    known["model_use"] = ModelUse(
+    known["model_use"] = schema.ModelUse(
         metering="relay",
         limits=limits,
         requests=used.requests,
@@ -292,14 +273,14 @@ def _complete(folder: RunFolder, plan: Plan, facts: dict[str, Any]) -> dict[str,
         rate_limit_s=round(used.wait_s, 3),
         record=plan.record_model,
         record_stopped=model_record.stopped(folder.root),
-        reported=None if own is None else msgspec.convert(own, Tokens),
+        reported=None if own is None else msgspec.convert(own, schema.Tokens),
     )
     return known
 
 
-def _agent(plan: Plan, facts: dict[str, Any], times: Times) -> Agent:
+def _agent(plan: Plan, facts: dict[str, Any], times: Times) -> schema.Agent:
     tokens = facts.get("tokens")
-    return Agent(
+    return schema.Agent(
         entry=plan.settings.entry,
         prompts=sha256_text(plan.settings.prompts) if plan.settings.prompts else "",
         inputs=plan.texts.inputs,
@@ -317,7 +298,7 @@ def _agent(plan: Plan, facts: dict[str, Any], times: Times) -> Agent:
         ),
         retries=int(facts.get("retries", 0)),
         turns=int(facts.get("turns", 0)),
-        tokens=None if tokens is None else msgspec.convert(tokens, Tokens),
+        tokens=None if tokens is None else msgspec.convert(tokens, schema.Tokens),
         model_use=facts.get("model_use"),
         resources=times.resources,
     )
@@ -325,15 +306,13 @@ def _agent(plan: Plan, facts: dict[str, Any], times: Times) -> Agent:
 
 def _outcome(
     finished: RunFinished, code: Mapping[int, CodeMetrics | None], transitions: Transitions | None
-) -> Outcome:
+) -> schema.Outcome:
     heldout, reference = finished.heldout_returns, finished.random_heldout_returns
     completed = finished.status == "completed"
     error = finished.error
     if finished.status == "cancelled" and error is None:
-        error = (
-            "cancelled by the operator, or because other runs waited for its agent (the coordinator's log:"
-            " run_cancelled)"
-        )
+        error = "cancelled by the operator, or because other runs waited for its agent"
+        error += " (the coordinator's log: run_cancelled)"
     best = finished.best_submit_index if completed else None
     auxiliary: dict[str, Any] = {
         "code_metrics_best": None if best is None else code.get(best),
@@ -347,7 +326,7 @@ def _outcome(
         "nondeterministic_results": finished.nondeterministic_results,
         **({} if transitions is None else {"transitions": msgspec.to_builtins(transitions)}),
     }
-    return Outcome(
+    return schema.Outcome(
         status=finished.status,
         error=error,
         # As published: a run without an ok submit has the score 0.0.
@@ -360,7 +339,7 @@ def _outcome(
         heldout_successes=finished.heldout_successes if completed else (),
         quarantined_submits=tuple(sorted(finished.validation_ineligible)),
         random_reference=(
-            ReferenceScore(
+            schema.ReferenceScore(
                 mean_return=mean(reference),
                 std_return=std(reference),
                 returns=reference,
@@ -375,11 +354,11 @@ def _outcome(
     )
 
 
-def _versions(finished: RunFinished, staged: Staged | None) -> Versions:
+def _versions(finished: RunFinished, staged: Staged | None) -> schema.Versions:
     fingerprint = finished.fingerprint
     hashes = {name: sha256_text(digest) for name, digest in finished.split_hashes.items()}
     cases: dict[Split, str] = {split: hashes.get(split, "") for split in ("train", "validation", "heldout")}
-    return Versions(
+    return schema.Versions(
         harness=f"evopolicy {version('evopolicy')}",
         env=finished.env_version,
         agents_md_hash=sha256_text(staged.agents_md_file_hash) if staged else "",
@@ -397,12 +376,6 @@ def _versions(finished: RunFinished, staged: Staged | None) -> Versions:
     )
 
 
-async def _bundle(folder: RunFolder, digest: str, operations: Operations) -> Bundle:
-    """Reads the bundle from the gateway's store, or else from the coordinator."""
-    own = await asyncio.to_thread(_own_bundle, folder, digest)
-    return own if own is not None else bundles.load(await operations.download(digest), digest)
-
-
 def _own_bundle(folder: RunFolder, digest: str | None) -> Bundle | None:
     """Reads the bundle from the gateway's store; None when it is missing there."""
     if digest is None or not folder.blobs.is_dir():
@@ -416,18 +389,15 @@ def _own_bundle(folder: RunFolder, digest: str | None) -> Bundle | None:
 def _journal(folder: RunFolder) -> list[AnyEntry]:
     if not folder.journal.exists():
         return []
-    journal = Journal(folder.journal)
-    journal.close()
-    return journal.entries
+    with contextlib.closing(Journal(folder.journal)) as journal:
+        return journal.entries
 
 
 def _kept(entries: Sequence[AnyEntry]) -> dict[int, str]:
     """Maps a submit's index to the digest of a `system/` without a policy, which the coordinator does not have."""
-    kept = {
-        entry.key: entry.kept for entry in entries if isinstance(entry, Requested) and entry.kept is not None
-    }
-    accepted = [entry for entry in entries if isinstance(entry, Accepted) and entry.key in kept]
-    return {entry.submit_index: kept[entry.key] for entry in accepted}
+    kept = {entry.key: entry.kept for entry in entries if isinstance(entry, Requested) and entry.kept}
+    accepted = [entry for entry in entries if isinstance(entry, Accepted)]
+    return {entry.submit_index: kept[entry.key] for entry in accepted if entry.key in kept}
 
 
 def _write_checkpoint(
@@ -456,37 +426,27 @@ def _write_checkpoint(
 
 def _env_log(finished: RunFinished) -> bytes:
     """JSON lines: the environment's version, the played episodes and their results."""
-    lines: list[dict[str, Any]] = [
-        {"event": "environment", "env": finished.settings.env, "version": finished.env_version}
+    settings, best = finished.settings, finished.best_submit_index
+    events: list[tuple[str, dict[str, Any]]] = [
+        ("environment", {"env": settings.env, "version": finished.env_version})
     ]
     for submit in finished.submits:
-        lines.append(
-            {
-                "event": "train",
-                "submit_index": submit.submit_index,
-                "started_at": utc_text(submit.started_at),
-                "completed_at": utc_text(submit.completed_at),
-                "env_instances": submit.env_instances,
-                "status": submit.status,
-                "mean_return": submit.mean_return,
-            }
-        )
+        times = {
+            "started_at": utc_text(submit.started_at),
+            "completed_at": utc_text(submit.completed_at),
+        }
+        played = {name: getattr(submit, name) for name in ("env_instances", "status", "mean_return")}
+        events.append(("train", {"submit_index": submit.submit_index, **times, **played}))
     for index, score in finished.val_scores.items():
-        lines.append({"event": "validation", "submit_index": index, "mean_return": score})
+        events.append(("validation", {"submit_index": index, "mean_return": score}))
     for index, why in finished.validation_ineligible.items():
-        lines.append({"event": "not_eligible", "submit_index": index, "reason": why})
+        events.append(("not_eligible", {"submit_index": index, "reason": why}))
     if finished.heldout_returns:
-        lines.append(
-            {
-                "event": "heldout",
-                "submit_index": finished.best_submit_index,
-                "returns": finished.heldout_returns,
-            }
-        )
+        events.append(("heldout", {"submit_index": best, "returns": finished.heldout_returns}))
     if finished.random_heldout_returns:
-        lines.append({"event": "random_reference", "returns": finished.random_heldout_returns})
-    lines.append({"event": "finished", "at": utc_text(finished.finished_at), "status": finished.status})
-    return b"".join(msgspec.json.encode(line) + b"\n" for line in lines)
+        events.append(("random_reference", {"returns": finished.random_heldout_returns}))
+    events.append(("finished", {"at": utc_text(finished.finished_at), "status": finished.status}))
+    return b"".join(msgspec.json.encode({"event": kind, **about}) + b"\n" for kind, about in events)
 
 
 def _put_in_place(system: Path, bundle: Bundle) -> None:
@@ -509,7 +469,7 @@ def _write_record(
     plan: Plan,
     finished: RunFinished,
     times: Times,
-    recorded: tuple[Replay, ...],
+    recorded: tuple[schema.Replay, ...],
     code: Mapping[int, CodeMetrics | None],
     rejected: Sequence[Rejected],
     parts: _Parts,

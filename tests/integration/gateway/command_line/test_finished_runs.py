@@ -36,7 +36,6 @@ FUNCTIONS = sorted(
 )
 """Every function that the module calls, its own and others': each is a step that may fail."""
 SPARED = (
-    "_bundle",
     "_env_log",
     "_journal",
     "_own_bundle",
