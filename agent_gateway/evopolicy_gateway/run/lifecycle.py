@@ -146,7 +146,12 @@ class RunLifecycle:
         # Checking starts programs that try the jail, which another run's search would take for orphans.
         async with child_process.starting():
             plan.check_held()
-        wanted = self._wanted
+        replays = plan.replays
+        wanted = IntendedRun(
+            key=uuid.uuid4().hex,
+            settings=plan.settings,
+            replay_key="" if replays is None else replays.key,
+        )
         if folder.root.exists() or folder.asked.exists():
             wanted = await self._ask(wanted)
         await self._operations.drop(folder)
@@ -159,20 +164,10 @@ class RunLifecycle:
             await asyncio.to_thread(starts.stage, starts.find(plan.start_from, plan.started_in), folder)
         save(folder.intended, wanted)
         folder.asked.unlink(missing_ok=True)
-        if (replays := plan.replays) is not None:
+        if replays is not None:
             save(folder.service, Address(host=LOOPBACK, port=replays.port, token=replays.token))
         if plan.listener is not None:
             save(folder.listener, plan.listener)
-
-    @property
-    def _wanted(self) -> IntendedRun:
-        """A new request for the run."""
-        replays = self._plan.replays
-        return IntendedRun(
-            key=uuid.uuid4().hex,
-            settings=self._plan.settings,
-            replay_key="" if replays is None else replays.key,
-        )
 
     async def _ask(self, wanted: IntendedRun) -> IntendedRun:
         """Opens the run and returns the request for it while the folder has its earlier run, which a refusal keeps.
@@ -206,10 +201,8 @@ class RunLifecycle:
     async def _open(self) -> None:
         folder = self._folder
         if resumed := folder.opened_run.exists():
-            self.run, token = (
-                saved(folder.opened_run, OpenedRun).run,
-                credentials.read(folder.credentials).token,
-            )
+            self.run = saved(folder.opened_run, OpenedRun).run
+            token = credentials.read(folder.credentials).token
         else:
             created = await self._operations.create(saved(folder.intended, IntendedRun))
             self.run, token = created.run, created.capability
@@ -247,9 +240,8 @@ class RunLifecycle:
     async def _result(self) -> RunFinished:
         async for progress in self._operations.wait(self.run):
             self._watch.phase(self._plan.name, progress)
-            if progress.finished is not None:
-                return progress.finished
-        raise AssertionError("waiting ends with the finished run")
+        assert progress.finished is not None
+        return progress.finished
 
     async def _write(self, why: str | None = None) -> None:
         assert self._finished is not None
@@ -258,8 +250,8 @@ class RunLifecycle:
             how = f"as root: chown -R {os.getuid()} {root}; chmod -R a-s,o-w {root}"
             kept = "files and folders that the agent left belong to other users and keep their modes"
             self._note(f"{refused} {kept}; {how}")
-        given = (self._folder, self._plan, self._finished, self._operations, times, self._note, why)
-        self._record = await record.write(*given)
+        known = (self._folder, self._plan, self._finished, self._operations)
+        self._record = await record.write(*known, times, self._note, why)
 
     async def _leave(self, error: BaseException) -> None:
         """Prints how the open run can be continued, or gives it up."""

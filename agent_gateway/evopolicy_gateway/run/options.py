@@ -1,4 +1,4 @@
-"""The options of a run, and how their values become settings. A wrong value is a ConfigError."""
+"""How texts of options are read. A wrong one is a ConfigError."""
 
 from __future__ import annotations
 
@@ -6,113 +6,15 @@ import contextlib
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import msgspec
 
 from evopolicy_common import catalogue
 from evopolicy_common.errors import ConfigError, ProtocolError, RequestError
 from evopolicy_common.messages.episode import LARGEST_LIMIT, LARGEST_LIMITS, ResourceLimits
-from evopolicy_common.messages.run_settings import HIDDEN_COUNTS, PUBLISHED, RunSettings, episode_counts
 from evopolicy_common.processes.packages import checked_names, packages_in, policy_versions
 from evopolicy_common.records.run_files import read_record
-from evopolicy_common.records.run_record import AgentLimits
 from evopolicy_gateway.submits.submit_request import Bounds, ids_in
-
-AGENT_LIMITS: dict[str, tuple[str, float, float]] = {
-    "cpus": ("cpus", 0.1, 1e4),
-    "memory": ("memory_bytes", 1e8, 1e15),
-    "pids": ("pids", 16, 1 << 22),
-    "disk": ("disk_bytes", 1e6, 1e18),
-}
-"""Options `--agent-NAME`: the field of `AgentLimits`, the least value with which programs still start, the
-greatest."""
-OWN = {
-    "policy_scope": "episode",
-    "observations": "arrays",
-    "simulation": "forbidden",
-    "finish": "early",
-    "step_limit": "published",
-    "hidden_cases": "shared",
-    "feedback": "pictures",
-    "failed_episodes": "play-on",
-    "hidden_evaluation": "submit",
-}
-"""Defaults of settings that neither an option nor a profile gives."""
-
-
-def settings_of(profile: str | None, **given: str | None) -> dict[str, str]:
-    """The settings that a profile decides, and the profile. `given`: by name of `RunSettings`, None if not given.
-
-    ConfigError for a profile that has another value than a given one.
-    """
-    chosen = profile or "own"
-    usual = OWN if chosen == "own" else PUBLISHED
-    for name, value in given.items():
-        if chosen != "own" and value not in (None, usual[name]):
-            raise ConfigError(
-                f"profile {chosen} has {name} = {usual[name]}, but {value} was given: drop one of them"
-            )
-    return usual | {name: value for name, value in given.items() if value is not None} | {"profile": chosen}
-
-
-def run_settings(given: Any, **named: Any) -> RunSettings:
-    """The settings of one run. `given`: `RunOptions`. Raises ConfigError that names the invalid option."""
-    names = (
-        "policy_scope",
-        "observations",
-        "simulation",
-        "finish",
-        "step_limit",
-        "feedback",
-        "failed_episodes",
-    )
-    chosen: dict[str, Any] = settings_of(
-        given.profile,
-        hidden_cases=given.hidden_cases and given.hidden_cases.replace("-", "_"),
-        **{name: getattr(given, name) for name in names},
-    )
-    if chosen["feedback"] != "pictures" and given.video != "off":
-        raise ConfigError(
-            f"feedback {chosen['feedback']} shows no videos, and video {given.video} is asked for: leave out one of"
-            " them"
-        )
-    counts = {"n_validation": given.validation, "n_heldout": given.heldout}
-    for (name, n), fixed in zip(counts.items(), HIDDEN_COUNTS.get(chosen["profile"], ()), strict=False):
-        if n not in (None, fixed):
-            raise ConfigError(
-                f"profile {chosen['profile']} has {name} = {fixed}, but {n} was given: drop one of them"
-            )
-        counts[name] = fixed
-    settings = RunSettings(
-        budget=given.budget,
-        min_episodes_per_submit=given.min_episodes,
-        max_episodes_per_submit=given.max_episodes,
-        **counts,
-        sandbox_tier=given.tier,
-        video=given.video,
-        replays=given.replays,
-        limits=given.limits,
-        definition=catalogue.pinned(named["env"]),
-        **chosen,
-        **named,
-    )
-    episode_counts(settings, catalogue.suite_of(settings.env))
-    return settings
-
-
-def agent_limits(given: Any) -> AgentLimits:
-    """Limits of the agent's use of its machine; `given` as for `run_settings`. Raises ConfigError that names
-    the option."""
-    chosen: dict[str, Any] = {}
-    for name, (field, least, most) in AGENT_LIMITS.items():
-        value = getattr(given, f"agent_{name}")
-        if value is None:
-            continue
-        if not least <= value <= most:
-            raise ConfigError(f"--agent-{name} {value:g}: give a number from {least:g} to {most:g}")
-        chosen[field] = value if name == "cpus" else int(value)
-    return AgentLimits(**chosen)
 
 
 def default_exp_id() -> str:

@@ -9,30 +9,46 @@ from typing import Annotated, Any, ClassVar, Literal
 import msgspec
 from msgspec import Meta
 
+from evopolicy_common import catalogue
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.environment import FailedEpisodes, ObservationForm, PolicyScope, StepLimit
 from evopolicy_common.messages.episode import ResourceLimits, Tier
-from evopolicy_common.messages.gateway import (
-    FeedbackDetail,
-    FinishRule,
-    Profile,
-    SimulationRule,
-    VideoOption,
-)
-from evopolicy_common.messages.run_settings import RunSettings
+from evopolicy_common.messages.gateway import FeedbackDetail, FinishRule, Profile, SimulationRule, VideoOption
+from evopolicy_common.messages.run_settings import HIDDEN_COUNTS, PUBLISHED, RunSettings, episode_counts
 from evopolicy_common.records.model_record import Level
+from evopolicy_common.records.run_record import AgentLimits
 from evopolicy_gateway import harnesses
 from evopolicy_gateway.declared import Count, Option, Several
 from evopolicy_gateway.harnesses.interface.agent_config import AgentConfig
 from evopolicy_gateway.processes.clock import SILENCE_S
-from evopolicy_gateway.run import prices, starts, texts
-from evopolicy_gateway.run.options import agent_limits, default_exp_id, limits_of, run_settings
+from evopolicy_gateway.run import starts, texts
+from evopolicy_gateway.run.options import default_exp_id, limits_of
 from evopolicy_gateway.run.plan import WALL_S, Plan
 from evopolicy_gateway.run.texts import Texts
 from evopolicy_gateway.run_folder.listener import Listener, agent_host_of, listener_of
 
 Seconds = Annotated[float, Meta(ge=1.0)]
 OF_ONE_RUN = Option(suite=None)
+AGENT_LIMITS: dict[str, tuple[str, float, float]] = {
+    "cpus": ("cpus", 0.1, 1e4),
+    "memory": ("memory_bytes", 1e8, 1e15),
+    "pids": ("pids", 16, 1 << 22),
+    "disk": ("disk_bytes", 1e6, 1e18),
+}
+"""Options `--agent-NAME`: the field of `AgentLimits`, the least value with which programs still start, the
+greatest."""
+OWN: dict[str, str] = {
+    "policy_scope": "episode",
+    "observations": "arrays",
+    "simulation": "forbidden",
+    "finish": "early",
+    "step_limit": "published",
+    "hidden_cases": "shared",
+    "feedback": "pictures",
+    "failed_episodes": "play-on",
+    "hidden_evaluation": "submit",
+}
+"""Defaults of settings that neither an option nor a profile gives."""
 
 
 class RunPart(msgspec.Struct, frozen=True, kw_only=True):
@@ -152,10 +168,59 @@ class RunOptions(PolicyPart, frozen=True, kw_only=True):
         self, env: str, exp_id: str, agent_host: str = "", texts: Texts | None = None, **notes: str
     ) -> RunSettings:
         """The settings of one run, `agent_host` as it has it. ConfigError naming the option that is wrong."""
+        profile = self.profile or "own"
+        given = {name: getattr(self, name, None) for name in OWN}
+        given |= {"n_validation": self.validation, "n_heldout": self.heldout}
+        given["hidden_cases"] = self.hidden_cases and self.hidden_cases.replace("-", "_")
+        usual: dict[str, Any] = dict(OWN)
+        if profile != "own":
+            usual = PUBLISHED | dict(zip(("n_validation", "n_heldout"), HIDDEN_COUNTS[profile], strict=True))
+            for name, value in given.items():
+                if value not in (None, usual[name]):
+                    raise ConfigError(
+                        f"profile {profile} has {name} = {usual[name]}, but {value} was given: drop one of them"
+                    )
+        chosen = usual | {name: value for name, value in given.items() if value is not None}
+        if chosen["feedback"] != "pictures" and self.video != "off":
+            raise ConfigError(
+                f"feedback {chosen['feedback']} shows no videos, and video {self.video} is asked for: leave out one of"
+                " them"
+            )
         entry = self.entry or harnesses.entry_name(self.agent)
-        named = {"env": env, "entry": entry, "model": self.model or entry, "exp_id": exp_id, "notes": notes}
-        named |= (texts or Texts()).digests
-        return run_settings(self, repeat=self.repeat, agent_host=agent_host, **named)
+        settings = RunSettings(
+            env=env,
+            entry=entry,
+            model=self.model or entry,
+            exp_id=exp_id,
+            repeat=self.repeat,
+            notes=notes,
+            profile=profile,
+            budget=self.budget,
+            min_episodes_per_submit=self.min_episodes,
+            max_episodes_per_submit=self.max_episodes,
+            sandbox_tier=self.tier,
+            video=self.video,
+            replays=self.replays,
+            limits=self.limits,
+            definition=catalogue.pinned(env),
+            agent_host=agent_host,
+            **chosen,
+            **(texts or Texts()).digests,
+        )
+        episode_counts(settings, catalogue.suite_of(env))
+        return settings
+
+    def _agent_limits(self) -> AgentLimits:
+        """Limits of the agent's use of its machine. ConfigError naming the option that is wrong."""
+        chosen: dict[str, Any] = {}
+        for name, (field, least, most) in AGENT_LIMITS.items():
+            value = getattr(self, f"agent_{name}")
+            if value is None:
+                continue
+            if not least <= value <= most:
+                raise ConfigError(f"--agent-{name} {value:g}: give a number from {least:g} to {most:g}")
+            chosen[field] = value if name == "cpus" else int(value)
+        return AgentLimits(**chosen)
 
     def plan(
         self, settings: RunSettings, started_in: Path, config: AgentConfig | None = None, **more: Any
@@ -170,8 +235,8 @@ class RunOptions(PolicyPart, frozen=True, kw_only=True):
         return Plan(
             settings=settings,
             config=config,
-            prices=prices.read(self.prices, known, started_in),
-            limits=agent_limits(self),
+            prices=texts.read_prices(self.prices, known, started_in),
+            limits=self._agent_limits(),
             agent=self.agent,
             runs=self.runs,
             started_in=started_in,

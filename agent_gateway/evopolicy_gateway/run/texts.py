@@ -1,5 +1,4 @@
-"""An operator's texts for an agent in place of the standard ones, and its skills and MCP servers, read before a run is
-opened.
+"""An operator's files for a run: texts in place of the standard ones, skills and MCP servers, prices.
 
 The digests are settings of the run, which its commitment covers; the texts and files themselves stay with the gateway.
 """
@@ -11,10 +10,13 @@ from pathlib import Path
 
 import msgspec
 
+from evopolicy_common.errors import ConfigError
 from evopolicy_common.records.run_record import AgentInput, inputs_digest
+from evopolicy_common.regular_files import read_given
 from evopolicy_gateway import shipped
 from evopolicy_gateway.harnesses.interface.agent_config import AgentConfig
 from evopolicy_gateway.inputs import declared as inputs
+from evopolicy_gateway.relay.usage import Prices
 from evopolicy_gateway.workspace.agents_md import check_agents_md
 from evopolicy_gateway.workspace.prompts import Prompts, read_prompts, read_text
 
@@ -51,3 +53,25 @@ def read(
         chosen = (config.prompts if config is not None else None) or Prompts()
     declared = () if config is None else inputs.read(config.skills, config.mcp, started_in)
     return Texts(agents_md=text, prompts=chosen, inputs=tuple(each.recorded for each in declared))
+
+
+def read_prices(file: str | Path | None, config: AgentConfig | None, started_in: Path) -> Prices | None:
+    """The prices of an agent's model from a file with a table for each model; None without a file, or for an agent
+    without a model. Raises ConfigError that names the file and the fault."""
+    if file is None or config is None:
+        return None
+    path = shipped.found(file, started_in)
+    try:
+        tables = msgspec.toml.decode(read_given(path, f"--prices {path}"), type=dict[str, Prices])
+    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"--prices {path}: {error}") from error
+    if config.model is None:
+        raise ConfigError(
+            f"--prices {path}: the agent's model is not named; write it as in codex:gpt-5.5, or in its file"
+        )
+    if config.model not in tables:
+        raise ConfigError(
+            f'--prices {path} has no prices for {config.model}: add a table ["{config.model}"] with input and'
+            " output, in US dollars per million tokens"
+        )
+    return tables[config.model]

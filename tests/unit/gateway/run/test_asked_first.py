@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import uuid
 from pathlib import Path
 from typing import Any
 
@@ -36,22 +37,15 @@ class Operations:
 def ask(folder: Path, operations: Operations, budget: int = 8) -> str:
     """The key of the run that a command opens before it is killed."""
     settings = RunSettings(env="toy/line", entry="a", model="a", exp_id="t", budget=budget)
-    plan = Plan(
-        name="toy/line",
-        settings=settings,
-        agent="random",
-        runs=folder,
-        started_in=folder,
-        wall_limit_s=60.0,
-        overwrite=True,
-    )
+    where: dict[str, Any] = {"runs": folder, "started_in": folder, "overwrite": True}
+    plan = Plan(name="toy/line", settings=settings, agent="random", wall_limit_s=60.0, **where)
     plan.folder.root.mkdir(parents=True, exist_ok=True)
     (plan.folder.run_json).write_text("earlier")
 
     async def main() -> str:
         nothing: Any = object()
         lifecycle = RunLifecycle(plan, operations, nothing, nothing)  # type: ignore[arg-type]
-        return (await lifecycle._ask(lifecycle._wanted)).key
+        return (await lifecycle._ask(IntendedRun(key=uuid.uuid4().hex, settings=settings))).key
 
     key = asyncio.run(main())
     assert plan.folder.run_json.read_text() == "earlier"

@@ -11,7 +11,7 @@ from evopolicy import _cluster
 from evopolicy_common.errors import ConfigError
 from evopolicy_gateway.harnesses.interface.agent_config import AgentConfig
 from evopolicy_gateway.relay.usage import Prices
-from evopolicy_gateway.run import prices
+from evopolicy_gateway.run.texts import read_prices
 
 FILE = '["m-1"]\ninput = 1.0\noutput = 10.0\n'
 AGENT = 'harness = "codex"\nmodel = "m-1"\nmax_cost = 2.0\n'
@@ -20,8 +20,8 @@ AGENT = 'harness = "codex"\nmodel = "m-1"\nmax_cost = 2.0\n'
 def test_the_prices_of_the_agents_model_are_read(tmp_path: Path) -> None:
     (tmp_path / "prices.toml").write_text(FILE)
     config = AgentConfig(harness="codex", model="m-1")
-    assert prices.read("prices.toml", config, tmp_path) == Prices(input=1.0, output=10.0)
-    assert prices.read("prices.toml", None, tmp_path) is prices.read(None, config, tmp_path) is None
+    assert read_prices("prices.toml", config, tmp_path) == Prices(input=1.0, output=10.0)
+    assert read_prices("prices.toml", None, tmp_path) is read_prices(None, config, tmp_path) is None
 
 
 @pytest.mark.parametrize(
@@ -40,7 +40,7 @@ def test_a_wrong_file_of_prices_is_named_with_its_fault(
 ) -> None:
     (tmp_path / "prices.toml").write_text(text)
     with pytest.raises(ConfigError, match=told):
-        prices.read("prices.toml", AgentConfig(harness="codex", model=model), tmp_path)
+        read_prices("prices.toml", AgentConfig(harness="codex", model=model), tmp_path)
 
 
 def test_max_cost_needs_prices_which_an_option_gives(tmp_path: Path) -> None:
