@@ -13,6 +13,8 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import hmac
+import html
+from http.server import BaseHTTPRequestHandler
 from typing import Any
 
 import orjson
@@ -26,7 +28,6 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from evopolicy_common.errors import RequestError
 from evopolicy_common.logs import structlog
 from evopolicy_common.messages.gateway import CANCELLED
-from evopolicy_gateway.http import published
 from evopolicy_gateway.http.info import info_document, progress_document
 from evopolicy_gateway.http.task import task_markdown
 from evopolicy_gateway.submits.pipeline import SubmitPipeline
@@ -112,27 +113,33 @@ def make_app(pipeline: SubmitPipeline, token: str, bearer: str = "") -> ASGIApp:
     if machine.run.profile == "own":
         return _TokenGate(app, token, bearer)
     app.add_exception_handler(HTTPException, _published_http_error)
-    return _TokenGate(_PublishedMethods(app), token, bearer)
+    return _TokenGate(_published_methods(app), token, bearer)
 
 
 async def _published_http_error(request: Request, error: Exception) -> Response:
-    code, status, message = published.ODD_URLS.get((request.method, request.url.path), published.UNKNOWN_URL)
+    if (request.method, request.url.path) == ("POST", "/finalize"):
+        code, status, message = 405, "method_not_allowed", "a run is finalized by itself"
+    else:
+        code, status, message = 404, "not_found", "unknown endpoint"
     return _json(code, {"status": status, "error": {"message": message}})
 
 
-class _PublishedMethods:
-    """Answers methods that the published service does not have."""
+def _published_methods(app: ASGIApp) -> ASGIApp:
+    """Answers other methods than the published service's as Python's `http.server` does, whatever the URL."""
 
-    def __init__(self, app: ASGIApp) -> None:
-        self._app = app
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["method"] in published.METHODS:
-            await self._app(scope, receive, send)
+    async def answer(scope: Scope, receive: Receive, send: Send) -> None:
+        method = scope["method"]
+        if method in ("GET", "POST"):
+            await app(scope, receive, send)
             return
-        page, content_type = published.unsupported(scope["method"])
-        answer = Response(page, 501, headers={"Content-Type": content_type, "Connection": "close"})
-        await answer(scope, receive, send)
+        message = html.escape(f"Unsupported method ({method!r})", quote=False)
+        explain = "Server does not support this operation"
+        page = BaseHTTPRequestHandler.error_message_format
+        page %= {"code": 501, "message": message, "explain": explain}
+        headers = {"Content-Type": BaseHTTPRequestHandler.error_content_type, "Connection": "close"}
+        await Response("" if method == "HEAD" else page, 501, headers=headers)(scope, receive, send)
+
+    return answer
 
 
 def _of_ticket(ticket: Ticket, pipeline: SubmitPipeline) -> Response:
@@ -142,21 +149,17 @@ def _of_ticket(ticket: Ticket, pipeline: SubmitPipeline) -> Response:
     summary = pipeline.summary(ticket)
     if summary is None:
         return _json(202, progress_document(ticket))
-    if ticket.request.rejected is not None:
-        head = orjson.dumps({"submit_id": ticket.index, "status": ticket.status})
-        return Response(head[:-1] + b',"summary":' + summary + b"}", 400, media_type="application/json")
-    head = orjson.dumps(
-        {
-            "submit_id": ticket.index,
-            "status": ticket.status,
+    head: dict[str, Any] = {"submit_id": ticket.index, "status": ticket.status}
+    if ticket.request.rejected is None:
+        head |= {
             "is_finalized": pipeline.machine.finalizes(ticket),
             "feedback": f"feedback/{ticket.submit_id}",
             "policy_failures": ticket.policy_failures,
             "warning": ticket.warning,
         }
-    )
-    body = head[:-1] + b',"summary":' + summary + b"}"
-    return Response(body, media_type="application/json")
+    body = orjson.dumps(head)[:-1] + b',"summary":' + summary + b"}"
+    code = 200 if ticket.request.rejected is None else 400
+    return Response(body, code, media_type="application/json")
 
 
 async def _read_body(request: Request) -> bytes:
@@ -176,18 +179,13 @@ async def _read_body(request: Request) -> bytes:
     return bytes(body)
 
 
-def _json(status: int, document: dict[str, Any]) -> Response:
-    return Response(orjson.dumps(document), status_code=status, media_type="application/json")
+def _json(status: int, document: dict[str, Any], headers: dict[str, str] | None = None) -> Response:
+    return Response(orjson.dumps(document), status, headers, "application/json")
 
 
-_STRANGER = Response(
-    orjson.dumps({"error": {"message": "this service needs a bearer token"}}),
-    status_code=401,
-    media_type="application/json",
-    headers={"WWW-Authenticate": "Bearer"},
+_STRANGER = _json(
+    401, {"error": {"message": "this service needs a bearer token"}}, {"WWW-Authenticate": "Bearer"}
 )
-
-
 _STOPS = "the gateway stops; accepted submits continue: send the request again, with the same Idempotency-Key"
 _STOPPING = _json(503, {"status": "closed", "error": {"message": _STOPS}})
 
@@ -287,13 +285,8 @@ class _Exchange:
             await self._send(message)
             return
         await self._send({**message, "more_body": True})
-        try:
+        with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(self._linger_s):
-                await self._discard()
-        except TimeoutError:
-            pass
+                while self._unread and self._left > 0:
+                    self._left -= len((await self.receive()).get("body", b""))
         await self._send({"type": "http.response.body", "body": b"", "more_body": False})
-
-    async def _discard(self) -> None:
-        while self._unread and self._left > 0:
-            self._left -= len((await self.receive()).get("body", b""))

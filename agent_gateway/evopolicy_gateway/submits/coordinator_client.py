@@ -15,25 +15,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
+import msgspec
+
 from evopolicy_common.errors import ConfigError, RefusedError, TransportError
 from evopolicy_common.logs import structlog
+from evopolicy_common.messages import gateway as messages
 from evopolicy_common.messages.episode import BlobRef
-from evopolicy_common.messages.gateway import (
-    CloseRun,
-    GatewayReply,
-    OpenRun,
-    Permit,
-    RequestPermit,
-    ResultsPage,
-    ResultsRequest,
-    RunClosed,
-    RunOpened,
-    RunState,
-    StateReply,
-    StateRequest,
-    Submit,
-    SubmitAccepted,
-)
 from evopolicy_common.messages.worker import Message
 from evopolicy_common.records.open_run import Requested
 from evopolicy_common.refusals import NOT_NOW
@@ -55,12 +42,9 @@ LARGE_BYTES = 16 << 20
 """A larger recording is kept in a file."""
 
 NOT_NOW_PAUSE_S = 0.5
+_AS_REQUESTED = ("key", "env_instances", "bundle", "bundle_error", "tree")
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
-
-
-def _permit_lost(waits_for: str) -> None:
-    log.warning("the agent's permit has ended; asking for another", waits_for=waits_for)
 
 
 Wanted = TypeVar("Wanted")
@@ -72,16 +56,15 @@ class CoordinatorClient:
     def __init__(self, link: Link, run: str, scratch: Path | None = None) -> None:
         """`scratch`: folder of temporary files; None: the system's."""
         self._scratch = scratch
-        self._run = run
-        self._token = link.credentials.token
-        self._requests: Requester[GatewayReply] = Requester(
+        self._known: dict[str, Any] = {"run": run, "token": link.credentials.token}
+        self._requests: Requester[messages.GatewayReply] = Requester(
             link, partial(keys.gateway_key, link.credentials.cluster, run), codec.gateway_replies
         )
 
-    async def open(self) -> RunOpened:
+    async def open(self) -> messages.RunOpened:
         """Opens the run; returns everything that is fixed for it, and its state."""
-        message = OpenRun(run=self._run, token=self._token, asks_permit=True, reads_rendered=True)
-        return await self._ask("open", message, RunOpened)
+        message = messages.OpenRun(**self._known, asks_permit=True, reads_rendered=True)
+        return await self._ask("open", message, messages.RunOpened)
 
     async def permit(self, place: AgentPlace, on_wait: Callable[[str], None]) -> bool:
         """Returns True once the run's agent may be alive at `place`; calls `on_wait` with the reason while it waits.
@@ -90,15 +73,10 @@ class CoordinatorClient:
         """
         wait_s = FIRST_PERMIT_WAIT_S
         while True:
-            message = RequestPermit(
-                run=self._run,
-                token=self._token,
-                boot_id=place.boot_id,
-                host=place.host,
-                wait_s=wait_s,
-            )
+            known = self._known | msgspec.structs.asdict(place)
+            message = messages.RequestPermit(**known, wait_s=wait_s)
             try:
-                permit = await self._ask("permit", message, Permit, wait_s=wait_s)
+                permit = await self._ask("permit", message, messages.Permit, wait_s=wait_s)
             except RefusedError as error:
                 if error.status != "bad_message":
                     raise
@@ -113,63 +91,59 @@ class CoordinatorClient:
 
     async def keep_permit(self, place: AgentPlace) -> None:
         """Renews the permit until cancelled, or until the coordinator accepts no more for this run."""
+
+        def lost(waits_for: str) -> None:
+            log.warning("the agent's permit has ended; asking for another", waits_for=waits_for)
+
         with contextlib.suppress(RefusedError):
             while True:
                 await asyncio.sleep(RENEWAL_S)
-                await self.permit(place, _permit_lost)
+                await self.permit(place, lost)
 
-    async def state(self) -> RunState | None:
+    async def state(self) -> messages.RunState | None:
         """Returns the run's current state; None when the coordinator does not answer within a second."""
-        question = StateRequest(run=self._run, token=self._token)
+        question = messages.StateRequest(**self._known)
         try:
             async with asyncio.timeout(STATE_TIMEOUT_S):
-                return (await self._requests.once("state", question, StateReply)).state
+                return (await self._requests.once("state", question, messages.StateReply)).state
         except (TransportError, TimeoutError):
             return None
 
     async def upload(self, digest: str, data: bytes) -> None:
         """Uploads a bundle to the coordinator."""
-        await self._requests.upload(self._run, self._token, digest, data)
+        await self._requests.upload(*self._known.values(), digest, data)
 
-    async def submit(self, request: Requested) -> SubmitAccepted:
+    async def submit(self, request: Requested) -> messages.SubmitAccepted:
         """Requests an evaluation. The same request gets the same answer however often it is sent."""
-        message = Submit(
-            run=self._run,
-            token=self._token,
-            key=request.key,
-            env_instances=request.env_instances,
-            bundle=request.bundle,
-            bundle_error=request.bundle_error,
-            tree=request.tree,
+        message = messages.Submit(
+            **self._known,
+            **{name: getattr(request, name) for name in _AS_REQUESTED},
             rejected=None if request.rejected is None else request.rejected.status,
         )
-        return await self._ask("submit", message, SubmitAccepted)
+        return await self._ask("submit", message, messages.SubmitAccepted)
 
-    async def results(self, submit_index: int, cursor: int, wait_s: float = RESULTS_WAIT_S) -> ResultsPage:
+    async def results(
+        self, submit_index: int, cursor: int, wait_s: float = RESULTS_WAIT_S
+    ) -> messages.ResultsPage:
         """Returns the submit's results since `cursor`, within `wait_s` seconds; the page may be empty."""
-        question = ResultsRequest(
-            run=self._run,
-            token=self._token,
-            submit_index=submit_index,
-            cursor=cursor,
-            wait_s=wait_s,
-        )
-        return await self._ask("results", question, ResultsPage, wait_s=wait_s)
+        asked = {"submit_index": submit_index, "cursor": cursor, "wait_s": wait_s}
+        question = messages.ResultsRequest(**self._known, **asked)
+        return await self._ask("results", question, messages.ResultsPage, wait_s=wait_s)
 
     async def fetch(self, ref: BlobRef) -> bytes:
         """Returns the bytes that `ref` names, verified. Large ones are in an unnamed temporary file, not in
         memory."""
         if ref.inline is not None or ref.size <= LARGE_BYTES:
-            return await self._requests.fetch(self._run, self._token, ref)
+            return await self._requests.fetch(*self._known.values(), ref)
         with tempfile.TemporaryFile(dir=self._scratch) as file:
-            await self._requests.download_to(file, self._run, self._token, ref.digest, ref.size)
+            await self._requests.download_to(file, *self._known.values(), ref.digest, ref.size)
             file.flush()
             return cast(bytes, memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)))
 
     async def close(self, reason: str, agent: dict[str, Any]) -> None:
         """Closes the run to further submits. Call it only when the agent and all its children are gone."""
-        message = CloseRun(run=self._run, token=self._token, reason=reason, agent=agent)
-        await self._ask("close", message, RunClosed)
+        message = messages.CloseRun(**self._known, reason=reason, agent=agent)
+        await self._ask("close", message, messages.RunClosed)
 
     async def _ask(self, verb: str, message: Message, wanted: type[Wanted], *, wait_s: float = 0.0) -> Wanted:
         last_message = ""

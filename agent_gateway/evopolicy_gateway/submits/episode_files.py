@@ -6,16 +6,13 @@ errors), since a policy could write its observations there.
 
 from __future__ import annotations
 
-import json
-
 import msgspec
 
 from evopolicy_common.errors import ProtocolError
 from evopolicy_common.messages.environment import ObsStorage
-from evopolicy_common.messages.episode import ResourceLimits
+from evopolicy_common.messages.episode import PolicyFailure, ResourceLimits
 from evopolicy_common.messages.gateway import EpisodeFeedback, FeedbackDetail
 from evopolicy_common.records.episodes import rendered, trajectory
-from evopolicy_common.records.summary import SCHEMA_VERSION, utc_text
 from evopolicy_gateway.submits.formatting import cut_text, failure_line
 from evopolicy_gateway.submits.stacked import as_published
 
@@ -109,17 +106,12 @@ def set_aside_files(episode: EpisodeFeedback, why: str, *, at: float, texts: boo
     `texts`: whether these include the policy's own texts (`shows_texts`).
     """
     files = _text_files(episode, at, whole=texts)
-    line = {
-        "schema_version": SCHEMA_VERSION,
-        "timestamp": utc_text(at),
-        "category": FEEDBACK_ERROR,
-        "message": f"{why}; the episode's return counts",
-        "traceback": "",
-        "step_index": None,
-    }
-    files["error.txt"] = (
-        files.get("error.txt", b"") + json.dumps(line, separators=(",", ":")).encode() + b"\n"
+    failure = PolicyFailure(
+        category=FEEDBACK_ERROR,  # type: ignore[arg-type]  # not the policy's
+        message=f"{why}; the episode's return counts",
+        step_index=None,
     )
+    files["error.txt"] = files.get("error.txt", b"") + failure_line(failure, at, with_step=True)
     return files
 
 

@@ -21,6 +21,12 @@ MAX_TEXT_BYTES = 64 << 10
 """Maximum size of each of stdout.txt, stderr.txt, error.txt and errors.txt."""
 
 
+_VERDICTS = {
+    "rollout_timeout": "the submit's wall-time limit was reached before all episodes were played",
+    "quarantined": "the policy brought its slot down three times; it is not played again",
+    "cancelled": "the operator cancelled the run before all episodes were played; nothing is charged",
+}
+"""Messages of submits that are not ok without a failure of the policy, by status."""
 _MAX_WARNED = 300
 """Characters of a policy's own message in a warning."""
 
@@ -80,22 +86,19 @@ def verdict_line(
     The failure's own category precedes the message when the two differ. `message`: of a rejected request. `traceback`:
     False writes null for it, as published.
     """
+    own, details = message, ""
     if failure is None:
-        message = message or {
-            "rollout_timeout": "the submit's wall-time limit was reached before all episodes were played",
-            "quarantined": "the policy brought its slot down three times; it is not played again",
-            "cancelled": "the operator cancelled the run before all episodes were played; nothing is charged",
-        }.get(status, f"the submit ended with {status}")
-        failure_fields: dict[str, Any] = {"message": message, "traceback": ""}
+        own = own or _VERDICTS.get(status, f"the submit ended with {status}")
     else:
         same = failure.category == status or failure.category in NO_POLICY
-        message = failure.message if same else f"{failure.category}: {failure.message}"
-        failure_fields = {"message": message, "traceback": failure.traceback}
-    if not traceback:
-        failure_fields["traceback"] = None
-    return _fitting(
-        {"schema_version": SCHEMA_VERSION, "timestamp": utc_text(at), "category": status} | failure_fields
-    )
+        own = failure.message if same else f"{failure.category}: {failure.message}"
+        details = failure.traceback
+    line: dict[str, Any] = {
+        "schema_version": SCHEMA_VERSION,
+        "timestamp": utc_text(at),
+        "category": status,
+    }
+    return _fitting(line | {"message": own, "traceback": details if traceback else None})
 
 
 def summary_bytes(
@@ -171,9 +174,7 @@ def _summary(
         reward_components_per_episode=components if with_components else None,
         successes=solved if played and None not in solved and solved else None,
         policy_failures=len(_where(ordered, None)) if played else None,
-        warning=_warning(ordered, observations, ends=played and not ok, messages=messages)
-        if played
-        else None,
+        warning=_warning(ordered, observations, ends=not ok, messages=messages) if played else None,
     )
 
 

@@ -91,9 +91,8 @@ def check(asked: Asked, bounds: Bounds) -> tuple[int, ...]:
     if asked.largest >= bounds.n_env_instances:
         text = f"train id {asked.largest} is outside 0 to {bounds.n_env_instances - 1}"
         raise OddRequestError(NO_CASE, text, asked.ids)
-    least, most = max(1, bounds.min_episodes), min(bounds.max_episodes, bounds.remaining_budget)
-    if not least <= asked.n <= most:
-        text = f"{asked.n} episodes asked for; this submit may have {least} to {most}"
+    if not bounds.least <= asked.n <= bounds.most:
+        text = f"{asked.n} episodes asked for; this submit may have {bounds.least} to {bounds.most}"
         raise OddRequestError(WRONG_NUMBER, text, asked.ids)
     return asked.ids
 

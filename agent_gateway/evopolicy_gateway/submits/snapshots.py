@@ -74,7 +74,6 @@ def record_tree(
 def _fault_of_source(files: dict[str, bytes]) -> PolicyFailure | None:
     """The verdict of the published software on sources that it does not run: `import_error` for a Python file that
     cannot be parsed, `missing_policy` for a `policy.py` without a class statement `Policy` at its top level."""
-    category: FailureCategory = "import_error"
     remaining = MAX_PARSED_BYTES
     for path in sorted(path for path in files if path.endswith(".py")):
         remaining -= len(files[path])
@@ -82,18 +81,17 @@ def _fault_of_source(files: dict[str, bytes]) -> PolicyFailure | None:
             break
         tree = parse(files[path])
         if tree is None:
-            message = f"system/{path} cannot be parsed as Python"
-        elif path == POLICY_FILE and not any(
-            isinstance(node, ast.ClassDef) and node.name == "Policy" for node in tree.body
-        ):
-            category, message = (
-                "missing_policy",
-                "system/policy.py has no class statement Policy at its top level",
+            return _failure("import_error", f"system/{path} cannot be parsed as Python")
+        classes = {node.name for node in tree.body if isinstance(node, ast.ClassDef)}
+        if path == POLICY_FILE and "Policy" not in classes:
+            return _failure(
+                "missing_policy", "system/policy.py has no class statement Policy at its top level"
             )
-        else:
-            continue
-        return PolicyFailure(category=category, step_index=None, message=message)
     return None
+
+
+def _failure(category: FailureCategory, message: str) -> PolicyFailure:
+    return PolicyFailure(category=category, step_index=None, message=message[:4000])
 
 
 def _failed(system: Path, message: str) -> Snapshot:
@@ -101,7 +99,4 @@ def _failed(system: Path, message: str) -> Snapshot:
         there = stat.S_ISREG((system / POLICY_FILE).lstat().st_mode) and not system.is_symlink()
     except OSError:
         there = False
-    category: FailureCategory = "import_error" if there else "missing_policy"
-    return Snapshot(
-        digest=None, error=PolicyFailure(category=category, step_index=None, message=message[:4000])
-    )
+    return Snapshot(digest=None, error=_failure("import_error" if there else "missing_policy", message))

@@ -16,12 +16,7 @@ import msgspec
 import numpy as np
 
 from evopolicy_common.records.episodes.npz import read_arrays
-from evopolicy_common.records.episodes.rendered import (
-    MAX_OBSERVATIONS_BYTES,
-    OBSERVATIONS,
-    ROWS,
-    SINGLE,
-)
+from evopolicy_common.records.episodes.rendered import MAX_OBSERVATIONS_BYTES, OBSERVATIONS, ROWS, SINGLE
 
 MOST_INLINE_BYTES = 4096
 STACKED = "observations.npy"
@@ -34,11 +29,10 @@ def as_published(files: dict[str, bytes]) -> dict[str, bytes]:
     """An episode's files with its observations where the published software has them. ValueError for a damaged file."""
     rows = [_rows.decode(line) for line in files[ROWS].splitlines()]
     beside = files.get(OBSERVATIONS)
-    columns = (
-        _columns([msgspec.json.decode(row["obs"]) for row in rows])
-        if beside is None
-        else read_arrays(beside, MAX_OBSERVATIONS_BYTES)
-    )
+    if beside is None:
+        columns = _columns([msgspec.json.decode(row["obs"]) for row in rows])
+    else:
+        columns = read_arrays(beside, MAX_OBSERVATIONS_BYTES)
     if not rows or not columns:
         return files
     columns = {name: _small(column) for name, column in columns.items()}

@@ -13,7 +13,7 @@ produces more ids than a submit may hold.
 from __future__ import annotations
 
 import re
-from typing import Any, NoReturn
+from typing import NoReturn
 
 import msgspec
 import orjson
@@ -37,12 +37,30 @@ class Bounds(msgspec.Struct, frozen=True, kw_only=True):
     max_episodes: int
     remaining_budget: int
 
+    @property
+    def least(self) -> int:
+        """Number of episodes that the next submit must have."""
+        return max(1, self.min_episodes)
+
+    @property
+    def most(self) -> int:
+        """Greatest number that it may have."""
+        return min(self.max_episodes, self.remaining_budget)
+
 
 def parse(body: bytes, bounds: Bounds) -> tuple[int, ...]:
     """Returns the requested train ids in order. Raises RequestError with one of the two statuses and the remedy."""
     if len(body) > MAX_BODY_BYTES:
         refuse_size(len(body))
-    wanted = _field(body)
+    try:
+        document = orjson.loads(body)
+    except orjson.JSONDecodeError as error:
+        _budget(f"the body is not JSON ({error}); send {_FORM}")
+    if not isinstance(document, dict):
+        _budget(f"the body is {_kind(document)}; send an object: {_FORM}")
+    if _FIELD not in document:
+        _budget(f"the body has no {_FIELD!r}; send {_FORM}")
+    wanted = document[_FIELD]
     if isinstance(wanted, list):
         if len(wanted) > bounds.max_episodes:
             _refuse_count(len(wanted), bounds)
@@ -59,18 +77,6 @@ def refuse_size(n_bytes: int | None) -> NoReturn:
     """Raises RequestError for a body that is too long; `n_bytes` None when its length is unknown."""
     size = f"{n_bytes:,} bytes" if n_bytes is not None else "longer"
     _budget(f"the request's body is {size}; at most {MAX_BODY_BYTES:,} bytes are read. Send {_FORM}")
-
-
-def _field(body: bytes) -> Any:
-    try:
-        document = orjson.loads(body)
-    except orjson.JSONDecodeError as error:
-        _budget(f"the body is not JSON ({error}); send {_FORM}")
-    if not isinstance(document, dict):
-        _budget(f"the body is {_kind(document)}; send an object: {_FORM}")
-    if _FIELD not in document:
-        _budget(f"the body has no {_FIELD!r}; send {_FORM}")
-    return document[_FIELD]
 
 
 def _listed(item: object, index: int, bounds: Bounds) -> int:
@@ -121,29 +127,30 @@ def _check_count(n: int, bounds: Bounds) -> None:
             f"{bounds.remaining_budget} episodes remain and a submit needs at least {bounds.min_episodes}:"
             " the budget is spent, no more submits are taken"
         )
-    if n < max(1, bounds.min_episodes) or n > min(bounds.max_episodes, bounds.remaining_budget):
+    if not bounds.least <= n <= bounds.most:
         _refuse_count(n, bounds)
 
 
 def _refuse_count(n: int, bounds: Bounds) -> NoReturn:
-    most = min(bounds.max_episodes, bounds.remaining_budget)
     _budget(
-        f"{n} episodes asked for; this submit may have {max(1, bounds.min_episodes)} to {most}"
+        f"{n} episodes asked for; this submit may have {bounds.least} to {bounds.most}"
         f" ({bounds.max_episodes} at once, {bounds.remaining_budget} of the budget remain)"
     )
 
 
 def _kind(value: object) -> str:
-    names = {
-        dict: "an object",
-        list: "a list",
-        str: "a text",
-        bool: "true or false",
-        int: "a number",
-        float: "a number with a fraction or out of range",
-        type(None): "null",
-    }
-    return names.get(type(value), "something else")
+    return _KINDS.get(type(value), "something else")
+
+
+_KINDS: dict[type, str] = {
+    dict: "an object",
+    list: "a list",
+    str: "a text",
+    bool: "true or false",
+    int: "a number",
+    float: "a number with a fraction or out of range",
+    type(None): "null",
+}
 
 
 def _budget(message: str) -> NoReturn:
