@@ -107,16 +107,13 @@ class ClaimedSweep(Sweep):
         return waits_until <= time.monotonic() and self._used_up() is None
 
     async def _wait(self, active: list[asyncio.Task[None]]) -> None:
-        self._stop_at_the_cap()
-        await super()._wait(active)
-
-    def _stop_at_the_cap(self) -> None:
-        """Interrupts the runs that still use tokens once a cap of the sweep is used up."""
+        """As in `Sweep`; once a cap is used up, first interrupts the runs that still use tokens."""
         why = self._used_up()
         for name, task in self._active.items() if why is not None else ():
             play = self._plays.get(name)
             if self._decided[name].run.config is not None and play is not None and play.agent_at_work:
                 self._end(name, task, f"interrupted: {why}; it can be resumed once the cap is raised")
+        await super()._wait(active)
 
     def _end(self, name: str, task: asyncio.Task[None], why: str) -> None:
         """Ends a run here and leaves it open; only once, since a second cancellation would abort its shutdown."""
@@ -140,7 +137,7 @@ class ClaimedSweep(Sweep):
         run = decision.run
         claim = await self._ask(run)
         if claim.result is not None:
-            entry = msgspec.structs.replace(msgspec.convert(claim.result, Entry), directory="")
+            entry = msgspec.convert(claim.result | {"directory": ""}, Entry)
             self._put(entry)
             self._view.finished(run.name, entry)
             return True
@@ -150,7 +147,8 @@ class ClaimedSweep(Sweep):
             return False
         others = bool(claim.run) and claim.run != _opened(run)
         if others:
-            await self._forget(claim.run)
+            with contextlib.suppress(EvopolicyError):
+                await self._operations.cancel(claim.run)
         if claim.previous:
             self._view.note(run.name, f"taken over from {claim.previous.partition(':')[0]}")
         if claim.previous or (others and decision.kind in ("resume", "finish")):
@@ -166,17 +164,13 @@ class ClaimedSweep(Sweep):
         await super()._play(decision)
         entry = self._index.runs[decision.run.name]
         self._view.finished(entry.name, entry)
-        if entry.state in FINISHED:
-            await self._ask(decision.run, result=msgspec.to_builtins(entry))
-        else:
-            await self._ask(decision.run, ttl_s=0.0)
+        result = msgspec.to_builtins(entry) if entry.state in FINISHED else None
+        await self._ask(decision.run, None if result else 0.0, result)
 
     async def _record(self, decision: Decision, begun: Entry) -> Entry:
         run = decision.run
-        if decision.kind == "finish" and await self._is_taken_over(run):
-            self._view.note(run.name, "another host has it now: its files are not written here")
-            self._anew(run.name)
-            raise asyncio.CancelledError
+        if decision.kind == "finish":
+            await self._check_held(run, "another host has it now: its files are not written here")
         self._view.started(run.name, decision.attempt)
         settings = msgspec.structs.replace(run.settings, attempt=decision.attempt)
         aside = None
@@ -185,16 +179,18 @@ class ClaimedSweep(Sweep):
         record = await self._played(
             decision, msgspec.structs.replace(run, settings=settings, overwrite=is_new), aside
         )
-        if record.outcome.status == "cancelled" and await self._is_taken_over(run):
-            self._view.note(run.name, "another host has it now and has cancelled it here")
-            self._anew(run.name)
-            raise asyncio.CancelledError
+        if record.outcome.status == "cancelled":
+            await self._check_held(run, "another host has it now and has cancelled it here")
         known = {"settings": begun.settings, "earlier": begun.earlier}
         return suite_index.entry_of(run, record, host=self._host, run=self._run_of(run), **known)
 
-    async def _is_taken_over(self, run: Plan) -> bool:
+    async def _check_held(self, run: Plan, otherwise: str) -> None:
+        """Ends the run here, with a note, if another host has taken its claim."""
         claim = await self._ask(run)
-        return claim.result is not None or not claim.granted
+        if claim.result is not None or not claim.granted:
+            self._view.note(run.name, otherwise)
+            self._anew(run.name)
+            raise asyncio.CancelledError
 
     async def _renew(self) -> None:
         """Renews the claims of active runs, and reports soon which run of the cluster belongs to each."""
@@ -223,14 +219,9 @@ class ClaimedSweep(Sweep):
     ) -> ClaimState:
         # By its digest, a run with other settings is another run, and an earlier result does not count for it.
         name = f"{run.name}@{run.digest}"
-        return await self._operations.claim(
-            self._suite.name,
-            name,
-            self._holder,
-            self._limits.claim_ttl_s if ttl_s is None else ttl_s,
-            self._run_of(run),
-            result,
-        )
+        ttl_s = self._limits.claim_ttl_s if ttl_s is None else ttl_s
+        known = (self._suite.name, name, self._holder, ttl_s, self._run_of(run), result)
+        return await self._operations.claim(*known)
 
     def _put_aside(self, folder: RunFolder, attempt: int) -> None:
         """Keeps the files of an earlier attempt."""
@@ -243,10 +234,6 @@ class ClaimedSweep(Sweep):
         target.parent.mkdir(parents=True, exist_ok=True)
         remove_tree(folder.state)
         folder.root.rename(target)
-
-    async def _forget(self, run: str) -> None:
-        with contextlib.suppress(EvopolicyError):
-            await self._operations.cancel(run)
 
     def _anew(self, name: str) -> Decision:
         """The new decision for a run that another host has taken over meanwhile: a restart as a new attempt."""
@@ -279,12 +266,13 @@ class ClaimedSweep(Sweep):
     def _used_up(self) -> str | None:
         caps = self._suite.caps
         tokens, cost, requests = suite_index.used(self._index)
-        if caps.max_requests is not None and requests >= caps.max_requests:
-            return f"{requests} of {caps.max_requests} requests are made"
-        if caps.max_tokens is not None and tokens >= caps.max_tokens:
-            return f"{tokens} of {caps.max_tokens} tokens are used"
-        if caps.max_cost is not None and cost >= caps.max_cost:
-            return f"{cost:.2f} of {caps.max_cost:.2f} dollars are spent"
+        for used, most, form in (
+            (requests, caps.max_requests, "{} of {} requests are made"),
+            (tokens, caps.max_tokens, "{} of {} tokens are used"),
+            (cost, caps.max_cost, "{:.2f} of {:.2f} dollars are spent"),
+        ):
+            if most is not None and used >= most:
+                return form.format(used, most)
         return None
 
     def _put(self, entry: Entry) -> None:
@@ -314,26 +302,13 @@ def _opened(run: Plan) -> str:
 
 async def facts_of(run: Plan, index: Index, operations: Operations) -> Facts:
     """Collects the known facts about a run."""
-    folder = run.folder
-    status: str | None = None
+    folder, entry = run.folder, index.runs.get(run.name)
     with contextlib.suppress(OSError, EvopolicyError):
-        status = suite_index.state_of(read_record(folder.root))
-    opened = status is None and folder.opened_run.exists() and folder.credentials.exists()
-    phase: str | None = None
-    has_session = False
-    if opened:
-        identity = saved(folder.opened_run, OpenedRun).run
-        phase = await operations.phase(identity)
-        resumable = run.harness().resumable
-        has_session = resumable and session.load(folder.session).session is not None
-    entry = index.runs.get(run.name)
-    intended = None if status is not None or opened else run.intended()
+        return Facts(entry=entry, status=suite_index.state_of(read_record(folder.root)))
+    if folder.opened_run.exists() and folder.credentials.exists():
+        phase = await operations.phase(saved(folder.opened_run, OpenedRun).run)
+        has_session = run.harness().resumable and session.load(folder.session).session is not None
+        return Facts(entry=entry, opened=True, phase=phase, has_session=has_session)
+    intended = run.intended()
     settings = msgspec.structs.replace(run.settings, attempt=1 if entry is None else entry.attempt)
-    return Facts(
-        entry=entry,
-        status=status,
-        opened=opened,
-        intended=intended is not None and intended.settings == settings,
-        phase=phase,
-        has_session=has_session,
-    )
+    return Facts(entry=entry, intended=intended is not None and intended.settings == settings)

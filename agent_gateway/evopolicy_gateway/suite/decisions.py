@@ -25,7 +25,7 @@ from evopolicy_gateway.run.plan import Plan
 Kind = Literal["keep", "new", "resume", "finish", "restart"]
 Changed = Literal["refuse", "keep", "rerun"]
 
-_SHOWN_CHANGES = 4
+_SHOWN = 4
 _WORDS: dict[Kind, str] = {
     "keep": "kept",
     "new": "new",
@@ -67,35 +67,36 @@ class Decision(msgspec.Struct, frozen=True, kw_only=True):
 def decide(run: Plan, facts: Facts, changed: Changed = "refuse") -> Decision:
     """Returns the decision for a run."""
     entry = facts.entry
-    attempt = 1 if entry is None else entry.attempt
+    before = 1 if entry is None else entry.attempt
     exists = facts.status is not None or facts.opened or (entry is not None and entry.state != "pending")
     differs = entry is not None and exists and entry.digest != run.digest
     how = "" if entry is None or not differs else _changed(entry.settings, run.defining)
+
+    def decided(kind: Kind, why: str = "", *, differs: bool = False) -> Decision:
+        attempt = before + (kind == "restart")
+        return Decision(run=run, kind=kind, attempt=attempt, why=why, changed=differs)
+
     if differs and changed != "keep":
-        return Decision(run=run, kind="restart", attempt=attempt + 1, why=how, changed=True)
+        return decided("restart", how, differs=True)
     settled = entry is not None and entry.state in FINISHED
     elsewhere = entry is not None and not entry.directory
     if facts.status in FINISHED or (settled and (elsewhere or not facts.opened)):
-        return Decision(run=run, kind="keep", attempt=attempt, why=how, changed=differs)
+        return decided("keep", how, differs=differs)
     if facts.status is not None:
-        why = (entry.error if entry is not None else None) or "it ended in an error"
-        return Decision(run=run, kind="restart", attempt=attempt + 1, why=why)
+        return decided("restart", (entry.error if entry is not None else None) or "it ended in an error")
     if not facts.opened:
         if facts.intended:
-            why = "its command ended while it was opened"
-            return Decision(run=run, kind="resume", attempt=attempt, why=why)
+            return decided("resume", "its command ended while it was opened")
         if entry is not None and entry.state in ("running", "error", "cancelled"):
-            return Decision(run=run, kind="restart", attempt=attempt + 1, why="its folder is gone")
-        return Decision(run=run, kind="new", attempt=attempt)
+            return decided("restart", "its folder is gone")
+        return decided("new")
     if facts.phase is None:
-        why = "the cluster does not know it any more"
-        return Decision(run=run, kind="restart", attempt=attempt + 1, why=why)
+        return decided("restart", "the cluster does not know it any more")
     if facts.phase != "open":
-        return Decision(run=run, kind="finish", attempt=attempt)
+        return decided("finish")
     if facts.has_session:
-        return Decision(run=run, kind="resume", attempt=attempt)
-    why = "its agent keeps no session that could be continued"
-    return Decision(run=run, kind="restart", attempt=attempt + 1, why=why)
+        return decided("resume")
+    return decided("restart", "its agent keeps no session that could be continued")
 
 
 def side_by_side(waiting: Sequence[Decision], under_way: Iterable[Plan]) -> list[Decision]:
@@ -118,13 +119,13 @@ def _changed(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
         return text
     old, new = dict(_leaves("", before)), dict(_leaves("", msgspec.to_builtins(now)))
     names = [name for name in {**old, **new} if old.get(name) != new.get(name)]
-    changes = [
-        f"{name} is {_shown_value(new.get(name))}, was {_shown_value(old.get(name))}" for name in names
-    ]
-    shown = ", ".join(changes[:_SHOWN_CHANGES])
-    return f"{text}: {shown}" + (
-        f" and {len(changes) - _SHOWN_CHANGES} more" if changes[_SHOWN_CHANGES:] else ""
-    )
+    changes = [f"{name} is {_shown(new.get(name))}, was {_shown(old.get(name))}" for name in names]
+    return f"{text}: {_first(changes)}"
+
+
+def _first(texts: Sequence[str]) -> str:
+    more = len(texts) - _SHOWN
+    return ", ".join(texts[:_SHOWN]) + (f" and {more} more" if more > 0 else "")
 
 
 def _leaves(path: str, value: Any) -> Iterator[tuple[str, Any]]:
@@ -136,7 +137,7 @@ def _leaves(path: str, value: Any) -> Iterator[tuple[str, Any]]:
         yield path, value
 
 
-def _shown_value(value: Any) -> str:
+def _shown(value: Any) -> str:
     return "not set" if value is None else msgspec.json.encode(value).decode()
 
 
@@ -144,22 +145,20 @@ def check_changes(decisions: Sequence[Decision], changed: Changed) -> None:
     """Raises ConfigError that names the runs with changed settings, unless the operator has decided about them."""
     names = [one.run.name for one in decisions if one.changed]
     if names and changed == "refuse":
-        shown = ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
         raise ConfigError(
-            f"the suite's file has changed since {shown} {'was' if len(names) == 1 else 'were'} played:"
+            f"the suite's file has changed since {_first(names)} {'was' if len(names) == 1 else 'were'} played:"
             " give --changed keep to keep them, or --changed rerun to play them again"
         )
 
 
 def feedback_bytes(decisions: Sequence[Decision]) -> int:
     """Upper bound for the feedback of the runs to be played, bytes, without videos."""
-    played = [one.run.settings for one in decisions if one.kind in ("new", "resume", "restart")]
-    return sum(
-        catalogue.entry(settings.env).feedback_bytes(
-            settings.budget or catalogue.suite_of(settings.env).budget
-        )
-        for settings in played
-    )
+    total = 0
+    for one in decisions:
+        env, budget = one.run.settings.env, one.run.settings.budget
+        if one.kind in ("new", "resume", "restart"):
+            total += catalogue.entry(env).feedback_bytes(budget or catalogue.suite_of(env).budget)
+    return total
 
 
 def lines(decisions: Sequence[Decision], left_alone: Sequence[str]) -> list[str]:

@@ -16,11 +16,9 @@ from evopolicy_common.records.run_record import Outcome, RunRecord
 from evopolicy_common.records.suite_folder import Entry, Index
 from evopolicy_common.records.words import in_words
 from evopolicy_common.terminal import number
-from evopolicy_common.wire.credentials import Credentials
 from evopolicy_gateway.operator.cluster import Cluster, connected
-from evopolicy_gateway.run.operations import Operations
 from evopolicy_gateway.run.plan import Plan
-from evopolicy_gateway.run.watch import RunView, View
+from evopolicy_gateway.run.watch import RunView
 from evopolicy_gateway.suite.decisions import Decision
 from evopolicy_gateway.suite.ends import next_step
 from evopolicy_gateway.suite.suite_file import Parallel
@@ -46,24 +44,17 @@ class PlayedRuns(msgspec.Struct, frozen=True):
 class _Runs(Sweep):
     stays_open = False
 
-    def __init__(
-        self,
-        played: PlayedRuns,
-        parallel: int,
-        operations: Operations,
-        gateway: Credentials,
-        watch: View,
-    ) -> None:
-        super().__init__(Parallel(machine=parallel), played.index, operations, gateway, watch)
+    def __init__(self, played: PlayedRuns, parallel: int, *known: Any) -> None:
+        """`known`: the further arguments of `Sweep`."""
+        super().__init__(Parallel(machine=parallel), played.index, *known)
         self._results = played
 
     async def _record(self, decision: Decision, begun: Entry) -> Entry:
         run = decision.run
         record = self._results.records[run.name] = await self._played(decision, run)
         # Unlike a suite, this never repeats a run whose agent did not play, so the run keeps its own status.
-        return msgspec.structs.replace(
-            entry_of(run, record), state=record.outcome.status, error=record.outcome.error
-        )
+        own = {"state": record.outcome.status, "error": record.outcome.error}
+        return msgspec.structs.replace(entry_of(run, record), **own)
 
     def _why(self, run: Plan, error: Exception) -> str:
         if isinstance(error, ConfigError) and run.name not in self._scored:
@@ -84,9 +75,8 @@ async def play(plans: Sequence[Plan], where: Cluster, parallel: int, console: Te
     with RunView(console).shown() as watch:
         settings = [plan.settings for plan in plans]
         where.check_cases(settings)
-        async with connected(
-            where, [one.env for one in settings], {one.sandbox_tier for one in settings}
-        ) as (operations, gateway, failed):
+        wanted = [one.env for one in settings], {one.sandbox_tier for one in settings}
+        async with connected(where, *wanted) as (operations, gateway, failed):
             runs = _Runs(played, parallel, operations, gateway, watch)
             await unless_failed(asyncio.create_task(runs.play(decided)), failed)
     if played.wrong == set(played.index.runs):
@@ -96,11 +86,11 @@ async def play(plans: Sequence[Plan], where: Cluster, parallel: int, console: Te
 
 def documents(played: PlayedRuns) -> list[dict[str, Any]]:
     """The results of the runs, for scripts."""
-    return [_document(run, played.index.runs[run.name], played) for run in played.plans]
+    return [_document(run, played) for run in played.plans]
 
 
-def _document(run: Plan, entry: Entry, played: PlayedRuns) -> dict[str, Any]:
-    record = played.records.get(run.name)
+def _document(run: Plan, played: PlayedRuns) -> dict[str, Any]:
+    entry, record = played.index.runs[run.name], played.records.get(run.name)
     audit = None if record is None else record.audit
     return {
         "env": entry.env,
@@ -138,16 +128,11 @@ def _against_random(difference: Estimate) -> str:
     """The difference from random actions as a sentence."""
     if difference.low is None or difference.high is None:
         return f"score − random = {number(difference.value)}, without an interval: {difference.reason}"
-    least, most = (
-        (difference.low, difference.high) if difference.value >= 0.0 else (-difference.high, -difference.low)
-    )
-    interval = f"{number(abs(difference.value))} (95 % interval {number(least)} to {number(most)})"
-    word = "better" if difference.value >= 0.0 else "worse"
-    return (
-        f"{interval} {word} than random"
-        if least > 0.0
-        else f"not distinguishable from random: {interval} {word}"
-    )
+    word, least, most = "better", difference.low, difference.high
+    if difference.value < 0.0:
+        word, least, most = "worse", -most, -least
+    interval = f"{number(abs(difference.value))} (95 % interval {number(least)} to {number(most)}) {word}"
+    return f"{interval} than random" if least > 0.0 else f"not distinguishable from random: {interval}"
 
 
 def report(played: PlayedRuns, runs: Path, console: Terminal) -> None:

@@ -6,8 +6,9 @@ from the agent's `[agents.run]`, else from `[defaults]`, else from the environme
 
 from __future__ import annotations
 
+import contextlib
 import fnmatch
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -150,41 +151,37 @@ def expand(suite: SuiteFile, root: Path, started_in: Path, only: tuple[str, ...]
         agent.name: catalogue.resolve(agent.environments or suite.environments) for agent in suite.agents
     }
     everything = list(dict.fromkeys(env for agent in suite.agents for env in chosen[agent.name]))
-    tables = {
-        (agent.name, env): _table(suite, agent, env) for agent in suite.agents for env in chosen[agent.name]
-    }
-    most = max((table.get("repeats", 1) for table in tables.values()), default=0)
-    for repeat in range(most):
-        for env in everything:
-            for agent in suite.agents:
-                table = tables.get((agent.name, env))
-                if table is not None and repeat < table.get("repeats", 1):
-                    runs.append(_plan(suite, agent, env, repeat, table, root, started_in))
+    places = [(env, agent) for env in everything for agent in suite.agents if env in chosen[agent.name]]
+    tables = [(env, agent, _table(suite, agent, env)) for env, agent in places]
+    for repeat in range(max((table.get("repeats", 1) for _, _, table in tables), default=0)):
+        for env, agent, table in tables:
+            if repeat < table.get("repeats", 1):
+                runs.append(_plan(suite, agent, env, repeat, table, root, started_in))
     if only:
         runs = [run for run in runs if any(fnmatch.fnmatch(run.name, pattern) for pattern in only)]
         if not runs:
             raise ConfigError(f"--only {' '.join(only)} matches no run of the suite")
     for run in {run.entry: run for run in runs}.values():
-        _check_agent(run)
+        with _named(run):
+            if not run.entry or "/" in run.entry:
+                raise ConfigError("a name without '/' is needed")
+            run.harness()
+            run.jail.check()
     return runs
 
 
 def check_agents_start(runs: Iterable[Plan]) -> None:
     """Raises ConfigError when an agent of these runs cannot start on this machine, such as a missing CLI."""
     for run in {(run.entry, run.settings.env): run for run in runs}.values():
-        try:
+        with _named(run):
             run.harness().check(run.settings.env)
-        except ConfigError as error:
-            error.args = (f"agent {run.entry!r}: {error}",)
-            raise
 
 
-def _check_agent(run: Plan) -> None:
-    if not run.entry or "/" in run.entry:
-        raise ConfigError(f"agent {run.entry!r}: a name without '/' is needed")
+@contextlib.contextmanager
+def _named(run: Plan) -> Iterator[None]:
+    """Errors inside the `with` name the run's agent."""
     try:
-        run.harness()
-        run.jail.check()
+        yield
     except ConfigError as error:
         error.args = (f"agent {run.entry!r}: {error}",)
         raise
@@ -207,10 +204,9 @@ def _table(suite: SuiteFile, agent: AgentTable, env: str) -> dict[str, Any]:
 
 
 def _resolved(name: str) -> list[str]:
-    try:
+    with contextlib.suppress(ConfigError):
         return list(catalogue.resolve([name]))
-    except ConfigError:
-        return []
+    return []
 
 
 def _plan(

@@ -60,8 +60,11 @@ def directory_of(run: Plan) -> str:
 
 def entry_of(plan: Plan, record: RunRecord, **more: Any) -> Entry:
     """The index entry of a finished run."""
-    outcome = record.outcome
-    state = state_of(record)
+    outcome, state, use = record.outcome, state_of(record), record.agent.model_use
+    tokens = None
+    if record.agent.tokens is not None:
+        requests = 0 if use is None else use.requests or 0
+        tokens = msgspec.to_builtins(record.agent.tokens) | {"requests": requests}
     return msgspec.structs.replace(
         waiting(plan),
         state=state,
@@ -72,20 +75,12 @@ def entry_of(plan: Plan, record: RunRecord, **more: Any) -> Entry:
         n_submits=len(outcome.val_scores or ()),
         budget_used=outcome.budget_used,
         closed_reason=outcome.closed_reason,
-        tokens=_tokens_of(record),
+        tokens=tokens,
         error=outcome.error or (_NO_RUN if state == "error" else None),
         wall_s=record.timing.wall_time_seconds,
         finished_at=record.timing.end_time,
         **more,
     )
-
-
-def _tokens_of(record: RunRecord) -> dict[str, Any] | None:
-    """A run's tokens, with the number of its requests."""
-    if record.agent.tokens is None:
-        return None
-    use = record.agent.model_use
-    return {**msgspec.to_builtins(record.agent.tokens), "requests": 0 if use is None else use.requests or 0}
 
 
 def waiting(plan: Plan) -> Entry:

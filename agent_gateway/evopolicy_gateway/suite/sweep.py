@@ -119,7 +119,6 @@ class Sweep(ABC):
         return msgspec.structs.replace(waiting(run), **now, directory=directory_of(run))
 
     def _why(self, run: Plan, error: Exception) -> str:
-        """Why a run failed, in one line."""
         return why_failed(error, run.folder.harness_log)
 
     # Internals of the loop.
@@ -138,28 +137,26 @@ class Sweep(ABC):
         if len(self._scored) >= MAX_SCORED:
             return []
         # A run that is only finished has no agent and needs no place.
-        finishes = [one for one in self._todo if one.kind == "finish" and self._may_begin(one.run)]
-        waiting = [one for one in self._todo if one.kind != "finish" and self._may_begin(one.run)]
+        able = [one for one in self._todo if self._may_begin(one.run)]
+        starting = [one for one in able if one.kind == "finish"]
+        waiting = [one for one in able if one.kind != "finish"]
         while len(placed) < self._limits.machine:
-            fitting = (one for one in side_by_side(waiting, under_way) if self._fits(one.run, placed))
-            decision = next(fitting, None)
-            if decision is None:
+            fitting = [one for one in side_by_side(waiting, under_way) if self._fits(one.run, placed)]
+            if not fitting:
                 break
-            waiting.remove(decision)
-            finishes.append(decision)
-            placed.append(decision.run)
-            under_way.append(decision.run)
-        return finishes
+            waiting.remove(fitting[0])
+            starting.append(fitting[0])
+            placed.append(fitting[0].run)
+            under_way.append(fitting[0].run)
+        return starting
 
     def _fits(self, run: Plan, placed: list[Plan]) -> bool:
         """Whether the limits allow a run beside those that have a place."""
         limits = self._limits
+        most, at_provider = run.parallel or limits.agent, limits.providers.get(run.provider, limits.machine)
         same_agent = sum(other.entry == run.entry for other in placed)
         same_provider = sum(other.provider == run.provider for other in placed)
-        most = run.parallel or limits.agent
-        return (most is None or same_agent < most) and same_provider < limits.providers.get(
-            run.provider, limits.machine
-        )
+        return (most is None or same_agent < most) and same_provider < at_provider
 
     def _agent_gone(self, name: str) -> None:
         self._scored.add(name)
@@ -183,11 +180,7 @@ class Sweep(ABC):
                     play = self._plays.get(begun.name)
                     if before is not None and (play is None or not play.run):
                         # The folder still holds the earlier run, if there was one.
-                        known = {
-                            "digest": before.digest,
-                            "settings": before.settings,
-                            "attempt": before.attempt,
-                        }
+                        known = {name: getattr(before, name) for name in ("digest", "settings", "attempt")}
                         done = msgspec.structs.replace(done, **known)
             finally:
                 self._plays.pop(begun.name, None)
