@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -42,21 +43,9 @@ from evopolicy_gateway.suite.claimed import ClaimedSweep, facts_of
 from evopolicy_gateway.suite.decisions import Changed, Decision
 from evopolicy_gateway.suite.ends import exit_code, next_step
 from evopolicy_gateway.suite.suite_file import SuiteFile
-from evopolicy_gateway.suite.suite_view import JsonView, results_table, view_of
+from evopolicy_gateway.suite.suite_view import JsonView, SuiteView, results_table
 
 app = App()
-
-
-class Order(msgspec.Struct, frozen=True, kw_only=True):
-    """The command's options."""
-
-    suite: SuiteFile
-    runs: tuple[Plan, ...]
-    root: Path
-    where: Cluster
-    changed: Changed
-    dry_run: bool
-    as_json: bool
 
 
 @app.command("suite", epilog="Example: evopolicy suite smoke.toml --local")
@@ -130,40 +119,41 @@ def suite(
         patient = not local and (root / INDEX).exists()
         where = msgspec.structs.replace(where, patient=patient, web=root if web else None)
         where.check_cases(run.settings for run in expanded)
-        order = Order(
-            suite=wanted,
-            runs=tuple(expanded),
-            root=root,
-            where=where,
-            changed=changed,
-            dry_run=dry_run,
-            as_json=as_json,
-        )
         try:
-            code = run_to_end(_suite(order))
+            code = run_to_end(_suite(wanted, expanded, root, where, changed, dry_run, as_json))
         except KeyboardInterrupt:
             fail("interrupted; repeat the command to continue the sweep", 130)
     if code:
         raise typer.Exit(code)
 
 
-async def _suite(order: Order) -> int:
-    console = terminal(stderr=order.as_json)
-    check_writable(order.root, "--runs")
+async def _suite(
+    suite: SuiteFile,
+    runs: Sequence[Plan],
+    root: Path,
+    where: Cluster,
+    changed: Changed,
+    dry_run: bool,
+    as_json: bool,
+) -> int:
+    console = terminal(stderr=as_json)
+    check_writable(root, "--runs")
     check_loopback()
     check_installed("gateway")
-    with alone(order.root / ".lock", order.root):
-        index = suite_index.load(order.root, order.suite.name)
-        env_ids = list(dict.fromkeys(run.settings.env for run in order.runs))
-        tiers = {run.settings.sandbox_tier for run in order.runs}
-        async with connected(order.where, env_ids, tiers) as (operations, gateway, failed):
-            decided = [
-                decisions.decide(run, await facts_of(run, index, operations), order.changed)
-                for run in order.runs
-            ]
-            _tell(order, index, decided, console)
-            decisions.check_changes(decided, order.changed)
-            if order.dry_run:
+    with alone(root / ".lock", root):
+        index = suite_index.load(root, suite.name)
+        env_ids = list(dict.fromkeys(run.settings.env for run in runs))
+        tiers = {run.settings.sandbox_tier for run in runs}
+        async with connected(where, env_ids, tiers) as (operations, gateway, failed):
+            facts = [(run, await facts_of(run, index, operations)) for run in runs]
+            decided = [decisions.decide(run, known, changed) for run, known in facts]
+            _tell(suite, root, index, decided, console)
+            if as_json:
+                planned = JsonView([], 1)
+                for one in decided:
+                    planned.event("planned", one.run.name, what=one.kind, attempt=one.attempt, why=one.why)
+            decisions.check_changes(decided, changed)
+            if dry_run:
                 return 0
             begun = [one.run for one in decided if one.kind in ("new", "resume", "restart")]
             suite_file.check_agents_start(begun)
@@ -173,47 +163,43 @@ async def _suite(order: Order) -> int:
                 elif one.run.name not in index.runs:
                     # The live view then also shows the reasons of waiting runs.
                     index.runs[one.run.name] = suite_index.waiting(one.run)
-            suite_index.save(order.root, index)
-            names = [run.name for run in order.runs]
-            view = view_of(names, order.suite.parallel.machine, console, as_json=order.as_json)
+            suite_index.save(root, index)
+            names = [run.name for run in runs]
+            known = (names, suite.parallel.machine)
+            view = JsonView(*known) if as_json else SuiteView(*known, console)
             with view.shown():
                 for one in decided:
                     if one.kind == "keep":
                         view.kept(one.run.name, index.runs.get(one.run.name))
-                sweep = ClaimedSweep(order.suite, order.root, index, operations, gateway, view)
+                sweep = ClaimedSweep(suite, root, index, operations, gateway, view)
                 await unless_failed(asyncio.create_task(sweep.play(decided)), failed)
     entries = [index.runs[name] for name in names if name in index.runs]
     entries = [entry for entry in entries if entry.state != "pending"]
-    if not order.as_json:
+    if not as_json:
         console.print(results_table(entries))
         if (usage := suite_index.usage_line(index)) is not None:
             console.print(usage)
-        console.print(f"index: {order.root / INDEX}", soft_wrap=True)
+        console.print(f"index: {root / INDEX}", soft_wrap=True)
         if any(entry.state == "completed" for entry in entries):
-            console.print(next_step(order.root), soft_wrap=True)
-    return exit_code(order.runs, index)
+            console.print(next_step(root), soft_wrap=True)
+    return exit_code(runs, index)
 
 
-def _tell(order: Order, index: Index, decided: list[Decision], console: Terminal) -> None:
-    known = {run.name for run in order.runs}
+def _tell(suite: SuiteFile, root: Path, index: Index, decided: list[Decision], console: Terminal) -> None:
     # Runs that --only leaves out are still the file's.
-    in_file = {run.name for run in suite_file.expand(order.suite, order.root, Path.cwd())}
-    left_alone = [name for name in index.runs if name not in known and name not in in_file]
+    in_file = {run.name for run in suite_file.expand(suite, root, Path.cwd())}
+    left_alone = [name for name in index.runs if name not in in_file]
     for line in decisions.lines(decided, left_alone):
         console.print(line, soft_wrap=True)
-    needed, free = decisions.feedback_bytes(decided), shutil.disk_usage(order.root).free
+    needed, free = decisions.feedback_bytes(decided), shutil.disk_usage(root).free
     if needed:
         fits = "" if needed <= free else "; it may not fit: make room, or choose another --runs"
         console.print(
             f"feedback takes at most {bytes_text(needed)} of the {bytes_text(free)} that are free in"
-            f" {order.root}{fits}",
+            f" {root}{fits}",
             highlight=False,
             soft_wrap=True,
         )
-    if order.as_json:
-        view = JsonView([], 1)
-        for one in decided:
-            view.event("planned", one.run.name, what=one.kind, attempt=one.attempt, why=one.why)
 
 
 def _keep(index: Index, decision: Decision) -> None:

@@ -176,11 +176,6 @@ class JsonView(SuiteView):
         say_json(document, indent=False)
 
 
-def view_of(names: list[str], parallel: int, console: Terminal, *, as_json: bool) -> SuiteView:
-    """The view for the kind of output."""
-    return JsonView(names, parallel) if as_json else SuiteView(names, parallel, console)
-
-
 def results_table(entries: list[Entry]) -> Table:
     """A table of the runs' results."""
     headings = ("run", "state", "score", "random", "budget used", "tokens")
