@@ -27,23 +27,17 @@ Web = Annotated[
 ]
 
 _LOCAL_ONLY = {
-    (
-        "audit",
-    ): "--audit applies only with --local; otherwise set it at the coordinator: evopolicy-coordinator --audit",
-    (
-        "hidden_isolation",
-    ): "--hidden-isolation applies only to a cluster started by this command; otherwise set it at the"
+    "audit": "--audit applies only with --local; otherwise set it at the coordinator: evopolicy-coordinator --audit",
+    "hidden_isolation": "--hidden-isolation applies only to a cluster started by this command; otherwise set it at the"
     " coordinator: evopolicy-coordinator --hidden-isolation",
-    (
-        "policy_package",
-    ): "--policy-package is for a cluster that this command brings up; give it to evopolicy-coordinator and to"
-    " each evopolicy-worker",
-    ("browser",): "--browser is for a cluster that this command brings up; give it to each evopolicy-worker",
-    (
-        "env_timeout",
-        "env_memory",
-    ): "--env-timeout and --env-memory are for a cluster that this command brings up; give them to each"
-    " evopolicy-worker",
+    "policy_package": "--policy-package is for a cluster that this command brings up; give it to"
+    " evopolicy-coordinator and to each evopolicy-worker",
+    "browser": "--browser is for a cluster that this command brings up; give it to each evopolicy-worker",
+    **dict.fromkeys(
+        ("env_timeout", "env_memory"),
+        "--env-timeout and --env-memory are for a cluster that this command brings up; give them to each"
+        " evopolicy-worker",
+    ),
 }
 """Refusals of options of a local cluster where another one is used."""
 
@@ -54,8 +48,8 @@ def cluster_of(
     """The cluster that a command plays on. ConfigError for an option that does not go with it."""
     packages = list(checked_names(given.policy_package))
     if not local:
-        for names, text in _LOCAL_ONLY.items():
-            if any(getattr(given, name) for name in names):
+        for name, text in _LOCAL_ONLY.items():
+            if getattr(given, name):
                 raise ConfigError(text)
         return Cluster(connect=tuple(connect or ()), file=file)
     if given.fresh and given.state is not None:

@@ -172,23 +172,17 @@ def try_policy(
     from evopolicy_gateway.operator import trials
 
     with fail_on_our_errors():
-        trial = trials.Trial(
-            env=one_environment(env),
-            policy=shipped.found(policy_dir, Path.cwd()),
-            split="train",
-            cases=cases_of(cases),
-            out=out,
-            tier=tier,
-            limits=limits,
-        )
+        env_id, ids = one_environment(env), cases_of(cases)
+        policy = shipped.found(policy_dir, Path.cwd())
         local = not (connect or credentials_file)
         if local:
-            packages = list(packages_for(trial.policy, cluster.policy_package))
+            packages = list(packages_for(policy, cluster.policy_package))
             cluster = msgspec.structs.replace(cluster, policy_package=packages)
         where = options.cluster_of(cluster, connect, credentials_file, local=local)
         where = msgspec.structs.replace(where, unjailed=tier == "none")
-        where.check_ids([trial.env], trial.split, trial.cases)
-        _exit(run_to_end(trials.try_policy(trial, where, as_json=as_json)))
+        where.check_ids([env_id], "train", ids)
+        given: dict[str, Any] = {"sandbox_tier": tier, "limits": limits, "as_json": as_json}
+        _exit(run_to_end(trials.try_policy(env_id, policy, ids, out, where, **given)))
 
 
 @app.command("random", epilog="Example: evopolicy random --env gym/acrobot --split heldout")

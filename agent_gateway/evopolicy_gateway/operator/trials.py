@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import itertools
 import uuid
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import msgspec
 from rich.progress import Progress
@@ -15,7 +18,7 @@ from evopolicy_common.console import Terminal, table, terminal
 from evopolicy_common.errors import BundleError, ConfigError
 from evopolicy_common.local.cluster import unless_failed
 from evopolicy_common.messages.environment import Split
-from evopolicy_common.messages.episode import EpisodeOutcome, ResourceLimits, Tier
+from evopolicy_common.messages.episode import EpisodeOutcome, Tier
 from evopolicy_common.messages.operator import Evaluate
 from evopolicy_common.processes.notices import Waiting
 from evopolicy_common.processes.preflight import check_writable
@@ -30,16 +33,21 @@ from evopolicy_gateway.run.operations import Operations
 from evopolicy_gateway.submits.formatting import cut_text, failure_text
 
 
-class Trial(msgspec.Struct, frozen=True, kw_only=True):
-    """A policy to be tried."""
-
-    env: str
-    policy: Path
-    split: Split
-    cases: tuple[int, ...]
-    out: Path
-    tier: Tier
-    limits: ResourceLimits
+def evaluation(
+    env: str, bundle: str | None, split: Split, cases: Sequence[int] | None, **more: Any
+) -> Evaluate:
+    """The request for cases outside any run; `bundle` None: uniform random actions, `more`: further fields."""
+    return Evaluate(
+        token="",
+        key=uuid.uuid4().hex,
+        env=env,
+        bundle=bundle,
+        split=split,
+        cases=None if cases is None else tuple(cases),
+        step_limit="published",
+        definition=catalogue.pinned(env),
+        **more,
+    )
 
 
 class TriedEpisode(msgspec.Struct, frozen=True, kw_only=True):
@@ -81,43 +89,28 @@ class TrialResult(msgspec.Struct, frozen=True, kw_only=True):
     """The cases derive from the secret of a temporary cluster: another call has other cases under the same ids."""
 
 
-async def try_policy(trial: Trial, where: Cluster, *, as_json: bool) -> int:
-    """Plays the policy and prints the results; returns 1 if it failed in an episode, else 0.
+async def try_policy(
+    env: str, policy: Path, cases: Sequence[int], out: Path, where: Cluster, *, as_json: bool, **more: Any
+) -> int:
+    """Plays the policy on train cases and prints the results; returns 1 if it failed in an episode, else 0.
 
-    Raises ConfigError when the folder holds no policy.
+    `out`: folder for trajectories; `more`: as for `evaluation`. Raises ConfigError when `policy` holds none.
     """
-    bundle = policy_bundle(trial.policy)
-    check_writable(trial.out, "--out")
+    bundle = policy_bundle(policy)
+    check_writable(out, "--out")
     console = terminal(stderr=as_json)
     results: list[TrialResult] = []
     notes: set[str] = set()
+    message = evaluation(env, bundle.digest, "train", cases, **more)
 
     async def work(operations: Operations) -> None:
         await operations.upload(bundle.digest, bundle.packed)
-        message = Evaluate(
-            token="",
-            key=uuid.uuid4().hex,
-            env=trial.env,
-            bundle=bundle.digest,
-            split=trial.split,
-            cases=trial.cases,
-            sandbox_tier=trial.tier,
-            limits=trial.limits,
-            step_limit="published",
-            definition=catalogue.pinned(trial.env),
-        )
-        outcomes = await _outcomes(operations, message, console)
-        folder = await asyncio.to_thread(_new_folder, trial.out, trial.env)
-        episodes = [
-            await _tried(outcome, case, folder, operations)
-            for outcome, case in zip(outcomes, trial.cases, strict=True)
-        ]
-        results.append(_result(trial.env, episodes, where, folder))
-        if not catalogue.is_shipped(trial.env):
+        results.append(await _result(message, where, operations, console, out))
+        if not catalogue.is_shipped(env):
             offered = (each.description for each in (await operations.environments())[0])
-            notes.update(each.notes() for each in offered if each.env == trial.env)
+            notes.update(each.notes() for each in offered if each.env == env)
 
-    async with connected(where, [trial.env], {trial.tier}) as (operations, _, failed):
+    async with connected(where, [env], {message.sandbox_tier}) as (operations, _, failed):
         await unless_failed(asyncio.create_task(work(operations)), failed)
     _print(results, as_json, console)
     for note in filter(None, notes):
@@ -126,46 +119,22 @@ async def try_policy(trial: Trial, where: Cluster, *, as_json: bool) -> int:
 
 
 async def play_random(
-    env_ids: Sequence[str],
-    split: str,
-    cases: tuple[int, ...] | None,
-    where: Cluster,
-    *,
-    as_json: bool,
+    env_ids: Sequence[str], split: Split, cases: Sequence[int] | None, where: Cluster, *, as_json: bool
 ) -> int:
     """Plays uniform random actions and prints the returns."""
     console = terminal(stderr=as_json)
     results: list[TrialResult] = []
+    # Without a policy no sandbox is needed, but a worker of another cluster may not offer the tier `none`.
+    tier: Tier = "bwrap" if where.local is None else "none"
 
     async def work(operations: Operations) -> None:
         for env_id in env_ids:
-            message = Evaluate(
-                token="",
-                key=uuid.uuid4().hex,
-                env=env_id,
-                bundle=None,
-                split=msgspec.convert(split, Split),
-                cases=cases,
-                record="actions",
-                # Without a policy no sandbox is needed, but a worker of another cluster may not offer the tier `none`.
-                sandbox_tier="bwrap" if where.local is None else "none",
-                step_limit="published",
-                definition=catalogue.pinned(env_id),
-            )
-            outcomes = await _outcomes(operations, message, console)
-            ids = range(len(outcomes)) if cases is None else cases
-            episodes = [
-                TriedEpisode(case=case, episode_return=outcome.episode_return, length=outcome.length)
-                for outcome, case in zip(outcomes, ids, strict=True)
-            ]
-            results.append(_result(env_id, episodes, where))
+            message = evaluation(env_id, None, split, cases, record="actions", sandbox_tier=tier)
+            results.append(await _result(message, where, operations, console))
 
     async with connected(where, env_ids, {"none"}) as (operations, _, failed):
         await unless_failed(asyncio.create_task(work(operations)), failed)
-    if as_json or len(results) == 1:
-        _print(results, as_json, console)
-    else:
-        _print_means(results, console)
+    _print(results, as_json, console)
     return 0
 
 
@@ -185,17 +154,41 @@ async def _outcomes(operations: Operations, message: Evaluate, console: Terminal
     return sorted(outcomes, key=lambda outcome: outcome.index)
 
 
-async def _tried(outcome: EpisodeOutcome, case: int, folder: Path, operations: Operations) -> TriedEpisode:
-    target = folder / f"ep_{outcome.index:03d}"
-    packed = None if outcome.trajectory is None else await operations.fetch(outcome.trajectory)
-    await asyncio.to_thread(_write, target, packed, outcome)
-    return TriedEpisode(
-        case=case,
-        episode_return=outcome.episode_return if outcome.length else None,
-        length=outcome.length,
-        failure=failure_text(outcome.failure),
-        failed_at=None if outcome.failure is None else outcome.failure.step_index,
-        folder=str(target),
+async def _result(
+    message: Evaluate, where: Cluster, operations: Operations, console: Terminal, out: Path | None = None
+) -> TrialResult:
+    """Plays the cases. `out`: writes their files into a new folder there."""
+    outcomes = await _outcomes(operations, message, console)
+    folder = None if out is None else await asyncio.to_thread(_new_folder, out, message.env)
+    episodes = []
+    cases = range(len(outcomes)) if message.cases is None else message.cases
+    for outcome, case in zip(outcomes, cases, strict=True):
+        target = None if folder is None else folder / f"ep_{outcome.index:03d}"
+        if target is not None:
+            ref = outcome.trajectory
+            packed = None if ref is None else await operations.fetch(ref)
+            await asyncio.to_thread(_write, target, packed, outcome)
+        episodes.append(
+            TriedEpisode(
+                case=case,
+                episode_return=outcome.episode_return if outcome.length else None,
+                length=outcome.length,
+                failure=failure_text(outcome.failure),
+                failed_at=None if outcome.failure is None else outcome.failure.step_index,
+                folder=None if target is None else str(target),
+            )
+        )
+    good = [one.episode_return for one in episodes if one.failure is None]
+    returns = [one for one in good if one is not None]
+    local = where.local
+    return TrialResult(
+        env=message.env,
+        mean_return=mean(returns) if returns else None,
+        std_return=std(returns) if returns else None,
+        n_failed=sum(one.failure is not None for one in episodes),
+        episodes=tuple(episodes),
+        folder=None if folder is None else str(folder),
+        other_cases_next_time=local is not None and local.state is None and local.data is None,
     )
 
 
@@ -216,13 +209,9 @@ def policy_bundle(policy: Path) -> bundles.Bundle:
     if not (folder / "policy.py").is_file():
         if text := described(policy):
             raise ConfigError(f"{policy} is {text}")
-        problem = (
-            f"{policy} holds no policy.py"
-            if policy.is_dir()
-            else f"{policy} is a file"
-            if policy.exists()
-            else f"there is no folder {policy}"
-        )
+        problem = f"{policy} is a file" if policy.exists() else f"there is no folder {policy}"
+        if policy.is_dir():
+            problem = f"{policy} holds no policy.py"
         raise ConfigError(f"{problem}; name a folder with policy.py in it, or in its folder system/")
     try:
         return bundle_of(folder)
@@ -233,52 +222,47 @@ def policy_bundle(policy: Path) -> bundles.Bundle:
 def _new_folder(out: Path, env: str) -> Path:
     base = out / catalogue.folder_name(env)
     base.mkdir(parents=True, exist_ok=True)
-    number = 0
-    while True:
-        folder = base / f"try_{number:03d}"
-        try:
+    for number in itertools.count():
+        with contextlib.suppress(FileExistsError):
+            folder = base / f"try_{number:03d}"
             folder.mkdir()
-            return folder.absolute()
-        except FileExistsError:
-            number += 1
-
-
-def _result(
-    env: str, episodes: Sequence[TriedEpisode], where: Cluster, folder: Path | None = None
-) -> TrialResult:
-    returns = [
-        one.episode_return for one in episodes if one.failure is None and one.episode_return is not None
-    ]
-    return TrialResult(
-        env=env,
-        mean_return=mean(returns) if returns else None,
-        std_return=std(returns) if returns else None,
-        n_failed=sum(one.failure is not None for one in episodes),
-        episodes=tuple(episodes),
-        folder=None if folder is None else str(folder),
-        other_cases_next_time=where.local is not None
-        and where.local.state is None
-        and where.local.data is None,
-    )
+            break
+    return folder.absolute()
 
 
 def _print(results: Sequence[TrialResult], as_json: bool, console: Terminal) -> None:
     if as_json:
         say_json(results)
         return
-    for result in results:
-        # Random actions alone have no policy, and no folder.
-        more = () if result.folder is None else ("played by", "failure")
-        made = table("case", "return", "steps", *more, right=("case", "return", "steps"))
-        for one in result.episodes:
-            shown = "–" if one.episode_return is None else f"{one.episode_return:.4g}"
-            cells = (str(one.case), shown, str(one.length), one.played_by, one_line(one.failure or ""))
-            made.add_row(*cells[: 3 + len(more)])
+    if len(results) == 1:
+        _print_episodes(results[0], console)
+    else:
+        numbers = ("episodes", "mean return", "population std")
+        made = table("environment", *numbers, right=numbers)
+        for result in results:
+            means = f"{result.mean_return:.4g}", f"{result.std_return:.4g}"
+            made.add_row(result.env, str(len(result.episodes)), *means)
         console.print(made)
-        console.print(_summary(result), soft_wrap=True)
-        if result.folder is not None:
-            console.print(f"trajectories and errors: {result.folder}", soft_wrap=True)
-    _tell_of_cases(results, console)
+    if any(result.other_cases_next_time for result in results):
+        console.print(
+            "note: this cluster's cases end with it, the next call has others under the same ids;"
+            " leave out --fresh, or give --data DIR or --connect, to keep them the same",
+            soft_wrap=True,
+        )
+
+
+def _print_episodes(result: TrialResult, console: Terminal) -> None:
+    # Random actions alone have no policy, and no folder.
+    more = () if result.folder is None else ("played by", "failure")
+    made = table("case", "return", "steps", *more, right=("case", "return", "steps"))
+    for one in result.episodes:
+        shown = "–" if one.episode_return is None else f"{one.episode_return:.4g}"
+        cells = (str(one.case), shown, str(one.length), one.played_by, one_line(one.failure or ""))
+        made.add_row(*cells[: 3 + len(more)])
+    console.print(made)
+    console.print(_summary(result), soft_wrap=True)
+    if result.folder is not None:
+        console.print(f"trajectories and errors: {result.folder}", soft_wrap=True)
 
 
 def _summary(result: TrialResult) -> str:
@@ -295,23 +279,3 @@ def _summary(result: TrialResult) -> str:
 
 def _cases(n: int) -> str:
     return f"{n} case{'s' * (n != 1)}"
-
-
-def _tell_of_cases(results: Sequence[TrialResult], console: Terminal) -> None:
-    if any(result.other_cases_next_time for result in results):
-        console.print(
-            "note: this cluster's cases end with it, the next call has others under the same ids;"
-            " leave out --fresh, or give --data DIR or --connect, to keep them the same",
-            soft_wrap=True,
-        )
-
-
-def _print_means(results: Sequence[TrialResult], console: Terminal) -> None:
-    numbers = ("episodes", "mean return", "population std")
-    made = table("environment", *numbers, right=numbers)
-    for result in results:
-        made.add_row(
-            result.env, str(len(result.episodes)), f"{result.mean_return:.4g}", f"{result.std_return:.4g}"
-        )
-    console.print(made)
-    _tell_of_cases(results, console)
