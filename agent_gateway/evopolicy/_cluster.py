@@ -7,7 +7,6 @@ import atexit
 import contextlib
 import importlib.util
 import os
-import uuid
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple, Self, TypeVar, Unpack
@@ -33,7 +32,7 @@ from evopolicy_gateway import shipped
 from evopolicy_gateway.agents.function import Workspace
 from evopolicy_gateway.jail.settings import JailSettings
 from evopolicy_gateway.operator import cluster as operator
-from evopolicy_gateway.operator.trials import policy_bundle
+from evopolicy_gateway.operator.trials import evaluation, policy_bundle
 from evopolicy_gateway.run import run_options
 from evopolicy_gateway.run.lifecycle import RunLifecycle
 from evopolicy_gateway.run.options import one_environment, packages_for
@@ -314,18 +313,8 @@ def trial_of(
     env = one_environment(env)
     folder = given["policy"]
     bundle = policy_of(folder) if callable(folder) else policy_bundle(shipped.found(folder, Path.cwd()))
-    message = Evaluate(
-        token="",
-        key=uuid.uuid4().hex,
-        env=env,
-        bundle=bundle.digest,
-        split="train",
-        cases=given["cases"],
-        sandbox_tier=tier,
-        limits=given["limits"] or ResourceLimits(),
-        step_limit="published",
-    )
-    return Trial(bundle, message)
+    known = {"sandbox_tier": tier, "limits": given["limits"] or ResourceLimits()}
+    return Trial(bundle, evaluation(env, bundle.digest, "train", given["cases"], **known))
 
 
 def plan_of(
