@@ -105,12 +105,12 @@ def _server(name: str, server: McpServer, started_in: Path) -> Content:
             raise ConfigError(f"{field}: two of its files or folders are named {root.name!r}; rename one")
         files |= _files(f"{field}: {path}", root, root.name)
     program = _program(field, server.command, started_in)
-    about = [
-        os.path.basename(program),
-        _executable_digest(program),
-        words,
-        sorted(server.environment.items()),
-    ]
+    try:
+        with open(program, "rb") as file:
+            digest = hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise ConfigError(f"{program} cannot be read: {error.strerror}") from error
+    about = [os.path.basename(program), digest, words, sorted(server.environment.items())]
     recorded = AgentInput(kind="mcp", name=name, digest=_digest(files, about), hosts=server.hosts)
     return Content(recorded, files, (program, *words), server.environment)
 
@@ -123,14 +123,6 @@ def _program(field: str, command: str, started_in: Path) -> str:
             f"{field}.command: there is no program {command!r}, neither as a file nor on the PATH"
         )
     return program
-
-
-def _executable_digest(program: str) -> str:
-    try:
-        with open(program, "rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-    except OSError as error:
-        raise ConfigError(f"{program} cannot be read: {error.strerror}") from error
 
 
 def _check_name(field: str, name: str) -> None:

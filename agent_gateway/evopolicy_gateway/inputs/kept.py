@@ -67,43 +67,33 @@ def keep(
     """The copies in `folder`, made where there are none. ConfigError when the declared files, or the copies, are not
     those with which the run was opened."""
     declared = read(skills, servers, started_in)
-    _compare([each.recorded for each in declared], expected, "in the agent's file")
+    _check_unchanged([each.recorded for each in declared], expected)
     if not (folder / "mcp.json").exists():
         remove_tree(folder)
         _write(declared, folder)
     for each in declared:
         _check_copy(each, folder)
-    return Kept(
-        folder=folder,
-        skills=tuple(each.recorded.name for each in declared if each.recorded.kind == "skill"),
-        servers={each.recorded.name: _start(each) for each in declared if each.recorded.kind == "mcp"},
-    )
+    skills_named = tuple(each.recorded.name for each in declared if each.recorded.kind == "skill")
+    return Kept(folder=folder, skills=skills_named, servers=_servers(declared))
 
 
-def changed(now: Sequence[AgentInput], then: Sequence[AgentInput]) -> str:
-    """Which inputs differ, for an error; empty for none."""
-    known = {(each.kind, each.name): each for each in then}
-    here = {(each.kind, each.name): each for each in now}
-    differing = [
-        f"{kind} {name}"
-        for kind, name in sorted(known.keys() | here.keys())
-        if known.get((kind, name)) != here.get((kind, name))
-    ]
-    return ", ".join(differing)
-
-
-def _compare(now: Sequence[AgentInput], then: Sequence[AgentInput], where: str) -> None:
-    if differing := changed(now, then):
+def _check_unchanged(now: Sequence[AgentInput], then: Sequence[AgentInput]) -> None:
+    differing = {(each.kind, each.name) for each in set(now) ^ set(then)}
+    if differing:
+        names = ", ".join(f"{kind} {name}" for kind, name in sorted(differing))
         raise ConfigError(
-            f"{differing} {where} changed after the run was opened: restore what was there, or start the run anew with"
-            " --overwrite"
+            f"{names} in the agent's file changed after the run was opened: restore what was there, or start the run"
+            " anew with --overwrite"
         )
+
+
+def _place(folder: Path, about: AgentInput) -> Path:
+    return folder / ("skills" if about.kind == "skill" else "mcp") / about.name
 
 
 def _check_copy(content: Content, folder: Path) -> None:
     """Raises ConfigError when a copy does not have the content."""
-    about = content.recorded
-    place = folder / ("skills" if about.kind == "skill" else "mcp") / about.name
+    about, place = content.recorded, _place(folder, content.recorded)
     copies = {
         path.relative_to(place).as_posix(): path
         for path in place.rglob("*")
@@ -121,18 +111,20 @@ def _check_copy(content: Content, folder: Path) -> None:
 
 def _write(declared: Sequence[Content], folder: Path) -> None:
     for each in declared:
-        place = folder / ("skills" if each.recorded.kind == "skill" else "mcp") / each.recorded.name
         for name, file in each.files.items():
-            path = place / name
+            path = _place(folder, each.recorded) / name
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(file.data)
             path.chmod(0o555 if file.executable else 0o444)
     folder.mkdir(parents=True, exist_ok=True)
-    servers = {each.recorded.name: _start(each) for each in declared if each.recorded.kind == "mcp"}
-    document: dict[str, Any] = {"mcpServers": msgspec.to_builtins(servers)}
+    document: dict[str, Any] = {"mcpServers": msgspec.to_builtins(_servers(declared))}
     # Written last and atomically: it marks the copies as complete.
     write_atomically(folder / "mcp.json", json.dumps(document, indent=2).encode())
 
 
-def _start(content: Content) -> Server:
-    return Server(command=content.words[0], args=content.words[1:], env=dict(content.environment))
+def _servers(declared: Sequence[Content]) -> dict[str, Server]:
+    return {
+        each.recorded.name: Server(command=each.words[0], args=each.words[1:], env=dict(each.environment))
+        for each in declared
+        if each.recorded.kind == "mcp"
+    }

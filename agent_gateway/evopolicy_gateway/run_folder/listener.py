@@ -10,6 +10,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import ipaddress
 import platform
 import re
@@ -58,7 +59,10 @@ def listener_of(http: str, url: str | None) -> Listener:
             f"--http {http!r}: use the form HOST:PORT, such as 10.0.0.5:8080; port 0 takes a free one"
         )
     if url is None:
-        if _is_wildcard(address):
+        wildcard = False
+        with contextlib.suppress(ValueError):  # a name
+            wildcard = ipaddress.ip_address(address).is_unspecified
+        if wildcard:
             raise ConfigError(
                 f"--http {http}: an agent cannot connect to a wildcard address; name an address of this machine, or"
                 " give the URL with --http-url"
@@ -74,37 +78,34 @@ def listener_of(http: str, url: str | None) -> Listener:
 
 def check_agent(agent: str, listener: Listener | None) -> None:
     """Raises ConfigError for a remote agent without a listener, or a listener without a remote agent."""
-    if (agent == AGENT) == (listener is not None):
-        return
-    if listener is None:
+    if agent == AGENT and listener is None:
         raise ConfigError(
             "--agent remote needs --http HOST:PORT: where the run is served; it goes with `evopolicy run` alone"
         )
-    raise ConfigError("--http applies only with --agent remote; a local agent is served on loopback")
+    if agent != AGENT and listener is not None:
+        raise ConfigError("--http applies only with --agent remote; a local agent is served on loopback")
 
 
 def agent_host_of(agent: str, named: str) -> str:
     """Parses `--agent-host`: a kernel's boot id or `ELSEWHERE`. Raises ConfigError for anything else."""
     if agent != AGENT:
         raise ConfigError("--agent-host applies only with --agent remote; a local agent is on this machine")
-    if named != ELSEWHERE and not _BOOT_ID.fullmatch(named):
-        raise ConfigError(
-            f"--agent-host {named!r}: give the boot id of the agent's machine (there: cat"
-            f" /proc/sys/kernel/random/boot_id), or `{ELSEWHERE}` when it is on no machine of the cluster"
-        )
-    return named if named == ELSEWHERE else named.lower()
+    return _boot_id(named, ELSEWHERE, " when it is on no machine of the cluster")
 
 
 def place_of(named: str) -> AgentPlace:
     """Parses `evopolicy-gateway --agent-host`: a boot id or `unknown`. Raises ConfigError for anything else."""
-    if named == "unknown":
-        return AgentPlace()
-    if not _BOOT_ID.fullmatch(named):
+    kernel = _boot_id(named, "unknown")
+    return AgentPlace() if kernel == "unknown" else AgentPlace(boot_id=kernel)
+
+
+def _boot_id(named: str, other: str, when: str = "") -> str:
+    if named != other and not _BOOT_ID.fullmatch(named):
         raise ConfigError(
             f"--agent-host {named!r}: give the boot id of the agent's machine (there: cat"
-            " /proc/sys/kernel/random/boot_id), or `unknown`"
+            f" /proc/sys/kernel/random/boot_id), or `{other}`{when}"
         )
-    return AgentPlace(boot_id=named.lower())
+    return named if named == other else named.lower()
 
 
 def agent_place(folder: RunFolder) -> AgentPlace:
@@ -148,10 +149,3 @@ def finish(folder: RunFolder) -> None:
             " command started"
         )
     folder.finish.touch(mode=0o600)
-
-
-def _is_wildcard(address: str) -> bool:
-    try:
-        return ipaddress.ip_address(address).is_unspecified
-    except ValueError:
-        return False
