@@ -1,6 +1,6 @@
 """The agent supervisor: a process that starts one agent, watches its wall clock, and ends all its processes.
 
-It exchanges the messages of `operator/child_messages.py` with `evopolicy run`, one per line. It is separate from the
+It exchanges the messages of `processes/child_messages.py` with `evopolicy run`, one per line. It is separate from the
 gateway, so that an agent's parent holds no credentials, and so that a restarted gateway finds the agent still running.
 """
 
@@ -26,20 +26,11 @@ from evopolicy_gateway.harnesses.interface.base import RelayAddress, Stage
 from evopolicy_gateway.inputs import kept as inputs
 from evopolicy_gateway.inputs import own_config
 from evopolicy_gateway.jail.jail import Jail
-from evopolicy_gateway.processes import child_messages
+from evopolicy_gateway.processes import child_messages as messages
 from evopolicy_gateway.processes import trees as processes
 from evopolicy_gateway.processes.agent_log import AgentLog
 from evopolicy_gateway.processes.agent_process import environment_of
-from evopolicy_gateway.processes.child_messages import (
-    AgentDoing,
-    AgentEnded,
-    AgentSurvives,
-    AgentTime,
-    AgentTurn,
-    AgentUsed,
-    Orders,
-    StartAgent,
-)
+from evopolicy_gateway.processes.child_messages import AgentEnded, Orders, StartAgent, emit
 from evopolicy_gateway.processes.clock import Activity, AgentClock
 from evopolicy_gateway.processes.resources import Resources
 from evopolicy_gateway.workspace.prompts import Prompts
@@ -59,14 +50,12 @@ async def keep(order: StartAgent, orders: Orders) -> AgentEnded:
     """Runs the agent until it ends, is stopped, or its time is up; afterwards none of its processes is left."""
     environment = environment_of({**order.urls, **order.variables})
     try:
-        config = (
-            config_of(order.agent, Path(order.started_in))
-            if order.config is None
-            else msgspec.convert(order.config, AgentConfig)
-        )
+        config = config_of(order.agent, Path(order.started_in)) if order.config is None else None
     except ConfigError as error:
         # The agent's file has changed since the run was opened.
         return AgentEnded(reason="agent_failed", detail=str(error))
+    if order.config is not None:
+        config = msgspec.convert(order.config, AgentConfig)
     on_command_line: list[str] = []
     shown = without_keys([order.agent, msgspec.to_builtins(config)], on_command_line)[0]
     redact = Redaction.of(secrets_in(environment, config), order.urls).knowing(on_command_line)
@@ -79,7 +68,7 @@ async def keep(order: StartAgent, orders: Orders) -> AgentEnded:
         urls=order.urls,
         environment=environment,
         log=agent_log,
-        on_turn=lambda turn, text: child_messages.emit(AgentTurn(turn=turn, text=text[:_TEXT_SHOWN])),
+        on_turn=lambda turn, text: emit(messages.AgentTurn(turn=turn, text=text[:_TEXT_SHOWN])),
         session_file=None if order.session_file is None else Path(order.session_file),
         on_doing=_tell,
         clock=clock,
@@ -107,8 +96,7 @@ async def keep(order: StartAgent, orders: Orders) -> AgentEnded:
     finally:
         for task in (stopped, late, full, telling):
             task.cancel()
-        child_messages.emit(AgentTime(used_s=clock.used_s()))
-        child_messages.emit(AgentUsed(resources=resources.used()))
+        emit(messages.AgentUsed(used_s=clock.used_s(), resources=resources.used()))
         resources.remove()
         agent_log.close()
     if isinstance(ending, AgentEnded):
@@ -130,7 +118,7 @@ def _resources(order: StartAgent) -> Resources:
         folders += [Path(order.jail.private, name) for name in ("home", "tmp")]
     made = Resources(order.limits, folders, workspace / "feedback", jailed=order.jail is not None)
     if words := made.words():
-        child_messages.emit(AgentDoing(note=f"agent limits: {words}"))
+        emit(messages.AgentDoing(note=f"agent limits: {words}"))
     return made
 
 
@@ -192,9 +180,9 @@ def secrets_in(environment: Mapping[str, str], config: AgentConfig | None) -> di
     return {**environment, **named}
 
 
-def _tell(doing: AgentDoing) -> None:
+def _tell(doing: messages.AgentDoing) -> None:
     shown = {"action": doing.action[:_TEXT_SHOWN], "note": doing.note[:_TEXT_SHOWN]}
-    child_messages.emit(msgspec.structs.replace(doing, **shown))
+    emit(msgspec.structs.replace(doing, **shown))
 
 
 async def _tell_use(clock: AgentClock, resources: Resources) -> None:
@@ -202,23 +190,22 @@ async def _tell_use(clock: AgentClock, resources: Resources) -> None:
     extra time; and each limit when it is reached first."""
     told = ""
     while True:
-        child_messages.emit(AgentUsed(resources=resources.used()))
+        emit(messages.AgentUsed(used_s=clock.used_s(), resources=resources.used()))
         reached = resources.reached()
         if reached and not told:
             told = reached
-            child_messages.emit(AgentDoing(note=reached))
+            emit(messages.AgentDoing(note=reached))
         await asyncio.sleep(_TELL_TIME_S)
-        child_messages.emit(AgentTime(used_s=clock.used_s()))
 
 
 async def _stopped(orders: Orders, clock: AgentClock, activity: Activity | None) -> None:
     """Returns when the parent requests the stop or is gone; until then forwards its reports to the clocks."""
     while (order := await orders.next()) is not None:
-        if isinstance(order, child_messages.HeldTime):
+        if isinstance(order, messages.HeldTime):
             clock.held(order.seconds)
-        if isinstance(order, child_messages.SubmitsSeen) and activity is not None:
+        if isinstance(order, messages.SubmitsSeen) and activity is not None:
             activity.note(order.asked, order.running)
-        if isinstance(order, child_messages.StopAgent):
+        if isinstance(order, messages.StopAgent):
             return
 
 
@@ -232,7 +219,7 @@ async def _until_gone(started: Collection[int]) -> None:
     while survivors := await asyncio.to_thread(processes.end_descendants, END_GRACE_S, waited=started):
         if survivors != reported:
             log.error("processes of the agent survive", pids=survivors)
-            child_messages.emit(AgentSurvives(pids=tuple(survivors)))
+            emit(messages.AgentSurvives(pids=tuple(survivors)))
             reported = survivors
         await asyncio.sleep(_SURVIVORS_PAUSE_S)
 
@@ -255,7 +242,7 @@ async def _main() -> int:
         loop.add_signal_handler(number, orders.end)
     ended = await main
     log.info("agent ended", reason=ended.reason, detail=ended.detail, turns=ended.turns)
-    child_messages.emit(ended)
+    emit(ended)
     return 0
 
 

@@ -5,6 +5,7 @@ A whole folder is shown only if it looks like an installation of its own; otherw
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import os
 import shlex
@@ -68,20 +69,15 @@ def hidden_below(folder: str) -> Iterator[str]:
     """Yields files and folders of packages that no agent may see, in Python installations at and directly below
     `folder`."""
     root = Path(folder)
-    sites: list[Path] = []
+    sites = [root] if root.name in _SITE_FOLDERS else []
     for base in ("", "lib/", "lib64/", "local/lib/", "versions/*/lib/", "envs/*/lib/", "*/lib/"):
         for name in _SITE_FOLDERS:
             sites += root.glob(f"{base}python3*/{name}")
-    if root.name in _SITE_FOLDERS:
-        sites.append(root)
     for site in sites:
-        try:
-            names = os.listdir(site)
-        except OSError:
-            continue
-        for name in names:
-            if name.partition(".")[0] in _HIDDEN and not name.endswith((".dist-info", ".egg-info")):
-                yield str(site / name)
+        with contextlib.suppress(OSError):
+            for name in os.listdir(site):
+                if name.partition(".")[0] in _HIDDEN and not name.endswith((".dist-info", ".egg-info")):
+                    yield str(site / name)
 
 
 def _our_python(needs: Needs) -> None:

@@ -8,6 +8,7 @@ import socket
 import sys
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 from urllib.parse import urlsplit
 
 import msgspec
@@ -35,9 +36,7 @@ HARNESS_HOSTS: Mapping[str, tuple[str, ...]] = {
 HARNESS_VARIABLES: Mapping[str, tuple[str, ...]] = {
     "codex": ("OPENAI_API_KEY", "CODEX_API_KEY", "OPENAI_BASE_URL"),
     "claude-code": (
-        "ANTHROPIC_API_KEY",
-        "ANTHROPIC_AUTH_TOKEN",
-        "ANTHROPIC_BASE_URL",
+        *("ANTHROPIC_API_KEY", "ANTHROPIC_AUTH_TOKEN", "ANTHROPIC_BASE_URL"),
         "CLAUDE_CODE_OAUTH_TOKEN",
     ),
 }
@@ -166,7 +165,7 @@ class Jail:
         """
         settings = order.settings
         self._open_network = settings.mode == "open-network"
-        self._pids, self._fixed_cores = pids, fixed_cores
+        self._limits: dict[str, Any] = {"pids": pids, "fixed_cores": fixed_cores}
         self._variables = frozenset(
             (*_PASSED, *settings.environment, *variables, *HARNESS_VARIABLES.get(harness, ()))
         )
@@ -186,19 +185,17 @@ class Jail:
             hidden=tuple(Path(path).resolve() for path in order.hidden),
             open_network=self._open_network,
             packages=tuple(packages),
-            inputs=tuple((source, _at_home(target, self._home)) for source, target in inputs),
+            inputs=tuple(
+                (source, os.path.join(self._home, target.removeprefix("~/"))) for source, target in inputs
+            ),
         )
         self._view.prepare()
         self._proxy_port = self._proxy().proxy_port
 
     def environment(self, surroundings: Mapping[str, str], ours: Mapping[str, str]) -> dict[str, str]:
         """The agent's variables: the permitted ones of `surroundings`, `ours`, and the proxy for the allowed hosts."""
-        kept = {
-            name: value
-            for name, value in surroundings.items()
-            if name in self._variables or name.startswith("LC_")
-        }
-        kept |= {"HOME": self._home, "TMPDIR": "/tmp", **ours}
+        passed = [name for name in surroundings if name in self._variables or name.startswith("LC_")]
+        kept = {name: surroundings[name] for name in passed} | {"HOME": self._home, "TMPDIR": "/tmp", **ours}
         if self._open_network:
             return kept
         proxy = f"http://127.0.0.1:{self._proxy_port}"
@@ -212,7 +209,7 @@ class Jail:
     def way(self, program: Sequence[str]) -> Way:
         """Prepares one start of a program."""
         proxy = None if self._open_network else self._proxy()
-        return Way(self._view.arguments(), program, proxy, pids=self._pids, fixed_cores=self._fixed_cores)
+        return Way(self._view.arguments(), program, proxy, **self._limits)
 
     def sealed(self, program: Sequence[str]) -> Way:
         """One start of a program without network access, such as a CLI that prints its version."""
@@ -220,10 +217,6 @@ class Jail:
 
     def _proxy(self) -> JailProxy:
         return JailProxy(self._forwards, self._hosts)
-
-
-def _at_home(path: str, home: str) -> str:
-    return f"{home}/{path[2:]}" if path.startswith("~/") else path
 
 
 def _port(url: str) -> int:

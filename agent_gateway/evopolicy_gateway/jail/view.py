@@ -75,21 +75,12 @@ class View(msgspec.Struct, frozen=True, kw_only=True):
         """The bubblewrap command, up to the program."""
         command = [*_bubblewrap(), *([] if self.open_network else ["--unshare-net"])]
         command += [*_system(self.open_network), *self._proc()]
-        command += [
-            "--bind",
-            str(self.private / "tmp"),
-            "/tmp",
-            "--dir",
-            "/var",
-            "--symlink",
-            "../tmp",
-            "/var/tmp",
-        ]
+        command += ["--bind", str(self.private / "tmp"), "/tmp"]
+        command += ["--dir", "/var", "--symlink", "../tmp", "/var/tmp"]
         command += ["--bind", str(self.private / "home"), self.home]
-        inside: list[str] = []
-        outside: list[str] = []
-        for path in (*self.needs.paths, *self.read, *self.write):
-            (inside if self._is_hidden(path) else outside).append(path)
+        paths = (*self.needs.paths, *self.read, *self.write)
+        inside = [path for path in paths if self._is_hidden(path)]
+        outside = [path for path in paths if path not in inside]
         command += self._binds(outside)
         for path, target in self.needs.links.items():
             if not any(_is_in(path, shown) for shown in outside):
@@ -143,9 +134,7 @@ class View(msgspec.Struct, frozen=True, kw_only=True):
     def _binds(self, paths: Sequence[str]) -> list[str]:
         """Binds parents before their content, and writable paths over read-only ones."""
         words: list[str] = []
-        for path in sorted(
-            dict.fromkeys(paths), key=lambda path: (path.count("/"), path in self.write, path)
-        ):
+        for path in sorted(set(paths), key=lambda path: (path.count("/"), path in self.write, path)):
             self._make_way(path)
             words += ["--bind" if path in self.write else "--ro-bind", path, path]
         return words
@@ -179,21 +168,12 @@ def confined(read: Sequence[Path], write: Sequence[Path]) -> list[str]:
     """The bubblewrap command, up to the program, for a process of our own that needs the network: it sees the system,
     `read` and
     `write`, and no variable but those of its proxy and certificates."""
-    command = [
-        *_bubblewrap(),
-        *_system(True),
-        "--proc",
-        "/proc",
-        "--dev",
-        "/dev",
-        "--tmpfs",
-        "/tmp",
-        "--clearenv",
-    ]
-    for name in ("PATH", *_NETWORK_VARIABLES):
+    command = [*_bubblewrap(), *_system(True)]
+    command += ["--proc", "/proc", "--dev", "/dev", "--tmpfs", "/tmp", "--clearenv"]
+    for name in ("PATH", *_PROXY_VARIABLES, *map(str.lower, _PROXY_VARIABLES), *_CERTIFICATES):
         if name in os.environ:
             command += ["--setenv", name, os.environ[name]]
-    files = [os.environ[name] for name in ("SSL_CERT_FILE", "SSL_CERT_DIR") if name in os.environ]
+    files = [os.environ[name] for name in _CERTIFICATES if name in os.environ]
     for path in dict.fromkeys((*map(str, read), *files)):
         command += ["--ro-bind", path, path]
     for path in map(str, write):
@@ -201,19 +181,8 @@ def confined(read: Sequence[Path], write: Sequence[Path]) -> list[str]:
     return [*command, "--remount-ro", "/", "--chdir", "/"]
 
 
-_NETWORK_VARIABLES = (
-    *(
-        "HTTP_PROXY",
-        "HTTPS_PROXY",
-        "ALL_PROXY",
-        "NO_PROXY",
-        "http_proxy",
-        "https_proxy",
-        "all_proxy",
-        "no_proxy",
-    ),
-    *("SSL_CERT_FILE", "SSL_CERT_DIR"),
-)
+_PROXY_VARIABLES = ("HTTP_PROXY", "HTTPS_PROXY", "ALL_PROXY", "NO_PROXY")
+_CERTIFICATES = ("SSL_CERT_FILE", "SSL_CERT_DIR")
 
 
 @functools.cache
@@ -250,11 +219,9 @@ def _without_counts(name: str, content: str) -> str:
         return "0.00 0.00 0.00 1/1 1\n"
     if name == "uptime":
         return f"{content.split()[0]} 0.00\n"
-    lines = []
-    for line in content.splitlines():
-        key, *numbers = line.split()
-        lines.append(line if key == "btime" else " ".join([key, *("0" for _ in numbers)]))
-    return "\n".join(lines) + "\n"
+    rows = [line.split() for line in content.splitlines()]
+    zeroed = [row if row[0] == "btime" else [row[0], *("0" for _ in row[1:])] for row in rows]
+    return "".join(" ".join(row) + "\n" for row in zeroed)
 
 
 def _is_in(path: str, folder: str) -> bool:

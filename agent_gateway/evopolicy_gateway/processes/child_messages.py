@@ -97,6 +97,13 @@ class AgentDoing(Event, frozen=True, kw_only=True, tag="doing"):
     provider: str = ""
 
 
+class AgentUsed(Event, frozen=True, kw_only=True, tag="agent_used"):
+    """The agent's use of its wall limit and its machine since it was started."""
+
+    used_s: float
+    resources: AgentResources
+
+
 class AgentSurvives(Event, frozen=True, kw_only=True, tag="agent_survives"):
     """The agent was ended, but the kernel holds killed processes of it; `AgentEnded` follows when they are gone."""
 
@@ -135,18 +142,6 @@ class CloseRun(Order, frozen=True, kw_only=True, tag="close"):
 
     reason: str
     agent: dict[str, Any] = {}
-
-
-class AgentTime(Event, frozen=True, kw_only=True, tag="agent_time"):
-    """Seconds of its wall limit that the agent has used since it was started."""
-
-    used_s: float
-
-
-class AgentUsed(Event, frozen=True, kw_only=True, tag="agent_used"):
-    """The agent's use of its machine since it was started."""
-
-    resources: AgentResources
 
 
 class StartAgent(Order, frozen=True, kw_only=True, tag="start_agent"):
@@ -217,7 +212,6 @@ AnyEvent = (
     | RunClosed
     | AgentTurn
     | AgentDoing
-    | AgentTime
     | AgentUsed
     | AgentSurvives
     | AgentEnded

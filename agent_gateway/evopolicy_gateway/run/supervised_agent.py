@@ -101,10 +101,9 @@ class SupervisedAgent:
                     if relay is not None:
                         event = msgspec.structs.replace(event, tokens=None)  # the relay's count is the run's
                     run.watch.doing(plan.name, event)
-                case child_messages.AgentTime():
-                    run.stopwatch.reported("agent", agent_s=event.used_s)
-                case child_messages.AgentUsed() if plan.listener is None:
-                    run.stopwatch.reported("agent", resources=event.resources)
+                case child_messages.AgentUsed():
+                    resources = event.resources if plan.listener is None else None
+                    run.stopwatch.reported("agent", agent_s=event.used_s, resources=resources)
                 case child_messages.AgentSurvives():
                     self.survivors = list(event.pids)
                     self.tell_survivors()
@@ -155,8 +154,9 @@ class SupervisedAgent:
 
     def _hidden(self) -> tuple[str, ...]:
         """Folders that the jail never shows: the runs, and the states of the clusters."""
-        sockets = [endpoint.partition("/") for endpoint in self._credentials.endpoints]
+        known = self._credentials
+        sockets = [endpoint.partition("/") for endpoint in known.endpoints]
         states = [str(Path(path).parent.resolve()) for kind, _, path in sockets if kind == "unixsock-stream"]
-        if self._credentials.tls is not None:
-            states.append(str(Path(self._credentials.tls.private_key).parent))
+        if known.tls is not None:
+            states.append(str(Path(known.tls.private_key).parent))
         return (str(self._run.plan.runs.absolute()), str(credentials.default_state_dir()), *states)

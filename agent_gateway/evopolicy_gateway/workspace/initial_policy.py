@@ -66,15 +66,8 @@ def constant_action(space: SpaceSchema) -> Any:
 def _box(shape: list[int], low: Any, high: Any, number: type[int] | type[float]) -> Any:
     if not shape:
         return number(min(max(0.0, float(low)), float(high)))
-    return [
-        _box(
-            shape[1:],
-            low[index] if isinstance(low, list) else low,
-            high[index] if isinstance(high, list) else high,
-            number,
-        )
-        for index in range(shape[0])
-    ]
+    lows, highs = (each if isinstance(each, list) else [each] * shape[0] for each in (low, high))
+    return [_box(shape[1:], *bounds, number) for bounds in zip(lows, highs, strict=True)]
 
 
 def _like(nvec: Any, start: Any) -> Any:
