@@ -45,24 +45,19 @@ async def bind(folder: RunFolder) -> tuple[socket.socket, Address]:
     if folder.service.exists():
         address = saved(folder.service, Address)
         return await _rebind(address), address
-    token = secrets.token_hex(16)
-    if not folder.listener.exists():
-        try:
-            sock = bound(LOOPBACK, 0)
-        except OSError as error:
+    named, bearer = Listener(host=LOOPBACK, port=0), ""
+    if folder.listener.exists():
+        named, bearer = saved(folder.listener, Listener), secrets.token_hex(32)
+    try:
+        sock = bound(named.host, named.port)
+    except OSError as error:
+        if not bearer:
             raise ConfigError(no_loopback(error)) from error
-        address = Address(host=LOOPBACK, port=sock.getsockname()[1], token=token)
-    else:
-        listener = saved(folder.listener, Listener)
-        try:
-            sock = bound(listener.host, listener.port)
-        except OSError as error:
-            where = f"{listener.host}:{listener.port}"
-            raise ConfigError(f"--http {where}: cannot listen there: {error.strerror or error}") from error
-        bearer = secrets.token_hex(32)
-        address = Address(
-            host=listener.host, port=sock.getsockname()[1], token=token, bearer=bearer, url=listener.url
-        )
+        where = f"{named.host}:{named.port}"
+        raise ConfigError(f"--http {where}: cannot listen there: {error.strerror or error}") from error
+    token, port = secrets.token_hex(16), sock.getsockname()[1]
+    address = Address(host=named.host, port=port, token=token, bearer=bearer, url=named.url)
+    if bearer:
         write_atomically(folder.bearer, f"{bearer}\n".encode(), mode=0o600)
     save(folder.service, address)
     return sock, address

@@ -67,11 +67,8 @@ class Gateway:
         `alone`: no other process watches the agent. `place`: where the agent is, when it differs from the run's folder.
         """
         self._folder = folder
-        self._connect = connect
-        self._credentials_file = credentials_file
-        self._on_ready = on_ready
-        self._on_change = on_change
-        self._on_wait = on_wait
+        self._place_of_credentials = connect, credentials_file
+        self._on_ready, self._on_change, self._on_wait = on_ready, on_change, on_wait
         self._alone = alone
         self._place = place
         self._stopped = asyncio.Event()
@@ -90,7 +87,7 @@ class Gateway:
 
     async def run(self) -> bool:
         """Serves until `tell`; returns whether the run was closed. Raises errors that make serving impossible."""
-        own, known = _load(self._folder, self._connect, self._credentials_file)
+        own, known = _load(self._folder, *self._place_of_credentials)
         run = known.run
         async with contextlib.AsyncExitStack() as stack:
             sock, address = await bind(self._folder)
@@ -110,16 +107,13 @@ class Gateway:
                     raise
                 log.warning("the run takes no more", status=error.status, why=error.message)
                 return True
-            workspace.stage(self._folder, opened, address.urls(), known.agents_md)
-            blobs = BlobStore(self._folder.blobs)
-            started = self._folder.start.exists()
-            trees = Recorder(self._folder.workspace, self._folder.trees, started=started)
-            pipeline = SubmitPipeline(
-                session, opened, self._folder.workspace, journal, blobs, self._changed.set, trees
-            )
-            http = await stack.enter_async_context(
-                serving(make_app(pipeline, address.token, address.bearer), sock)
-            )
+            folder = self._folder
+            workspace.stage(folder, opened, address.urls(), known.agents_md)
+            trees = Recorder(folder.workspace, folder.trees, started=folder.start.exists())
+            given = (folder.workspace, journal, BlobStore(folder.blobs), self._changed.set, trees)
+            pipeline = SubmitPipeline(session, opened, *given)
+            app = make_app(pipeline, address.token, address.bearer)
+            http = await stack.enter_async_context(serving(app, sock))
             log.info("serving", run=run, env=opened.env.env, port=address.port)
             self._on_ready(address.urls(), pipeline)
             if not self._orders.done():
@@ -155,17 +149,17 @@ class Gateway:
             waited: list[asyncio.Future[Any]] = [changed, self._orders, pipeline.fatal, http]
             await asyncio.wait(waited, return_when=asyncio.FIRST_COMPLETED)
             changed.cancel()
-            if pipeline.fatal.done():
-                pipeline.fatal.result()
-            if http.done():
-                http.result()
-                raise ConfigError("the HTTP service ended unexpectedly")
+            for ended in (pipeline.fatal, http):
+                if ended.done():
+                    ended.result()
+                    raise ConfigError("the HTTP service ended unexpectedly")
             if self._orders.done():
                 return self._orders.result()
             self._changed.clear()
             self._on_change(pipeline)
-            if self._alone and (pipeline.machine.spent or self._folder.finish.exists()):
-                return CloseRun(reason="budget_spent" if pipeline.machine.spent else "agent_stopped")
+            spent = pipeline.machine.spent
+            if self._alone and (spent or self._folder.finish.exists()):
+                return CloseRun(reason="budget_spent" if spent else "agent_stopped")
 
     async def _close(
         self, session: CoordinatorClient, journal: Journal, pipeline: SubmitPipeline, close: CloseRun

@@ -15,7 +15,6 @@ import sysconfig
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import msgspec
 
@@ -26,7 +25,6 @@ from evopolicy_common.processes.preflight import LOOPBACK
 from evopolicy_common.records.open_run import IntendedRun
 from evopolicy_common.records.secrets import Redaction, without_keys
 from evopolicy_common.wire.http import bound
-from evopolicy_gateway import harnesses
 from evopolicy_gateway.agent_supervisor.supervisor import secrets_in
 from evopolicy_gateway.http.server import Address
 from evopolicy_gateway.inputs import own_config
@@ -165,8 +163,7 @@ def of_run(run: OpenRun, ready: Ready, model_spent: asyncio.Event) -> ModelRelay
 
 def _secrets(run: OpenRun, ready: Ready) -> tuple[str, ...]:
     """Texts that the record of model calls leaves out, as the agent's log does."""
-    plan, harness = run.plan, run.plan.harness()
-    config = plan.agent_config or harnesses.config_of(plan.agent, plan.started_in)
+    plan, harness, config = run.plan, run.plan.harness(), run.plan.known_config
     variables = environment_of({**ready.variables, **workspace.variables(run.folder)})
     on_command_line: list[str] = []
     without_keys([plan.agent, msgspec.to_builtins(config)], on_command_line)
@@ -178,8 +175,7 @@ def _program(fd: int, more: list[Path], written: list[Path], jailed: bool) -> li
     python = [sys.executable, "-P", "-m", "evopolicy_gateway.relay", str(fd)]
     if not jailed:
         return python
-    ours: list[Any] = [evopolicy_common, evopolicy_gateway]
     places = [sys.base_prefix, os.path.realpath(sys.base_prefix), sys.prefix, sysconfig.get_path("platlib")]
-    places += [str(Path(each.__file__).parent) for each in ours]
+    places += [*evopolicy_common.__path__, *evopolicy_gateway.__path__]
     read = [Path(place) for place in dict.fromkeys(places) if not place.startswith("/usr")] + more
     return [*confined(read, written), "--", *python]

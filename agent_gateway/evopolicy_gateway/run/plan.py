@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 from pathlib import Path
 from typing import Any
@@ -100,12 +101,15 @@ class Plan(msgspec.Struct, frozen=True, kw_only=True):
         return self.settings.entry
 
     @property
-    def agent_config(self) -> AgentConfig | None:
-        """A coding agent's settings with the operator's prices; None where the agent's own text says all."""
-        if self.prices is None:
-            return self.config
+    def known_config(self) -> AgentConfig | None:
+        """A coding agent's settings with the operator's prices."""
         config = self.config or harnesses.config_of(self.agent, self.started_in)
-        return config and msgspec.structs.replace(config, prices=self.prices)
+        return config and msgspec.structs.replace(config, prices=self.prices or config.prices)
+
+    @property
+    def agent_config(self) -> AgentConfig | None:
+        """As `known_config`; None where the agent's own text says all."""
+        return self.config if self.prices is None else self.known_config
 
     def harness(self) -> Harness:
         """The agent's harness. Raises ConfigError for an invalid agent."""
@@ -153,9 +157,8 @@ class Plan(msgspec.Struct, frozen=True, kw_only=True):
     @property
     def digest(self) -> str:
         """First 16 hex digits of the SHA-256 of `defining`."""
-        return hashlib.sha256(msgspec.json.encode(list(self.defining.values()), order="sorted")).hexdigest()[
-            :16
-        ]
+        data = msgspec.json.encode(list(self.defining.values()), order="sorted")
+        return hashlib.sha256(data).hexdigest()[:16]
 
     def check(self) -> None:
         """Raises ConfigError when the agent cannot start, or when its jail or the run's folder is not available.
@@ -171,10 +174,10 @@ class Plan(msgspec.Struct, frozen=True, kw_only=True):
         msgspec.json.encode((self.settings, self.agent))  # UnicodeEncodeError for an option that is not UTF-8
         check_installed("gateway")
         check_writable(self.runs, "--runs")
+        check_agent(self.agent, self.listener)
         if self.listener is None:
             check_loopback()
-        check_agent(self.agent, self.listener)
-        if self.listener is not None and self.limits != AgentLimits():
+        elif self.limits != AgentLimits():
             raise ConfigError(
                 "--agent-cpus, --agent-memory, --agent-pids and --agent-disk limit an agent that is started here;"
                 " leave them out"
@@ -190,30 +193,28 @@ class Plan(msgspec.Struct, frozen=True, kw_only=True):
             return
         if not (folder.run_json.exists() or folder.state.exists() or not any(folder.root.iterdir())):
             raise ConfigError(f"{folder.root} is not a run's folder; choose another --runs or --exp-id")
-        if self.resume:
-            intended = self.intended()
-            if intended is not None and intended.settings.inputs != self.settings.inputs:
+        if self.resume and (intended := self.intended()) is not None:
+            if intended.settings.inputs != self.settings.inputs:
                 raise ConfigError(
                     f"{folder.root} holds a run whose agent has other skills or MCP servers than are declared now:"
                     " restore their files, or start the run anew with --overwrite"
                 )
-            if intended is not None and intended.settings != self.settings:
+            if intended.settings != self.settings:
                 raise ConfigError(
                     f"{folder.root} holds a run with other settings; resume it with its original options"
                 )
-        elif not self.overwrite:
-            kind = "a finished" if folder.run_json.exists() else "an unfinished"
+        elif not (self.resume or self.overwrite):
+            finished = folder.run_json.exists()
+            kind, more = ("a finished", "") if finished else ("an unfinished", ", or resume it with --resume")
             raise ConfigError(
-                f"{folder.root} holds {kind} run; choose another --exp-id, or replace it with --overwrite"
-                + ("" if folder.run_json.exists() else ", or resume it with --resume")
+                f"{folder.root} holds {kind} run; choose another --exp-id, or replace it with --overwrite{more}"
             )
 
     def intended(self) -> IntendedRun | None:
         """The request that opened the run in the folder; None when there is none."""
-        try:
+        with contextlib.suppress(FileNotFoundError):
             return saved(self.folder.intended, IntendedRun)
-        except FileNotFoundError:
-            return None
+        return None
 
     def claim(self) -> None:
         """Creates the run's empty folder, which no other user may enter; only for the holder of its lock. Raises
@@ -227,9 +228,7 @@ class Plan(msgspec.Struct, frozen=True, kw_only=True):
 def _unusual(values: dict[str, Any], usual: dict[str, Any]) -> dict[str, Any]:
     """Values that differ from the defaults, also within inner tables."""
     unusual = {name: value for name, value in values.items() if name not in usual or value != usual[name]}
-    return {
-        name: _unusual(value, usual[name])
-        if isinstance(value, dict) and isinstance(usual.get(name), dict)
-        else value
-        for name, value in unusual.items()
-    }
+    for name, value in unusual.items():
+        if isinstance(value, dict) and isinstance(usual.get(name), dict):
+            unusual[name] = _unusual(value, usual[name])
+    return unusual

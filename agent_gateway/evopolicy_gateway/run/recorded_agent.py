@@ -25,12 +25,12 @@ from evopolicy_common.records.secrets import without_keys
 from evopolicy_common.regular_files import read_regular
 from evopolicy_common.wire.credentials import state_home
 from evopolicy_common.wire.http import bound
-from evopolicy_gateway import harnesses
 from evopolicy_gateway.relay.replaying import DIFFERENCE
 from evopolicy_gateway.run.plan import Plan, Replays
 from evopolicy_gateway.run_folder.layout import RunFolder
 
 _MAX_BYTES = 4 << 20
+_KEYS = {"codex": ("OPENAI_API_KEY",), "claude-code": ("ANTHROPIC_API_KEY",)}
 _NO_KEY = "no-key-is-needed-to-replay"
 _OWN = tuple(f"run.json: agent.{name}" for name in ("model_use.", "settings.agent: ", "settings.program: "))
 """Values of a replay's own, or of its machine."""
@@ -52,8 +52,7 @@ class Recorded(msgspec.Struct, frozen=True, kw_only=True):
 
 def keep(folder: RunFolder, plan: Plan, replays: Replays) -> None:
     """Writes `.replay.json`. Raises StorageError."""
-    config = plan.agent_config or harnesses.config_of(plan.agent, plan.started_in)
-    whole = msgspec.structs.replace(plan, config=config, prices=None)
+    whole = msgspec.structs.replace(plan, config=plan.known_config, prices=None)
     kept = Recorded(plan=without_keys(_plain(whole)), replays=_plain(replays))
     kept = msgspec.structs.replace(kept, code=_code(kept))
     write_atomically(folder.replay, msgspec.json.encode(kept), mode=0o600)
@@ -82,8 +81,10 @@ def plan_of(run: Path, runs: Path, *, trusted: bool = False) -> Plan:
         raise ConfigError(f"{run} is not finished; finish it with --resume, or name a finished run")
     if why := model_record.stopped(folder.root):
         raise ConfigError(f"the record of {run} is not whole, and cannot be replayed: {why}")
-    for name in _keys(plan):
-        os.environ.setdefault(name, _NO_KEY)
+    if (config := plan.config) is not None:
+        # The variables in which the agent's settings look for a key.
+        for name in (*config.secret, *(() if config.api else _KEYS.get(config.harness, ()))):
+            os.environ.setdefault(name, _NO_KEY)
     _check_free(replays)
     replays = msgspec.structs.replace(replays, folder=folder.model_record)
     settings = msgspec.structs.replace(plan.settings, replay_of=replays.run)
@@ -95,9 +96,8 @@ def outcome(run: Path, plan: Plan) -> str:
     """The first place in which the replay differs from the run, with versions that differ; empty where they are
     identical but for these."""
     found = differences(run, plan.folder.root)
-    first = _different_request(run, plan.folder) or next(
-        (line for line in found if not line.startswith((*_OWN, *_VERSIONS))), ""
-    )
+    others = (line for line in found if not line.startswith((*_OWN, *_VERSIONS)))
+    first = _different_request(run, plan.folder) or next(others, "")
     explained = [f"other versions: {line}" for line in found if line.startswith(_VERSIONS)]
     return "\n".join([first, *explained]) if first else ""
 
@@ -122,15 +122,6 @@ def _check_free(replays: Replays) -> None:
                 f"port {port} on {LOOPBACK}, at which the recorded agent found a service, cannot be used:"
                 f" {error.strerror}; end what listens there (`ss -ltnp` shows it), then replay again"
             ) from error
-
-
-def _keys(plan: Plan) -> tuple[str, ...]:
-    """The variables in which the agent's settings look for a key."""
-    config = plan.config
-    if config is None:
-        return ()
-    own = {"codex": ("OPENAI_API_KEY",), "claude-code": ("ANTHROPIC_API_KEY",)}
-    return (*config.secret, *(() if config.api else own.get(config.harness, ())))
 
 
 def _code(kept: Recorded) -> str:
