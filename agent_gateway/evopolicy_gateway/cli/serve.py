@@ -9,7 +9,7 @@ import signal
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import orjson
 import typer
@@ -81,9 +81,8 @@ def serve(
         place = None if agent_host is None else place_of(agent_host)
         # The command that controls a gateway holds the folder for both.
         with contextlib.nullcontext() if controlled else alone(folder.lock, folder.root):
-            closed = asyncio.run(
-                _serve(folder, tuple(connect or ()), credentials_file, place, json_output, controlled)
-            )
+            known = (folder, tuple(connect or ()), credentials_file)
+            closed = asyncio.run(_serve(known, place, json_output, controlled))
     sys.stdout.flush()
     # A thread that still reads stdin, or a session that cannot be closed, must not hold up the exit.
     os._exit(0 if closed or not controlled else 3)
@@ -107,27 +106,20 @@ def _failures_in_the_log() -> Iterator[None]:
 
 
 async def _serve(
-    folder: RunFolder,
-    connect: tuple[str, ...],
-    credentials_file: Path | None,
+    known: tuple[RunFolder, tuple[str, ...], Path | None],
     place: AgentPlace | None,
     json_output: bool,
     controlled: bool,
 ) -> bool:
     def ready(urls: Urls, pipeline: SubmitPipeline) -> None:
-        variables = urls.environment() | workspace.variables(folder)
+        variables = urls.environment() | workspace.variables(known[0])
         if controlled:
-            opened = pipeline.machine.run
-            undrawn = opened.video != "off" and not opened.env.renders
-            notes = (f"--video {opened.video}: {opened.env.env} does not render; there are no videos",)
-            child_messages.emit(
-                Ready(
-                    variables=urls.environment(),
-                    notes=notes if undrawn else (),
-                    held_s=round(pipeline.machine.held_s, 3),
-                    permit_s=round(gateway.permit_s, 3),
-                )
-            )
+            opened, held_s = pipeline.machine.run, round(pipeline.machine.held_s, 3)
+            notes: tuple[str, ...] = ()
+            if opened.video != "off" and not opened.env.renders:
+                notes = (f"--video {opened.video}: {opened.env.env} does not render; there are no videos",)
+            times = {"held_s": held_s, "permit_s": round(gateway.permit_s, 3)}
+            child_messages.emit(Ready(variables=urls.environment(), notes=notes, **times))
         elif json_output:
             print(orjson.dumps(variables).decode(), flush=True)
         else:
@@ -149,16 +141,8 @@ async def _serve(
         elif what:
             print(f"waiting for {what}", file=sys.stderr, flush=True)
 
-    gateway = Gateway(
-        folder,
-        connect,
-        credentials_file,
-        on_ready=ready,
-        on_change=changed,
-        on_wait=waits,
-        alone=not controlled,
-        place=place,
-    )
+    calls: dict[str, Any] = {"on_ready": ready, "on_change": changed, "on_wait": waits}
+    gateway = Gateway(*known, **calls, alone=not controlled, place=place)
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, gateway.tell, None)
@@ -177,38 +161,35 @@ async def _serve(
 
 async def _listen(gateway: Gateway) -> None:
     orders = Orders()
-    while True:
-        order = await orders.next()
-        if order is None:
-            gateway.tell(None)
-            return
+    while (order := await orders.next()) is not None:
         if isinstance(order, child_messages.CloseRun):
             gateway.tell(order)
+    gateway.tell(None)
 
 
 def progress_of(machine: TicketMachine) -> Progress:
     """A run in the operator's live view."""
     settled = [ticket for ticket in machine.tickets if ticket.status is not None]
     means = [ticket.mean for ticket in settled if ticket.mean is not None]
-    running = machine.in_flight
+    running, last = machine.in_flight, settled[-1] if settled else None
+    now: dict[str, Any] = {}
+    if running is not None:
+        now = {name: getattr(running, name) for name in ("submit_id", "n_episodes", "n_done", "waits_for")}
     return Progress(
         episode_budget=machine.run.episode_budget,
         remaining_budget=machine.state.remaining_budget,
         n_submits=machine.state.n_submits,
         n_rejected=machine.n_rejected,
-        submit_id=None if running is None else running.submit_id,
-        n_episodes=0 if running is None else running.n_episodes,
-        n_done=0 if running is None else running.n_done,
-        waits_for="" if running is None else running.waits_for,
-        last_submit_id=settled[-1].submit_id if settled else None,
-        last_status=settled[-1].status if settled else None,
-        last_mean=settled[-1].mean if settled else None,
+        last_submit_id=last and last.submit_id,
+        last_status=last and last.status,
+        last_mean=last and last.mean,
         best_mean=max(means, default=None),
         in_flight_s=round(machine.in_flight_s, 3),
         feedback_s=round(machine.feedback_s, 3),
         held_s=round(machine.held_s, 3),
         spent=machine.spent,
         cancelled=machine.cancelled,
+        **now,
     )
 
 

@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 from collections.abc import AsyncIterator, Collection, Iterable, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
 
@@ -82,28 +82,17 @@ async def reached(where: Cluster, workers: Workers | None = None) -> AsyncIterat
         local: LocalCluster | None = None
         file, opened = where.file, None
         if (chosen := where.local) is not None:
-            local = await stack.enter_async_context(
-                local_cluster(
-                    "local",
-                    state=chosen.state,
-                    data=chosen.data,
-                    audit=chosen.audit,
-                    hidden_isolation=chosen.hidden_isolation,
-                    unjailed=where.unjailed,
-                    workers=workers,
-                    policy_packages=tuple(chosen.policy_package or ()),
-                    browser=chosen.browser,
-                    env_timeout=chosen.env_timeout,
-                    env_memory=chosen.env_memory,
-                )
-            )
+            names = ("state", "data", "audit", "hidden_isolation", "browser", "env_timeout", "env_memory")
+            given: dict[str, Any] = {name: getattr(chosen, name) for name in names}
+            given |= {"unjailed": where.unjailed, "policy_packages": tuple(chosen.policy_package or ())}
+            starting = local_cluster("local", workers=workers, **given)
+            local = await stack.enter_async_context(starting)
             if local.note:
                 say(f"note: {local.note}", err=True)
             file, opened = local.operator_file, local.opened
         operator, gateway = find_credentials(where.connect, file)
-        link = await stack.enter_async_context(
-            transport.connect(operator, timeout_s=None if where.patient else CONNECT_S)
-        )
+        timeout_s = None if where.patient else CONNECT_S
+        link = await stack.enter_async_context(transport.connect(operator, timeout_s=timeout_s))
         if where.web is not None:
             await stack.enter_async_context(live_view(where.web, where.connect, file))
         yield Reached(Operations(link, opened), gateway, local)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections import deque
 from pathlib import Path
 from typing import Any
@@ -32,11 +33,8 @@ class AgentLog:
         if stream == "stderr":
             self.last_errors.append(line[:500].decode("utf-8", "replace").strip())
         if stream == "stdout" and line.startswith(b"{") and len(line) <= MAX_LINE_BYTES:
-            try:
+            with contextlib.suppress(orjson.JSONDecodeError):
                 orjson.loads(line)
-            except orjson.JSONDecodeError:
-                pass
-            else:
                 self._write(line)
                 return
         cut = line[:MAX_LINE_BYTES]
@@ -66,7 +64,5 @@ class AgentLog:
             line = orjson.dumps(
                 {"type": "log_full", "text": f"more than {MAX_LOG_BYTES} bytes: the rest is not kept"}
             )
-        try:
+        with contextlib.suppress(OSError):
             self._file.write(line + b"\n")
-        except OSError:
-            pass

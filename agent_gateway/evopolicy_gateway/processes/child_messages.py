@@ -256,10 +256,8 @@ def event_of(data: bytes) -> AnyEvent:
 
 def emit(event: Event) -> None:
     """Sends an event to the parent; dropped when the parent is gone."""
-    try:
+    with contextlib.suppress(BrokenPipeError):
         os.write(sys.stdout.fileno(), line(event))
-    except BrokenPipeError:
-        pass
 
 
 class Orders:
@@ -283,11 +281,8 @@ class Orders:
         try:
             with open(sys.stdin.fileno(), "rb", closefd=False) as stdin:
                 for data in stdin:
-                    try:
-                        order = _orders.decode(data)
-                    except DECODE_ERRORS:
-                        continue
-                    loop.call_soon_threadsafe(self._queue.put_nowait, order)
+                    with contextlib.suppress(*DECODE_ERRORS):
+                        loop.call_soon_threadsafe(self._queue.put_nowait, _orders.decode(data))
         finally:
             # A child that can no longer read commands ends as if its parent were gone.
             with contextlib.suppress(RuntimeError):  # the loop is closed already

@@ -67,8 +67,7 @@ def _below(root: Path, skipped: Path, counted: set[tuple[int, int]]) -> int:
                 for entry in entries:
                     with contextlib.suppress(OSError):
                         info = entry.stat(follow_symlinks=False)
-                        is_skipped = len(stack) == 2 and root / entry.name == skipped
-                        if is_skipped:
+                        if len(stack) == 2 and root / entry.name == skipped:
                             continue
                         total += _space(info, counted)
                         if stat.S_ISDIR(info.st_mode):

@@ -17,15 +17,9 @@ from evopolicy_common.processes.notices import Waiting
 from evopolicy_common.records.secrets import without_keys
 from evopolicy_common.records.words import in_words
 from evopolicy_common.wire.credentials import Credentials
+from evopolicy_gateway.processes import child_messages as messages
 from evopolicy_gateway.processes import child_rpc
-from evopolicy_gateway.processes.child_messages import (
-    AgentEnded,
-    CloseRun,
-    Progress,
-    Ready,
-    StopAgent,
-    SubmitsSeen,
-)
+from evopolicy_gateway.processes.child_messages import Progress, Ready
 from evopolicy_gateway.run import model_relay, record
 from evopolicy_gateway.run.gateway_process import GatewayProcess
 from evopolicy_gateway.run.open_run import OpenRun
@@ -79,8 +73,7 @@ class AgentSide:
         tasks: list[asyncio.Task[Any]] = []
 
         def begin(work: Coroutine[Any, Any, T]) -> asyncio.Task[T]:
-            task = asyncio.create_task(work)
-            tasks.append(task)
+            tasks.append(task := asyncio.create_task(work))
             return task
 
         relay: model_relay.ModelRelay | None = None
@@ -110,7 +103,7 @@ class AgentSide:
             if serving.done() and not self.closed:
                 serving.result()
             if not keeping.done():
-                await self.agent.tell(StopAgent())
+                await self.agent.tell(messages.StopAgent())
             await self._close(await keeping)
             await serving
         finally:
@@ -146,20 +139,19 @@ class AgentSide:
         if held_s > before:
             await self.agent.note_held(held_s)
         asked, running = progress.n_submits + progress.n_rejected, progress.submit_id is not None
-        await self.agent.note_submits(SubmitsSeen(asked=asked, running=running))
+        await self.agent.note_submits(messages.SubmitsSeen(asked=asked, running=running))
         self.cancelled = self.cancelled or progress.cancelled
         if progress.spent:
             self._spent.set()
 
-    async def _close(self, ended: AgentEnded) -> None:
+    async def _close(self, ended: messages.AgentEnded) -> None:
         """Prints why the agent ended, and has the run closed."""
         run = self._run
         reason = "budget_spent" if self._spent.is_set() else ended.reason
         if self._model_spent.is_set() and reason in ("agent_stopped", "agent_failed", "told"):
             reason = "model_budget_spent"
         reason = CANCELLED if self.cancelled else reason
-        how = f"agent ended: {in_words(reason)}"
-        run.note(f"{how}, {ended.detail}" if ended.detail else how)
+        run.note(", ".join(filter(None, (f"agent ended: {in_words(reason)}", ended.detail))))
         if reason == "agent_failed":
             for line in ended.stderr_tail:
                 run.note(f"stderr: {line}")
@@ -172,4 +164,4 @@ class AgentSide:
         except Exception as error:  # the agent has ended: no bug in this costs the run
             why = record.why_failed(error, run.folder.harness_log)
             run.note(f"the coordinator does not commit to this side of run.json: {why}")
-        await self._gateway.close(CloseRun(reason=reason, agent=about))
+        await self._gateway.close(messages.CloseRun(reason=reason, agent=about))

@@ -37,27 +37,14 @@ async def fetch(root: Path, finished: RunFinished, operations: Operations) -> tu
                 data = await operations.fetch(outcome.video)
             except RefusedError:
                 continue
-            await asyncio.to_thread(_write, target, data)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            await asyncio.to_thread(write_atomically, target, data)
+        known = {"episode_return": outcome.episode_return, "length": outcome.length}
         recordings.append(
-            Replay(
-                path=path,
-                split="heldout",
-                episode=outcome.index,
-                submit_index=index,
-                episode_return=outcome.episode_return,
-                length=outcome.length,
-            )
+            Replay(path=path, split="heldout", episode=outcome.index, submit_index=index, **known)
         )
     return tuple(sorted(recordings, key=lambda replay: replay.episode))
 
 
 def _has(path: Path, digest: str) -> bool:
-    try:
-        return digest_of(path.read_bytes()) == digest
-    except OSError:
-        return False
-
-
-def _write(path: Path, data: bytes) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(path, data)
+    return path.is_file() and digest_of(path.read_bytes()) == digest
