@@ -12,6 +12,9 @@ from evopolicy_common.records.run_record import PROTOCOL_VERSION
 from evopolicy_gateway.submits.tickets import Ticket
 from evopolicy_gateway.workspace.agents_md import LAST_WORDS_S
 
+_COUNTS = ("episode_budget", "min_episodes_per_submit", "max_episodes_per_submit")
+_SETTINGS = ("policy_scope", "finish", "feedback", "observations", "sandbox_tier", "video")
+
 
 def info_document(
     run: RunOpened,
@@ -27,14 +30,10 @@ def info_document(
         "env_version": env.env_version,
         "n_env_instances": run.n_env_instances,
         "max_episode_steps": run.announced_steps,
-        "obs_space": env.obs_space,
-        "action_space": env.action_space,
-        "obs_storage": env.obs_storage,
+        **{name: getattr(env, name) for name in ("obs_space", "action_space", "obs_storage")},
     }
-    if env.reward_components:
-        env_meta["reward_components"] = {
-            name: env.reward_texts.get(name, "") for name in env.reward_components
-        }
+    if names := env.reward_components:
+        env_meta["reward_components"] = {name: env.reward_texts.get(name, "") for name in names}
     limits = msgspec.to_builtins(run.limits)
     rollout_wall_s = min(run.limits.episode_wall_s, run.limits.submit_wall_s or math.inf)
     return {
@@ -46,18 +45,11 @@ def info_document(
         },
         "env_meta": env_meta,
         "episode_ends_after": min(env.max_episode_steps, run.announced_steps),
-        "episode_budget": run.episode_budget,
-        "min_episodes_per_submit": run.min_episodes_per_submit,
-        "max_episodes_per_submit": run.max_episodes_per_submit,
+        **{name: getattr(run, name) for name in _COUNTS},
         "resource_limits": {"rollout_wall_s": rollout_wall_s} | limits,
         "allowed_imports": list(run.allowed_imports),
         "denied_imports": list(run.denied_imports),
-        "policy_scope": run.policy_scope,
-        "finish": run.finish,
-        "feedback": run.feedback,
-        "observations": run.observations,
-        "sandbox_tier": run.sandbox_tier,
-        "video": run.video,
+        **{name: getattr(run, name) for name in _SETTINGS},
         "deterministic": env.deterministic,
         "end_grace_s": LAST_WORDS_S,
         "last_warning": last_warning,

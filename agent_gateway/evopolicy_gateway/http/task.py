@@ -11,25 +11,15 @@ from evopolicy_gateway.submits.episode_files import episode_share
 
 def task_markdown(run: RunOpened) -> str:
     """Everything that an agent needs to write a policy and to submit it."""
-    parts = [
-        run.env.task_text.strip(),
-        f"This environment is `{run.env.env}`: {run.env.env_version}.",
-        _policy(run),
-        _cases(run),
-        _scope(run),
-        _failures(run),
-        _limits(run),
-        _randomness(run),
-    ]
+    parts = [run.env.task_text.strip(), f"This environment is `{run.env.env}`: {run.env.env_version}."]
+    parts += [part(run) for part in (_policy, _cases, _scope, _failures, _limits, _randomness)]
     return "\n\n".join(parts) + "\n"
 
 
 def _policy(run: RunOpened) -> str:
-    form = (
-        "as numpy arrays, ints, strings, dicts and tuples, as the space says"
-        if run.observations == "arrays"
-        else "as plain numbers, strings, dicts and nested lists"
-    )
+    form = "as plain numbers, strings, dicts and nested lists"
+    if run.observations == "arrays":
+        form = "as numpy arrays, ints, strings, dicts and tuples, as the space says"
     stored = {
         "inline": "in the rows of `trajectory.jsonl`",
         "npy": "in `observations.npy`, one array row a step (`obs` in `trajectory.jsonl` is null)",
@@ -41,13 +31,11 @@ def _policy(run: RunOpened) -> str:
             "in the rows of `trajectory.jsonl`, or, if those of an episode have more than 4,096 bytes as one array, in"
             " `observations.npy` (`observations.npz` for dictionaries; `obs` is null then)"
         )
-    kept = {
-        "scores": "Feedback is the summary of each submit; it has no trajectories.",
-        "trajectories": f"Feedback keeps the observations {stored}."
-        if run.env.obs_storage == "inline"
-        else "Feedback has rewards and actions, and no observations (`obs` in `trajectory.jsonl` is null).",
-        "pictures": f"Feedback keeps the observations {stored}.",
-    }[run.feedback]
+    kept = f"Feedback keeps the observations {stored}."
+    if run.feedback == "scores":
+        kept = "Feedback is the summary of each submit; it has no trajectories."
+    elif run.feedback == "trajectories" and run.env.obs_storage != "inline":
+        kept = "Feedback has rewards and actions, and no observations (`obs` in `trajectory.jsonl` is null)."
     return f"""## The policy
 
 `system/policy.py` holds a top-level `class Policy`:
@@ -99,14 +87,13 @@ def _scope(run: RunOpened) -> str:
             "episode to the next. Episodes of a submit run in parallel."
         )
     else:
+        hidden = "One new `Policy` plays all validation cases, another one all held-out cases."
+        if run.hidden_evaluation == "submit":
+            hidden = "Hidden cases are played with a new `Policy` every `n_episodes_this_submit` cases."
         text = (
             "Policy scope `submit`: one `Policy` plays all episodes of a submit one after another, in the order asked for,\n"
-            "in one process. "
+            f"in one process. {hidden}"
         )
-        if run.hidden_evaluation == "submit":
-            text += "Hidden cases are played with a new `Policy` every `n_episodes_this_submit` cases."
-        else:
-            text += "One new `Policy` plays all validation cases, another one all held-out cases."
     return f"## Policy scope\n\n{text}"
 
 
@@ -168,11 +155,11 @@ def _limits(run: RunOpened) -> str:
 
 
 def _randomness(run: RunOpened) -> str:
-    sentence = (
-        "This environment is deterministic: the same case and the same actions give the same episode."
-        if run.env.deterministic
-        else "This environment is **not** deterministic: the same case and the same actions may give another episode."
-    )
+    sentence = "This environment is **not** deterministic: the same case and the same actions may give another episode."
+    if run.env.deterministic:
+        sentence = (
+            "This environment is deterministic: the same case and the same actions give the same episode."
+        )
     return f"""## Randomness
 
 {sentence}

@@ -17,8 +17,8 @@ from evopolicy_gateway import shipped
 from evopolicy_gateway.harnesses.interface.agent_config import AgentConfig
 from evopolicy_gateway.inputs import declared as inputs
 from evopolicy_gateway.relay.usage import Prices
-from evopolicy_gateway.workspace.agents_md import check_agents_md
-from evopolicy_gateway.workspace.prompts import Prompts, read_prompts, read_text
+from evopolicy_gateway.workspace.agents_md import PLACEHOLDERS
+from evopolicy_gateway.workspace.prompts import Prompts, check_text, read_prompts, read_text
 
 
 class Texts(msgspec.Struct, frozen=True, kw_only=True):
@@ -46,7 +46,7 @@ def read(
     if agents_md is not None:
         path = shipped.found(agents_md, started_in)
         text = read_text(path)
-        check_agents_md(str(path), text)
+        check_text(str(path), text, PLACEHOLDERS)
     if prompts is not None:
         chosen = read_prompts(shipped.found(prompts, started_in))
     else:

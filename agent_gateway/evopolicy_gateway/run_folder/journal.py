@@ -35,9 +35,8 @@ class AtWork:
         """Request indices of episodes, by the key of their submit."""
         data = os.pread(self._fd, 1 << 16, 0)
         for at in range(0, len(data), self._RECORD):
-            key, _, index = (
-                data[at : at + self._RECORD].rstrip(b"\0").decode("ascii", "replace").partition(" ")
-            )
+            record = data[at : at + self._RECORD].rstrip(b"\0").decode("ascii", "replace")
+            key, _, index = record.partition(" ")
             if key and index.isdecimal():
                 self.died_over.setdefault(key, []).append(int(index))
         self._lock = threading.Lock()

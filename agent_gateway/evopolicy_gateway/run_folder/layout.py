@@ -74,14 +74,8 @@ class RunFolder(msgspec.Struct, frozen=True):
 
     def artifacts(self) -> Artifacts:
         """The existing files of a finished run, under their names in `run.json`."""
-        places = {
-            "workspace": self.workspace,
-            "feedback": self.feedback,
-            "checkpoints": self.checkpoints,
-            "logs_harness": self.harness_log,
-            "logs_agent": self.agent_log,
-            "logs_env": self.env_log,
-        }
+        logs = {"logs_harness": self.harness_log, "logs_agent": self.agent_log, "logs_env": self.env_log}
+        places = {name: getattr(self, name) for name in ("workspace", "feedback", "checkpoints")} | logs
         existing = {name: path for name, path in places.items() if path.exists()}
         return Artifacts(**{name: path.relative_to(self.root).as_posix() for name, path in existing.items()})
 

@@ -10,7 +10,6 @@ from evopolicy_common.messages.gateway import FeedbackDetail, RunOpened
 from evopolicy_common.records.canary import CANARY
 from evopolicy_gateway.run_folder.names import episode_name, submit_id
 from evopolicy_gateway.submits.episode_files import episode_share, shows_texts
-from evopolicy_gateway.workspace.prompts import check_text
 
 
 class Urls(msgspec.Struct, frozen=True, kw_only=True):
@@ -48,17 +47,17 @@ def urls_below(base: str, token: str, *, bearer: bool = False) -> Urls:
     return Urls(info=f"{root}/info", task=f"{root}/task", submit=f"{root}/submit", bearer=bearer)
 
 
+_SCOPE = {
+    "episode": "Every episode gets a fresh process and a fresh `Policy`.",
+    "submit": "One `Policy` plays all episodes of a submit one after another; `reset` is called before each.",
+}
 _FAILS = {
     "play-on": "random actions play the rest of that episode.",
     "end-submit": "that episode ends, and the submit has no mean return and cannot\nbe selected.",
 }
 _ASK = 'SUBMIT_URL + "/" + str(answer["submit_id"])'
-_WITHOUT_BEARER = {
-    "auth": "",
+_WITHOUT_BEARER = dict.fromkeys(("auth", "os", "headers", "more_headers"), "") | {
     "addresses": "service's addresses are also in `EVOPOLICYGYM_API` (base), `EVOPOLICYGYM_INFO_URL`, `EVOPOLICYGYM_TASK_URL` and `EVOPOLICYGYM_SUBMIT_URL`.",
-    "os": "",
-    "headers": "",
-    "more_headers": "",
     "question": _ASK,
 }
 _WITH_BEARER = {
@@ -284,11 +283,6 @@ PLACEHOLDERS = ("standard", *_TEXT.get_identifiers())
 """In an operator's own text; `$standard` is the whole standard text."""
 
 
-def check_agents_md(where: str, text: str) -> None:
-    """Raises ConfigError for an operator's text that cannot be filled in; `where`: how the error begins."""
-    check_text(where, text, PLACEHOLDERS)
-
-
 def agents_md(run: RunOpened, urls: Urls, text: str = "", *, started: bool = False) -> str:
     """The text for one run. `text`: the operator's own with `PLACEHOLDERS`; empty: the standard text. `started`: the
     run starts from a submit of an earlier one."""
@@ -296,13 +290,7 @@ def agents_md(run: RunOpened, urls: Urls, text: str = "", *, started: bool = Fal
     example = [index % run.n_env_instances for index in range(n_example)]
     most = min(run.max_episodes_per_submit, run.episode_budget)
     usual = run.n_env_instances > 7 and run.min_episodes_per_submit <= 5 <= most
-    scope = (
-        "Every episode gets a fresh process and a fresh `Policy`."
-        if run.policy_scope == "episode"
-        else "One `Policy` plays all episodes of a submit one after another; `reset` is called before each."
-    )
-    known = dict(_WITH_BEARER if urls.bearer else _WITHOUT_BEARER)
-    known |= {
+    known = (_WITH_BEARER if urls.bearer else _WITHOUT_BEARER) | {
         "env": run.env.env,
         "budget": str(run.episode_budget),
         "least": str(run.min_episodes_per_submit),
@@ -310,7 +298,7 @@ def agents_md(run: RunOpened, urls: Urls, text: str = "", *, started: bool = Fal
         "last_id": str(run.n_env_instances - 1),
         "example": str(example),
         "ranges": "0-3,7" if usual else _ranges(n_example, run.n_env_instances),
-        "scope": scope,
+        "scope": _SCOPE[run.policy_scope],
         "evidence": _EVIDENCE[run.simulation],
         "rule": _RULE[run.simulation],
         "finish": _FINISH[run.finish],
@@ -327,8 +315,8 @@ def agents_md(run: RunOpened, urls: Urls, text: str = "", *, started: bool = Fal
         "last_words": f"{LAST_WORDS_S:g}",
         "canary": CANARY,
         "history": _HISTORY if started else "",
+        "share": f"{episode_share(run.limits, run.episode_budget):,}",
     }
-    known["share"] = f"{episode_share(run.limits, run.episode_budget):,}"
     known["look"] = "" if run.feedback == "scores" else Template(_LOOK).substitute(known)
     known["files"] = Template(_feedback_files(run)).substitute(known)
     standard = _TEXT.substitute(known)

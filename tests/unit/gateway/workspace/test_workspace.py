@@ -19,8 +19,9 @@ from evopolicy_common.records.blobs import digest_of
 from evopolicy_gateway.http.info import info_document
 from evopolicy_gateway.http.task import task_markdown
 from evopolicy_gateway.run_folder.layout import RunFolder, run_folder
-from evopolicy_gateway.workspace.agents_md import NO_URLS, STANDARD, agents_md, check_agents_md, urls_below
+from evopolicy_gateway.workspace.agents_md import NO_URLS, PLACEHOLDERS, STANDARD, agents_md, urls_below
 from evopolicy_gateway.workspace.initial_policy import constant_action, initial_policy
+from evopolicy_gateway.workspace.prompts import check_text
 from evopolicy_gateway.workspace.staging import stage
 
 URLS = urls_below("http://127.0.0.1:4711", "ab" * 16)
@@ -145,7 +146,7 @@ def test_the_printed_standard_text_gives_the_same_rules() -> None:
 )
 def test_a_text_that_cannot_be_filled_in_is_refused(text: str, fault: str) -> None:
     with pytest.raises(ConfigError, match=fault):
-        check_agents_md("rules.md", text)
+        check_text("rules.md", text, PLACEHOLDERS)
 
 
 def test_the_task_says_what_differs_between_runs() -> None:
