@@ -1,5 +1,4 @@
-"""`evopolicy files` and `evopolicy texts`: the files in the package that are not code, for installations without a
-clone."""
+"""`evopolicy files`, `texts` and `schema`: what comes with the package besides code."""
 
 from __future__ import annotations
 
@@ -12,8 +11,9 @@ import typer
 from evopolicy_common.cli.conventions import fail_on_our_errors
 from evopolicy_common.cli.frame import App
 from evopolicy_common.errors import ConfigError
-from evopolicy_common.terminal import say_lines
+from evopolicy_common.terminal import say_json, say_lines
 from evopolicy_gateway import shipped
+from evopolicy_gateway.cli import schemas
 from evopolicy_gateway.workspace import agents_md, prompts
 
 app = App()
@@ -66,3 +66,17 @@ def texts(
         return
     for name, text in prompts.STANDARD.items():
         say_lines([f'{name} = """\\', f'{text}"""'])
+
+
+@app.command("schema", epilog="Example: evopolicy schema suite.toml > suite.schema.json")
+def schema(
+    name: Annotated[
+        str, typer.Argument(help="Name of the file, such as run.json; default: list the names.")
+    ] = "",
+) -> None:
+    """Print the JSON Schema of one of evopolicy's files."""
+    with fail_on_our_errors():
+        if not name:
+            say_lines([f"{each:<14}{kind.about}" for each, kind in schemas.KINDS.items()])
+            return
+        say_json(schemas.schema(name))

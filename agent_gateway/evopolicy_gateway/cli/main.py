@@ -119,7 +119,7 @@ GROUPS = {
             "Print the standard texts for agents, as templates for --agents-md and --prompts.",
         ),
         "schema": Place(
-            "evopolicy_gateway.cli.schema:app", "Print the JSON Schema of one of evopolicy's files."
+            "evopolicy_gateway.cli.files:app", "Print the JSON Schema of one of evopolicy's files."
         ),
         "data": Place(
             f"{_COORDINATOR}.data:app",

@@ -21,10 +21,8 @@ from evopolicy_gateway.processes import child_messages as messages
 from evopolicy_gateway.processes import child_rpc
 from evopolicy_gateway.processes.child_messages import Progress, Ready
 from evopolicy_gateway.run import model_relay, record
-from evopolicy_gateway.run.gateway_process import GatewayProcess
-from evopolicy_gateway.run.open_run import OpenRun
+from evopolicy_gateway.run.children import GatewayProcess, OpenRun, SupervisedAgent
 from evopolicy_gateway.run.operations import Operations
-from evopolicy_gateway.run.supervised_agent import SupervisedAgent
 from evopolicy_gateway.workspace.agents_md import LAST_WORDS_S
 
 T = TypeVar("T")
@@ -91,7 +89,8 @@ class AgentSide:
             self._run.stopwatch.opened()
             relay = model_relay.of_run(self._run, ready, self._model_spent)
             relaying = [] if relay is None else [begin(relay.serve())]
-            keeping = begin(self.agent.keep(ready, relay, self._spent))
+            address = None if relay is None else relay.address
+            keeping = begin(self.agent.keep(ready, address, self._spent))
             going: list[asyncio.Future[Any]] = [serving, keeping, *ends, *relaying]
             await asyncio.wait(going, return_when=asyncio.FIRST_COMPLETED)
             for task in relaying:

@@ -44,7 +44,7 @@ from evopolicy_gateway.http.server import Address
 from evopolicy_gateway.processes.child_messages import Ready
 from evopolicy_gateway.run import record, starts
 from evopolicy_gateway.run.agent_side import AgentSide
-from evopolicy_gateway.run.open_run import OpenRun
+from evopolicy_gateway.run.children import OpenRun
 from evopolicy_gateway.run.operations import Operations
 from evopolicy_gateway.run.plan import Plan
 from evopolicy_gateway.run.times import Stopwatch

@@ -26,6 +26,7 @@ from evopolicy_common.records.open_run import IntendedRun
 from evopolicy_common.records.secrets import Redaction, without_keys
 from evopolicy_common.wire.http import bound
 from evopolicy_gateway.agent_supervisor.supervisor import secrets_in
+from evopolicy_gateway.harnesses.interface.base import RelayAddress
 from evopolicy_gateway.http.server import Address
 from evopolicy_gateway.inputs import own_config
 from evopolicy_gateway.jail.view import confined
@@ -34,7 +35,7 @@ from evopolicy_gateway.processes.child_messages import AgentDoing, ModelBudgetSp
 from evopolicy_gateway.processes.child_rpc import Child
 from evopolicy_gateway.relay.service import Order
 from evopolicy_gateway.run import recorded_agent
-from evopolicy_gateway.run.open_run import OpenRun
+from evopolicy_gateway.run.children import OpenRun
 from evopolicy_gateway.run.plan import Replays
 from evopolicy_gateway.run_folder.layout import saved
 from evopolicy_gateway.workspace import staging as workspace
@@ -64,11 +65,11 @@ class ModelRelay:
         # Connections queue here while a relay is started.
         self._sock.listen(64)
         self.port = self._sock.getsockname()[1]
-        self.url = f"http://{LOOPBACK}:{self.port}"
-        self.token = token or secrets.token_hex(24)
+        url, token = f"http://{LOOPBACK}:{self.port}", token or secrets.token_hex(24)
+        self.address = RelayAddress(url=url, token=token)
         ledger.parent.mkdir(parents=True, exist_ok=True)
         ledger.touch(mode=0o600)
-        made = order(self.token)
+        made = order(token)
         self._order = StartRelay(order=msgspec.to_builtins(made))
         written = [ledger]
         if made.record != "off":
@@ -155,7 +156,7 @@ def of_run(run: OpenRun, ready: Ready, model_spent: asyncio.Event) -> ModelRelay
             port=service.port,
             token=service.token,
             model_port=made.port,
-            model_token=made.token,
+            model_token=made.address.token,
         )
         recorded_agent.keep(folder, plan, kept)
     return made

@@ -1,0 +1,302 @@
+"""The gateway and the supervised agent of an open run: child processes, each of which is started again when it dies."""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+import time
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+
+import msgspec
+
+from evopolicy_common.errors import EvopolicyError
+from evopolicy_common.processes import child_process, host
+from evopolicy_common.records.run_record import AgentLimits
+from evopolicy_common.wire import credentials
+from evopolicy_common.wire.credentials import Credentials
+from evopolicy_gateway.harnesses.interface.base import RelayAddress
+from evopolicy_gateway.jail.jail import JailOrder
+from evopolicy_gateway.processes import child_messages as messages
+from evopolicy_gateway.processes import child_rpc
+from evopolicy_gateway.processes.child_messages import (
+    AgentEnded,
+    CloseRun,
+    Order,
+    Progress,
+    Ready,
+    SubmitsSeen,
+)
+from evopolicy_gateway.processes.child_rpc import Child
+from evopolicy_gateway.run.plan import Plan
+from evopolicy_gateway.run.times import Stopwatch
+from evopolicy_gateway.run.watch import View
+from evopolicy_gateway.run_folder.layout import RunFolder
+from evopolicy_gateway.run_folder.listener import TOKEN_VARIABLE, place_notice
+from evopolicy_gateway.workspace import staging as workspace
+
+
+class RunError(EvopolicyError):
+    """The run could not be played to its end; its folder and the message tell how far it came."""
+
+
+class OpenRun(msgspec.Struct, frozen=True, kw_only=True):
+    """One open run."""
+
+    plan: Plan
+    run: str
+    """Its id at the cluster."""
+    stopwatch: Stopwatch
+    watch: View
+
+    @property
+    def folder(self) -> RunFolder:
+        return self.plan.folder
+
+    def note(self, text: str) -> None:
+        """Prints a line about the run."""
+        self.watch.note(self.plan.name, text)
+
+
+_QUICK_DEATH_S = 5.0
+_MAX_QUICK_DEATHS = 5
+_USAGE_ERROR = 2
+
+
+class _Kept:
+    """A part of an open run, over all its processes, of which one is alive at a time."""
+
+    def __init__(self, run: OpenRun) -> None:
+        self._run = run
+        self._child: Child | None = None
+
+    async def tell(self, order: Order) -> None:
+        """Sends an order to the present process, if there is one."""
+        if self._child is not None:
+            await self._child.tell(order)
+
+    async def end(self, grace_s: float) -> None:
+        """Ends the process; an agent's supervisor ends its agent."""
+        if self._child is not None:
+            await self._child.end(grace_s)
+
+    async def _start(self, module: str, *arguments: str) -> Child:
+        program = [sys.executable, "-P", "-m", module, *arguments]
+        self._child = await Child.start(program, self._run.folder.harness_log, talks=True)
+        return self._child
+
+
+class GatewayProcess(_Kept):
+    """The gateway of one run."""
+
+    def __init__(
+        self,
+        run: OpenRun,
+        served: asyncio.Future[Ready],
+        on_progress: Callable[[Progress], Awaitable[None]],
+        *,
+        closed: bool,
+    ) -> None:
+        """`served`: gets the result when the agent is served for the first time. `closed`: the run is closed."""
+        super().__init__(run)
+        self._served = served
+        self._on_progress = on_progress
+        self.closed = asyncio.Event()
+        """Set when the coordinator has closed the run."""
+        if closed:
+            self.closed.set()
+        self._close: CloseRun | None = None
+
+    @property
+    def is_closing(self) -> bool:
+        """Whether the run is closed, or its closing was requested."""
+        return self._close is not None or self.closed.is_set()
+
+    async def keep(self) -> None:
+        """Runs the gateway until it has closed the run. Raises RunError when it cannot serve."""
+        run, log = self._run, self._run.folder.harness_log
+        quick_deaths = 0
+        while not self.closed.is_set():
+            started = time.monotonic()
+            run.stopwatch.begins("gateway")
+            child = await self._start("evopolicy_gateway.cli.serve", str(run.folder.root), "--controlled")
+            async for event in child.events():
+                await self._on_event(event)
+            code = await child.ended()
+            if self.closed.is_set():
+                return
+            quick_deaths = quick_deaths + 1 if time.monotonic() - started < _QUICK_DEATH_S else 0
+            if code == _USAGE_ERROR or quick_deaths > _MAX_QUICK_DEATHS:
+                words = child_process.last_words(log)
+                raise RunError(f"the gateway cannot serve (exit status {code}): {words}; see {log}")
+            run.note(f"the gateway ended with status {code}; starting it again")
+            await asyncio.sleep(0.1 * 2**quick_deaths)
+
+    async def close(self, order: CloseRun) -> None:
+        """Has the run closed, by this gateway or the next one."""
+        self._close = order
+        await self.tell(order)
+
+    async def _on_event(self, event: object) -> None:
+        run = self._run
+        match event:
+            case messages.Waits():
+                run.watch.held(run.plan.name, event.waits_for)
+            case Ready():
+                run.stopwatch.permit_reported(event.permit_s)
+                run.stopwatch.held_reported(event.held_s)
+                if not self._served.done():
+                    for text in (*event.notes, *_place_notes(run, event)):
+                        run.note(text)
+                    self._served.set_result(event)
+                if self._close is not None:
+                    await self.close(self._close)
+            case Progress():
+                await self._on_progress(event)
+            case messages.RunClosed():
+                self.closed.set()
+
+
+def _place_notes(run: OpenRun, ready: Ready) -> list[str]:
+    """Facts about the agent's place: for a remote agent, those that the operator passes on to it."""
+    if run.plan.listener is None:
+        until = "until then no hidden case that this run shares is played while its agent lives"
+        return [] if host.boot_id() else [f"{host.NO_BOOT_ID}; {until}"]
+    return [
+        place_notice(run.plan.settings.agent_host, run.folder.root),
+        f"the agent is served at {ready.variables['EVOPOLICYGYM_SUBMIT_URL']}",
+        f"its bearer token is in {run.folder.bearer}; it finds it in {TOKEN_VARIABLE}",
+        f"its workspace is {run.folder.workspace}; the rules are in AGENTS.md there",
+        f"when it is done before its budget is spent: evopolicy finish {run.folder.root}",
+    ]
+
+
+_MAX_SUPERVISOR_DEATHS = 5
+_SURVIVORS_PAUSE_S = 1.0
+_ENDLESS = 1 << 62
+"""Bytes that a remote agent's workspace may take: its files may be elsewhere, and are its operator's."""
+
+
+class SupervisedAgent(_Kept):
+    """The agent of one run below its supervisor."""
+
+    def __init__(self, run: OpenRun, gateway: Credentials) -> None:
+        """`gateway`: credentials whose files the jail hides."""
+        super().__init__(run)
+        self._credentials = gateway
+        self.survivors: list[int] = []
+        """Process ids of the agent that survive being killed."""
+        self._submits = SubmitsSeen(asked=0, running=False)
+        """As last reported by the gateway."""
+        self._held_before = 0.0
+        """`held_s` of the run when the supervisor was started."""
+
+    @property
+    def has_begun(self) -> bool:
+        return self._child is not None
+
+    async def keep(self, ready: Ready, relay: RelayAddress | None, spent: asyncio.Event) -> AgentEnded:
+        """Runs the agent to its end. An agent whose supervisor dies, our failure, resumes its session if it has one,
+        else begins anew in its workspace, unless the budget is `spent`."""
+        for _ in range(_MAX_SUPERVISOR_DEATHS):
+            ended = await self._keep_once(ready, relay)
+            if ended is not None:
+                return ended
+            if spent.is_set():
+                break
+            self._run.note("the agent's supervisor died; starting it again, and the agent with it")
+        known = self._run.plan.harness().known()
+        return AgentEnded(reason="agent_failed", detail="its agent supervisor died", facts=known)
+
+    async def note_held(self, held_s: float) -> None:
+        """Gives time for which submits waited for hidden episodes back to the agent's clock; `held_s` of the run."""
+        await self.tell(messages.HeldTime(seconds=held_s - self._held_before))
+
+    async def note_submits(self, submits: SubmitsSeen) -> None:
+        self._submits = submits
+        await self.tell(submits)
+
+    def tell_survivors(self) -> None:
+        """Prints which processes of the agent survive."""
+        pids = ", ".join(map(str, self.survivors))
+        self._run.note(
+            f"processes of the agent survive being killed ({pids}): the run stays open, and no hidden case"
+            " that it shares is played on this machine, before they are gone"
+        )
+
+    async def _keep_once(self, ready: Ready, relay: RelayAddress | None) -> AgentEnded | None:
+        """Returns how the agent ended; None when its supervisor died."""
+        run, plan = self._run, self._run.plan
+        run.stopwatch.begins("agent")
+        self._held_before = run.stopwatch.times.held_s
+        child = await self._start("evopolicy_gateway.agent_supervisor.supervisor")
+        await child.tell(self._start_order(ready, relay))
+        await child.tell(self._submits)
+        ended: AgentEnded | None = None
+        async for event in child.events():
+            match event:
+                case messages.AgentTurn():
+                    run.watch.turn(plan.name, event.turn, event.text)
+                case messages.AgentDoing():
+                    if relay is not None:
+                        event = msgspec.structs.replace(event, tokens=None)  # the relay's count is the run's
+                    run.watch.doing(plan.name, event)
+                case messages.AgentUsed():
+                    resources = event.resources if plan.listener is None else None
+                    run.stopwatch.reported("agent", agent_s=event.used_s, resources=resources)
+                case messages.AgentSurvives():
+                    self.survivors = list(event.pids)
+                    self.tell_survivors()
+                case AgentEnded():
+                    ended = event
+        await child.ended()
+        # Processes left behind by a supervisor that died have become our children.
+        while survivors := await child_rpc.end_orphans():
+            if survivors != self.survivors:
+                self.survivors = survivors
+                self.tell_survivors()
+            await asyncio.sleep(_SURVIVORS_PAUSE_S)
+        self.survivors = []
+        return ended
+
+    def _start_order(self, ready: Ready, relay: RelayAddress | None) -> messages.StartAgent:
+        plan, folder, config = self._run.plan, self._run.folder, self._run.plan.agent_config
+        # A replayed agent sees the recorded run's paths.
+        shown = folder if plan.replays is None else RunFolder(plan.replays.root)
+        jail = None
+        if plan.jail.mode != "none":
+            jail = JailOrder(
+                settings=plan.jail,
+                private=str(folder.agent),
+                hidden=self._hidden(),
+                shown="" if plan.replays is None else str(shown.workspace),
+            )
+        return messages.StartAgent(
+            agent=plan.agent,
+            workspace=str(folder.workspace),
+            agent_log=str(folder.agent_log),
+            urls=ready.variables,
+            variables=workspace.variables(shown),
+            started_in=str(plan.started_in),
+            wall_limit_s=max(1.0, plan.wall_limit_s - self._run.stopwatch.times.agent_s),
+            silence_s=plan.silence_s,
+            prompts=msgspec.to_builtins(plan.texts.prompts),
+            inputs=plan.texts.inputs,
+            config=None if config is None else msgspec.to_builtins(config),
+            model_url="" if relay is None else relay.url,
+            model_token="" if relay is None else relay.token,
+            session_file=str(folder.session),
+            passed_file=str(folder.passed),
+            lock=str(folder.supervisor_lock),
+            jail=jail,
+            limits=plan.limits if plan.listener is None else AgentLimits(disk_bytes=_ENDLESS),
+        )
+
+    def _hidden(self) -> tuple[str, ...]:
+        """Folders that the jail never shows: the runs, and the states of the clusters."""
+        known = self._credentials
+        sockets = [endpoint.partition("/") for endpoint in known.endpoints]
+        states = [str(Path(path).parent.resolve()) for kind, _, path in sockets if kind == "unixsock-stream"]
+        if known.tls is not None:
+            states.append(str(Path(known.tls.private_key).parent))
+        return (str(self._run.plan.runs.absolute()), str(credentials.default_state_dir()), *states)
