@@ -8,8 +8,9 @@ import signal
 import subprocess
 import sys
 import uuid
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 from coordinator_harness import Coordinator
 from waiting import TIMEOUT_S, wait_until
@@ -149,6 +150,35 @@ def command(cwd: Path, *arguments: str) -> Iterator[Command]:
         yield running
     finally:
         running.kill_all()
+
+
+def ended(cwd: Path, *arguments: str, ends: int = 0) -> tuple[str, str]:
+    """Standard output and standard error of `evopolicy`, which ends with that code."""
+    with command(cwd, *arguments) as running:
+        code, out, err = running.finish()
+    assert code == ends, out + err
+    return out, err
+
+
+class Ran(NamedTuple):
+    """A run named `t` that has ended, and what its command said."""
+
+    folder: Path
+    out: str
+    err: str
+
+    @property
+    def record(self) -> RunRecord:
+        return record_in(self.folder)
+
+
+def ran_on(operator_file: Path, cwd: Path, agent_name: str, *more: str, ends: int = 0) -> Ran:
+    """A run on that cluster, whose command ends with that code."""
+    out, err = ended(cwd, *run_arguments(operator_file, agent_name), *more, ends=ends)
+    return Ran(run_dir(cwd), out, err)
+
+
+Plays = Callable[..., Ran]
 
 
 @contextlib.contextmanager

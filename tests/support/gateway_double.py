@@ -482,6 +482,14 @@ def prepare(root: Path, found: Credentials, double: Double) -> RunFolder:
     return folder
 
 
+@contextlib.asynccontextmanager
+async def prepared(root: Path, double: Double | None = None) -> AsyncIterator[tuple[RunFolder, Double]]:
+    """A double that answers, and a run folder in `root` for its gateway."""
+    double = double or Double(opened())
+    async with answering(root, double) as found:
+        yield prepare(root / "run", found, double), double
+
+
 class Served(msgspec.Struct, frozen=True):
     """A gateway that serves, and what a test looks at."""
 
@@ -527,9 +535,5 @@ async def gateway_on(folder: RunFolder, double: Double, **more: Any) -> AsyncIte
 @contextlib.asynccontextmanager
 async def served(tmp_path: Path, double: Double | None = None) -> AsyncIterator[Served]:
     """Double and gateway together in `tmp_path`."""
-    double = double or Double(opened())
-    async with (
-        answering(tmp_path, double) as found,
-        gateway_on(prepare(tmp_path / "run", found, double), double) as service,
-    ):
+    async with prepared(tmp_path, double) as known, gateway_on(*known) as service:
         yield service

@@ -18,7 +18,7 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 import pytest
-from gateway_double import Double, Served, answering, gateway_on, opened, prepare
+from gateway_double import Served, gateway_on, prepared
 
 from evopolicy_gateway.run_folder.layout import save
 from evopolicy_gateway.run_folder.listener import Listener
@@ -86,9 +86,7 @@ def status(answer: bytes) -> int:
 
 @asynccontextmanager
 async def serving(tmp_path: Path, listener: Listener | None = None) -> AsyncIterator[Wire]:
-    double = Double(opened())
-    async with answering(tmp_path, double) as found:
-        folder = prepare(tmp_path / "run", found, double)
+    async with prepared(tmp_path) as (folder, double):
         if listener is not None:
             save(folder.listener, listener)
         async with gateway_on(folder, double) as service:

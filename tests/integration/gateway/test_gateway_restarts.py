@@ -14,7 +14,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 import pytest
-from gateway_double import Double, answering, gateway_on, opened, prepare, served
+from gateway_double import Double, gateway_on, opened, prepared, served
 
 from evopolicy_common.errors import ConfigError, StorageError
 from evopolicy_common.messages.gateway import CloseRun, Submit
@@ -39,9 +39,7 @@ def tree_of(folder: Path) -> dict[str, bytes]:
 
 
 async def test_a_restarted_gateway_has_the_same_urls_and_completes_the_feedback(tmp_path: Path) -> None:
-    double = Double(opened())
-    async with answering(tmp_path, double) as found:
-        folder = prepare(tmp_path / "run", found, double)
+    async with prepared(tmp_path) as (folder, double):
         async with gateway_on(folder, double) as s:
             urls = s.urls
             rules = (folder.workspace / "AGENTS.md").read_bytes()
@@ -63,9 +61,7 @@ async def test_a_restarted_gateway_has_the_same_urls_and_completes_the_feedback(
 
 
 async def test_an_answer_survives_a_restart_and_a_changed_file(tmp_path: Path) -> None:
-    double = Double(opened())
-    async with answering(tmp_path, double) as found:
-        folder = prepare(tmp_path / "run", found, double)
+    async with prepared(tmp_path) as (folder, double):
         async with gateway_on(folder, double) as s:
             before = await s.http.post(s.urls.submit, json=BODY)
         (folder.feedback / "submit_000" / "summary.json").write_text("{}")
@@ -75,8 +71,8 @@ async def test_an_answer_survives_a_restart_and_a_changed_file(tmp_path: Path) -
 
 
 async def test_a_submit_waits_for_a_coordinator_that_is_away(tmp_path: Path) -> None:
-    double = Double(opened())
-    async with served(tmp_path, double) as s:
+    async with served(tmp_path) as s:
+        double = s.double
         double.up = False
         request = asyncio.create_task(s.http.post(s.urls.submit, json=BODY))
         info = await s.http.get(s.urls.info)
@@ -91,9 +87,7 @@ async def test_a_submit_waits_for_a_coordinator_that_is_away(tmp_path: Path) -> 
 
 
 async def test_a_request_written_down_but_never_sent_is_sent_after_the_restart(tmp_path: Path) -> None:
-    double = Double(opened())
-    async with answering(tmp_path, double) as found:
-        folder = prepare(tmp_path / "run", found, double)
+    async with prepared(tmp_path) as (folder, double):
         async with gateway_on(folder, double) as s:
             double.up = False
             request = asyncio.create_task(s.http.post(s.urls.submit, json=BODY))
@@ -161,8 +155,8 @@ async def test_the_same_results_give_the_same_bytes_whatever_the_order_of_arriva
 
 
 async def test_a_coordinator_that_refuses_for_want_of_disk_is_asked_again(tmp_path: Path) -> None:
-    double = Double(opened())
-    async with served(tmp_path, double) as s:
+    async with served(tmp_path) as s:
+        double = s.double
         double.world.full = True
         request = asyncio.create_task(s.http.post(s.urls.submit, json=BODY))
         await asyncio.sleep(0.2)
@@ -172,8 +166,8 @@ async def test_a_coordinator_that_refuses_for_want_of_disk_is_asked_again(tmp_pa
 
 
 async def test_a_run_that_the_operator_cancelled_takes_no_more_submits(tmp_path: Path) -> None:
-    double = Double(opened())
-    async with served(tmp_path, double) as s:
+    async with served(tmp_path) as s:
+        double = s.double
         await double.cancel()
         for _ in range(2):
             answer = await s.http.post(s.urls.submit, json=BODY)
@@ -205,9 +199,7 @@ async def test_a_port_that_somebody_else_has_taken_is_reported(tmp_path: Path, m
     monkeypatch.setattr(server, "_REBIND_TRIES", 2)
     monkeypatch.setattr(server, "_REBIND_PAUSE_S", 0.01)
 
-    double = Double(opened())
-    async with answering(tmp_path, double) as found:
-        folder = prepare(tmp_path / "run", found, double)
+    async with prepared(tmp_path) as (folder, double):
         async with gateway_on(folder, double) as s:
             port = urlsplit(s.urls.info).port
         with socket.socket() as thief:
@@ -223,10 +215,8 @@ def test_a_gateway_that_stops_during_a_submit_shows_no_traceback(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     async def main() -> None:
-        double = Double(opened())
-        async with answering(tmp_path, double) as found:
+        async with prepared(tmp_path) as (folder, double):
             double.go.clear()
-            folder = prepare(tmp_path / "run", found, double)
             async with gateway_on(folder, double) as s:
                 header = {"Idempotency-Key": "mine"}
                 request = asyncio.create_task(s.http.post(s.urls.submit, json=BODY, headers=header))
@@ -279,9 +269,7 @@ async def test_a_gateway_keeps_nothing_of_the_episodes_that_it_has_answered(tmp_
 
 def test_a_damaged_journal_is_refused_and_leaves_no_socket_open(tmp_path: Path) -> None:
     async def main() -> None:
-        double = Double(opened())
-        async with answering(tmp_path, double) as found:
-            folder = prepare(tmp_path / "run", found, double)
+        async with prepared(tmp_path) as (folder, double):
             folder.journal.write_bytes(b"damaged\n")
             with pytest.raises(StorageError, match="line 1"):
                 async with gateway_on(folder, double):

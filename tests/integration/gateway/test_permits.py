@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from gateway_double import Double, answering, gateway_on, opened, prepare, served
+from gateway_double import Double, answering, gateway_on, opened, prepare, prepared, served
 
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.gateway import CloseRun, OpenRun, RequestPermit
@@ -57,10 +57,8 @@ def remote(folder: RunFolder, agent_host: str) -> None:
 
 
 async def test_nothing_is_served_before_the_permit_and_the_operator_hears_why(tmp_path: Path) -> None:
-    double = Double(opened())
-    async with answering(tmp_path, double) as found:
+    async with prepared(tmp_path) as (folder, double):
         await double.score_another_run(host.boot_id())
-        folder = prepare(tmp_path / "run", found, double)
         gateway, events = quiet(folder)
         task = asyncio.create_task(gateway.run())
         await until(lambda: events)
@@ -80,9 +78,7 @@ async def test_nothing_is_served_before_the_permit_and_the_operator_hears_why(tm
 
 
 async def test_gateway_that_is_started_again_asks_again(tmp_path: Path) -> None:
-    double = Double(opened())
-    async with answering(tmp_path, double) as found:
-        folder = prepare(tmp_path / "run", found, double)
+    async with prepared(tmp_path) as (folder, double):
         for _ in range(2):
             async with gateway_on(folder, double):
                 pass
@@ -95,9 +91,7 @@ async def test_an_agent_whose_permit_was_ended_by_mistake_gets_another(
 ) -> None:
     monkeypatch.setattr(coordinator_client, "RENEWAL_S", 1.0)
 
-    double = Double(opened())
-    async with answering(tmp_path, double) as found:
-        folder = prepare(tmp_path / "run", found, double)
+    async with prepared(tmp_path) as (folder, double):
         async with gateway_on(folder, double):
             await double.agent_gone()
             assert not double.has_permit()
@@ -106,10 +100,9 @@ async def test_an_agent_whose_permit_was_ended_by_mistake_gets_another(
 
 
 async def test_run_that_is_cancelled_while_it_waits_is_over(tmp_path: Path) -> None:
-    double = Double(opened())
-    async with answering(tmp_path, double) as found:
+    async with prepared(tmp_path) as (folder, double):
         await double.score_another_run(host.boot_id())
-        gateway, events = quiet(prepare(tmp_path / "run", found, double))
+        gateway, events = quiet(folder)
         task = asyncio.create_task(gateway.run())
         await until(lambda: events)
         await double.cancel()
@@ -118,10 +111,9 @@ async def test_run_that_is_cancelled_while_it_waits_is_over(tmp_path: Path) -> N
 
 
 async def test_an_ended_agents_gateway_closes_the_run_without_a_permit(tmp_path: Path) -> None:
-    double = Double(opened())
-    async with answering(tmp_path, double) as found:
+    async with prepared(tmp_path) as (folder, double):
         await double.score_another_run(host.boot_id())
-        gateway, _ = quiet(prepare(tmp_path / "run", found, double))
+        gateway, _ = quiet(folder)
         gateway.tell(child_messages.CloseRun(reason="agent_stopped"))
         assert await gateway.run()
     assert double.closed is not None
@@ -150,9 +142,7 @@ def test_a_remote_agents_permit_is_for_the_named_kernel(
 
 
 async def test_a_remote_agents_run_closes_on_its_operators_word(tmp_path: Path) -> None:
-    double = Double(opened())
-    async with answering(tmp_path, double) as found:
-        folder = prepare(tmp_path / "run", found, double)
+    async with prepared(tmp_path) as (folder, double):
         remote(folder, KERNEL)
         async with gateway_on(folder, double) as service:
             service.gateway.tell(child_messages.CloseRun(reason="budget_spent"))
@@ -168,9 +158,7 @@ async def test_a_remote_agents_run_closes_on_its_operators_word(tmp_path: Path) 
 
 
 async def test_run_whose_operator_vouches_for_its_agent_is_closed_at_once(tmp_path: Path) -> None:
-    double = Double(opened())
-    async with answering(tmp_path, double) as found:
-        folder = prepare(tmp_path / "run", found, double)
+    async with prepared(tmp_path) as (folder, double):
         remote(folder, ELSEWHERE)
         async with gateway_on(folder, double) as service:
             assert await service.close()
@@ -178,9 +166,7 @@ async def test_run_whose_operator_vouches_for_its_agent_is_closed_at_once(tmp_pa
 
 
 async def test_a_gateway_stopped_before_its_agents_end_leaves_the_run_open(tmp_path: Path) -> None:
-    double = Double(opened())
-    async with answering(tmp_path, double) as found:
-        folder = prepare(tmp_path / "run", found, double)
+    async with prepared(tmp_path) as (folder, double):
         remote(folder, "")
         async with gateway_on(folder, double) as service:
             service.gateway.tell(child_messages.CloseRun(reason="wall_limit"))
@@ -191,16 +177,15 @@ async def test_a_gateway_stopped_before_its_agents_end_leaves_the_run_open(tmp_p
 
 
 async def test_agent_that_nobody_watches_ends_by_its_operators_word(tmp_path: Path) -> None:
-    double = Double(opened(episode_budget=1))
-    async with answering(tmp_path, double) as found:
-        folder = prepare(tmp_path / "run", found, double)
-        async with gateway_on(folder, double, alone=True, place=AgentPlace(boot_id=KERNEL)) as service:
-            await service.http.post(service.urls.submit, json={"env_instances": [1]})
-            await until(lambda: len(service.waits) > 1)
-            assert "evopolicy finish" in service.waits[1]
-            assert double.closed is None
-            listener.finish(folder)
-            assert await service.task
+    more = {"alone": True, "place": AgentPlace(boot_id=KERNEL)}
+    known = prepared(tmp_path, Double(opened(episode_budget=1)))
+    async with known as (folder, double), gateway_on(folder, double, **more) as service:
+        await service.http.post(service.urls.submit, json={"env_instances": [1]})
+        await until(lambda: len(service.waits) > 1)
+        assert "evopolicy finish" in service.waits[1]
+        assert double.closed is None
+        listener.finish(folder)
+        assert await service.task
     permit = asked(double, RequestPermit)[0]
     assert isinstance(permit, RequestPermit)
     assert permit.boot_id == KERNEL

@@ -10,7 +10,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 import pytest
-from commands import agent, command, record_in, run_dir
+from commands import agent, command, ended, record_in, run_dir
 
 import evopolicy as evp
 from evopolicy_common.records.run_record import RunRecord
@@ -59,8 +59,7 @@ assert answer["policy_failures"] == 0, answer["warning"]
     arguments = ("--env", "toy/line", "--agent", agent(folder, code), "--exp-id", "t", "--budget", "2")
     small = ("--validation", "1", "--heldout", "1", "--slots", "1", "--policy-package", "scipy")
     shown = ("--jail-bind", str(folder / "policy.py"), "--state", "state")
-    with command(folder, "local", *arguments, *small, *shown) as running:
-        assert running.wait() == 0, running.text
+    ended(folder, "local", *arguments, *small, *shown)
     return folder
 
 

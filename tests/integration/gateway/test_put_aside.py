@@ -10,7 +10,7 @@ from typing import Any
 
 import gateway_double
 import pytest
-from gateway_double import Double, answering, gateway_on, opened, packed_episode, prepare, served
+from gateway_double import Double, gateway_on, opened, packed_episode, prepared, served
 
 from evopolicy_common.records.episodes import rendered
 from evopolicy_common.records.open_run import Died, SetAside
@@ -101,9 +101,7 @@ async def test_an_episode_that_kills_two_gateways_is_set_aside(tmp_path: Path) -
         process = await asyncio.create_subprocess_exec(sys.executable, "-c", KILLED, str(folder))
         return await asyncio.wait_for(process.wait(), 120)
 
-    double = Double(opened())
-    async with answering(tmp_path, double) as found:
-        folder = prepare(tmp_path / "run", found, double)
+    async with prepared(tmp_path) as (folder, double):
         async with gateway_on(folder, double) as s:
             double.go.clear()
             await s.http.post(s.urls.submit + "?wait=false", json={"env_instances": [1, 2, 3, 4]})
@@ -143,9 +141,7 @@ async def test_a_submit_that_ends_two_gateways_is_put_aside(
 
     monkeypatch.setattr(formatting, "summary_bytes", summary_bytes)
 
-    double = Double(opened())
-    async with answering(tmp_path, double) as found:
-        folder = prepare(tmp_path / "run", found, double)
+    async with prepared(tmp_path) as (folder, double):
         with pytest.raises(KeyError):
             await ended_by_a_submit(folder, double)
         async with gateway_on(folder, double) as s:

@@ -10,12 +10,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from rigs.finished_run import finished
 
 from evopolicy_common.console import Terminal
-from evopolicy_common.messages.operator import ClaimState, RunFinished
+from evopolicy_common.messages.operator import ClaimState
 from evopolicy_common.messages.run_settings import RunSettings
 from evopolicy_common.records.run_record import RunRecord
-from evopolicy_common.records.suite_folder import Index
+from evopolicy_common.records.suite_folder import Entry, Index
 from evopolicy_common.wire.credentials import Credentials
 from evopolicy_gateway.operator.cluster import Cluster as LocalCluster
 from evopolicy_gateway.processes.child_messages import AgentDoing
@@ -66,34 +67,18 @@ class Cluster:
         pass
 
 
-def finished(plan: Plan) -> RunFinished:
-    return RunFinished(
-        run="r",
-        settings=plan.settings,
-        status="completed",
-        error=None,
-        closed_reason="budget_spent",
-        agent={},
-        final_score=1.0,
-        best_submit_index=0,
-        val_scores={0: 1.0},
-        heldout_returns=(1.0,),
-        validation_ineligible={},
-        policy_failures={},
-        random_heldout_returns=(0.0,),
-        episode_budget=8,
-        budget_used=8,
-        split_hashes={},
-        split_secret=True,
-        env_version="1",
-        deterministic=True,
-        fingerprint=None,
-        created_at=1.0,
-        closed_at=2.0,
-        finished_at=3.0,
-        submits=(),
-        wall_s={},
-    )
+def record_of(plan: Plan) -> RunRecord:
+    """Of a completed run."""
+    scores: dict[str, Any] = {"final_score": 1.0, "best_submit_index": 0, "val_scores": {0: 1.0}}
+    returns: dict[str, Any] = {"heldout_returns": (1.0,), "random_heldout_returns": (0.0,)}
+    done = finished(settings=plan.settings, agent={}, submits=(), wall_s={}, **scores, **returns)
+    return run_record(plan, done, None, [], Times())
+
+
+def entry_of(plan: Plan, **more: Any) -> Entry:
+    """In a sweep's index."""
+    known = {"name": plan.name, "agent": plan.entry, "env": plan.settings.env, "digest": plan.digest}
+    return Entry(**{**known, "repeat": 0, **more})
 
 
 class Lifecycle:
@@ -155,13 +140,13 @@ class Stage:
                     stage.going.discard(self.name)
                 self.on_agent_gone()
                 await stage.score(self.name)
-                return run_record(self.plan, finished(self.plan), None, [], Times())
+                return record_of(self.plan)
 
             async def go_on(self) -> RunRecord:
                 if self.name not in stage.attempts:
                     return await self.play()
                 await stage.score(self.name)
-                return run_record(self.plan, finished(self.plan), None, [], Times())
+                return record_of(self.plan)
 
         monkeypatch.setattr(sweep, "RunLifecycle", Play)
 
@@ -188,6 +173,9 @@ class Stage:
 
         asyncio.run(main())
         return suite_index.load(self.root, "s")
+
+
+Staged = Callable[..., Stage]
 
 
 class Direct:
@@ -220,7 +208,7 @@ class Direct:
                     await stage.act(self.plan.name)
                 finally:
                     stage.ended.append(self.plan.name)
-                return run_record(self.plan, finished(self.plan), None, [], Times())
+                return record_of(self.plan)
 
             async def go_on(self) -> RunRecord:
                 return await self.play(kind="go_on")

@@ -18,7 +18,7 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 import pytest
-from gateway_double import Double, Served, answering, gateway_on, opened, prepare
+from gateway_double import Served, answering, gateway_on, prepared
 from typer.testing import CliRunner
 from waiting import wait_until
 
@@ -36,9 +36,7 @@ TIMEOUT_S = 120.0
 @asynccontextmanager
 async def open_listener(tmp_path: Path, listener: Listener | None = None) -> AsyncIterator[Served]:
     """A gateway that serves a remote agent."""
-    double = Double(opened())
-    async with answering(tmp_path, double) as found:
-        folder = prepare(tmp_path / "run", found, double)
+    async with prepared(tmp_path) as (folder, double):
         save(folder.listener, listener or Listener(host=HOST, port=0))
         async with gateway_on(folder, double) as service:
             yield service

@@ -8,7 +8,7 @@ import signal
 from pathlib import Path
 
 import pytest
-from commands import SMALL, agent, command, record_in, run_dir
+from commands import SMALL, agent, command, ended, record_in, run_dir
 from waiting import wait_until
 
 from evopolicy_common.processes import scratch
@@ -61,9 +61,7 @@ def test_local_plays_a_whole_run_and_leaves_nothing_behind(tmp_path: Path) -> No
 def test_video_all_leaves_a_video_beside_each_trajectory(tmp_path: Path) -> None:
     small = ["--budget", "2", "--validation", "1", "--heldout", "1"]
     arguments = ["local", "--env", "toy/line", "--agent", "random", "--exp-id", "t", "--video", "all", *small]
-    with command(tmp_path, *arguments) as running:
-        code, _, err = running.finish()
-    assert code == 0, err
+    ended(tmp_path, *arguments)
     episodes = [path.parent for path in (run_dir(tmp_path) / "workspace").rglob("trajectory.jsonl")]
     assert episodes
     for folder in episodes:
@@ -124,9 +122,7 @@ def test_feedback_is_the_same_with_one_slot_and_with_two(tmp_path: Path) -> None
     for slots in ("1", "2"):
         arguments = ["local", "--env", "toy/line", "--agent", "replay:given", "--exp-id", f"s{slots}", *SMALL]
         more = ["--slots", slots, "--state", str(tmp_path / "state"), "--max-episodes", "6"]
-        with command(tmp_path, *arguments, *more) as running:
-            code, _, err = running.finish()
-            assert code == 0, err
+        ended(tmp_path, *arguments, *more)
         feedback = run_dir(tmp_path, exp_id=f"s{slots}") / "workspace" / "feedback"
         trees.append(
             {path.relative_to(feedback): timeless(path) for path in feedback.rglob("*") if path.is_file()}

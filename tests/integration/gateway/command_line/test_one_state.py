@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 
 import pytest
-from commands import SMALL, Command, agent, command, record_in, run_dir
+from commands import SMALL, Command, agent, command, ended, record_in, run_dir
 from waiting import wait_until
 
 from evopolicy_common.local.cluster import WORKERS_ENDED
@@ -34,9 +34,7 @@ def played(folder: Path, exp_id: str, *arguments: str) -> tuple[dict[str, str], 
         "--json",
         *arguments,
     ]
-    with command(folder, *words) as running:
-        code, out, err = running.finish()
-    assert code == 0, err
+    out, err = ended(folder, *words)
     (result,) = json.loads(out)
     versions = record_in(Path(result["run_directory"])).versions
     return {split: versions.cases_hash(split) for split in SPLITS}, err
@@ -102,9 +100,7 @@ def test_what_a_user_plays_shares_cases_until_a_run_without_a_jail(tmp_path: Pat
         "--jail",
         "none",
     ]
-    with command(tmp_path, *words, *SMALL) as running:
-        code, _, err = running.finish()
-    assert code == 0, err
+    _, err = ended(tmp_path, *words, *SMALL)
     assert "note: agents of this run have no full jail" in err
     thief = run_dir(tmp_path, exp_id="s")
     versions = record_in(thief).versions

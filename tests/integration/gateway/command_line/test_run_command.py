@@ -6,13 +6,13 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from commands import agent, command, record_in, run_arguments, run_dir, run_on
+from commands import Plays, agent, command, ended, ran_on, record_in, run_arguments, run_dir
 from waiting import wait_until
 
 from evopolicy_common.records.summary import decode_summary
 
 
-def test_a_prompted_agent_gets_turns_until_it_stops(operator_file: Path, tmp_path: Path) -> None:
+def test_a_prompted_agent_gets_turns_until_it_stops(ran: Plays) -> None:
     code = """
 for line in sys.stdin:
     prompt = json.loads(line)
@@ -20,14 +20,13 @@ for line in sys.stdin:
     print("a line of its own")
     print(json.dumps({"turn": prompt["turn"], "text": answer["status"], "stop": prompt["turn"] == 1}), flush=True)
 """
-    exit_code, out, _ = run_on(operator_file, tmp_path, agent(tmp_path, code))
-    assert exit_code == 0
-    record = record_in(run_dir(tmp_path))
+    played = ran(code)
+    record = played.record
     assert record.outcome.closed_reason == "agent_stopped"
     assert record.outcome.budget_used == 2
     assert record.agent.turns == 2
-    assert "agent stopped" in out
-    lines = [json.loads(line) for line in (run_dir(tmp_path) / "logs/agent.jsonl").read_text().splitlines()]
+    assert "agent stopped" in played.out
+    lines = [json.loads(line) for line in (played.folder / "logs/agent.jsonl").read_text().splitlines()]
     assert [line["turn"] for line in lines if line.get("type") == "prompt"] == [0, 1]
     assert {"type": "stdout", "text": "a line of its own"} in lines
     assert "4 episodes" not in lines[0]["message"]
@@ -36,31 +35,24 @@ for line in sys.stdin:
     )
 
 
-def test_an_agent_that_outstays_its_budget_and_ignores_requests_is_ended(
-    operator_file: Path, tmp_path: Path
-) -> None:
+def test_an_agent_that_outstays_its_budget_and_ignores_requests_is_ended(ran: Plays) -> None:
     code = """
 import signal
 signal.signal(signal.SIGTERM, signal.SIG_IGN)
 submit([0, 1, 2, 3, 4, 5])
 time.sleep(1000)
 """
-    exit_code, _, err = run_on(operator_file, tmp_path, agent(tmp_path, code))
-    assert exit_code == 0, err
-    outcome = record_in(run_dir(tmp_path)).outcome
+    outcome = ran(code).record.outcome
     assert (outcome.closed_reason, outcome.budget_used) == ("budget_spent", 6)
 
 
-def test_an_agent_that_does_nothing_is_ended_by_its_wall_limit(operator_file: Path, tmp_path: Path) -> None:
-    exit_code, _, err = run_on(
-        operator_file, tmp_path, agent(tmp_path, "submit([0, 1])\ntime.sleep(1000)"), "--agent-wall-s", "2"
-    )
-    assert exit_code == 0, err
-    outcome = record_in(run_dir(tmp_path)).outcome
+def test_an_agent_that_does_nothing_is_ended_by_its_wall_limit(ran: Plays) -> None:
+    played = ran("submit([0, 1])\ntime.sleep(1000)", "--agent-wall-s", "2")
+    outcome = played.record.outcome
     assert (outcome.closed_reason, outcome.budget_used, outcome.status) == ("wall_limit", 2, "completed")
 
 
-def test_an_agents_children_are_gone_however_they_hide(operator_file: Path, tmp_path: Path) -> None:
+def test_an_agents_children_are_gone_however_they_hide(ran: Plays) -> None:
     code = """
 hide = (
     "import os, signal, sys, time\\n"
@@ -75,9 +67,8 @@ while not os.path.exists("child.pid"):
     time.sleep(0.01)
 submit([0])
 """
-    exit_code, _, err = run_on(operator_file, tmp_path, agent(tmp_path, code), "--jail", "none")
-    assert exit_code == 0, err
-    child = int((run_dir(tmp_path) / "workspace" / "child.pid").read_text())
+    played = ran(code, "--jail", "none")
+    child = int((played.folder / "workspace" / "child.pid").read_text())
     assert not Path(f"/proc/{child}").exists()
 
 
@@ -114,12 +105,9 @@ Path("log.json").write_text(json.dumps(log))
 """  # noqa: E501
 
 
-def test_bad_input_gets_its_verdict_and_a_message_that_helps(operator_file: Path, tmp_path: Path) -> None:
-    exit_code, _, err = run_on(
-        operator_file, tmp_path, agent(tmp_path, BAD_INPUT), "--budget", "20", "--limit", "act_wall_s=1"
-    )
-    assert exit_code == 0, err
-    folder = run_dir(tmp_path)
+def test_bad_input_gets_its_verdict_and_a_message_that_helps(ran: Plays) -> None:
+    played = ran(BAD_INPUT, "--budget", "20", "--limit", "act_wall_s=1")
+    folder = played.folder
     log = {
         name: (status, left, message)
         for name, status, left, message in json.loads((folder / "workspace" / "log.json").read_text())
@@ -154,21 +142,20 @@ def test_bad_input_gets_its_verdict_and_a_message_that_helps(operator_file: Path
     assert all(
         json.loads(line)["info"]["action_invalid"] for path in rows for line in path.read_text().splitlines()
     )
-    record = record_in(folder)
+    record = played.record
     assert [one.status for one in record.rejected_submits] == ["invalid_env_instance"] * 2 + [
         "budget_invalid"
     ]
     assert set(record.outcome.val_scores) == {"8", "9", "10"}
 
 
-def test_without_an_ok_submit_the_exit_code_says_so(operator_file: Path, tmp_path: Path) -> None:
+def test_without_an_ok_submit_the_exit_code_says_so(ran: Plays) -> None:
     code = "open('system/policy.py', 'w').write('1 / 0')\nsubmit([0, 1])"
-    exit_code, out, _ = run_on(operator_file, tmp_path, agent(tmp_path, code))
-    assert exit_code == 3
-    outcome = record_in(run_dir(tmp_path)).outcome
+    played = ran(code, ends=3)
+    outcome = played.record.outcome
     assert (outcome.status, outcome.final_score, outcome.best_submit_index) == ("no_ok_submit", 0.0, None)
     assert outcome.budget_used == 2
-    assert "no working submit" in out
+    assert "no working submit" in played.out
 
 
 def test_replay_submits_the_given_policies_in_order_with_even_shares(
@@ -178,9 +165,7 @@ def test_replay_submits_the_given_policies_in_order_with_even_shares(
     for name, push in (("b", 0.5), ("a", -0.5)):
         (tmp_path / "given" / name / "system").mkdir(parents=True)
         (tmp_path / "given" / name / "system" / "policy.py").write_text(policy.format(push))
-    exit_code, _, err = run_on(operator_file, tmp_path, "replay:given", "--budget", "5")
-    assert exit_code == 0, err
-    folder = run_dir(tmp_path)
+    folder = ran_on(operator_file, tmp_path, "replay:given", "--budget", "5").folder
     assert folder.parts[-3] == "replay-given"
     sources = [(folder / f"checkpoints/submit_00{i}/policy.py").read_text() for i in range(2)]
     assert "-0.5" in sources[0]
@@ -192,19 +177,15 @@ def test_replay_submits_the_given_policies_in_order_with_even_shares(
     assert [summary.env_instances for summary in summaries] == [(0, 1, 2), (0, 1)]
 
 
-def test_a_run_of_that_name_is_refused_and_replaced_only_on_demand(
-    operator_file: Path, tmp_path: Path
-) -> None:
-    stop_at_once = agent(tmp_path, "")
-    assert run_on(operator_file, tmp_path, stop_at_once)[0] == 3
-    before = (run_dir(tmp_path) / "run.json").read_bytes()
-    code, _, err = run_on(operator_file, tmp_path, stop_at_once)
-    assert code == 2
-    assert len(err.strip().splitlines()) == 1
-    assert "--overwrite" in err
-    assert (run_dir(tmp_path) / "run.json").read_bytes() == before
-    assert run_on(operator_file, tmp_path, stop_at_once, "--overwrite")[0] == 3
-    assert (run_dir(tmp_path) / "run.json").read_bytes() != before
+def test_a_run_of_that_name_is_refused_and_replaced_only_on_demand(ran: Plays) -> None:
+    file = ran("", ends=3).folder / "run.json"
+    before = file.read_bytes()
+    refused = ran("", ends=2)
+    assert len(refused.err.strip().splitlines()) == 1
+    assert "--overwrite" in refused.err
+    assert file.read_bytes() == before
+    assert ran("", "--overwrite", ends=3)
+    assert file.read_bytes() != before
 
 
 def test_a_run_that_is_played_is_nobody_elses_to_replace(operator_file: Path, tmp_path: Path) -> None:
@@ -213,9 +194,7 @@ def test_a_run_that_is_played_is_nobody_elses_to_replace(operator_file: Path, tm
     with command(tmp_path, *arguments) as first:
         wait_until(lambda: [*tmp_path.glob("runs/*/toy_line/t/workspace/here")], lambda: first.text)
         for more in (["--overwrite"], ["--resume"], []):
-            with command(tmp_path, *arguments, *more) as second:
-                exit_code, _, err = second.finish()
-            assert exit_code == 2, err
+            _, err = ended(tmp_path, *arguments, *more, ends=2)
             if more:
                 assert f"process {first.process.pid}" in err
                 assert len(err.splitlines()) == 1
@@ -245,16 +224,15 @@ def test_of_two_commands_that_overwrite_one_run_at_once_one_plays_it(
     assert len([*(run_dir(tmp_path) / "workspace").glob("played-*")]) == 1
 
 
-def test_an_agent_failing_after_its_submits_has_its_own_exit_code(
-    operator_file: Path, tmp_path: Path
+def test_an_agent_failing_after_its_submits_has_its_own_exit_code(ran: Plays) -> None:
+    played = ran("submit([0])\nsys.exit(7)", ends=4)
+    assert "agent failed" in played.out
+    assert played.record.outcome.status == "completed"
+
+
+def test_a_run_with_other_texts_and_less_feedback_records_both(
+    ran: Plays, operator_file: Path, tmp_path: Path
 ) -> None:
-    code, out, _ = run_on(operator_file, tmp_path, agent(tmp_path, "submit([0])\nsys.exit(7)"))
-    assert code == 4
-    assert "agent failed" in out
-    assert record_in(run_dir(tmp_path)).outcome.status == "completed"
-
-
-def test_a_run_with_other_texts_and_less_feedback_records_both(operator_file: Path, tmp_path: Path) -> None:
     code = """
 for line in sys.stdin:
     answer = submit([0, 1])
@@ -264,10 +242,9 @@ for line in sys.stdin:
     (tmp_path / "rules.md").write_text("House rules for $env.\n$standard")
     (tmp_path / "prompts.toml").write_text('first = "Begin, please."\n')
     text_options = ("--feedback", "scores", "--agents-md", "rules.md", "--prompts", "prompts.toml")
-    exit_code, _, err = run_on(operator_file, tmp_path, agent(tmp_path, code), *text_options)
-    assert exit_code == 0, err
-    folder = run_dir(tmp_path)
-    record = record_in(folder)
+    played = ran(code, *text_options)
+    folder = played.folder
+    record = played.record
     dimensions = record.experiment_dimensions
     assert dimensions.feedback == "scores"
     assert dimensions.agents_md.startswith("sha256:")
@@ -278,5 +255,4 @@ for line in sys.stdin:
     feedback = folder / "workspace/feedback/submit_000"
     assert sorted(path.name for path in feedback.iterdir()) == ["episodes", "summary.json"]
     assert list((feedback / "episodes").iterdir()) == []
-    with command(tmp_path, "verify", str(folder), "--credentials", str(operator_file)) as checking:
-        assert checking.wait() == 0, checking.text
+    ended(tmp_path, "verify", str(folder), "--credentials", str(operator_file))

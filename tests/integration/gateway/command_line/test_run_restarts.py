@@ -13,7 +13,7 @@ import urllib.request
 from pathlib import Path
 
 import pytest
-from commands import agent, command, record_in, run_arguments, run_dir, run_on, toy_cluster
+from commands import Plays, agent, command, ended, record_in, run_arguments, run_dir, toy_cluster
 from coordinator_harness import Coordinator
 from waiting import TIMEOUT_S, wait_until
 
@@ -94,13 +94,9 @@ time.sleep(1000)
     assert (outcome.closed_reason, outcome.budget_used) == ("agent_stopped", 2)
 
 
-def test_an_agent_whose_supervisor_dies_again_and_again_has_failed(
-    operator_file: Path, tmp_path: Path
-) -> None:
+def test_an_agent_whose_supervisor_dies_again_and_again_has_failed(ran: Plays) -> None:
     code = "submit([0])\nos.kill(os.getppid(), 9)\ntime.sleep(1000)"
-    exit_code, _, err = run_on(operator_file, tmp_path, agent(tmp_path, code), "--jail", "none")
-    assert exit_code == 4, err
-    record = record_in(run_dir(tmp_path))
+    record = ran(code, "--jail", "none", ends=4).record
     assert (record.outcome.closed_reason, record.outcome.budget_used) == ("agent_failed", 5)
     assert record.agent.settings["program"], (
         "what was known beforehand does not depend on who is left to tell"
@@ -120,19 +116,13 @@ patient_submit([2, 3], "two")
     arguments = [*run_arguments(operator_file, agent(tmp_path, code)), "--resume"]
     with command(tmp_path, *arguments) as running:
         here = wait_until(lambda: [*(tmp_path / "runs").glob("*/*/t/workspace/here")])[0]
-        with command(tmp_path, *arguments) as second:
-            code_of_second, _, err = second.finish()
-        assert code_of_second == 2
+        _, err = ended(tmp_path, *arguments, ends=2)
         assert "is in use by process" in err
         (here.parent / "again").touch()
         running.process.kill()
-        with command(tmp_path, *arguments, "--validation", "3") as other:
-            code_of_other, _, err = other.finish()
-        assert code_of_other == 2
+        _, err = ended(tmp_path, *arguments, "--validation", "3", ends=2)
         assert "other settings" in err
-        with command(tmp_path, *arguments) as again:
-            exit_code, out, err = again.finish()
-        assert exit_code == 0, err
+        out, err = ended(tmp_path, *arguments)
         wait_until(lambda: not running.alive())
     assert "resumes run" in out
     record = record_in(run_dir(tmp_path))
@@ -165,9 +155,7 @@ def test_interruptions_do_not_reset_the_agents_time(operator_file: Path, tmp_pat
     assert times["open_s"] >= times["in_flight_s"]
     # As if it had been at work for a day.
     kept.write_text(json.dumps({**times, "agent_s": 86400.0, "open_s": 86400.0}))
-    with command(tmp_path, *arguments) as again:
-        exit_code, _, err = again.finish()
-    assert exit_code == 0, err
+    ended(tmp_path, *arguments)
     record = record_in(run_dir(tmp_path))
     assert (record.outcome.closed_reason, record.outcome.budget_used) == ("wall_limit", 2)
     assert record.timing.agent_s > 86000.0

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from commands import Command, command, toy_cluster
+from commands import Command, command, ended, toy_cluster
 from waiting import wait_until
 
 from evopolicy_common.records.run_record import decode_run_record
@@ -299,8 +299,7 @@ def test_runs_on_published_cases_stay_where_a_rerun_of_them_is_refused(tmp_path:
     with sweep(tmp_path, *arguments) as first:
         assert first.wait() == 0, first.text
     words = ("publish", str(root), "--local", "--state", str(root / ".cluster"), "--out", "r.evp")
-    with command(tmp_path, *words) as publishing:
-        assert publishing.wait() == 0, publishing.text
+    ended(tmp_path, *words)
     run = root / "evolve/toy_line/t-0"
     before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
     file.write_text(file.read_text().replace("budget = 4", "budget = 3"))
@@ -478,8 +477,7 @@ def test_a_killed_sweep_leaves_no_just_opened_run(
         file = tmp_path / "t.toml"
         file.write_text(file.read_text().replace("budget = 4", "budget = 5"))
         arguments += ["--changed", "rerun"]
-    with command(tmp_path, *arguments) as again:
-        assert again.wait() == 0, again.text
+    ended(tmp_path, *arguments)
     (entry,) = index_in(tmp_path / "runs" / "t").values()
     assert entry["state"] == "completed"
     # Nothing was played before: a run that the coordinator alone knew is gone on with.

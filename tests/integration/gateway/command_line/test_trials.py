@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from commands import command
+from commands import ended
 
 
 def test_try_shows_returns_and_where_the_trajectories_are(operator_file: Path, tmp_path: Path) -> None:
@@ -17,18 +17,14 @@ def test_try_shows_returns_and_where_the_trajectories_are(operator_file: Path, t
         "  def act(self, obs): return [obs[2] - obs[0]]\n"
     )
     where = ["--env", "toy/line", "--credentials", str(operator_file)]
-    with command(tmp_path, "try", "mine", "--cases", "0-1,5", "--json", *where) as running:
-        code, out, err = running.finish()
-    assert code == 0, err
+    out, _ = ended(tmp_path, "try", "mine", "--cases", "0-1,5", "--json", *where)
     (result,) = json.loads(out)
     assert [episode["case"] for episode in result["episodes"]] == [0, 1, 5]
     first = Path(result["episodes"][0]["folder"])
     assert len((first / "trajectory.jsonl").read_text().splitlines()) == result["episodes"][0]["length"]
     assert "hello from" in (first / "stdout.txt").read_text()
     (tmp_path / "mine" / "policy.py").write_text("import nothing_like_it\n")
-    with command(tmp_path, "try", "mine", "--cases", "0", *where) as running:
-        code, out, _ = running.finish()
-    assert code == 1
+    out, _ = ended(tmp_path, "try", "mine", "--cases", "0", *where, ends=1)
     assert "nothing_like_it" in out
 
 
@@ -43,17 +39,13 @@ def test_try_leaves_cases_with_a_failure_out_of_the_mean(operator_file: Path, tm
         "    return [obs[2] - obs[0]]\n"
     )
     where = ["--env", "toy/line", "--credentials", str(operator_file), "--cases", "0-2"]
-    with command(tmp_path, "try", ".", "--json", *where) as running:
-        code, out, err = running.finish()
-    assert code == 1, err
+    out, _ = ended(tmp_path, "try", ".", "--json", *where, ends=1)
     (result,) = json.loads(out)
     returns = [episode["episode_return"] for episode in result["episodes"]]
     assert [episode["failed_at"] for episode in result["episodes"]] == [None, 2, None]
     assert result["mean_return"] == (returns[0] + returns[2]) / 2
     assert (result["n_failed"], result["other_cases_next_time"]) == (1, False)
-    with command(tmp_path, "try", ".", *where) as running:
-        code, out, err = running.finish()
-    assert code == 1, err
+    out, _ = ended(tmp_path, "try", ".", *where, ends=1)
     assert "policy to step 2, then random" in out
     assert "[/x] \ufffd[2J broken" in out
     assert "over 2 of 3 cases; 1 case left out, in which the policy failed" in out
@@ -62,9 +54,7 @@ def test_try_leaves_cases_with_a_failure_out_of_the_mean(operator_file: Path, tm
 def test_a_policy_that_fails_in_every_case_has_no_mean(operator_file: Path, tmp_path: Path) -> None:
     (tmp_path / "policy.py").write_text("class Policy:\n  pass\n")
     where = ["--env", "toy/line", "--credentials", str(operator_file), "--cases", "0-1"]
-    with command(tmp_path, "try", ".", "--json", *where) as running:
-        code, out, err = running.finish()
-    assert code == 1, err
+    out, _ = ended(tmp_path, "try", ".", "--json", *where, ends=1)
     (result,) = json.loads(out)
     assert (result["mean_return"], result["std_return"], result["n_failed"]) == (None, None, 2)
     assert result["episodes"][0]["episode_return"] is None
@@ -80,9 +70,7 @@ def test_the_same_ids_are_the_same_cases_in_the_next_call(operator_file: Path, t
     where = ["--env", "toy/line", "--credentials", str(operator_file), "--json"]
     found = []
     for cases in ("0-3", "2,3,0,1"):
-        with command(tmp_path, "try", ".", *where, "--cases", cases) as running:
-            code, out, err = running.finish()
-        assert code == 0, err
+        out, _ = ended(tmp_path, "try", ".", *where, "--cases", cases)
         found.append({one["case"]: one["episode_return"] for one in json.loads(out)[0]["episodes"]})
     assert found[0] == found[1]
     assert len(set(found[0].values())) == 4
@@ -90,9 +78,7 @@ def test_the_same_ids_are_the_same_cases_in_the_next_call(operator_file: Path, t
 
 def test_random_plays_the_reference_on_a_split(operator_file: Path, tmp_path: Path) -> None:
     where = ["--env", "toy", "--cases", "0-3", "--json", "--credentials", str(operator_file)]
-    with command(tmp_path, "random", *where) as running:
-        code, out, err = running.finish()
-    assert code == 0, err
+    out, _ = ended(tmp_path, "random", *where)
     assert [(result["env"], len(result["episodes"])) for result in json.loads(out)] == [
         ("toy/line", 4),
         ("toy/maze", 4),

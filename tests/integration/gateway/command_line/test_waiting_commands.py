@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from commands import SMALL, agent, command, record_in, run_arguments, run_dir
+from commands import SMALL, agent, command, ended, record_in, run_arguments, run_dir
 from waiting import wait_until
 
 from evopolicy_common.wire import credentials
@@ -73,9 +73,7 @@ def test_without_bubblewrap_what_needs_no_sandbox_is_played(tmp_path: Path, poli
         ["random", "--env", "toy/line", "--split", "train", "--cases", "0-1"],
         ["try", policy, "--env", "toy/line", "--cases", "0-1", "--tier", "none"],
     ):
-        with command(tmp_path, *arguments) as running:
-            code, out, err = running.finish()
-        assert code == 0, err
+        out, _ = ended(tmp_path, *arguments)
         assert "mean return" in out
         # The cluster's state is kept.
         assert "the next call has others" not in out
@@ -103,8 +101,7 @@ def resume(operator_file: Path, cwd: Path) -> None:
     words = ("--credentials", str(operator_file))
     with command(cwd, "status", "--json", *words) as asked:
         (worker,) = json.loads(asked.finish()[1])["workers"]
-    with command(cwd, "workers", "resume", worker["worker"], *words) as done:
-        assert done.wait() == 0
+    ended(cwd, "workers", "resume", worker["worker"], *words)
 
 
 def test_a_run_whose_workers_are_paused_says_so_and_so_does_status(paused: Path, tmp_path: Path) -> None:

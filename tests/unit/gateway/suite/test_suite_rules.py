@@ -10,12 +10,13 @@ import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from stages.sweep_stage import entry_of
 
 from evopolicy_common import catalogue
 from evopolicy_common.catalogue import worlds
 from evopolicy_common.console import Terminal
 from evopolicy_common.errors import ConfigError
-from evopolicy_common.records.suite_folder import Entry, Index
+from evopolicy_common.records.suite_folder import Index
 from evopolicy_gateway.processes.child_messages import AgentDoing, Progress
 from evopolicy_gateway.run.plan import Plan
 from evopolicy_gateway.suite import suite_index
@@ -182,27 +183,20 @@ def test_a_file_that_contradicts_its_profile_is_refused(tmp_path: Path) -> None:
         suite_in(tmp_path, text)
 
 
-def entry(run: Plan, **more: object) -> Entry:
-    fields = {
-        "name": run.name,
-        "agent": run.entry,
-        "env": run.settings.env,
-        "repeat": 0,
-        "digest": run.digest,
-    }
-    return Entry(**(fields | more))  # type: ignore[arg-type]
-
-
 def test_what_becomes_of_each_run(tmp_path: Path) -> None:
     run = suite_in(tmp_path)[0]
-    running = entry(run, state="running")
+    running = entry_of(run, state="running")
     cases = [
         (Facts(), "new", 1),
-        (Facts(status="completed", entry=entry(run, state="completed")), "keep", 1),
+        (Facts(status="completed", entry=entry_of(run, state="completed")), "keep", 1),
         (Facts(status="no_ok_submit"), "keep", 1),
-        (Facts(entry=entry(run, state="completed", host="other")), "keep", 1),
-        (Facts(entry=entry(run, state="completed", host="other"), opened=True, phase="finished"), "keep", 1),
-        (Facts(status="error", entry=entry(run, state="error", attempt=2)), "restart", 3),
+        (Facts(entry=entry_of(run, state="completed", host="other")), "keep", 1),
+        (
+            Facts(entry=entry_of(run, state="completed", host="other"), opened=True, phase="finished"),
+            "keep",
+            1,
+        ),
+        (Facts(status="error", entry=entry_of(run, state="error", attempt=2)), "restart", 3),
         (Facts(opened=True, phase="open", has_session=True, entry=running), "resume", 1),
         (Facts(opened=True, phase="open", has_session=False, entry=running), "restart", 2),
         (Facts(opened=True, phase="heldout", has_session=False, entry=running), "finish", 1),
@@ -217,7 +211,7 @@ def test_what_becomes_of_each_run(tmp_path: Path) -> None:
 
 def test_a_changed_file_is_the_operators_decision(tmp_path: Path) -> None:
     run = suite_in(tmp_path)[0]
-    found = Facts(status="completed", entry=entry(run, state="completed", digest="another"))
+    found = Facts(status="completed", entry=entry_of(run, state="completed", digest="another"))
     refused = [decide(run, found, "refuse")]
     with pytest.raises(ConfigError, match="evolve/toy/line/0 was played: give --changed keep"):
         check_changes(refused, "refuse")
@@ -250,7 +244,7 @@ def test_what_has_changed_in_the_file_is_named(tmp_path: Path) -> None:
     )
     for run in suite_in(tmp_path, text):
         was = before[run.name]
-        known = entry(was, state="completed", settings=msgspec.to_builtins(was.defining))
+        known = entry_of(was, state="completed", settings=msgspec.to_builtins(was.defining))
         decision = decide(run, Facts(status="completed", entry=known), "rerun")
         if run.entry == "evolve":
             assert decision.kind == "keep"
@@ -260,7 +254,7 @@ def test_what_has_changed_in_the_file_is_named(tmp_path: Path) -> None:
         assert 'config.effort is "high", was not set' in changes
         assert changes.endswith("and 4 more")
     only_budget = suite_in(tmp_path, FILE.replace("budget = 16", "budget = 32"))[1]
-    known = entry(
+    known = entry_of(
         was := before[only_budget.name], settings=msgspec.to_builtins(was.defining), state="completed"
     )
     why = decide(only_budget, Facts(status="completed", entry=known), "keep").why
@@ -285,7 +279,7 @@ def test_a_jails_permissions_make_another_run_but_program_paths_do_not(tmp_path:
 
 def test_the_index_is_another_sweeps_or_is_read_back(tmp_path: Path) -> None:
     run = suite_in(tmp_path)[0]
-    index = Index(suite="s", runs={run.name: entry(run, state="completed", score=1.5)})
+    index = Index(suite="s", runs={run.name: entry_of(run, state="completed", score=1.5)})
     suite_index.save(tmp_path, index)
     assert suite_index.load(tmp_path, "s") == index
     with pytest.raises(ConfigError, match="is of suite 's'"):
@@ -299,9 +293,9 @@ def test_a_sweeps_use_adds_up_over_its_runs(tmp_path: Path) -> None:
     one, two, three = suite_in(tmp_path)[:3]
     tokens = {"input_noncached": 1, "cache_read": 2, "cache_creation": 3, "output": 4, "reasoning": 4}
     runs = {
-        one.name: entry(one, tokens=tokens),
-        two.name: entry(two, tokens={**tokens, "cost": 0.5, "requests": 7}),
-        three.name: entry(three),
+        one.name: entry_of(one, tokens=tokens),
+        two.name: entry_of(two, tokens={**tokens, "cost": 0.5, "requests": 7}),
+        three.name: entry_of(three),
     }
     assert used(Index(suite="s", runs=runs)) == (20, 0.5, 7)
 
@@ -312,7 +306,7 @@ def test_the_live_table_shows_each_run_and_the_totals(tmp_path: Path) -> None:
     console = Terminal(file=out, width=160)
     view = SuiteView([run.name for run in runs], 2, console)
     first, second, third, failed = runs[:4]
-    known = entry(first, state="completed", score=-1.25, wall_s=60.0, finished_at="2026-01-01T00:00:00Z")
+    known = entry_of(first, state="completed", score=-1.25, wall_s=60.0, finished_at="2026-01-01T00:00:00Z")
     view.kept(first.name, known)
     later = {
         "score": 2.5,
@@ -321,8 +315,8 @@ def test_the_live_table_shows_each_run_and_the_totals(tmp_path: Path) -> None:
         "n_submits": 3,
         "finished_at": "2026-01-02T00:00:00Z",
     }
-    view.finished(third.name, entry(third, state="completed", wall_s=60.0, **later))
-    view.finished(failed.name, entry(failed, state="error", error="no key"))
+    view.finished(third.name, entry_of(third, state="completed", wall_s=60.0, **later))
+    view.finished(failed.name, entry_of(failed, state="error", error="no key"))
     view.started(second.name, 1)
     view.progress(second.name, Progress(episode_budget=16, remaining_budget=10, n_submits=2, best_mean=-3.5))
     tokens = {"input_noncached": 1000, "cache_read": 500, "output": 0}

@@ -6,19 +6,19 @@ import asyncio
 from pathlib import Path
 
 import pytest
-from stages.sweep_stage import CODEX, EVOLVE, HEAD, TIMEOUT_S, TOKENS, Stage, until
+from stages.sweep_stage import CODEX, EVOLVE, TIMEOUT_S, TOKENS, Stage, Staged, entry_of, until
 
 from evopolicy_common.errors import StorageError
-from evopolicy_common.records.suite_folder import PAUSED, Entry, Index
+from evopolicy_common.records.suite_folder import PAUSED, Index
 from evopolicy_gateway.suite import suite_index, sweep
 
 
-def test_limits_per_machine_agent_and_provider_hold(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_limits_per_machine_agent_and_provider_hold(staged: Staged) -> None:
     limits = "[defaults]\nrepeats = 3\n[parallel]\nmachine = 4\nagent = 2\nproviders = { openai = 1 }\n"
     agents = (
         CODEX.format("a") + CODEX.format("b") + EVOLVE.format("c") + EVOLVE.format("d") + "parallel = 1\n"
     )
-    stage = Stage(tmp_path, HEAD + limits + agents, monkeypatch)
+    stage = staged(limits + agents)
     index = stage.play()
     assert {entry.state for entry in index.runs.values()} == {"completed"}
     assert len(stage.begun) == len(set(stage.begun)) == 12
@@ -30,10 +30,10 @@ def test_limits_per_machine_agent_and_provider_hold(tmp_path: Path, monkeypatch:
 
 
 def test_next_agent_begins_while_the_run_before_is_scored(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    staged: Staged, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    text = HEAD + "[defaults]\nrepeats = 3\n[parallel]\nmachine = 1\n" + EVOLVE.format("a")
-    stage = Stage(tmp_path, text, monkeypatch)
+    text = "[defaults]\nrepeats = 3\n[parallel]\nmachine = 1\n" + EVOLVE.format("a")
+    stage = staged(text)
     monkeypatch.setattr(sweep, "POLL_S", TIMEOUT_S)
 
     async def score(name: str) -> None:
@@ -46,10 +46,9 @@ def test_next_agent_begins_while_the_run_before_is_scored(
     assert max(map(len, stage.most)) == 1
 
 
-def test_a_paused_sweep_begins_no_further_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    text = HEAD + "[defaults]\nrepeats = 2\n[parallel]\nmachine = 1\n" + EVOLVE.format("a")
-    stage = Stage(tmp_path, text, monkeypatch)
-    monkeypatch.setattr(sweep, "POLL_S", 0.01)
+def test_a_paused_sweep_begins_no_further_run(staged: Staged) -> None:
+    text = "[defaults]\nrepeats = 2\n[parallel]\nmachine = 1\n" + EVOLVE.format("a")
+    stage = staged(text)
     pause = stage.root / PAUSED
     begun: list[int] = []
 
@@ -72,10 +71,10 @@ def test_a_paused_sweep_begins_no_further_run(tmp_path: Path, monkeypatch: pytes
 
 
 def test_runs_that_are_followed_without_an_agent_are_bounded(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    staged: Staged, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    text = HEAD + "[defaults]\nrepeats = 4\n[parallel]\nmachine = 1\n" + EVOLVE.format("a")
-    stage = Stage(tmp_path, text, monkeypatch)
+    text = "[defaults]\nrepeats = 4\n[parallel]\nmachine = 1\n" + EVOLVE.format("a")
+    stage = staged(text)
     monkeypatch.setattr(sweep, "MAX_SCORED", 2)
     scored: set[str] = set()
     most: list[int] = []
@@ -102,12 +101,9 @@ def test_unrelated_environments_are_played_side_by_side(
     assert stage.begun[:2] == ["a/toy/line/0", "a/toy/maze/0"]
 
 
-def test_an_unavailable_provider_holds_back_its_further_runs(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_unavailable_provider_holds_back_its_further_runs(staged: Staged) -> None:
     agents = CODEX.format("a") + EVOLVE.format("c") + CODEX.format("b")
-    stage = Stage(tmp_path, HEAD + "[parallel]\nmachine = 2\n" + agents, monkeypatch)
-    monkeypatch.setattr(sweep, "POLL_S", 0.01)
+    stage = staged("[parallel]\nmachine = 2\n" + agents)
     seen: list[list[str]] = []
 
     async def act(name: str) -> None:
@@ -127,12 +123,9 @@ def test_an_unavailable_provider_holds_back_its_further_runs(
 
 
 @pytest.mark.parametrize("cap", ["max_tokens = 149", "max_cost = 0.2", "max_requests = 7"])
-def test_a_sweeps_cap_begins_no_further_run(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cap: str
-) -> None:
+def test_a_sweeps_cap_begins_no_further_run(staged: Staged, cap: str) -> None:
     agents = CODEX.format("a") + EVOLVE.format("c") + EVOLVE.format("d")
-    stage = Stage(tmp_path, HEAD + f"[parallel]\nmachine = 2\n[caps]\n{cap}\n" + agents, monkeypatch)
-    monkeypatch.setattr(sweep, "POLL_S", 0.01)
+    stage = staged(f"[parallel]\nmachine = 2\n[caps]\n{cap}\n" + agents)
     ended: list[str] = []
 
     async def act(name: str) -> None:
@@ -158,22 +151,12 @@ def test_a_sweeps_cap_begins_no_further_run(
     assert "2 runs are left as they are" in stage.events[-1]
 
 
-def test_what_an_earlier_attempt_used_counts_towards_the_cap(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    text = HEAD + "[caps]\nmax_cost = 0.7\n" + CODEX.format("a") + CODEX.format("b")
-    stage = Stage(tmp_path, text, monkeypatch)
+def test_what_an_earlier_attempt_used_counts_towards_the_cap(staged: Staged) -> None:
+    text = "[caps]\nmax_cost = 0.7\n" + CODEX.format("a") + CODEX.format("b")
+    stage = staged(text)
     a, b = stage.runs
     for run in (a, b):
-        stage.index.runs[run.name] = Entry(
-            name=run.name,
-            agent=run.entry,
-            env=run.settings.env,
-            repeat=0,
-            digest=run.digest,
-            state="error",
-            tokens=TOKENS,
-        )
+        stage.index.runs[run.name] = entry_of(run, state="error", tokens=TOKENS)
 
     async def act(name: str) -> None:
         if name == a.name:
@@ -187,8 +170,8 @@ def test_what_an_earlier_attempt_used_counts_towards_the_cap(
     assert suite_index.used(index)[0] >= 2 * 150
 
 
-def test_a_bug_in_one_run_ends_that_run_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    stage = Stage(tmp_path, HEAD + CODEX.format("a") + CODEX.format("b"), monkeypatch)
+def test_a_bug_in_one_run_ends_that_run_alone(staged: Staged) -> None:
+    stage = staged(CODEX.format("a") + CODEX.format("b"))
 
     async def stumbles(name: str) -> None:
         if name.startswith("a/"):
@@ -204,10 +187,8 @@ def test_a_bug_in_one_run_ends_that_run_alone(tmp_path: Path, monkeypatch: pytes
     assert "Traceback" in log.read_text()
 
 
-def test_a_paused_sweep_begins_nothing_and_goes_on_later(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    stage = Stage(tmp_path, HEAD + EVOLVE.format("a") + EVOLVE.format("b"), monkeypatch)
+def test_a_paused_sweep_begins_nothing_and_goes_on_later(staged: Staged) -> None:
+    stage = staged(EVOLVE.format("a") + EVOLVE.format("b"))
     stage.root.mkdir(parents=True, exist_ok=True)
     paused = stage.root / "paused"
     paused.touch()
@@ -225,9 +206,9 @@ def test_a_paused_sweep_begins_nothing_and_goes_on_later(
 
 
 def test_a_run_whose_agent_is_gone_is_finished_again_after_an_error(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    staged: Staged, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    stage = Stage(tmp_path, HEAD + CODEX.format("a") + CODEX.format("b"), monkeypatch)
+    stage = staged(CODEX.format("a") + CODEX.format("b"))
     monkeypatch.setattr(sweep, "FINISH_AGAIN_S", (0.0, 0.0))
     failures = {"a/toy/line/0": 2, "b/toy/line/0": 3}
     agents: list[str] = []
@@ -246,8 +227,8 @@ def test_a_run_whose_agent_is_gone_is_finished_again_after_an_error(
     assert sorted(agents) == ["a/toy/line/0", "b/toy/line/0"]
 
 
-def test_runs_go_on_while_the_disk_refuses_the_index(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    stage = Stage(tmp_path, HEAD + EVOLVE.format("a") + EVOLVE.format("b"), monkeypatch)
+def test_runs_go_on_while_the_disk_refuses_the_index(staged: Staged, monkeypatch: pytest.MonkeyPatch) -> None:
+    stage = staged(EVOLVE.format("a") + EVOLVE.format("b"))
     save = suite_index.save
     refused: list[None] = []
 

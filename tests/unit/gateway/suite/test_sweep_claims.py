@@ -3,25 +3,22 @@
 from __future__ import annotations
 
 import asyncio
-from pathlib import Path
 
 import msgspec
 import pytest
-from stages.sweep_stage import CODEX, EVOLVE, HEAD, TOKENS, Stage, until
+from stages.sweep_stage import CODEX, EVOLVE, TOKENS, Staged, entry_of, until
 
 from evopolicy_common.errors import EvopolicyError
 from evopolicy_common.messages.operator import ClaimState
 from evopolicy_common.records.open_run import OpenedRun
-from evopolicy_common.records.suite_folder import Entry
 from evopolicy_gateway.run_folder.layout import save
-from evopolicy_gateway.suite import claimed, sweep
+from evopolicy_gateway.suite import sweep
 from evopolicy_gateway.suite.decisions import Decision, Facts, decide
 
 
-def test_an_open_run_is_announced_to_the_cluster(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    text = HEAD + "[parallel]\nclaim_ttl_s = 3600.0\n" + EVOLVE.format("a")
-    stage = Stage(tmp_path, text, monkeypatch)
-    monkeypatch.setattr(sweep, "POLL_S", 0.01)
+def test_an_open_run_is_announced_to_the_cluster(staged: Staged) -> None:
+    text = "[parallel]\nclaim_ttl_s = 3600.0\n" + EVOLVE.format("a")
+    stage = staged(text)
     name = stage.runs[0].name
 
     async def act(_: str) -> None:
@@ -36,10 +33,8 @@ def test_an_open_run_is_announced_to_the_cluster(tmp_path: Path, monkeypatch: py
     assert index.runs[name].settings["settings"]["env"] == "toy/line"
 
 
-def test_a_dead_hosts_run_is_ended_and_attempted_anew(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    stage = Stage(tmp_path, HEAD + EVOLVE.format("a"), monkeypatch)
+def test_a_dead_hosts_run_is_ended_and_attempted_anew(staged: Staged) -> None:
+    stage = staged(EVOLVE.format("a"))
     run = stage.runs[0]
     left = run.folder.workspace
     left.mkdir(parents=True)
@@ -53,24 +48,10 @@ def test_a_dead_hosts_run_is_ended_and_attempted_anew(
     assert any("taken over from other" in line for line in stage.events)
 
 
-def test_a_claim_lost_to_another_host_ends_the_run_here(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    stage = Stage(tmp_path, HEAD + "[parallel]\nclaim_ttl_s = 1.0\n" + EVOLVE.format("a"), monkeypatch)
-    monkeypatch.setattr(sweep, "POLL_S", 0.01)
-    monkeypatch.setattr(claimed, "_ASK_AGAIN_S", 0.01)
+def test_a_claim_lost_to_another_host_ends_the_run_here(staged: Staged) -> None:
+    stage = staged("[parallel]\nclaim_ttl_s = 1.0\n" + EVOLVE.format("a"))
     run = stage.runs[0]
-    theirs = Entry(
-        name=run.name,
-        agent="a",
-        env="toy/line",
-        repeat=0,
-        digest=run.digest,
-        state="completed",
-        directory="a/toy_line/s-0",
-        host="other",
-        score=3.0,
-    )
+    theirs = entry_of(run, state="completed", directory="a/toy_line/s-0", host="other", score=3.0)
     asked: list[str] = []
 
     def answer(name: str) -> ClaimState | None:
@@ -95,23 +76,12 @@ def test_a_claim_lost_to_another_host_ends_the_run_here(
 
 
 def test_a_finished_run_that_another_host_took_meanwhile_is_not_written_here(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    staged: Staged, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    stage = Stage(tmp_path, HEAD + "[parallel]\nclaim_ttl_s = 3600.0\n" + EVOLVE.format("a"), monkeypatch)
+    stage = staged("[parallel]\nclaim_ttl_s = 3600.0\n" + EVOLVE.format("a"))
     monkeypatch.setattr(sweep, "FINISH_AGAIN_S", (0.01, 0.01))
-    monkeypatch.setattr(claimed, "_ASK_AGAIN_S", 0.01)
     run = stage.runs[0]
-    theirs = Entry(
-        name=run.name,
-        agent="a",
-        env="toy/line",
-        repeat=0,
-        digest=run.digest,
-        state="completed",
-        directory="",
-        host="other",
-        score=3.0,
-    )
+    theirs = entry_of(run, state="completed", directory="", host="other", score=3.0)
     written: list[str] = []
 
     async def refused(name: str) -> None:
@@ -134,10 +104,8 @@ def test_a_finished_run_that_another_host_took_meanwhile_is_not_written_here(
 
 
 @pytest.mark.parametrize("ours", [False, True])
-def test_a_claim_that_was_given_back_ends_the_earlier_hosts_run(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ours: bool
-) -> None:
-    stage = Stage(tmp_path, HEAD + EVOLVE.format("a"), monkeypatch)
+def test_a_claim_that_was_given_back_ends_the_earlier_hosts_run(staged: Staged, ours: bool) -> None:
+    stage = staged(EVOLVE.format("a"))
     if ours:
         folder = stage.runs[0].folder
         folder.state.mkdir(parents=True)
@@ -147,10 +115,8 @@ def test_a_claim_that_was_given_back_ends_the_earlier_hosts_run(
     assert stage.cluster.cancelled == ([] if ours else ["r-7"])
 
 
-def test_our_own_failure_gives_the_claim_back_and_is_reported(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    stage = Stage(tmp_path, HEAD + CODEX.format("a"), monkeypatch)
+def test_our_own_failure_gives_the_claim_back_and_is_reported(staged: Staged) -> None:
+    stage = staged(CODEX.format("a"))
 
     async def fails(name: str) -> None:
         stage.doing(name, tokens=TOKENS)
@@ -163,10 +129,8 @@ def test_our_own_failure_gives_the_claim_back_and_is_reported(
     assert stage.cluster.reports[-1][2] is None
 
 
-def test_a_sweep_that_renews_no_claims_ends_with_the_reason(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    stage = Stage(tmp_path, HEAD + CODEX.format("a"), monkeypatch)
+def test_a_sweep_that_renews_no_claims_ends_with_the_reason(staged: Staged) -> None:
+    stage = staged(CODEX.format("a"))
     asked: list[str] = []
 
     def answer(name: str) -> ClaimState | None:
