@@ -64,14 +64,12 @@ class AgentProcess:
     async def say(self, line: bytes) -> bool:
         """Writes a line to its stdin and waits until the program reads it. Returns False when stdin is closed."""
         stdin = self._process.stdin
-        if stdin is None or stdin.is_closing():
-            return False
-        try:
-            stdin.write(line + b"\n")
-            await stdin.drain()
-        except (BrokenPipeError, ConnectionResetError):
-            return False
-        return True
+        if stdin is not None and not stdin.is_closing():
+            with contextlib.suppress(BrokenPipeError, ConnectionResetError):
+                stdin.write(line + b"\n")
+                await stdin.drain()
+                return True
+        return False
 
     async def drained(self) -> None:
         """Waits until the program has read most of what was written; not for one that has closed its stdin."""

@@ -11,6 +11,7 @@ from __future__ import annotations
 import asyncio
 import math
 import os
+import re
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -39,11 +40,8 @@ class Resources:
         and the programs that it starts are bound to some."""
         self._asked = asked
         self._folders, self._skipped = folders, skipped
-        wanted = {
-            "cpu": asked.cpus and max(1000, round(asked.cpus * _QUOTA_US)),
-            "memory": asked.memory_bytes,
-            "pids": asked.pids,
-        }
+        quota = asked.cpus and max(1000, round(asked.cpus * _QUOTA_US))
+        wanted = {"cpu": quota, "memory": asked.memory_bytes, "pids": asked.pids}
         self._group = cgroups.Group({name: value for name, value in wanted.items() if value})
         self.joins = self._group.procs
         """Files into which a program of the agent writes its id before it starts."""
@@ -128,9 +126,8 @@ class Resources:
             return f"its folders are nested deeper than {MAX_DEPTH}, so that their size is unknown"
         self._now = msgspec.structs.replace(self._now, disk_bytes=max(self._now.disk_bytes, n_bytes))
         most = self._asked.disk_bytes
-        return (
-            f"its files take {n_bytes:,} bytes; {most:,} are allowed (--agent-disk)" if n_bytes > most else ""
-        )
+        taken = f"its files take {n_bytes:,} bytes; {most:,} are allowed (--agent-disk)"
+        return taken if n_bytes > most else ""
 
 
 def _bind(n_cores: int) -> int:
@@ -143,7 +140,5 @@ def _bind(n_cores: int) -> int:
 
 
 def _counts_by_namespace() -> bool:
-    release = os.uname().release.split(".")
-    return (
-        tuple(int("".join(filter(str.isdecimal, part)) or 0) for part in release[:2]) >= _COUNTED_BY_NAMESPACE
-    )
+    release = re.findall(r"\d+", os.uname().release)
+    return tuple(map(int, release[:2])) >= _COUNTED_BY_NAMESPACE

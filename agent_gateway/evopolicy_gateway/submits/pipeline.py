@@ -220,12 +220,11 @@ class SubmitPipeline:
     async def _collect(self, ticket: Ticket) -> tuple[SubmitDone, bytes]:
         """Writes the feedback; starts over when the disk refuses."""
         assert ticket.accepted is not None
+        tree = SubmitTree(self._workspace / "feedback", ticket.submit_id)
+        known = (ticket, ticket.accepted, self._client, tree, self._journal.at_work, self._changed)
         while True:
-            tree = SubmitTree(self._workspace / "feedback", ticket.submit_id)
-            at_work, changed = self._journal.at_work, self._changed
-            collector = Collector(self.machine, ticket, ticket.accepted, self._client, tree, at_work, changed)
             try:
-                return await collector.collect()
+                return await Collector(self.machine, *known).collect()
             except (OSError, StorageError) as error:
                 # Without the error's paths: an agent reads this text.
                 why = error.strerror if isinstance(error, OSError) else None

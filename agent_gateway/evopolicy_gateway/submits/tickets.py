@@ -250,17 +250,12 @@ class TicketMachine:
         return "collect"
 
     def snapshotted(self, snapshot: Snapshot) -> Effect:
-        digest, error, kept, tree = snapshot.digest, snapshot.error, snapshot.kept, snapshot.tree
-        request = self._open.request
-        return msgspec.structs.replace(request, bundle=digest, bundle_error=error, kept=kept, tree=tree)
+        taken = {"bundle": snapshot.digest, "bundle_error": snapshot.error}
+        taken |= {"kept": snapshot.kept, "tree": snapshot.tree}
+        return msgspec.structs.replace(self._open.request, **taken)
 
     def sent(self, reply: messages.SubmitAccepted) -> Effect:
-        return open_run.Accepted(
-            key=self._open.request.key,
-            submit_index=reply.submit_index,
-            first_global_episode=reply.first_global_episode,
-            remaining_budget=reply.remaining_budget,
-        )
+        return open_run.Accepted(key=self._open.request.key, **msgspec.structs.asdict(reply))
 
     def paged(self, page: messages.ResultsPage, n_done: int, held_before: float) -> None:
         """A page is written, `n_done` episodes in all. `held_before`: `held_s` before the first page."""

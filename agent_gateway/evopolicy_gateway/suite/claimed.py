@@ -97,8 +97,7 @@ class ClaimedSweep(Sweep):
         return [] if self._paused else super()._startable()
 
     def _given_up(self) -> bool:
-        why = self._used_up()
-        if why is not None:
+        if (why := self._used_up()) is not None:
             self._view.say(f"{len(self._todo)} runs are left as they are: {why}")
         return why is not None
 
@@ -173,12 +172,10 @@ class ClaimedSweep(Sweep):
             await self._check_held(run, "another host has it now: its files are not written here")
         self._view.started(run.name, decision.attempt)
         settings = msgspec.structs.replace(run.settings, attempt=decision.attempt)
-        aside = None
-        if is_new := decision.kind in ("restart", "new"):
-            aside = partial(self._put_aside, run.folder, decision.attempt - 1)
-        record = await self._played(
-            decision, msgspec.structs.replace(run, settings=settings, overwrite=is_new), aside
-        )
+        is_new = decision.kind in ("restart", "new")
+        aside = partial(self._put_aside, run.folder, decision.attempt - 1) if is_new else None
+        plan = msgspec.structs.replace(run, settings=settings, overwrite=is_new)
+        record = await self._played(decision, plan, aside)
         if record.outcome.status == "cancelled":
             await self._check_held(run, "another host has it now and has cancelled it here")
         known = {"settings": begun.settings, "earlier": begun.earlier}

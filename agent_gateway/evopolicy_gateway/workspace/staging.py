@@ -30,11 +30,10 @@ def stage(folder: RunFolder, run: RunOpened, urls: Urls, text: str = "") -> Stag
         return saved(folder.staged, Staged)
     folder.system.mkdir(parents=True, exist_ok=True)
     folder.feedback.mkdir(exist_ok=True)
-    policy, started = initial_policy(run.env.action_space).encode(), folder.start.exists()
-    if started:  # its submit may have been without a policy
-        policy = (folder.system / "policy.py").read_bytes() if (folder.system / "policy.py").exists() else b""
-    else:
-        write_atomically(folder.system / "policy.py", policy)
+    path, started = folder.system / "policy.py", folder.start.exists()
+    if not started:
+        write_atomically(path, initial_policy(run.env.action_space).encode())
+    policy = path.read_bytes() if path.exists() else b""  # a start's submit may have been without a policy
     rules = agents_md(run, urls, text, started=started).encode()
     write_atomically(folder.agents_md, rules, mode=0o444)
     staged = Staged(
