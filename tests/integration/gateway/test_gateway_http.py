@@ -296,9 +296,7 @@ async def test_an_episode_that_failed_has_its_error_file_and_is_listed(tmp_path:
         assert json.loads((episodes / "ep_002" / "error.txt").read_text())["limit"] == 20.0
 
 
-async def test_a_submit_timeout_keeps_exactly_the_episodes_before_the_first_unfinished(
-    tmp_path: Path,
-) -> None:
+async def test_a_submit_timeout_keeps_the_episodes_before_the_first_unfinished(tmp_path: Path) -> None:
     double = Double(opened())
     double.order = lambda n: [0, 3, 1]
     async with served(tmp_path, double) as s:

@@ -101,9 +101,7 @@ async def test_a_request_written_down_but_never_sent_is_sent_after_the_restart(t
             assert (folder.feedback / "submit_000" / "summary.json").is_file()
 
 
-async def test_a_feedback_folder_that_cannot_be_written_is_written_once_it_can(
-    tmp_path: Path, monkeypatch: Any
-) -> None:
+async def test_feedback_is_written_once_the_disk_takes_it(tmp_path: Path, monkeypatch: Any) -> None:
     monkeypatch.setattr(submits, "DISK_PAUSE_S", 0.01)
     failures = iter([OSError(28, "No space left on device")] * 3)
     real = SubmitTree.put_episode
@@ -211,7 +209,7 @@ async def test_a_port_that_somebody_else_has_taken_is_reported(tmp_path: Path, m
                     pass
 
 
-def test_a_gateway_that_stops_during_a_submit_shows_no_traceback(
+def test_a_gateway_stopped_in_a_submit_shows_no_error(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     async def main() -> None:

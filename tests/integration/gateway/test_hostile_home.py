@@ -111,9 +111,7 @@ def test_a_read_only_home_is_reported_before_anything_is_begun(home: Path, name:
 
 @pytest.mark.parametrize("name", ["try", "local", "suite", "random", "worker"])
 @pytest.mark.parametrize("limit", ["size=1m", "nr_inodes=20"])
-def test_a_full_temporary_folder_is_reported_before_anything_is_begun(
-    home: Path, name: str, limit: str
-) -> None:
+def test_a_full_temporary_folder_is_reported_at_the_start(home: Path, name: str, limit: str) -> None:
     full = home / "tmp"
     full.mkdir()
     where = f"mount -t tmpfs -o {limit} none {full}; export TMPDIR={full}"
@@ -126,9 +124,7 @@ def test_a_full_temporary_folder_is_reported_before_anything_is_begun(
 @pytest.mark.parametrize(
     "how", ["true", "ip link set lo up; ip addr del 127.0.0.1/8 dev lo"], ids=["down", "ipv6 only"]
 )
-def test_a_machine_without_ipv4_loopback_is_reported_before_anything_is_begun(
-    home: Path, name: str, how: str
-) -> None:
+def test_a_machine_without_ipv4_loopback_is_reported_at_the_start(home: Path, name: str, how: str) -> None:
     output = refused(how, COMMANDS[name], home, "--net")
     assert "127.0.0.1" in output
     assert "ip link set lo up" in output

@@ -86,9 +86,7 @@ async def test_gateway_that_is_started_again_asks_again(tmp_path: Path) -> None:
     assert double.closed is None
 
 
-async def test_an_agent_whose_permit_was_ended_by_mistake_gets_another(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_a_permit_ended_by_mistake_is_renewed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(coordinator_client, "RENEWAL_S", 1.0)
 
     async with prepared(tmp_path) as (folder, double):
@@ -131,9 +129,7 @@ async def test_coordinator_of_an_older_version_is_an_error_with_the_remedy(tmp_p
 
 
 @pytest.mark.parametrize(("agent_host", "asks_for"), [("", ""), (KERNEL, KERNEL), (ELSEWHERE, "")])
-def test_a_remote_agents_permit_is_for_the_named_kernel(
-    tmp_path: Path, agent_host: str, asks_for: str
-) -> None:
+def test_a_remote_agents_permit_names_its_kernel(tmp_path: Path, agent_host: str, asks_for: str) -> None:
     folder = RunFolder(tmp_path)
     folder.state.mkdir()
     remote(folder, agent_host)

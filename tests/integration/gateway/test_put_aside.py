@@ -129,7 +129,7 @@ async def ended_by_a_submit(folder: RunFolder, double: Double) -> None:
         await asyncio.wait([s.task])
 
 
-async def test_a_submit_that_ends_two_gateways_is_put_aside(
+async def test_a_submit_ending_two_gateways_is_set_aside(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     real = formatting.summary_bytes

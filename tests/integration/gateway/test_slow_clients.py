@@ -70,9 +70,7 @@ async def test_headers_that_do_not_come_are_not_waited_for(
         assert await answers == [b""] * 20
 
 
-async def test_a_second_request_on_a_connection_may_not_drip_either(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_a_second_request_may_not_drip_either(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(server, "HEADERS_WAIT_S", SHORT_S)
 
     async with living(tmp_path) as s:
@@ -82,9 +80,7 @@ async def test_a_second_request_on_a_connection_may_not_drip_either(
         assert answer.count(b"HTTP/1.1 200") == 1
 
 
-async def test_a_body_that_drips_is_refused_and_costs_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_a_dripping_body_is_refused_uncharged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(http, "BODY_WAIT_S", SHORT_S)
     monkeypatch.setattr(http, "LINGER", (1 << 20, SHORT_S))
     monkeypatch.setattr(server, "HEADERS_WAIT_S", SHORT_S)
@@ -98,9 +94,7 @@ async def test_a_body_that_drips_is_refused_and_costs_nothing(
         assert s.double.submits == []
 
 
-async def test_an_answer_that_nobody_reads_is_not_kept_for_ever(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_an_unread_answer_is_not_kept_for_ever(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(server, "ANSWER_WAIT_S", SHORT_S)
 
     async with living(tmp_path) as s:

@@ -22,9 +22,7 @@ def test_an_example_is_found_anywhere_and_a_users_own_file_goes_first(tmp_path: 
     assert shipped.found("examples/none", tmp_path) == tmp_path / "examples/none"
 
 
-def test_a_wheel_has_the_examples_where_they_are_looked_for(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_a_wheel_has_the_examples_in_their_place(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     wheel = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["hatch"]["build"]["targets"]["wheel"]
     # Installed as the wheel says, with no checkout around it.
     package = tmp_path / "evopolicy_gateway"

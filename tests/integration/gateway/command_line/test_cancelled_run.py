@@ -84,9 +84,7 @@ def test_an_agent_that_thinks_is_ended_when_its_run_is_cancelled(operator_file: 
     assert (outcome.status, outcome.closed_reason, outcome.budget_used) == ("cancelled", "cancelled", 1)
 
 
-def test_a_run_cancelled_while_it_waits_for_a_worker_is_cancelled(
-    operator_file: Path, tmp_path: Path
-) -> None:
+def test_a_run_cancelled_while_it_waits_for_a_worker_ends(operator_file: Path, tmp_path: Path) -> None:
     arguments = run_arguments(operator_file, agent(tmp_path, ""))
     arguments[arguments.index("toy/line")] = "gym/acrobot"  # which no worker of this cluster offers
     with command(tmp_path, *arguments) as running:
@@ -105,9 +103,7 @@ def test_a_run_cancelled_while_it_waits_for_a_worker_is_cancelled(
     assert "Traceback" not in (folder / "logs/harness.log").read_text()
 
 
-def test_a_gateway_that_starts_again_after_the_cancelling_ends_its_run(
-    operator_file: Path, tmp_path: Path
-) -> None:
+def test_a_gateway_restarted_after_the_cancellation_ends_its_run(operator_file: Path, tmp_path: Path) -> None:
     with command(tmp_path, *run_arguments(operator_file, agent(tmp_path, SLOW))) as running:
         partial = "runs/*/toy_line/t/workspace/feedback/submit_000.partial"
         wait_until(lambda: [*tmp_path.glob(partial)], lambda: running.text)

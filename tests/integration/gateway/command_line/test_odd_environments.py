@@ -219,9 +219,7 @@ def test_a_package_that_is_only_a_checkout_is_played(folder: Path, monkeypatch: 
 
 @pytest.mark.slow
 @pytest.mark.system
-def test_an_installed_package_offers_its_environments_by_an_entry_point(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_entry_point_offers_a_packages_environments(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     site = folder / "site"
     info = site / "their_envs-1.0.dist-info"
     info.mkdir(parents=True)

@@ -158,9 +158,7 @@ def test_without_an_ok_submit_the_exit_code_says_so(ran: Plays) -> None:
     assert "no working submit" in played.out
 
 
-def test_replay_submits_the_given_policies_in_order_with_even_shares(
-    operator_file: Path, tmp_path: Path
-) -> None:
+def test_replay_submits_the_policies_in_order_with_even_shares(operator_file: Path, tmp_path: Path) -> None:
     policy = "class Policy:\n  def __init__(self, *a): pass\n  def reset(self, i): pass\n  def act(self, obs): return [{}]\n"  # noqa: E501
     for name, push in (("b", 0.5), ("a", -0.5)):
         (tmp_path / "given" / name / "system").mkdir(parents=True)
@@ -206,9 +204,7 @@ def test_a_run_that_is_played_is_nobody_elses_to_replace(operator_file: Path, tm
     assert [path.name for path in run_dir(tmp_path).parent.iterdir()] == ["t"]
 
 
-def test_of_two_commands_that_overwrite_one_run_at_once_one_plays_it(
-    operator_file: Path, tmp_path: Path
-) -> None:
+def test_of_two_commands_that_overwrite_a_run_one_plays_it(operator_file: Path, tmp_path: Path) -> None:
     code = (
         "submit([0])\nopen(f'played-{os.getpid()}', 'w')\nwhile not os.path.exists('go'): time.sleep(0.05)\n"
     )
@@ -230,9 +226,7 @@ def test_an_agent_failing_after_its_submits_has_its_own_exit_code(ran: Plays) ->
     assert played.record.outcome.status == "completed"
 
 
-def test_a_run_with_other_texts_and_less_feedback_records_both(
-    ran: Plays, operator_file: Path, tmp_path: Path
-) -> None:
+def test_other_texts_and_less_feedback_are_recorded(ran: Plays, operator_file: Path, tmp_path: Path) -> None:
     code = """
 for line in sys.stdin:
     answer = submit([0, 1])

@@ -67,9 +67,7 @@ def test_a_resumed_run_waits_for_a_coordinator_that_is_away(tmp_path: Path) -> N
         coordinator.stop()
 
 
-def test_a_killed_supervisor_leaves_nothing_of_its_agent_which_is_started_again(
-    operator_file: Path, tmp_path: Path
-) -> None:
+def test_a_killed_supervisors_agent_is_ended_and_started_again(operator_file: Path, tmp_path: Path) -> None:
     code = """
 if os.path.exists("child.pid"):
     open("gone", "w").write(str(not os.path.exists("/proc/" + open("child.pid").read())))
@@ -103,9 +101,7 @@ def test_an_agent_whose_supervisor_dies_again_and_again_has_failed(ran: Plays) -
     )
 
 
-def test_a_killed_commands_run_is_continued_and_a_finished_one_reported(
-    operator_file: Path, tmp_path: Path
-) -> None:
+def test_a_killed_commands_run_continues_and_is_then_reported(operator_file: Path, tmp_path: Path) -> None:
     code = """
 first = patient_submit([0, 1], "one")
 open("here", "w")

@@ -132,7 +132,7 @@ def test_the_record_has_the_lineage_and_a_full_budget(parent: Path, child: Path)
     assert record_in(parent).start is None
 
 
-def test_a_changed_tree_is_refused_and_leaves_no_folder(
+def test_a_changed_tree_is_refused_without_a_folder(
     parent: Path, operator_file: Path, tmp_path: Path
 ) -> None:
     forged = tmp_path / "forged"

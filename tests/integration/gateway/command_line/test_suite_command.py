@@ -203,9 +203,7 @@ def two_hosts(root: Path, agent: Path, flag: Path, *, budget: int) -> list[Path]
     return hosts
 
 
-def test_a_dead_hosts_runs_are_taken_over_and_their_results_return(
-    tmp_path: Path, operator_file: Path
-) -> None:
+def test_a_dead_hosts_runs_are_taken_over_and_return(tmp_path: Path, operator_file: Path) -> None:
     agent, flag = tmp_path / "agent.py", tmp_path / "seen" / "flag"
     flag.parent.mkdir()
     agent.write_text(
@@ -459,7 +457,7 @@ main()
 
 @pytest.mark.parametrize("changed", [False, True])
 @pytest.mark.parametrize("at", ["created", "saved"])
-def test_a_killed_sweep_leaves_no_just_opened_run(
+def test_a_killed_sweep_leaves_no_open_run(
     tmp_path: Path, operator_file: Path, at: str, changed: bool
 ) -> None:
     write_suite(tmp_path)

@@ -44,9 +44,7 @@ def policy(tmp_path: Path) -> str:
 
 @pytest.mark.usefixtures("without_bubblewrap")
 @pytest.mark.parametrize("name", ["try", "local", "run", "suite"])
-def test_without_bubblewrap_a_command_that_needs_it_says_what_to_do(
-    tmp_path: Path, policy: str, name: str
-) -> None:
+def test_a_command_without_bubblewrap_names_the_remedy(tmp_path: Path, policy: str, name: str) -> None:
     (tmp_path / "t.toml").write_text(
         'name = "t"\nenvironments = ["toy/line"]\n[[agents]]\nname = "e"\nagent = "evolve"\n'
         '[agents.jail]\nmode = "none"\n'
@@ -133,9 +131,7 @@ def test_a_trial_whose_workers_are_paused_says_so(paused: Path, tmp_path: Path, 
 
 
 @pytest.mark.parametrize("name", ["status", "run", "try"])
-def test_a_command_whose_coordinator_is_away_says_what_it_waits_for(
-    tmp_path: Path, policy: str, name: str
-) -> None:
+def test_a_command_without_coordinator_says_what_it_awaits(tmp_path: Path, policy: str, name: str) -> None:
     arguments = {
         "status": ["status", "--json"],
         "run": ["run", "--env", "toy/line", "--agent", "random"],

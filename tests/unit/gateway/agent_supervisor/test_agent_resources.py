@@ -179,7 +179,7 @@ def test_only_the_agents_own_space_counts_and_each_file_once(tmp_path: Path) -> 
     assert 1_000_000 < used < 1_100_000
 
 
-def test_without_cgroups_cores_and_processes_are_limited_in_the_jail(
+def test_without_cgroups_the_jail_limits_cores_and_pids(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(cgroups, "hierarchies", dict)

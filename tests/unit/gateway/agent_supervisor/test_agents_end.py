@@ -35,9 +35,7 @@ def supervisor(tmp_path: Path) -> Iterator[SupervisorProcess]:
     found.process.communicate()
 
 
-def test_a_surviving_agent_is_reported_until_it_is_gone(
-    supervisor: SupervisorProcess,
-) -> None:
+def test_a_surviving_agent_is_reported_until_it_is_gone(supervisor: SupervisorProcess) -> None:
     with freezer() as held:
         agent = supervisor.agent()
         held.freeze(agent)
@@ -54,9 +52,7 @@ def test_a_surviving_agent_is_reported_until_it_is_gone(
     assert not supervisor.holds_its_lock()
 
 
-def test_a_supervisor_waits_for_an_earlier_one_that_still_has_an_agent(
-    supervisor: SupervisorProcess, tmp_path: Path
-) -> None:
+def test_a_supervisor_waits_for_an_earlier_ones_agent(supervisor: SupervisorProcess, tmp_path: Path) -> None:
     first = supervisor.agent()
     second = SupervisorProcess(tmp_path)
     try:
@@ -105,7 +101,7 @@ class Cluster(Operations):
         self.asked.append(f"gone {run}")
 
 
-async def test_run_of_a_killed_command_is_dropped_when_its_agent_is_gone(
+async def test_a_killed_commands_run_waits_for_its_agent(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(locks, "_PAUSE_S", 0.01)

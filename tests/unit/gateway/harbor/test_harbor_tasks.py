@@ -108,9 +108,7 @@ def test_a_verifier_waits_for_a_service_that_is_busy(tmp_path: Path) -> None:
     assert (done.returncode, answers.read_text()) == (1, "")
 
 
-def test_a_run_that_ends_during_a_request_keeps_its_score(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_ending_in_a_request_keeps_its_score(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = RunFolder(write_run(tmp_path, [Version({"policy.py": "x = 1"}, (1.0, 2.0), 0.5)]))
     record = folder.run_json.read_bytes()
     folder.run_json.unlink()

@@ -52,9 +52,7 @@ def test_what_is_not_a_named_host_and_port_is_refused(request_line: str, status:
     assert answer.split()[1] == status
 
 
-def test_a_forbidden_host_is_logged_once(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_forbidden_host_is_logged_once(monkeypatch: pytest.MonkeyPatch) -> None:
     logged: list[str] = []
     monkeypatch.setattr(proxy.log, "warning", lambda text, host: logged.append(host))
     found = JailProxy({}, frozenset())

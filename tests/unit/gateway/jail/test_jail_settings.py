@@ -57,9 +57,7 @@ def test_a_wrong_option_is_named(settings: JailSettings, named: str) -> None:
         settings.check()
 
 
-def test_a_machine_without_bubblewrap_is_told_what_to_do(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_machine_without_bubblewrap_gets_a_remedy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(ConfigError, match="--jail none"):
         JailSettings().check()
@@ -75,9 +73,7 @@ def test_a_bubblewrap_that_fails_is_quoted(tmp_path: Path, monkeypatch: pytest.M
         check_bubblewrap()
 
 
-def test_ctrl_c_does_not_reach_a_bubblewrap_that_is_tried(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_ctrl_c_does_not_reach_a_tried_bubblewrap(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     program = tmp_path / "bwrap"
     program.write_text(
         '#!/bin/sh\nread -r pid name state parent group rest < /proc/$$/stat\n[ "$group" = $$ ]\n'

@@ -53,7 +53,7 @@ def test_no_call_gives_a_file_a_set_id_bit(machine: str, monkeypatch: pytest.Mon
 
 
 @pytest.mark.parametrize("mode", ["bwrap", "open-network", "none"])
-def test_no_jail_without_its_filter_on_a_processor_without_a_table(
+def test_a_processor_without_a_table_of_calls_has_no_jail(
     mode: Mode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(syscalls.os, "uname", lambda: SimpleNamespace(machine="riscv64"))
@@ -62,9 +62,7 @@ def test_no_jail_without_its_filter_on_a_processor_without_a_table(
         JailSettings(mode=mode).check()
 
 
-def test_a_program_that_only_tells_its_version_is_filtered_too(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_program_asked_for_its_version_is_filtered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
     workspace = tmp_path / "workspace"
     workspace.mkdir()

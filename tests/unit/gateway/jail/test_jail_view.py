@@ -116,9 +116,7 @@ def test_only_an_open_network_shares_this_machines(tmp_path: Path) -> None:
     assert "--unshare-net" not in arguments(tmp_path / "b", [], open_network=True)
 
 
-def test_an_agents_second_program_finds_the_firsts_links(
-    tmp_path: Path,
-) -> None:
+def test_an_agents_second_program_finds_the_firsts_links(tmp_path: Path) -> None:
     for home in ("/home/somebody", str(tmp_path)):
         needs = needs_of([], None)
         for place in ("/tmp/some/python", f"{home}/some/python"):

@@ -49,7 +49,7 @@ def plan(tmp_path: Path, **fields: Any) -> Plan:
     return Plan(**usual | fields)
 
 
-def test_a_cli_that_is_missing_is_refused_before_the_run_opens(
+def test_a_missing_cli_is_refused_before_the_run_opens(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
@@ -278,7 +278,7 @@ def test_watchers_on_a_terminal_draw_a_table() -> None:
         ("bwrap", "none", True),
     ],
 )
-def test_what_nothing_locks_in_could_read_the_state(
+def test_agents_without_a_jail_may_read_the_state(
     jail: Any, tier: Any, exposed: bool, tmp_path: Path
 ) -> None:
     settings = RunOptions(agent="evolve", tier=tier).settings("toy/line", "t")

@@ -54,7 +54,7 @@ def test_a_gateway_speaks_with_its_runs_credentials(run: RunFolder) -> None:
     assert gateway._load(run, (), None) == (RUNS_OWN, OpenedRun(run="r-1"))
 
 
-def test_on_another_machine_it_has_that_machines_rights_and_its_runs_capability(
+def test_elsewhere_it_has_that_machines_rights_and_its_runs_capability(
     run: RunFolder, tmp_path: Path
 ) -> None:
     found, opened = gateway._load(run, (), machines_folder(tmp_path / "m"))

@@ -76,9 +76,7 @@ def test_info_of_a_gateway_killed_while_answering_did_not_come() -> None:
         thread.join()
 
 
-def test_a_program_that_has_said_stop_and_stays_is_not_waited_for(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_program_that_stays_after_stop_is_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(command, "_STOP_TIMEOUT_S", SOON_S)
     code = """
 import json, os, sys, time
@@ -105,9 +103,7 @@ def test_pipes_that_a_child_holds_are_let_go(tmp_path: Path, monkeypatch: pytest
 # Coding agents' CLIs.
 
 
-def test_a_cli_that_does_not_tell_its_version_is_named(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_cli_that_tells_no_version_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cli_agent, "_PROBE_TIMEOUT_S", SOON_S)
     mute = tmp_path / "bin" / "claude"
     mute.parent.mkdir()
@@ -119,7 +115,7 @@ def test_a_cli_that_does_not_tell_its_version_is_named(
 
 
 @pytest.mark.parametrize("scenario", ["lingers", "lingers_stubborn"])
-def test_a_cli_that_is_done_and_does_not_exit_is_ended(
+def test_a_cli_that_does_not_exit_is_ended(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, scenario: str
 ) -> None:
     """Also one that ignores SIGTERM."""
@@ -130,9 +126,7 @@ def test_a_cli_that_is_done_and_does_not_exit_is_ended(
     assert (played.ending.reason, played.ending.turns, played.ending.retries) == ("agent_stopped", 1, 0)
 
 
-def test_a_child_holding_a_clis_pipe_does_not_delay_the_turn(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_child_with_a_clis_pipe_delays_no_turn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(turn, "_PIPE_TIMEOUT_S", SOON_S)
     try:
         played = cli_stage.play(tmp_path, settings("claude-code"), "leaves_child", budget=2)
@@ -203,9 +197,7 @@ async def _sent(url: str, text: str) -> bytes:
         writer.close()
 
 
-def test_a_missing_body_is_refused_without_further_wait(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_missing_body_is_refused_after_a_while(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(http, "BODY_WAIT_S", SOON_S)
     monkeypatch.setattr(http, "LINGER", (1 << 20, SOON_S))
 
@@ -241,9 +233,7 @@ def test_a_body_of_a_stranger_is_not_waited_for(monkeypatch: pytest.MonkeyPatch)
     assert received[-1]["more_body"] is False
 
 
-async def test_an_unawaited_submit_is_answered_before_it_is_decided(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_an_unawaited_submit_is_answered_soon(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(http, "DECIDED_WAIT_S", SOON_S)
 
     async with served(tmp_path) as s:
@@ -264,9 +254,7 @@ def test_an_idle_connection_is_closed(tmp_path: Path, monkeypatch: pytest.Monkey
     assert asyncio.run(main()).startswith(b"HTTP/1.1 200")
 
 
-async def test_an_endless_request_does_not_delay_the_services_end(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+async def test_an_endless_request_does_not_delay_the_services_end(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(server, "CLOSE_GRACE_S", 1)
 
     asked = asyncio.Event()
@@ -299,9 +287,7 @@ def test_a_child_that_ignores_being_asked_is_killed(tmp_path: Path) -> None:
     assert asyncio.run(main()) == -signal.SIGKILL
 
 
-async def test_giving_up_a_run_ends_although_nobody_hears_of_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_giving_up_ends_without_an_answer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(lifecycle, "GIVE_UP_TIMEOUT_S", SOON_S)
 
     class Deaf:

@@ -35,7 +35,7 @@ def test_the_prices_of_the_agents_model_are_read(tmp_path: Path) -> None:
         ("[", "m-1", "prices.toml"),
     ],
 )
-def test_a_wrong_file_of_prices_is_named_with_its_fault(
+def test_a_file_of_prices_is_named_with_its_fault(
     tmp_path: Path, text: str, model: str | None, told: str
 ) -> None:
     (tmp_path / "prices.toml").write_text(text)

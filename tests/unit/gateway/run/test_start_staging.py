@@ -76,14 +76,12 @@ def test_a_start_gets_the_recorded_workspace_and_no_hidden_result(parent: RunFol
         ("runs/e/toy_line/none@submit_000", "no run is there"),
     ],
 )
-def test_a_start_that_names_no_recorded_submit_is_refused(
-    parent: RunFolder, tmp_path: Path, text: str, why: str
-) -> None:
+def test_a_start_needs_a_recorded_submit(parent: RunFolder, tmp_path: Path, text: str, why: str) -> None:
     with pytest.raises(ConfigError, match=why):
         plan(tmp_path, text)
 
 
-def test_a_run_of_another_user_is_no_start(
+def test_another_users_run_is_no_start(
     parent: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(os, "getuid", lambda: parent.root.stat().st_uid + 1)

@@ -44,9 +44,7 @@ def test_the_summary_is_written_last(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert written == ["trajectory.jsonl", "stdout.txt", "errors.txt", "summary.json"]
 
 
-def test_all_of_it_is_on_the_disk_before_it_has_its_name(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_feedback_is_durable_before_it_has_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[list[str]] = []
 
     def flush(folder: Path) -> None:

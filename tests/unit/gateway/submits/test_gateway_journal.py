@@ -81,9 +81,7 @@ def test_a_damaged_line_in_the_middle_is_reported(tmp_path: Path) -> None:
         Journal(tmp_path / "j")
 
 
-def test_a_line_that_the_disk_refuses_leaves_no_trace(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_line_that_the_disk_refuses_is_cut_off(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     journal = Journal(tmp_path / "j")
     journal.append(REQUESTED)
 

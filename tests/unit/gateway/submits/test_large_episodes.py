@@ -124,9 +124,7 @@ def test_an_archive_of_very_many_arrays_is_refused_before_they_are_listed() -> N
     assert peak_of(work)[1] < 24 << 20
 
 
-def test_large_episodes_are_written_one_after_another(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_large_episodes_are_written_one_by_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     at_work, most, lock = 0, 0, threading.Lock()
     real = feedback.episode_files
 

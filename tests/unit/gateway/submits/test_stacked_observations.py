@@ -42,7 +42,7 @@ def shown(files: dict[str, bytes]) -> list[Any]:
         (["NaN", 1.0] * 600, True, None),
     ],
 )
-def test_the_threshold_is_the_size_of_the_whole_stacked_episode(
+def test_the_threshold_counts_the_whole_stacked_episode(
     obs: list[Any], inline: bool, dtype: str | None
 ) -> None:
     files = as_published({"trajectory.jsonl": rows(obs), "video.mp4": b"v"})

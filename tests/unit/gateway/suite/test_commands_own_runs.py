@@ -13,9 +13,7 @@ from evopolicy_common.errors import ConfigError, EvopolicyError
 from evopolicy_gateway.suite import runs
 
 
-def test_of_a_commands_own_runs_one_that_fails_stops_no_other(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_failing_run_stops_no_other_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     direct = Direct(tmp_path, monkeypatch)
 
     async def act(name: str) -> None:
@@ -30,9 +28,7 @@ def test_of_a_commands_own_runs_one_that_fails_stops_no_other(
     assert not list(tmp_path.glob("**/suite.json"))
 
 
-def test_a_wrong_option_of_each_run_is_the_commands_own(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_wrong_option_of_all_runs_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     direct = Direct(tmp_path, monkeypatch)
     wrong = {"toy/line"}
 

@@ -176,9 +176,7 @@ def test_a_sweep_plays_again_what_its_agent_never_played(tmp_path: Path) -> None
     assert "failed before its first submit" in (entry.error or "")
 
 
-def test_exit_codes_and_the_report_tell_how_runs_ended(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_exit_codes_and_report_tell_the_ends(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     ends: list[tuple[dict[str, Any], int]] = [
         ({"state": "completed", "score": 1.0, "random": 0.5}, 0),
         ({"state": "no_ok_submit"}, 3),

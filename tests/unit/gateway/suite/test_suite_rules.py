@@ -83,9 +83,7 @@ def test_runs_are_agents_times_environments_times_repeats_with_overrides(tmp_pat
     assert len({run.digest for run in runs}) == len(runs)
 
 
-def test_a_cli_that_is_missing_is_refused_before_a_run_begins(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_missing_cli_is_refused_before_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     runs = suite_in(tmp_path)
     monkeypatch.setenv("PATH", str(tmp_path))
     check_agents_start([run for run in runs if run.entry == "evolve"])
@@ -362,7 +360,7 @@ def related(one: Plan, other: Plan) -> bool:
 
 
 @given(st.lists(PLACES, max_size=12), st.lists(PLACES, max_size=6))
-def test_runs_with_fewest_related_ones_under_way_come_first(
+def test_runs_with_fewest_related_ones_come_first(
     places: list[tuple[str, str]], busy: list[tuple[str, str]]
 ) -> None:
     under_way = [

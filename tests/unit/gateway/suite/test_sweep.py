@@ -29,9 +29,7 @@ def test_limits_per_machine_agent_and_provider_hold(staged: Staged) -> None:
     assert max(one.count("d") for one in together) == 1
 
 
-def test_next_agent_begins_while_the_run_before_is_scored(
-    staged: Staged, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_next_agent_begins_during_scoring(staged: Staged, monkeypatch: pytest.MonkeyPatch) -> None:
     text = "[defaults]\nrepeats = 3\n[parallel]\nmachine = 1\n" + EVOLVE.format("a")
     stage = staged(text)
     monkeypatch.setattr(sweep, "POLL_S", TIMEOUT_S)
@@ -70,9 +68,7 @@ def test_a_paused_sweep_begins_no_further_run(staged: Staged) -> None:
     assert len([line for line in stage.events if "paused: no further run begins" in line]) == 1
 
 
-def test_runs_that_are_followed_without_an_agent_are_bounded(
-    staged: Staged, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_runs_that_are_scored_are_bounded(staged: Staged, monkeypatch: pytest.MonkeyPatch) -> None:
     text = "[defaults]\nrepeats = 4\n[parallel]\nmachine = 1\n" + EVOLVE.format("a")
     stage = staged(text)
     monkeypatch.setattr(sweep, "MAX_SCORED", 2)
@@ -91,9 +87,7 @@ def test_runs_that_are_followed_without_an_agent_are_bounded(
     assert max(most) == 2
 
 
-def test_unrelated_environments_are_played_side_by_side(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_unrelated_environments_meet(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     text = 'name = "s"\nenvironments = ["toy/line", "toy/maze"]\n[parallel]\nmachine = 2\n'
     stage = Stage(tmp_path, text + EVOLVE.format("a") + EVOLVE.format("b"), monkeypatch)
     stage.act = lambda name: until(lambda: len(stage.begun) >= 2)
@@ -205,9 +199,7 @@ def test_a_paused_sweep_begins_nothing_and_goes_on_later(staged: Staged) -> None
     assert sum("paused" in line for line in stage.events) == 1
 
 
-def test_a_run_whose_agent_is_gone_is_finished_again_after_an_error(
-    staged: Staged, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_is_finished_again_after_an_error(staged: Staged, monkeypatch: pytest.MonkeyPatch) -> None:
     stage = staged(CODEX.format("a") + CODEX.format("b"))
     monkeypatch.setattr(sweep, "FINISH_AGAIN_S", (0.0, 0.0))
     failures = {"a/toy/line/0": 2, "b/toy/line/0": 3}
