@@ -112,11 +112,17 @@ def sizes(pid: int) -> tuple[int, int] | None:
     return None
 
 
+def number(path: str, name: str) -> int | None:
+    """The number after a name at the start of a line of a file of /proc; None when it cannot be read."""
+    with contextlib.suppress(OSError, ValueError, IndexError), open(path) as lines:
+        for line in lines:
+            if line.startswith((f"{name}:", f"{name} ")):
+                return int(line.split()[1])
+    return None
+
+
 def proportional_bytes(pid: int) -> int | None:
     """Proportional set size of a process: its resident memory, in which memory that several processes share is divided
     among them. Bytes; None where the kernel does not show it."""
-    with contextlib.suppress(OSError, ValueError, IndexError):
-        for line in Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines():
-            if line.startswith("Pss:"):
-                return int(line.split()[1]) << 10
-    return None
+    size = number(f"/proc/{pid}/smaps_rollup", "Pss")
+    return None if size is None else size << 10

@@ -201,7 +201,7 @@ class EnvProcess:
     def _tell(self) -> None:
         now = time.monotonic()
         progress = self._progress
-        if passed := self._guard.look(now):
+        if passed := self._guard.check(now):
             if progress is not None:
                 progress.give_up(self._channel.send)
             self._channel.send(messages.Fault(kind="environment", message=passed))

@@ -154,42 +154,28 @@ class Watch:
             # Answers of late may have waited, too, and it was not looked.
             self._count_waits(self.cpu_s())
             running, in_episode = self._used(since, now)
-        left_answer = self.answer_limit_s - running
-        left_episode = limits.episode_wall_s - in_episode
+        remaining_answer_s = self.answer_limit_s - running
+        remaining_episode_s = limits.episode_wall_s - in_episode
         cpu = self.cpu_s() - self.cpu_start_s
         verdict: Verdict | None = None
-        if left_answer <= 0:
-            verdict = Verdict(
-                "act_timeout",
-                f"{self.what} took longer than {self.answer_limit_s:g} s",
-                self.answer_limit_s,
-                running,
-            )
-        elif left_episode <= 0:
-            verdict = Verdict(
-                "episode_timeout",
-                f"the policy worked for longer than {limits.episode_wall_s:g} s in this episode",
-                limits.episode_wall_s,
-                in_episode,
-            )
+        if remaining_answer_s <= 0:
+            text, most = f"{self.what} took longer than {self.answer_limit_s:g} s", self.answer_limit_s
+            verdict = Verdict("act_timeout", text, most, running)
+        elif remaining_episode_s <= 0:
+            text = f"the policy worked for longer than {limits.episode_wall_s:g} s in this episode"
+            verdict = Verdict("episode_timeout", text, limits.episode_wall_s, in_episode)
         elif cpu > limits.cpu_s:
-            verdict = Verdict(
-                "cpu_limit",
-                f"the policy used more than {limits.cpu_s:g} s of CPU time in this episode",
-                limits.cpu_s,
-                cpu,
-            )
-        elif self._count_threads and (n := _threads(self.child.host_pid)) > limits.processes:
-            verdict = Verdict(
-                "process_limit",
-                f"the policy had {n} threads; {limits.processes} are the limit",
-                limits.processes,
-                n,
-            )
+            text = f"the policy used more than {limits.cpu_s:g} s of CPU time in this episode"
+            verdict = Verdict("cpu_limit", text, limits.cpu_s, cpu)
+        elif self._count_threads:
+            n = proc.number(f"/proc/{self.child.host_pid}/status", "Threads") or 0
+            if n > limits.processes:
+                text = f"the policy had {n} threads; {limits.processes} are the limit"
+                verdict = Verdict("process_limit", text, limits.processes, n)
         if verdict is not None and self.since == since:
             self.verdict = verdict
             self.child.kill()
-        return max(_SHORTEST_TICK_S, min(TICK_S, left_answer, left_episode))
+        return max(_SHORTEST_TICK_S, min(TICK_S, remaining_answer_s, remaining_episode_s))
 
     def _excuse(self, now: float) -> None:
         """Count the time from the last look on in which the policy was not let run."""
@@ -310,11 +296,3 @@ def is_stopped(pid: int) -> bool:
     """Whether the process is stopped, or held by a debugger."""
     stat = proc.stat(pid)
     return stat is not None and stat.state in STOPPED
-
-
-def _threads(pid: int) -> int:
-    try:
-        with open(f"/proc/{pid}/status") as lines:
-            return next((int(line.split()[1]) for line in lines if line.startswith("Threads:")), 0)
-    except OSError:
-        return 0

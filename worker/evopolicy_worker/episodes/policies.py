@@ -63,9 +63,8 @@ class Policies:
         folder = self._scratch / "policies" / str(self._n_policies)
         if self._jail.home is None:
             self._folders.append(folder)
-        return PolicyProcess(
-            self._zygote, child, self._monitor, self._jail, limits, str(folder), self._oom_kills
-        )
+        own = str(folder), self._oom_kills
+        return PolicyProcess(self._zygote, child, self._monitor, self._jail, limits, *own)
 
     def _spawn(self) -> Child:
         self._bury()
@@ -135,9 +134,9 @@ class JobPolicies:
         job, files = self._job, self._files
         assert files is not None
         if self._policy is not None and not (job.policy_every and k % job.policy_every == 0):
-            self._policy.begin_episode(first=False)
+            self._policy.begin_episode()
             return self._policy
-        self._end()
+        self.drop()
         source = files.policy()
         if source is None:
             raise PolicyFailedError(
@@ -170,13 +169,10 @@ class JobPolicies:
 
     def close(self, progress: Progress) -> None:
         progress.policy = None
-        self._end()
+        self.drop()
 
     def drop(self) -> None:
-        """The policy is lost; the next episode gets another one."""
-        self._end()
-
-    def _end(self) -> None:
+        """Ends the policy, if there is one; the next episode gets another one."""
         if self._policy is not None:
             policy, self._policy = self._policy, None
             policy.kill()

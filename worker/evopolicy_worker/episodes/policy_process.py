@@ -31,19 +31,8 @@ from evopolicy_worker.sandbox.zygote import Child, Exit, Zygote, wait_dead
 from evopolicy_worker.slot_protocol import endings
 from evopolicy_worker.slot_protocol.endings import EndedFromOutsideError, Ending
 
-_DENIED = frozenset(
-    {
-        *SIMULATORS,
-        *(
-            "evopolicy_common",
-            "evopolicy_worker",
-            "evopolicy_coordinator",
-            "evopolicy_results",
-            "evopolicy_gateway",
-        ),
-        "zenoh",
-    }
-)
+_OURS = ("common", "worker", "coordinator", "results", "gateway")
+_DENIED = frozenset((*SIMULATORS, *(f"evopolicy_{name}" for name in _OURS), "zenoh"))
 """Modules that a policy may not import: simulators and our own code, which it does not see."""
 _GRACE_S = 1.0
 _SEAL_S = 60.0
@@ -63,6 +52,18 @@ _USUAL_ACTION_BYTES = 256
 its episode."""
 _MAX_MESSAGE = 2000
 _MAX_TRACEBACK = 16_000
+_LIMITS: dict[str, tuple[FailureCategory, str, str]] = {
+    "memory": ("oom", "memory_bytes", "memory: {:,} bytes beside Python's own are the limit"),
+    "files": ("file_limit", "file_bytes", "files: {:,} bytes written are the limit"),
+    "inodes": ("file_limit", "files", "files: {:,} files and folders are the limit"),
+    "descriptors": ("file_limit", "open_files", "files: {} open descriptors are the limit"),
+    "processes": (
+        "process_limit",
+        "processes",
+        "processes: {} threads are the limit, whose stacks count as memory, and no process may be started",
+    ),
+}
+"""By the kind of limit that a policy's process reports: the failure's category, the limit, and a text."""
 _STAGES: dict[str, FailureCategory] = {
     "import": "import_error",
     "init": "init_error",
@@ -138,7 +139,8 @@ class PolicyProcess:
         # A CPU limit of the worker's own is the policy's too, and ends it by SIGKILL.
         self._held = bool(jail.config["seals"]) and resource.getrlimit(resource.RLIMIT_CPU) == (-1, -1)
         self._watch = Watch(child, limits, count_threads=not self._enclosed, held=self._held)
-        self._base_bytes, self._base_resident = _memory(child.host_pid)
+        # If they cannot be read, those of Python with numpy.
+        self._base_bytes, self._base_resident = proc.sizes(child.host_pid) or (1 << 29, 1 << 25)
         self._oom_kills = oom_kills
         self._write: frames.Writer = list
         self._action_bytes = 0
@@ -160,9 +162,7 @@ class PolicyProcess:
         """
         self.seal(BundleFiles([("policy.py", False, len(source))], source), bytes(16), env_meta, "arrays")
         try:
-            return self._expect_ok(
-                [player.REQUEST_HEADER.pack(0, player.COMPILE, 0)], "init", self._limits.init_wall_s
-            )
+            return self._request(player.COMPILE, "init", self._limits.init_wall_s)
         except PolicyFailedError:
             # As the process that plays will find again, and report.
             return b""
@@ -172,17 +172,10 @@ class PolicyProcess:
 
         Raises PolicyFailedError with a category of NO_POLICY.
         """
-        frame = [player.REQUEST_HEADER.pack(len(code), player.LOAD, 0), code]
         self._watch.spent_s = 0.0
-        self._expect_ok(frame, "init", self._limits.init_wall_s)
+        self._request(player.LOAD, "init", self._limits.init_wall_s, payload=code)
 
-    def seal(
-        self,
-        bundle: BundleFiles,
-        seed: bytes,
-        env_meta: dict[str, Any],
-        observations: str,
-    ) -> None:
+    def seal(self, bundle: BundleFiles, seed: bytes, env_meta: dict[str, Any], observations: str) -> None:
         """Gives the process its bundle and its limits, and takes its rights away."""
         limits = self._limits
         needed = 16 * frames.elements(env_meta["action_space"])
@@ -218,16 +211,14 @@ class PolicyProcess:
         self._monitor.watch(self._watch)
         self._expect_ok(frames.init_frame(init, bundle.data), "seal", _SEAL_S)
 
-    def begin_episode(self, *, first: bool) -> None:
+    def begin_episode(self) -> None:
         """Wall, CPU time and output count from here; the first episode's include the import."""
-        if not first:
-            self._watch.begin_episode()
+        self._watch.begin_episode()
 
     def reset(self, episode_index: int) -> None:
         """Raises PolicyFailedError."""
         self._surplus_bytes = 0
-        frame = [player.REQUEST_HEADER.pack(0, player.RESET, episode_index)]
-        self._expect_ok(frame, "reset", self._limits.act_wall_s)
+        self._request(player.RESET, "reset", self._limits.act_wall_s, episode_index)
 
     def prepare_acts(self) -> None:
         """After `reset`: does once the work that `act` would otherwise do on every step."""
@@ -265,11 +256,6 @@ class PolicyProcess:
                 "act_error", f"{text} {limit:,} are the limit", limit=limit, used=self._surplus_bytes
             )
 
-    @property
-    def spent_s(self) -> float:
-        """The policy's own wall time in this episode, seconds."""
-        return self._watch.spent_s
-
     def take_output(self) -> Ended:
         """Output and CPU time of the episode that ends; the policy lives on when it can.
 
@@ -277,7 +263,7 @@ class PolicyProcess:
         """
         if not self.dead:
             with contextlib.suppress(PolicyFailedError):
-                self._expect_ok([player.REQUEST_HEADER.pack(0, player.FLUSH, 0)], "act", _GRACE_S)
+                self._request(player.FLUSH, "act", _GRACE_S)
         if self.dead:
             return self.end()
         # Under the monitor's lock, so no other thread reads.
@@ -293,7 +279,7 @@ class PolicyProcess:
         if self._finished is None:
             if not self.dead:
                 with contextlib.suppress(PolicyFailedError, EndedFromOutsideError):
-                    self._expect_ok([player.REQUEST_HEADER.pack(0, player.END, 0)], "act", _GRACE_S)
+                    self._request(player.END, "act", _GRACE_S)
             watch = self._watch
             cpu_s = self._cpu_of_episode() if self.dead else max(0.0, watch.cpu_s() - watch.cpu_start_s)
             self._monitor.watch(None)
@@ -314,6 +300,13 @@ class PolicyProcess:
                 self._child.kill()
 
     # Requests and replies.
+
+    def _request(
+        self, kind: int, what: str, limit_s: float, argument: int = 0, payload: bytes = b""
+    ) -> bytes:
+        return self._expect_ok(
+            [player.REQUEST_HEADER.pack(len(payload), kind, argument), payload], what, limit_s
+        )
 
     def _expect_ok(self, parts: list[bytes], what: str, limit_s: float) -> bytes:
         self._watch.what = what
@@ -339,11 +332,8 @@ class PolicyProcess:
         length, tag = player.REPLY_HEADER.unpack_from(data)
         if len(data) != 8 + length:
             if length > frames.MAX_REPLY_BYTES:
-                raise self._broken(
-                    f"it announced an answer of {length:,} bytes; {frames.MAX_REPLY_BYTES:,} are the limit",
-                    frames.MAX_REPLY_BYTES,
-                    length,
-                )
+                how = f"it announced an answer of {length:,} bytes; {frames.MAX_REPLY_BYTES:,} are the limit"
+                raise self._broken(how, frames.MAX_REPLY_BYTES, length)
             data = self._read_more(data, 8 + length)
             if len(data) > 8 + length:
                 raise self._broken("it sent more than one answer to one question")
@@ -352,9 +342,8 @@ class PolicyProcess:
         return tag, data[8:]
 
     def _write_rest(self, parts: list[Any], n: int) -> None:
-        unsent = memoryview(
-            b"".join([bytes(part) if type(part) is bytes else part.tobytes() for part in parts])
-        )[n:]
+        pieces = [part if type(part) is bytes else part.tobytes() for part in parts]
+        unsent = memoryview(b"".join(pieces))[n:]
         while unsent:
             unsent = unsent[os.write(self._requests, unsent) :]
 
@@ -388,46 +377,16 @@ class PolicyProcess:
         stage = report.stage if what == "init" and report.stage in ("import", "init") else what
         category = _STAGES[stage]
         limit, used = None, None
-        limits = self._limits
-        by_kind: dict[str, tuple[FailureCategory, float, float | None, str]] = {
-            "memory": (
-                "oom",
-                limits.memory_bytes,
-                self._memory_used(),
-                f"memory: {limits.memory_bytes:,} bytes beside Python's own are the limit",
-            ),
-            "files": (
-                "file_limit",
-                limits.file_bytes,
-                limits.file_bytes,
-                f"files: {limits.file_bytes:,} bytes written are the limit",
-            ),
-            "inodes": (
-                "file_limit",
-                limits.files,
-                limits.files,
-                f"files: {limits.files:,} files and folders are the limit",
-            ),
-            "descriptors": (
-                "file_limit",
-                limits.open_files,
-                limits.open_files,
-                f"files: {limits.open_files} open descriptors are the limit",
-            ),
-            "processes": (
-                "process_limit",
-                limits.processes,
-                limits.processes,
-                f"processes: {limits.processes} threads are the limit, whose stacks count as memory, and no process may"
-                " be started",
-            ),
-        }
         message = report.message
-        if report.kind in by_kind:
-            of_kind, limit, used, text = by_kind[report.kind]
+        if report.kind in _LIMITS:
+            of_kind, name, text = _LIMITS[report.kind]
+            limit = used = getattr(self._limits, name)
+            if report.kind == "memory":
+                peak = proc.number(f"/proc/{self._child.host_pid}/status", "VmPeak")
+                used = None if peak is None else max(0.0, float(peak * 1024 - self._base_bytes))
             if stage in ("reset", "act"):
                 category = of_kind
-            message = f"{message} [{text}]"
+            message = f"{message} [{text.format(limit)}]"
         elif report.kind == "action":
             limit, used = self._action_bytes, report.used
         if stage == "import" and report.missing:
@@ -447,7 +406,7 @@ class PolicyProcess:
         """Its pipe closed: the policy's failure, by the table of endings. EndedFromOutsideError when it is none."""
         watch, limits = self._watch, self._limits
         alive = not wait_dead(self._child.pidfd, 0.05)
-        if alive and _exiting(self._child.host_pid):
+        if alive and ((stat := proc.stat(self._child.host_pid)) is None or stat.exiting):
             alive = not wait_dead(self._child.pidfd, _EXIT_S)
         self._bury()
         exit_, verdict = self._exit, watch.verdict
@@ -475,9 +434,8 @@ class PolicyProcess:
             if watch.what == "seal":
                 raise EndedFromOutsideError(f"a policy's process could not seal itself: {text}")
             raise EndedFromOutsideError(f"{text}, and neither the policy nor a limit can have done that")
-        if verdict is None:
-            return self._failed(self._fatal(category), text)
-        return self._failed(self._fatal(category), text, limit=verdict.limit, used=verdict.used)
+        _, _, limit, used = verdict or (None, None, None, None)
+        return self._failed(self._fatal(category), text, limit=limit, used=used)
 
     def _limit_of(self, exit_: Exit) -> Verdict | None:
         """The limit for which the system ended it."""
@@ -488,13 +446,8 @@ class PolicyProcess:
             text = f"the policy used more than {limits.cpu_s:g} s of CPU time"
             return Verdict("cpu_limit", text, limits.cpu_s, cpu_s)
         held = exit_.peak_bytes - self._base_resident
-        counted = oom_kills()
-        killed = endings.how(exit_.status) == "SIGKILL"
-        if (
-            killed
-            and held > _LARGE_SHARE * limits.memory_bytes
-            and (counted is None or counted != self._oom_kills)
-        ):
+        large = endings.how(exit_.status) == "SIGKILL" and held > _LARGE_SHARE * limits.memory_bytes
+        if large and ((counted := oom_kills()) is None or counted != self._oom_kills):
             text = (
                 f"the system ended the policy for want of memory: it held {held:,} bytes beside Python's own;"
                 f" {limits.memory_bytes:,} are the limit"
@@ -520,14 +473,6 @@ class PolicyProcess:
     def _cpu_of_episode(self) -> float:
         """CPU time that the dead process used since the episode began, seconds; 0.0 if unknown."""
         return max(0.0, self._exit.cpu_s - self._watch.cpu_start_s) if self._exit is not None else 0.0
-
-    def _memory_used(self) -> float | None:
-        """The most that it had beside Python's own, bytes; None when that cannot be read."""
-        with contextlib.suppress(OSError, ValueError), open(f"/proc/{self._child.host_pid}/status") as lines:
-            for line in lines:
-                if line.startswith("VmPeak:"):
-                    return max(0.0, float(int(line.split()[1]) * 1024 - self._base_bytes))
-        return None
 
     def _failed(
         self,
@@ -560,19 +505,4 @@ class PolicyProcess:
 
 def oom_kills() -> int | None:
     """How many processes this machine has ended so far for want of memory; None when it does not tell."""
-    with contextlib.suppress(OSError, ValueError), open("/proc/vmstat") as lines:
-        for line in lines:
-            if line.startswith("oom_kill "):
-                return int(line.split()[1])
-    return None
-
-
-def _memory(pid: int) -> tuple[int, int]:
-    """Bytes of address space and of memory of the process; if they cannot be read, those of Python with numpy."""
-    return proc.sizes(pid) or (1 << 29, 1 << 25)
-
-
-def _exiting(pid: int) -> bool:
-    """Whether the process is on its way out."""
-    stat = proc.stat(pid)
-    return stat is None or stat.exiting
+    return proc.number("/proc/vmstat", "oom_kill")

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
 import select
+import signal
 import subprocess
 from collections.abc import Collection
 from functools import cache
@@ -32,7 +35,7 @@ def available_tiers(*, unsandboxed: bool = False, wanted: Collection[str] = SAND
 
 
 @cache
-def why_not(tier: Tier, allowed_packages: tuple[str, ...] = ("numpy",)) -> str | None:
+def why_not(tier: Tier) -> str | None:
     """Why this tier does not work here, with a remedy; None when it works.
 
     Starts an environment process in its jail, with the policies' sandbox inside. Call it on the main thread.
@@ -42,18 +45,15 @@ def why_not(tier: Tier, allowed_packages: tuple[str, ...] = ("numpy",)) -> str |
         scratch = folder / "slot"
         scratch.mkdir()
         try:
-            user = jail.plan(tier, scratch, allowed_packages).user
-            return _why_not_started(tier, scratch, allowed_packages, user)
+            return _why_not_started(tier, scratch)
         except (SandboxError, OSError) as error:
             return str(error)
 
 
-def _why_not_started(
-    tier: Tier, scratch: Path, allowed_packages: tuple[str, ...], user: int | None
-) -> str | None:
-    start = messages.Start(
-        tier=tier, core=None, scratch=str(scratch), allowed_packages=allowed_packages, user=user
-    )
+def _why_not_started(tier: Tier, scratch: Path) -> str | None:
+    packages = ("numpy",)
+    user = jail.plan(tier, scratch, packages).user
+    start = messages.Start(tier=tier, core=None, scratch=str(scratch), allowed_packages=packages, user=user)
     process = subprocess.Popen(
         env_jail.command(tier, scratch),
         stdin=subprocess.PIPE,
@@ -76,7 +76,9 @@ def _why_not_started(
     except (BrokenPipeError, msgspec.DecodeError):
         pass
     finally:
-        process.kill()
+        # The whole group, as in `slots`: bubblewrap's second process may still wait for the first.
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
         _, errors = process.communicate()
     words = errors.decode("utf-8", "replace").strip()[-2000:]
     return f"the environment process does not start: {words or 'no stderr output'}"

@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import select
 import signal
 import socket
 import struct
@@ -18,11 +19,11 @@ import subprocess
 import tempfile
 import time
 from pathlib import Path
-from typing import Any
 
 import msgspec
 
 from evopolicy_common.errors import SandboxError, SlotDiedError
+from evopolicy_common.processes import proc
 from evopolicy_worker.sandbox.jail import START, Jail
 
 START_TIMEOUT_S = 60.0
@@ -33,7 +34,7 @@ _REPORT = struct.Struct("8xi12xi100x5q")
 """Code and status from `siginfo_t` (128 bytes); user and system time and peak memory from `struct rusage`."""
 
 
-class Child(msgspec.Struct, kw_only=True):
+class Child(msgspec.Struct):
     """A forked policy process, and our ends of its pipes."""
 
     host_pid: int
@@ -129,15 +130,7 @@ class Zygote:
             raise SlotDiedError(f"the sandbox's zygote is gone: {error}") from error
         if len(fds) != 5:
             raise SandboxError(f"cannot create the policy's process: {reply.decode('utf-8', 'replace')}")
-        pidfd, requests, replies, stdout, stderr = fds
-        return Child(
-            host_pid=pid_of(pidfd),
-            pidfd=pidfd,
-            requests=requests,
-            replies=replies,
-            stdout=stdout,
-            stderr=stderr,
-        )
+        return Child(pid_of(fds[0]), *fds)
 
     def wait(self, child: Child) -> Exit:
         """Reaps a child that was killed or has ended. Raises SlotDiedError when the zygote does not reply."""
@@ -153,10 +146,9 @@ class Zygote:
             raise SlotDiedError(
                 f"the sandbox did not report how a policy's process ended: {error}"
             ) from error
+        status = status << 8 if code == os.CLD_EXITED else status
         cpu_s = user_s + system_s + (user_us + system_us) / 1e6
-        return Exit(
-            status=status << 8 if code == os.CLD_EXITED else status, cpu_s=cpu_s, peak_bytes=peak * 1024
-        )
+        return Exit(status=status, cpu_s=cpu_s, peak_bytes=peak * 1024)
 
     def bury_later(self, child: Child) -> None:
         """Kills the child now; `bury` reaps it later, because the kernel takes milliseconds to tear a process down."""
@@ -185,7 +177,8 @@ class Zygote:
 
     def _wait_until_ready(self, jail: Jail) -> None:
         while True:
-            answer, fds = self._receive()
+            data, fds, _, _ = socket.recv_fds(self._control, _MAX_MESSAGE, 4, socket.MSG_CMSG_CLOEXEC)
+            answer = json.loads(data) if data else {"error": "it closed its end"}
             if "map" in answer:
                 assert jail.user is not None
                 _map_user(pid_of(fds[0]), jail.user)
@@ -196,29 +189,14 @@ class Zygote:
             else:
                 raise SandboxError(str(answer.get("error", answer)))
 
-    def _receive(self) -> tuple[dict[str, Any], list[int]]:
-        data, fds, _, _ = socket.recv_fds(self._control, _MAX_MESSAGE, 4, socket.MSG_CMSG_CLOEXEC)
-        if not data:
-            raise ConnectionResetError("it closed its end")
-        answer = json.loads(data)
-        if not isinstance(answer, dict):
-            raise ConnectionResetError("it sent no message")
-        return answer, fds
-
 
 def pid_of(pidfd: int) -> int:
     """The process's pid in our namespace; 0 when it is gone."""
-    with open(f"/proc/self/fdinfo/{pidfd}") as lines:
-        for line in lines:
-            if line.startswith("Pid:"):
-                return max(0, int(line.split()[1]))
-    return 0
+    return max(0, proc.number(f"/proc/self/fdinfo/{pidfd}", "Pid") or 0)
 
 
 def wait_dead(pidfd: int, timeout_s: float) -> bool:
     """Waits until the process has ended; False on timeout."""
-    import select
-
     poller = select.poll()
     poller.register(pidfd, select.POLLIN)
     end = time.monotonic() + timeout_s

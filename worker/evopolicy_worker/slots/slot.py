@@ -58,7 +58,7 @@ SILENT_S = 60.0
 interpreter."""
 DESCRIBED_CALLS = 3
 """A description may take as long as this number of calls."""
-_LOOK_S = 5.0
+_CHECK_S = 5.0
 MAX_ANSWER_BYTES = 1 << 31
 
 
@@ -125,15 +125,25 @@ class Slot:
         for name in ("home", "tmp"):  # must not pass files from the previous process to this one
             remove_tree(self._scratch / name)
         start = self._start
-        self._process = await asyncio.create_subprocess_exec(
-            *env_jail.command(start.tier, self._scratch, draws=start.draws, definitions=start.definitions),
-            stdin=asyncio.subprocess.PIPE,
-            stdout=asyncio.subprocess.PIPE,
-            stderr=asyncio.subprocess.PIPE,
-            env=env_jail.variables(self._scratch),
-            start_new_session=True,
-            limit=1 << 20,
+        starting = asyncio.ensure_future(
+            asyncio.create_subprocess_exec(
+                *env_jail.command(
+                    start.tier, self._scratch, draws=start.draws, definitions=start.definitions
+                ),
+                stdin=asyncio.subprocess.PIPE,
+                stdout=asyncio.subprocess.PIPE,
+                stderr=asyncio.subprocess.PIPE,
+                env=env_jail.variables(self._scratch),
+                start_new_session=True,
+                limit=1 << 20,
+            )
         )
+        try:
+            self._process = await asyncio.shield(starting)
+        except asyncio.CancelledError:
+            # Of bubblewrap asyncio would kill the first process alone, and the second would wait for it forever.
+            _kill(await starting)
+            raise
         self._stderr.clear()
         self._listener = asyncio.create_task(self._listen(self._process))
         try:
@@ -175,7 +185,7 @@ class Slot:
         if job.tier != self._start.tier:
             raise WorkerError(f"job {job.job_id} demands tier {job.tier}; this slot has {self._start.tier}")
         self._idle.clear()
-        watcher = asyncio.create_task(self._end_what_stands_still(job.env))
+        watcher = asyncio.create_task(self._end_hung(job.env))
         failure: PolicyFailure | None = None
         try:
             if job.video and not self._start.draws and env_jail.graphics_devices():
@@ -269,13 +279,11 @@ class Slot:
                     reply = await self._reply()
             except TimeoutError:
                 self._end_process()
-                raise BrokenEnvironmentError(
-                    hung(f"environment {env_id}, make, reset or step", limits)
-                ) from None
+                why = hung(f"environment {env_id}, make, reset or step", limits)
+                raise BrokenEnvironmentError(why) from None
             except SlotDiedError as error:
-                raise self._broken(
-                    f"environment {env_id}: its process ended while it was tried out; {error}"
-                ) from error
+                why = f"environment {env_id}: its process ended while it was tried out; {error}"
+                raise self._broken(why) from error
             if not isinstance(reply, messages.Described):
                 raise _error(reply)
             descriptions += reply.environments
@@ -284,7 +292,13 @@ class Slot:
     def memory_bytes(self) -> int:
         """Resident memory of all of the slot's processes; each has its part of what several share, as a browser's
         do."""
-        return 0 if self._process is None else _memory(self._process.pid)
+        if self._process is None:
+            return 0
+        # Where the kernel does not show it, what several share counts for each.
+        return sum(
+            proc.proportional_bytes(each.pid) or (proc.sizes(each.pid) or (0, 0))[1]
+            for each in proc.family(self._process.pid)
+        )
 
     def cpu_s(self) -> float:
         """Processor time that the slot's live processes have used, seconds; policies that have ended are not in it."""
@@ -353,18 +367,18 @@ class Slot:
         except (asyncio.IncompleteReadError, ConnectionError) as error:
             raise SlotDiedError(await self._last_words()) from error
 
-    async def _end_what_stands_still(self, env_id: str) -> None:
+    async def _end_hung(self, env_id: str) -> None:
         """Kills the slot's processes when one of them has been stopped from outside for `STOPPED_S`, or when they say
         nothing although they tell twelve times a minute that they are alive."""
         stood_s = silent_s = 0.0
         n_replies = -1
         longest_s = self._start.limits.call_s + SILENT_S
         while True:
-            await asyncio.sleep(_LOOK_S)
+            await asyncio.sleep(_CHECK_S)
             process = self._process
             pids = [] if process is None else [process.pid, *_children(process.pid, self._start.tier)]
-            stood_s = stood_s + _LOOK_S if any(map(is_stopped, pids)) else 0.0
-            silent_s = silent_s + _LOOK_S if n_replies == self._n_replies and not stood_s else 0.0
+            stood_s = stood_s + _CHECK_S if any(map(is_stopped, pids)) else 0.0
+            silent_s = silent_s + _CHECK_S if n_replies == self._n_replies and not stood_s else 0.0
             n_replies = self._n_replies
             if silent_s >= longest_s:
                 self._hung = hung(f"environment {env_id}, reset or step", self._start.limits)
@@ -389,16 +403,14 @@ class Slot:
         return endings.how(-code if code < 0 else code << 8)
 
     async def _last_words(self) -> str:
-        process = self._process
         status = "?"
-        if process is not None:
+        if self._process is not None:
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(LAST_WORDS_S):
-                    status = str(await process.wait())
+                    status = str(await self._process.wait())
         await asyncio.sleep(0)
-        return (
-            f"the slot's process ended with status {status}; {last_words(self._stderr) or 'no stderr output'}"
-        )
+        words = last_words(self._stderr) or "no stderr output"
+        return f"the slot's process ended with status {status}; {words}"
 
     async def _listen(self, process: asyncio.subprocess.Process) -> None:
         """Keeps the last lines of the process's standard error (simulators' notices, our tracebacks) and logs them."""
@@ -421,21 +433,12 @@ class Slot:
 def _children(pid: int, tier: Tier) -> list[int]:
     """In tier bwrap, the processes below `pid` (bubblewrap) down to the environment's own. Empty in other tiers, where
     `pid` is the environment's process."""
-    found: list[int] = []
-    with contextlib.suppress(OSError, ValueError):
+    pids: list[int] = []
+    with contextlib.suppress(OSError, LookupError):
         for _ in range(2 if tier == "bwrap" else 0):
             pid = int(Path(f"/proc/{pid}/task/{pid}/children").read_text().split()[0])
-            found.append(pid)
-    return found
-
-
-def _memory(pid: int) -> int:
-    found = 0
-    for each in proc.family(pid):
-        # Where the kernel does not show it, what several share counts for each.
-        size = proc.proportional_bytes(each.pid)
-        found += size if size is not None else (proc.sizes(each.pid) or (0, 0))[1]
-    return found
+            pids.append(pid)
+    return pids
 
 
 def bundle_files(folder: Path) -> messages.Files:

@@ -218,7 +218,7 @@ class Policy:
 def test_what_prevents_an_episode_is_reported_by_name_and_is_nobodys_result(
     slots: Slots, how: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(slot_module, "_LOOK_S", 0.5)
+    monkeypatch.setattr(slot_module, "_CHECK_S", 0.5)
     monkeypatch.setattr(slot_module, "SILENT_S", 8.0)
     # Long enough for calls that return, also on a busy machine.
     limits = (
@@ -245,7 +245,7 @@ def test_what_prevents_an_episode_is_reported_by_name_and_is_nobodys_result(
 def test_an_environment_that_hangs_on_actions_gives_no_second_throw(
     slots: Slots, how: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(slot_module, "_LOOK_S", 0.5)
+    monkeypatch.setattr(slot_module, "_CHECK_S", 0.5)
     monkeypatch.setattr(slot_module, "SILENT_S", 8.0)
     slot = slot_of(slots, "Bad", Limits(call_s=4.0), kwargs={"how": f"{how} when pushed"})
     bundle = slots.bundle(LUCKY)

@@ -6,6 +6,7 @@ import asyncio
 import os
 import re
 import signal
+from asyncio.base_subprocess import BaseSubprocessTransport
 from pathlib import Path
 
 import pytest
@@ -99,6 +100,44 @@ def test_a_closed_slot_leaves_no_process_and_no_file(slots: Slots) -> None:
         slots.run(asyncio.sleep(0.02))
     assert not left
     assert not slot._scratch.exists()
+
+
+def test_a_start_that_is_cancelled_leaves_neither_half_of_bubblewrap(
+    slots: Slots, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    pid_file, program = tmp_path / "pid", tmp_path / "bwrap"
+    program.write_text(
+        f"#!/bin/sh\nsleep 1000 & echo $! > {pid_file}.new; mv {pid_file}.new {pid_file}; wait\n"
+    )
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    connect = BaseSubprocessTransport._connect_pipes
+
+    async def connect_late(transport: BaseSubprocessTransport, waiter: object) -> None:
+        while not pid_file.exists():
+            await asyncio.sleep(0.01)
+        await asyncio.sleep(0.1)
+        await connect(transport, waiter)
+
+    monkeypatch.setattr(BaseSubprocessTransport, "_connect_pipes", connect_late)
+
+    async def cancelled() -> None:
+        start = asyncio.create_task(slots.new().start())
+        while not pid_file.exists():
+            await asyncio.sleep(0.01)
+        start.cancel()
+        await asyncio.gather(start, return_exceptions=True)
+
+    slots.run(cancelled())
+    second = int(pid_file.read_text())
+    for _ in range(200):
+        if not runs(second):
+            break
+        slots.run(asyncio.sleep(0.02))
+    still_runs = runs(second)
+    if still_runs:
+        os.kill(second, signal.SIGKILL)
+    assert not still_runs
 
 
 def test_without_an_own_file_system_the_policys_folder_is_removed(slots: Slots) -> None:

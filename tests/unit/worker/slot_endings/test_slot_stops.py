@@ -76,7 +76,7 @@ def test_a_slot_whose_environment_is_stopped_for_good_is_given_up(
     slots: Slots, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("evopolicy_worker.slots.slot.STOPPED_S", 1.0)
-    monkeypatch.setattr("evopolicy_worker.slots.slot._LOOK_S", 0.2)
+    monkeypatch.setattr("evopolicy_worker.slots.slot._CHECK_S", 0.2)
     slot = slots.new()
     slots.run(slot.start())
     with pytest.raises(SlotDiedError):

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 import re
-import resource
 import sys
 import sysconfig
 import traceback
@@ -19,16 +18,16 @@ from typing import Literal
 import msgspec
 
 from evopolicy_common.errors import EvopolicyError, SandboxError, SlotDiedError
+from evopolicy_common.processes import proc
 from evopolicy_common.terminal import one_line
 
 Kind = Literal["", "make", "reset", "step", "render", "close"]
 
 NOTE = "note: "
 """Prefix of a line on the process's standard error that an operator should see."""
-_LONGEST_LOOK_S = 1.0
-"""More time between two looks does not count: this process was not let run."""
-_MEMORY_LOOK_S = 0.5
-_PAGE = resource.getpagesize()
+_LONGEST_CHECK_S = 1.0
+"""More time between two checks does not count: this process was not let run."""
+_MEMORY_CHECK_S = 0.5
 _NOT_THEIRS = tuple(
     os.path.join(folder, "")
     for name in ("evopolicy_worker", "gymnasium")
@@ -86,25 +85,25 @@ USUAL = Limits()
 
 
 class Guard:
-    """Looks from another thread whether the environment keeps its limits."""
+    """Checks from another thread whether the environment keeps its limits."""
 
     def __init__(self, limits: Limits) -> None:
         self._limits = limits
         self._call: tuple[str, Kind, int] = ("", "", 0)
         self._spent_s = 0.0
-        self._looked = 0.0
+        self._checked = 0.0
         self._weighed = 0.0
 
-    def look(self, now: float) -> str:
+    def check(self, now: float) -> str:
         """Which limit was passed, with the remedy; empty when none was. `now`: monotonic seconds."""
         call = current.env, current.what, current.step
-        since = min(now - self._looked, _LONGEST_LOOK_S)
-        self._looked = now
+        since = min(now - self._checked, _LONGEST_CHECK_S)
+        self._checked = now
         self._spent_s = self._spent_s + since if call == self._call and call[1] else 0.0
         self._call = call
         if self._spent_s > self._limits.call_s:
             return hung(str(current), self._limits)
-        if now - self._weighed >= _MEMORY_LOOK_S:
+        if now - self._weighed >= _MEMORY_CHECK_S:
             self._weighed = now
             used = resident_bytes()
             if used > self._limits.memory_bytes:
@@ -215,8 +214,4 @@ def raised(error: BaseException, text: str, limits: Limits) -> str:
 
 def resident_bytes() -> int:
     """Resident memory of this process, bytes; 0 where the system does not tell."""
-    try:
-        with open("/proc/self/statm") as file:
-            return int(file.read().split()[1]) * _PAGE
-    except (OSError, ValueError, IndexError):
-        return 0
+    return (proc.sizes(os.getpid()) or (0, 0))[1]
