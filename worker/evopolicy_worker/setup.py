@@ -221,26 +221,19 @@ def constraints(wanted: Mapping[str, Install]) -> str:
     pins = {
         _normal(name): f"{name}=={version}" for each in wanted.values() for name, version in each.pins.items()
     }
-    lines = _usual().read_text("utf-8").splitlines()
+    package = Path(evopolicy_common.__file__).parent
+    # In a wheel it is among the shipped files, in a checkout at its top.
+    places = (package.parent / "evopolicy_gateway", package.parents[1])
+    usual = next((file for each in places if (file := each / "constraints.txt").is_file()), None)
+    if usual is None:
+        raise ConfigError("constraints.txt is missing from this installation: install evopolicy again")
+    lines = usual.read_text("utf-8").splitlines()
     kept = [line for line in lines if _normal(re.split(r"[=;]", line)[0]) not in pins]
     return "\n".join([*kept, *pins.values()]) + "\n"
 
 
 def _normal(name: str) -> str:
     return re.sub(r"[-_.]+", "-", name.strip()).lower()
-
-
-def _usual() -> Path:
-    """`constraints.txt`: in a wheel it is among the shipped files, in a checkout at its top."""
-    package = Path(evopolicy_common.__file__).parent
-    places = (
-        package.parent / "evopolicy_gateway" / "constraints.txt",
-        package.parents[1] / "constraints.txt",
-    )
-    place = next((each for each in places if each.is_file()), None)
-    if place is None:
-        raise ConfigError("constraints.txt is missing from this installation: install evopolicy again")
-    return place
 
 
 def _ourselves(scratch: Path, extras: str) -> list[str]:

@@ -147,7 +147,11 @@ class Player:
                 films += film_of
                 progress.episodes_done += 1
                 if failure is not None and _verdict_of_submit(job, job.episodes[k], failure):
-                    others = (_unplayed(each.index, failure) for each in job.episodes[k + 1 :])
+                    none = {"episode_return": 0.0, "length": 0, "terminated": False, "truncated": False}
+                    others = (
+                        EpisodeOutcome(index=each.index, **none, failure=failure)
+                        for each in job.episodes[k + 1 :]
+                    )
                     finished = (messages.Finished(outcome=_brief(each, _share(job))) for each in others)
                     # Joined once: there may be thousands, each with a traceback.
                     frame = b"".join((frame, *map(messages.framed, finished)))
@@ -388,7 +392,8 @@ class _Course:
         if sums := self.sums:
             components = info.get("rewards", info)
             for name in sums:
-                sums[name] += _number(components.get(name))
+                part = components.get(name)
+                sums[name] += part if isinstance(part, (int, float)) else 0.0
         if self._solves and (reported := info.get(self._solves)) is not None:
             now = solved(reported)
             self.success = self.success if now is None else now or (self._ever and bool(self.success))
@@ -478,16 +483,6 @@ def _brief(outcome: EpisodeOutcome, share: int) -> EpisodeOutcome:
         return outcome
     kept = failure.traceback[-(share // 12) :]
     return msgspec.structs.replace(outcome, failure=msgspec.structs.replace(failure, traceback=kept))
-
-
-def _unplayed(index: int, failure: PolicyFailure) -> EpisodeOutcome:
-    return EpisodeOutcome(
-        index=index, episode_return=0.0, length=0, terminated=False, truncated=False, failure=failure
-    )
-
-
-def _number(value: Any) -> float:
-    return float(value) if isinstance(value, (int, float)) else 0.0
 
 
 def _blob(data: bytes) -> BlobRef:

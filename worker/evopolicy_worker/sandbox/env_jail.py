@@ -14,10 +14,8 @@ Rules:
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import os
 import platform
-import struct
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
@@ -54,15 +52,8 @@ _CHECK_S = 20.0
 
 _PASSED_ON = ("LD_LIBRARY_PATH", "LANG", "LANGUAGE", BROWSER)
 _PASSED_ON_PREFIXES = (
-    "EGL_",
-    "GALLIUM_",
-    "LIBGL_",
-    "LP_",
-    "MESA_",
-    "MUJOCO_",
-    "PYOPENGL_",
-    "__EGL_",
-    "__GLX_",
+    *("EGL_", "GALLIUM_", "LIBGL_", "LP_", "MESA_"),
+    *("MUJOCO_", "PYOPENGL_", "__EGL_", "__GLX_"),
 )
 _LATER_PATH = "EVOPOLICY_SIMULATORS_PATH"
 """Passes the operator's PYTHONPATH into the jail, where `seal` applies it: its modules could shadow standard ones."""
@@ -137,14 +128,8 @@ def enclose(tier: Tier, scratch: Path, *, draws: bool) -> None:
             user_code.mirror(folder, {*user_code.modules(folder), *below}, place)
         drawn_with = graphics_devices() if draws else ()
         devices = [path for path in drawn_with if path.startswith("/dev/")]
-        shown = [
-            *_code(declared),
-            f"{scratch}-modules",
-            *_etc(),
-            *_SYSTEM,
-            "/proc",
-            *(path for path in drawn_with if path not in devices),
-        ]
+        other = [path for path in drawn_with if path not in devices]
+        shown = [*_code(declared), f"{scratch}-modules", *_etc(), *_SYSTEM, "/proc", *other]
         with _explained("be closed in by Landlock"):
             inside.check(inside.libc.prctl(38, 1, 0, 0, 0), "no_new_privs")
             inside.landlock({"read": shown, "write": [*_DEVICES, *devices]}, str(scratch))
@@ -201,13 +186,9 @@ def expendable() -> Iterator[None]:
 def _install(program: bytes) -> None:
     """Installs a filter for all threads, without the mitigations of speculation with which older kernels slow filtered
     processes."""
-    program = program.replace(struct.pack("<I", seccomp.PID_MARK), struct.pack("<I", os.getpid()))
-    buffer = ctypes.create_string_buffer(program, len(program))
-    arguments = struct.pack("<HxxxxxxQ", len(program) // 8, ctypes.addressof(buffer))
-    number = SECCOMP[platform.machine()]
-    inside.check(
-        inside.libc.syscall(number, _SET_MODE_FILTER, _ALL_THREADS | _SPECULATION, arguments), "seccomp"
-    )
+    arguments, _buffer = inside.filter_of(program, os.getpid())
+    number, flags = SECCOMP[platform.machine()], _ALL_THREADS | _SPECULATION
+    inside.check(inside.libc.syscall(number, _SET_MODE_FILTER, flags, arguments), "seccomp")
 
 
 @contextlib.contextmanager
@@ -222,13 +203,9 @@ def _explained(what: str) -> Iterator[None]:
 
 
 def _bubblewrap(scratch: Path, draws: bool, declared: Sequence[str]) -> list[str]:
-    arguments = [jail.bubblewrap(), "--die-with-parent", "--new-session", "--hostname", "slot"]
-    arguments += ["--unshare-pid", "--unshare-net", "--unshare-ipc", "--unshare-uts", "--unshare-cgroup-try"]
-    if os.geteuid() == 0:
-        # Needed to start the policies' sandbox; dropped when `seal` changes the user.
-        arguments += ["--cap-add", "ALL"]
-    else:
-        arguments += ["--unshare-user", "--uid", "65534", "--gid", "65534"]
+    as_root = os.geteuid() == 0
+    # As root, all rights are needed to start the policies' sandbox; `seal` drops them when it changes the user.
+    arguments = jail.bubblewrap("slot", own_user=not as_root, rights=("ALL",) if as_root else ())
     for name in _SHELLS_OWN:
         arguments += ["--unsetenv", name]
     for path in _SYSTEM:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import secrets
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 
 import msgspec
@@ -120,20 +122,21 @@ def some_user() -> int:
     return _FIRST_UID + secrets.randbelow(0x10000)
 
 
-def bubblewrap() -> str:
-    """Path of bubblewrap. Raises SandboxError, with how to install it, when it is missing."""
+def bubblewrap(hostname: str, *, own_user: bool, rights: Sequence[str]) -> list[str]:
+    """The command line's begin: namespaces of its own, with these capabilities in them. `own_user`: also one of users.
+    Raises SandboxError, with how to install it, when bubblewrap is missing."""
     bwrap = shutil.which("bwrap")
     if bwrap is None:
         raise SandboxError(f"bubblewrap is not installed: {distribution.install('bubblewrap')}")
-    return bwrap
+    command = [bwrap, "--die-with-parent", "--new-session", "--hostname", hostname]
+    command += ["--unshare-pid", "--unshare-net", "--unshare-ipc", "--unshare-uts", "--unshare-cgroup-try"]
+    command += ["--unshare-user", "--uid", "65534", "--gid", "65534"] if own_user else []
+    return command + [part for right in rights for part in ("--cap-add", right)]
 
 
 def landlock_version() -> int:
     """ABI version of the kernel's Landlock; 0 without Landlock."""
-    import ctypes
-
-    libc = ctypes.CDLL(None, use_errno=True)
-    return max(0, int(libc.syscall(444, None, 0, 1)))
+    return max(0, int(ctypes.CDLL(None).syscall(444, None, 0, 1)))
 
 
 def _python(files: python_files.PythonFiles, folder: str) -> tuple[str, ...]:
@@ -143,14 +146,9 @@ def _python(files: python_files.PythonFiles, folder: str) -> tuple[str, ...]:
 
 
 def _bubblewrap(files: python_files.PythonFiles, as_root: bool) -> list[str]:
-    command = [bubblewrap(), "--die-with-parent", "--new-session", "--hostname", "policy"]
-    command += ["--unshare-pid", "--unshare-net", "--unshare-ipc", "--unshare-uts", "--unshare-cgroup-try"]
-    if as_root:
-        # The zygote makes the user namespace itself, so that the policy's user is unprivileged outside too.
-        command += ["--cap-add", "CAP_SYS_ADMIN", "--cap-add", "CAP_SETUID", "--cap-add", "CAP_SETGID"]
-    else:
-        command += ["--unshare-user", "--uid", "65534", "--gid", "65534", "--cap-add", "CAP_SYS_ADMIN"]
-    command.append("--clearenv")
+    # As root, the zygote makes the user namespace itself, so that the policy's user is unprivileged outside too.
+    rights = ("CAP_SYS_ADMIN", *(("CAP_SETUID", "CAP_SETGID") if as_root else ()))
+    command = [*bubblewrap("policy", own_user=not as_root, rights=rights), "--clearenv"]
     for name, value in START.items():
         command += ["--setenv", name, value]
     for path in parents([*files.read, *map(os.path.realpath, files.read), "/dev/null", POLICY_HOME]):
@@ -169,19 +167,9 @@ def _bubblewrap(files: python_files.PythonFiles, as_root: bool) -> list[str]:
     for device in _DEVICES:
         if os.path.exists(device):
             command += ["--dev-bind", device, device]
-    return [
-        *command,
-        "--dir",
-        POLICY_HOME,
-        "--dir",
-        "/tmp",
-        "--dir",
-        _PLACE,
-        "--chdir",
-        "/",
-        "--remount-ro",
-        "/",
-    ]
+    for path in (POLICY_HOME, "/tmp", _PLACE):
+        command += ["--dir", path]
+    return [*command, "--chdir", "/", "--remount-ro", "/"]
 
 
 def _own_files(files: python_files.PythonFiles) -> dict[str, object]:
