@@ -15,6 +15,7 @@ from __future__ import annotations
 import io
 import os
 import sys
+from collections.abc import Iterable, Iterator
 from typing import BinaryIO
 
 import msgspec
@@ -55,44 +56,37 @@ class Made(msgspec.Struct, frozen=True, kw_only=True):
     """Why there is no video."""
 
 
-class Encoder:
-    """Frames in, MP4 out: H.264 in 4:2:0, encoded in this process and in memory, by one thread for the same bytes."""
+def encoded(frames: Iterable[Frame], rate: int) -> bytes:
+    """An MP4 of frames of one size: H.264 in 4:2:0, encoded in this process and in memory, by one thread for the same
+    bytes. `rate`: frames a second. An odd side gains a line, as 4:2:0 needs: its last one again.
 
-    def __init__(self, rate: int) -> None:
-        """`rate`: frames a second. WorkerError where PyAV is not installed."""
-        try:
-            import av
-        except ImportError as error:
-            raise WorkerError(
-                f"videos are encoded with PyAV, which is not installed ({error}): {add_extra('worker')}"
-            ) from error
-        self._from_ndarray = av.VideoFrame.from_ndarray
-        self._file = io.BytesIO()
-        self._container = av.open(self._file, "w", format="mp4")
-        self._stream = self._container.add_stream(
-            "libx264", rate=rate, options={"preset": PRESET, "crf": str(CRF)}
-        )
-        self._stream.pix_fmt = "yuv420p"
-        self._stream.codec_context.thread_count = 1
-        self._shape: tuple[int, ...] | None = None
-
-    def add(self, frame: Frame) -> None:
-        """The next frame, all of one size. An odd side gains a line, as 4:2:0 needs: its last one again."""
-        if self._shape is None:
-            self._shape = frame.shape
-            self._stream.height, self._stream.width = (side + side % 2 for side in frame.shape[:2])
-        if frame.shape != self._shape:
-            raise WorkerError(f"a frame of shape {frame.shape} follows frames of shape {self._shape}")
+    WorkerError where PyAV is not installed, or frames are of several sizes.
+    """
+    try:
+        import av
+    except ImportError as error:
+        raise WorkerError(
+            f"videos are encoded with PyAV, which is not installed ({error}): {add_extra('worker')}"
+        ) from error
+    file = io.BytesIO()
+    container = av.open(file, "w", format="mp4")
+    stream = container.add_stream("libx264", rate=rate, options={"preset": PRESET, "crf": str(CRF)})
+    stream.pix_fmt = "yuv420p"
+    stream.codec_context.thread_count = 1
+    shape: tuple[int, ...] | None = None
+    for frame in frames:
         height, width = frame.shape[:2]
+        if shape is None:
+            shape = frame.shape
+            stream.height, stream.width = height + height % 2, width + width % 2
+        if frame.shape != shape:
+            raise WorkerError(f"a frame of shape {frame.shape} follows frames of shape {shape}")
         if height % 2 or width % 2:
             frame = np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
-        self._container.mux(self._stream.encode(self._from_ndarray(frame, format="rgb24")))
-
-    def finish(self) -> bytes:
-        """The file's bytes. The encoder is not used afterwards."""
-        self._container.mux(self._stream.encode(None))
-        self._container.close()
-        return self._file.getvalue()
+        container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
+    container.mux(stream.encode(None))
+    container.close()
+    return file.getvalue()
 
 
 def rate_of(max_episode_steps: int) -> int:
@@ -100,15 +94,14 @@ def rate_of(max_episode_steps: int) -> int:
     return max(MIN_RATE, min(MAX_RATE, max_episode_steps // EPISODE_S))
 
 
-def replay(environment: Environment, case: Case, actions: bytes) -> bytes:
-    """MP4 bytes of the episode in `actions`, a frame a row.
+def replay(environment: Environment, case: Case, actions: bytes) -> Iterator[Frame]:
+    """The frames of the episode in `actions`, one a row.
 
     `environment` was made with `render=True`. WorkerError where it does not draw, or plays another episode.
     """
-    encoder = Encoder(rate_of(environment.description.max_episode_steps))
     environment.reset(case)
     for row in decode(actions).rows():
-        encoder.add(environment.render())
+        yield environment.render()
         # Repaired already, and once more for its type: the codec's arrays may come back as other views.
         step = environment.step(environment.action_codec.repair(row.action)[0])
         # A run's own limit of steps truncates an episode that the environment would continue.
@@ -116,7 +109,6 @@ def replay(environment: Environment, case: Case, actions: bytes) -> bytes:
             raise WorkerError(
                 f"{environment.description.env} departs from the recorded episode at step {row.t}"
             )
-    return encoder.finish()
 
 
 def serve(env_id: str, orders: BinaryIO, replies: BinaryIO) -> None:
@@ -128,7 +120,8 @@ def serve(env_id: str, orders: BinaryIO, replies: BinaryIO) -> None:
         try:
             if environment is None:
                 environment = environments.make(env_id, render=True)
-            made = Made(mp4=replay(environment, order.case, order.actions))
+            rate = rate_of(environment.description.max_episode_steps)
+            made = Made(mp4=encoded(replay(environment, order.case, order.actions), rate))
         except Exception as error:
             # Drivers and simulators raise any exception here, and a missing picture is no failure of the episode.
             what = str(error) if isinstance(error, WorkerError) else f"{type(error).__name__}: {error}"

@@ -30,19 +30,17 @@ class PageText(msgspec.Struct, frozen=True):
     notes: str = ""
 
 
-def folder() -> Path | None:
-    """Folder of the package; None when it is not installed."""
+def folder() -> Path:
+    """Folder of the package. WorkerError when it is not installed."""
     spec = find_spec("miniwob")
-    places = [] if spec is None else list(spec.submodule_search_locations or ())
-    return Path(places[0]) if places else None
+    if spec is None or not spec.submodule_search_locations:
+        raise WorkerError("the package miniwob is not installed")
+    return Path(spec.submodule_search_locations[0])
 
 
 def root() -> Path:
-    """The folder of its pages. WorkerError when it is not installed."""
-    found = folder()
-    if found is None:
-        raise WorkerError("the package miniwob is not installed")
-    return found / "html"
+    """The folder of its pages."""
+    return folder() / "html"
 
 
 def document(name: str) -> str:
@@ -54,8 +52,7 @@ def document(name: str) -> str:
 def texts() -> dict[str, PageText]:
     """The documentation by page name."""
     found: dict[str, PageText] = {}
-    place = folder()
-    for path in sorted(place.glob("envs/*.py")) if place is not None else []:
+    for path in sorted(folder().glob("envs/*.py")):
         for node in ast.parse(path.read_text("utf-8")).body:
             if isinstance(node, ast.ClassDef) and (name := _subdomain(node)):
                 found[name] = _text(inspect.cleandoc(ast.get_docstring(node) or ""))
@@ -64,13 +61,8 @@ def texts() -> dict[str, PageText]:
 
 def _subdomain(node: ast.ClassDef) -> str:
     for each in node.body:
-        if (
-            isinstance(each, ast.Assign)
-            and isinstance(each.targets[0], ast.Name)
-            and each.targets[0].id == "subdomain"
-            and isinstance(each.value, ast.Constant)
-        ):
-            return str(each.value.value)
+        if isinstance(each, ast.Assign) and ast.unparse(each.targets[0]) == "subdomain":
+            return str(ast.literal_eval(each.value))
     return ""
 
 
@@ -94,10 +86,10 @@ def _text(doc: str) -> PageText:
 
 @cache
 def _extractors() -> dict[str, Callable[[str], Sequence[tuple[str, str]]]]:
-    place = folder()
-    if place is None or not (place / "fields.py").is_file():
+    place = folder() / "fields.py"
+    if not place.is_file():
         return {}
-    spec = importlib.util.spec_from_file_location("evopolicy_miniwob_fields", place / "fields.py")
+    spec = importlib.util.spec_from_file_location("evopolicy_miniwob_fields", place)
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)

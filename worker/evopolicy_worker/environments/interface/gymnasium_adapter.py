@@ -34,6 +34,7 @@ from evopolicy_worker.environments.interface.observations import compile_observa
 from evopolicy_worker.environments.interface.opaque import Opaque, converter, declared, visible
 from evopolicy_worker.environments.interface.wrappers import wrapped
 from evopolicy_worker.environments.tasks import task_text
+from evopolicy_worker.environments.tasks.template import About
 
 if TYPE_CHECKING:
     import gymnasium
@@ -206,6 +207,7 @@ class GymnasiumEnvironment(Environment):
         if self._rewards is not None:
             components = self._rewards.texts(components)
         spec, own_words = self.bare.spec, family.words(entry, self.bare)
+        about = About(entry, self.bare, obs_schema, action_schema, components, self._limit, own_words)
         self.solved_by = family.solved_by.get(entry.gymnasium_id or "", "")
         self.description = EnvironmentDescription(
             env=entry.id,
@@ -222,9 +224,7 @@ class GymnasiumEnvironment(Environment):
             max_episode_steps=self._limit,
             reward_components=tuple(components),
             reward_texts=dict(components),
-            task_text=task_text(
-                entry, self.bare, obs_schema, action_schema, components, self._limit, own_words
-            ),
+            task_text=task_text(about),
             deterministic=entry.deterministic and not (spec is not None and spec.nondeterministic),
             renders="rgb_array" in ((self.bare.metadata or {}).get("render_modes") or ()),
             adapter=adapter(type(family), family.revision, entry.gymnasium_id or ""),

@@ -12,7 +12,7 @@ import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from importlib.resources import files
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from evopolicy_common.catalogue import Entry, is_shipped
 from evopolicy_common.messages.environment import SpaceSchema
@@ -32,21 +32,29 @@ _INCLUDE = re.compile(r"^<!-- include: ([\w.-]+) -->$", re.MULTILINE)
 _UNSEEN = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff]")
 
 
-def text(
-    entry: Entry,
-    env: gymnasium.Env[Any, Any],
-    obs_space: SpaceSchema,
-    action_space: SpaceSchema,
-    components: Mapping[str, str],
-    limit: int,
-    own: Mapping[str, str],
-) -> str:
+class About(NamedTuple):
+    """What a task text is generated from."""
+
+    entry: Entry
+    env: gymnasium.Env[Any, Any]
+    obs_space: SpaceSchema
+    action_space: SpaceSchema
+    components: Mapping[str, str]
+    """Of the reward, with what each stands for."""
+    limit: int
+    """Steps."""
+    own: Mapping[str, str]
+    """Sections that the family writes for this environment, by heading."""
+
+
+def text(about: About) -> str:
     """Markdown with the sections of every task text.
 
     For a shipped environment, the documentation is reduced to words, without formulas and constants of its dynamics.
     """
+    entry, env, obs_space, action_space, components, limit, _ = about
     if is_shipped(entry.id):
-        return _in_sections(entry, env, obs_space, action_space, components, limit, own)
+        return _in_sections(about)
     documentation = _documentation(env)
     parts = [
         f"# {entry.label}",
@@ -65,16 +73,9 @@ def text(
     return "\n\n".join(parts) + "\n"
 
 
-def _in_sections(
-    entry: Entry,
-    env: gymnasium.Env[Any, Any],
-    obs_space: SpaceSchema,
-    action_space: SpaceSchema,
-    components: Mapping[str, str],
-    limit: int,
-    own: Mapping[str, str],
-) -> str:
+def _in_sections(about: About) -> str:
     """The sections that are written for the family, its groups of environments, and by it."""
+    entry, env, obs_space, action_space, components, limit, own = about
     found = {**_sections(_family_text(entry.family)), **own}
     grouped = _of_groups(entry, own)
     found |= grouped
