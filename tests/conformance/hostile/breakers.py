@@ -54,6 +54,105 @@ def limits(**changes: Any) -> ResourceLimits:
     return msgspec.structs.replace(PATIENT, **changes)
 
 
+PLAIN: dict[str | None, dict[str, str]] = {
+    "killed": {
+        "closes its reply pipe": "os.close(4); time.sleep(60)",
+        "closes its request pipe": "os.close(3)",
+        "closes every descriptor": "os.closerange(0, 256)",
+        "a random reply": "os.write(4, os.urandom(300))",
+        "an endless reply": "os.write(4, struct.pack('<IBxxx', 1 << 31, 3)); time.sleep(60)",
+        "two replies to one request": "os.write(4, struct.pack('<IBxxxqIBxxxq', 8, 1, 0, 8, 1, 0))",
+        "a reply of the wrong kind": "os.write(4, struct.pack('<IBxxx', 0, 0)); time.sleep(60)",
+        "an array of objects as a reply": (
+            "os.write(4, struct.pack('<IBxxx4sIIQ', 20, 3, b'|O\\0\\0', 1, 1, id(self))); time.sleep(60)"
+        ),
+        "a forged failure": "os.write(4, struct.pack('<IBxxx', 2, 6) + b'{}'); time.sleep(60)",
+        "a forged count that no encoder accepts": (
+            'b = b\'{"stage":"act","kind":"action","message":"","traceback":"","used":1\' + b"0" * 30 + b"}"\n'
+            "            os.write(4, struct.pack('<IBxxx', len(b), 6) + b); time.sleep(60)"
+        ),
+        "a forged sandbox failure": "os.write(4, struct.pack('<IBxxx', 4, 7) + b'ours'); time.sleep(60)",
+        "a flood of replies": "[os.write(4, bytes(65536)) for _ in iter(int, 1)]",
+        "a forged huge action": (
+            "os.write(4, struct.pack('<IBxxx', 1 << 16, 5) + bytes(1 << 16)); time.sleep(60)"
+        ),
+        "a forged action of thousands of empty lists": (
+            "os.write(4, struct.pack('<IBxxx', 8003, 5) + b'\\xdc\\x1f\\x40' + b'\\x90' * 8000); "
+            "time.sleep(60)"
+        ),
+        "a forged array of four billion empty lists": (
+            "os.write(4, struct.pack('<IBxxx4sIII', 16, 3, b'|u1', 2, 2**32 - 1, 0)); time.sleep(60)"
+        ),
+        "os._exit": "os._exit(0)",
+        "a segmentation fault": "ctypes.string_at(1)",
+        "an abort": "os.abort()",
+        "all built-in functions deleted": "import builtins\n            vars(builtins).clear()",
+        "exchanged pipes": "k = os.dup(3); os.dup2(4, 3); os.dup2(k, 4); return 0.0",
+        "a file of its own in place of the reply pipe": (
+            "os.dup2(os.open('f', os.O_RDWR | os.O_CREAT), 4); time.sleep(60)"
+        ),
+        "signals in the middle of a reply": (
+            "signal.signal(signal.SIGALRM, lambda *a: os.write(4, b'zz'))\n"
+            "            signal.setitimer(signal.ITIMER_REAL, 0.001, 0.001); time.sleep(0.1)"
+        ),
+        "a thread that continues to reply": (
+            "threading.Thread(target=lambda: [os.write(4, 2 * struct.pack('<IBxxxq', 8, 1, 0)) or time.sleep(0.001) for"
+            " _ in range(9999)]).start(); time.sleep(0.1)"
+        ),
+    },
+    "act_error": {
+        "an array of four billion empty lists": "return np.empty((2**31, 2**31, 0))",
+        "an endless dict": (
+            "D = type('D', (dict,), {'items': lambda s: iter(lambda: ('a', 1), None)}); return D()"
+        ),
+        "a list that reports a wrong length": (
+            "L = type('L', (list,), {'__len__': lambda s: 1 << 40}); return L([1.0])"
+        ),
+        "a nested action": "a = []; [a := [a] for _ in range(100000)]; return a",
+        "an action that contains itself": "a = []; a.append(a); return a",
+        "an action whose `__array__` raises": (
+            "return type('L', (), {'__array__': lambda s, *a, **k: 1 / 0})()"
+        ),
+        "stopping itself": "os.kill(os.getpid(), signal.SIGSTOP); time.sleep(60)",
+        "killing itself, to be played again": "os.kill(os.getpid(), signal.SIGKILL); time.sleep(60)",
+        "a timer that kills itself": (
+            "libc, which = ctypes.CDLL(None), ctypes.c_void_p()\n"
+            "            event = struct.pack('<qii48x', 0, 9, 0)\n"
+            "            if libc.timer_create(1, event, ctypes.byref(which)): raise OSError('no timer')\n"
+            "            libc.timer_settime(which, 0, struct.pack('<qqqq', 0, 0, 0, 10**7), None); time.sleep(60)"
+        ),
+        "a lower limit on its CPU time, to be killed by the kernel": (
+            "import resource; resource.setrlimit(resource.RLIMIT_CPU, (1, 1))\n            while True: pass"
+        ),
+        "endless recursion": "f = lambda: f(); f()",
+        "an error that cannot be printed": "raise type('E', (Exception,), {'__str__': lambda s: 1 / 0})",
+        "an error that raises when it is read": (
+            "raise type('E', (OSError,), {'errno': property(lambda s: 1 / 0)})"
+        ),
+        "an error with half a surrogate pair in its text": "raise ValueError(chr(0xD800))",
+        "tracing every call": "sys.setprofile(lambda *a: 1 / 0)",
+    },
+    None: {
+        "an array of objects as an action": "return np.array([self, None], dtype=object)",
+        "a generator as an action": "return (x for x in [1.0])",
+        "infinity as an action": "return [float('inf')]",
+        "NaN as an action": "return [float('nan')]",
+        "a pickle": (
+            "return type('P', (), {'__reduce__': lambda s: (os.system, ('touch /tmp/evopolicy-pickled',))})()"
+        ),
+        "a signal for an illegal instruction": "signal.raise_signal(signal.SIGILL)",
+        "a flood of output": "[os.write(k, b'x' * 65536) for k in (1, 2) for _ in range(200)]",
+        "a replaced shim": (
+            "import gc\n            for m in list(sys.modules.values()):\n                for n in ('encoded', 'reply',"
+            " 'answer', 'check', 'seal'):\n                    if hasattr(m, n) and hasattr(m, 'REPLIES'): setattr(m,"
+            " n, None)\n            m = sys.modules['__main__']; m.player.encoded = lambda action:"
+            " struct.pack('<IBxxxd', 8, 2, 9.0)"
+        ),
+        "all modules deleted": "sys.modules.clear(); sys.stdout = sys.stderr = None; return []",
+    },
+}
+"""What is done in `act`, by verdict and name, under the usual limits and with no other way to succeed."""
+
 BREAKERS = (
     Breaker(
         name="endless act",
@@ -157,15 +256,6 @@ BREAKERS = (
         verdict="process_limit",
         unsealed=True,
     ),
-    Breaker(name="closes its reply pipe", act="os.close(4); time.sleep(60)", verdict="killed"),
-    Breaker(name="closes its request pipe", act="os.close(3)", verdict="killed"),
-    Breaker(name="closes every descriptor", act="os.closerange(0, 256)", verdict="killed"),
-    Breaker(name="a random reply", act="os.write(4, os.urandom(300))", verdict="killed"),
-    Breaker(
-        name="an endless reply",
-        act="os.write(4, struct.pack('<IBxxx', 1 << 31, 3)); time.sleep(60)",
-        verdict="killed",
-    ),
     Breaker(
         name="half a reply",
         act="os.write(4, b'abc'); time.sleep(60)",
@@ -173,66 +263,10 @@ BREAKERS = (
         limits=limits(act_wall_s=0.3),
     ),
     Breaker(
-        name="two replies to one request",
-        act="os.write(4, struct.pack('<IBxxxqIBxxxq', 8, 1, 0, 8, 1, 0))",
-        verdict="killed",
-    ),
-    Breaker(
-        name="a reply of the wrong kind",
-        act="os.write(4, struct.pack('<IBxxx', 0, 0)); time.sleep(60)",
-        verdict="killed",
-    ),
-    Breaker(
-        name="an array of objects as a reply",
-        act="os.write(4, struct.pack('<IBxxx4sIIQ', 20, 3, b'|O\\0\\0', 1, 1, id(self))); time.sleep(60)",
-        verdict="killed",
-    ),
-    Breaker(
-        name="a forged failure",
-        act="os.write(4, struct.pack('<IBxxx', 2, 6) + b'{}'); time.sleep(60)",
-        verdict="killed",
-    ),
-    Breaker(
-        name="a forged count that no encoder accepts",
-        act=(
-            'b = b\'{"stage":"act","kind":"action","message":"","traceback":"","used":1\' + b"0" * 30 + b"}"\n'
-            "            os.write(4, struct.pack('<IBxxx', len(b), 6) + b); time.sleep(60)"
-        ),
-        verdict="killed",
-    ),
-    Breaker(
-        name="a forged sandbox failure",
-        act="os.write(4, struct.pack('<IBxxx', 4, 7) + b'ours'); time.sleep(60)",
-        verdict="killed",
-    ),
-    Breaker(
-        name="a flood of replies", act="[os.write(4, bytes(65536)) for _ in iter(int, 1)]", verdict="killed"
-    ),
-    Breaker(
         name="a huge action",
         act="return np.zeros(1 << 16)",
         verdict="act_error",
         off=limits(action_bytes=1 << 20),
-    ),
-    Breaker(
-        name="a forged huge action",
-        act="os.write(4, struct.pack('<IBxxx', 1 << 16, 5) + bytes(1 << 16)); time.sleep(60)",
-        verdict="killed",
-    ),
-    Breaker(
-        name="a forged action of thousands of empty lists",
-        act="os.write(4, struct.pack('<IBxxx', 8003, 5) + b'\\xdc\\x1f\\x40' + b'\\x90' * 8000); time.sleep(60)",
-        verdict="killed",
-    ),
-    Breaker(
-        name="an array of four billion empty lists",
-        act="return np.empty((2**31, 2**31, 0))",
-        verdict="act_error",
-    ),
-    Breaker(
-        name="a forged array of four billion empty lists",
-        act="os.write(4, struct.pack('<IBxxx4sIII', 16, 3, b'|u1', 2, 2**32 - 1, 0)); time.sleep(60)",
-        verdict="killed",
     ),
     Breaker(
         name="a large action in every step",
@@ -242,139 +276,16 @@ BREAKERS = (
         off=PATIENT,
     ),
     Breaker(
-        name="an endless dict",
-        act="D = type('D', (dict,), {'items': lambda s: iter(lambda: ('a', 1), None)}); return D()",
-        verdict="act_error",
-    ),
-    Breaker(
-        name="a list that reports a wrong length",
-        act="L = type('L', (list,), {'__len__': lambda s: 1 << 40}); return L([1.0])",
-        verdict="act_error",
-    ),
-    Breaker(
-        name="an array of objects as an action",
-        act="return np.array([self, None], dtype=object)",
-        verdict=None,
-    ),
-    Breaker(name="a generator as an action", act="return (x for x in [1.0])", verdict=None),
-    Breaker(name="infinity as an action", act="return [float('inf')]", verdict=None),
-    Breaker(name="NaN as an action", act="return [float('nan')]", verdict=None),
-    Breaker(
-        name="a nested action", act="a = []; [a := [a] for _ in range(100000)]; return a", verdict="act_error"
-    ),
-    Breaker(name="an action that contains itself", act="a = []; a.append(a); return a", verdict="act_error"),
-    Breaker(
-        name="a pickle",
-        act="return type('P', (), {'__reduce__': lambda s: (os.system, ('touch /tmp/evopolicy-pickled',))})()",
-        verdict=None,
-    ),
-    Breaker(
-        name="an action whose `__array__` raises",
-        act="return type('L', (), {'__array__': lambda s, *a, **k: 1 / 0})()",
-        verdict="act_error",
-    ),
-    Breaker(name="os._exit", act="os._exit(0)", verdict="killed"),
-    Breaker(name="a segmentation fault", act="ctypes.string_at(1)", verdict="killed"),
-    Breaker(name="an abort", act="os.abort()", verdict="killed"),
-    Breaker(
-        name="a signal for an illegal instruction", act="signal.raise_signal(signal.SIGILL)", verdict=None
-    ),
-    Breaker(
-        name="stopping itself",
-        act="os.kill(os.getpid(), signal.SIGSTOP); time.sleep(60)",
-        verdict="act_error",
-    ),
-    Breaker(
-        name="killing itself, to be played again",
-        act="os.kill(os.getpid(), signal.SIGKILL); time.sleep(60)",
-        verdict="act_error",
-    ),
-    Breaker(
-        name="a timer that kills itself",
-        act=(
-            "libc, which = ctypes.CDLL(None), ctypes.c_void_p()\n"
-            "            event = struct.pack('<qii48x', 0, 9, 0)\n"
-            "            if libc.timer_create(1, event, ctypes.byref(which)): raise OSError('no timer')\n"
-            "            libc.timer_settime(which, 0, struct.pack('<qqqq', 0, 0, 0, 10**7), None); time.sleep(60)"
-        ),
-        verdict="act_error",
-    ),
-    Breaker(
-        name="a lower limit on its CPU time, to be killed by the kernel",
-        act="import resource; resource.setrlimit(resource.RLIMIT_CPU, (1, 1))\n            while True: pass",
-        verdict="act_error",
-    ),
-    Breaker(name="endless recursion", act="f = lambda: f(); f()", verdict="act_error"),
-    Breaker(
-        name="an error that cannot be printed",
-        act="raise type('E', (Exception,), {'__str__': lambda s: 1 / 0})",
-        verdict="act_error",
-    ),
-    Breaker(
-        name="an error that raises when it is read",
-        act="raise type('E', (OSError,), {'errno': property(lambda s: 1 / 0)})",
-        verdict="act_error",
-    ),
-    Breaker(
-        name="an error with half a surrogate pair in its text",
-        act="raise ValueError(chr(0xD800))",
-        verdict="act_error",
-    ),
-    Breaker(
-        name="a flood of output",
-        act="[os.write(k, b'x' * 65536) for k in (1, 2) for _ in range(200)]",
-        verdict=None,
-    ),
-    Breaker(
-        name="a replaced shim",
-        act=(
-            "import gc\n            for m in list(sys.modules.values()):\n                for n in ('encoded', 'reply',"
-            " 'answer', 'check', 'seal'):\n                    if hasattr(m, n) and hasattr(m, 'REPLIES'): setattr(m,"
-            " n, None)\n            m = sys.modules['__main__']; m.player.encoded = lambda action:"
-            " struct.pack('<IBxxxd', 8, 2, 9.0)"
-        ),
-        verdict=None,
-    ),
-    Breaker(
-        name="all modules deleted",
-        act="sys.modules.clear(); sys.stdout = sys.stderr = None; return []",
-        verdict=None,
-    ),
-    Breaker(
-        name="all built-in functions deleted",
-        act="import builtins\n            vars(builtins).clear()",
-        verdict="killed",
-    ),
-    Breaker(
         name="a replaced os module under the shim",
         act="os.write = lambda *a: 0; os.readv = None",
         verdict=None,
         limits=limits(act_wall_s=0.3),
-    ),
-    Breaker(name="tracing every call", act="sys.setprofile(lambda *a: 1 / 0)", verdict="act_error"),
-    Breaker(
-        name="exchanged pipes",
-        act="k = os.dup(3); os.dup2(4, 3); os.dup2(k, 4); return 0.0",
-        verdict="killed",
     ),
     Breaker(
         name="its output in place of the reply pipe",
         act="os.dup2(1, 4)",
         verdict="killed",
         limits=limits(act_wall_s=0.3),
-    ),
-    Breaker(
-        name="a file of its own in place of the reply pipe",
-        act="os.dup2(os.open('f', os.O_RDWR | os.O_CREAT), 4); time.sleep(60)",
-        verdict="killed",
-    ),
-    Breaker(
-        name="signals in the middle of a reply",
-        act=(
-            "signal.signal(signal.SIGALRM, lambda *a: os.write(4, b'zz'))\n"
-            "            signal.setitimer(signal.ITIMER_REAL, 0.001, 0.001); time.sleep(0.1)"
-        ),
-        verdict="killed",
     ),
     Breaker(
         name="a reply before the request",
@@ -429,12 +340,9 @@ BREAKERS = (
         packages=("scipy",),
         unsealed=True,
     ),
-    Breaker(
-        name="a thread that continues to reply",
-        act=(
-            "threading.Thread(target=lambda: [os.write(4, 2 * struct.pack('<IBxxxq', 8, 1, 0)) or time.sleep(0.001) for"
-            " _ in range(9999)]).start(); time.sleep(0.1)"
-        ),
-        verdict="killed",
+    *(
+        Breaker(name=name, act=act, verdict=verdict)
+        for verdict, acts in PLAIN.items()
+        for name, act in acts.items()
     ),
 )

@@ -9,6 +9,7 @@ episode, or before its first; their verdict is the failure's category. docs/expl
 
 from __future__ import annotations
 
+from collections.abc import Set
 from pathlib import Path
 from typing import Any
 
@@ -42,16 +43,16 @@ class Policy:
 """
 
 
-class Probe(msgspec.Struct, frozen=True, kw_only=True):
+class Probe(msgspec.Struct, frozen=True):
     """A file of attack attempts."""
 
     name: str
     off: dict[str, Any] | None
     """Options under which every attempt not in `stays_shut` is seen to succeed: a weaker tier, or no seal; None where
     no unprivileged process of an ordinary machine gets through."""
-    stays_shut: frozenset[str] = frozenset()
+    stays_shut: Set[str] = frozenset()
     """Attempts that still fail when this defence is off, or that this machine may not support."""
-    opens_for_root: frozenset[str] = frozenset()
+    opens_for_root: Set[str] = frozenset()
     """Attempts that file permissions refuse too, unless the worker runs as root."""
     packages: tuple[str, ...] = ()
     """Packages besides numpy that it imports."""
@@ -61,76 +62,45 @@ NO_SEAL = {"tier": "bwrap", "sealed": False}
 NO_SANDBOX = {"tier": "none"}
 
 PROBES = (
+    Probe("read_files", NO_SANDBOX, {"a hard link", "home folders", "the host's name"}),
     Probe(
-        name="read_files",
-        off=NO_SANDBOX,
-        stays_shut=frozenset({"a hard link", "home folders", "the host's name"}),
+        "write_files",
+        NO_SANDBOX,
+        {"shared memory"},
+        opens_for_root={"numpy's folder", "the standard library", "the devices", "the root"},
+    ),
+    Probe("list_processes", NO_SANDBOX),
+    Probe("sockets", NO_SANDBOX, {"interfaces"}),
+    Probe(
+        "other_processes",
+        NO_SANDBOX,
+        {
+            *("signal 0 to pid 2", "signal 0 to everyone", "being traced", "comparing kernel objects"),
+            "memory of its own through process_vm_readv",
+        },
     ),
     Probe(
-        name="write_files",
-        off=NO_SANDBOX,
-        stays_shut=frozenset({"shared memory"}),
-        opens_for_root=frozenset({"numpy's folder", "the standard library", "the devices", "the root"}),
+        "kernel",
+        NO_SEAL,
+        {
+            *("an io_uring", "a key", "a new network namespace", "what of a file is in memory"),
+            *("being looked into by others", "a process in new namespaces", "watches of file systems"),
+        },
     ),
+    Probe("descriptors", NO_SANDBOX, {"a lease on a file", "a watch on a folder", "a larger pipe"}),
+    Probe("other_files", NO_SANDBOX, {"a file's length by opening it"}),
+    Probe("counters", NO_SEAL, {"shared memory of a device", "a huge page"}),
+    Probe("kernel_root", None),
+    Probe("forks", NO_SANDBOX),
+    Probe("exec_itself", NO_SANDBOX),
     Probe(
-        name="list_processes",
-        off=NO_SANDBOX,
-        stays_shut=frozenset(),
-    ),
-    Probe(name="sockets", off=NO_SANDBOX, stays_shut=frozenset({"interfaces"})),
-    Probe(
-        name="other_processes",
-        off=NO_SANDBOX,
-        stays_shut=frozenset(
-            {
-                "signal 0 to pid 2",
-                "signal 0 to everyone",
-                "being traced",
-                "comparing kernel objects",
-                "memory of its own through process_vm_readv",
-            }
-        ),
-    ),
-    Probe(
-        name="kernel",
-        off=NO_SEAL,
-        stays_shut=frozenset(
-            {
-                *("an io_uring", "a key", "a new network namespace", "what of a file is in memory"),
-                *("being looked into by others", "a process in new namespaces", "watches of file systems"),
-            }
-        ),
-    ),
-    Probe(
-        name="descriptors",
-        off=NO_SANDBOX,
-        stays_shut=frozenset({"a lease on a file", "a watch on a folder", "a larger pipe"}),
-    ),
-    Probe(
-        name="other_files",
-        off=NO_SANDBOX,
-        stays_shut=frozenset({"a file's length by opening it"}),
-    ),
-    Probe(
-        name="counters",
-        off=NO_SEAL,
-        stays_shut=frozenset({"shared memory of a device", "a huge page"}),
-    ),
-    Probe(name="kernel_root", off=None),
-    Probe(name="forks", off=NO_SANDBOX),
-    Probe(name="exec_itself", off=NO_SANDBOX),
-    Probe(
-        name="use_scipy",
-        off=NO_SANDBOX,
-        stays_shut=frozenset({"a compiler by f2py"}),
-        opens_for_root=frozenset({"scipy's folder"}),
+        "use_scipy",
+        NO_SANDBOX,
+        {"a compiler by f2py"},
+        opens_for_root={"scipy's folder"},
         packages=("scipy",),
     ),
-    Probe(
-        name="devices",
-        off=NO_SANDBOX,
-        stays_shut=frozenset({"kernel messages", "cgroups"}),
-    ),
+    Probe("devices", NO_SANDBOX, {"kernel messages", "cgroups"}),
 )
 
 
@@ -149,19 +119,18 @@ def document() -> str:
         rows.append((breaker.name, verdict, ", ".join(ways) or "-"))
     rows += [(what, "nothing is found", off) for what, off in PAIRS.items()]
     rows += [
-        (bundle.name, f"`{bundle.verdict}`", "by a plain copy" if bundle.harm else "-") for bundle in BUNDLES
-    ]
-    rows.append(
-        ("a packed bundle with `..` or a root in a path", "the worker refuses it", "by a plain write")
-    )
-    rows.append(
+        *(
+            (bundle.name, f"`{bundle.verdict}`", "by a plain copy" if bundle.harm else "-")
+            for bundle in BUNDLES
+        ),
+        ("a packed bundle with `..` or a root in a path", "the worker refuses it", "by a plain write"),
         (
             "a package `policy/`, or an extension module of that name, beside `policy.py`",
             "`policy.py` is played",
             "with Python's own order of modules",
-        )
-    )
-    rows.append(("a packed bundle with compiled code", "the worker refuses it", "by a plain write"))
+        ),
+        ("a packed bundle with compiled code", "the worker refuses it", "by a plain write"),
+    ]
     lines = [f"| {what} | {verdict} | {off} |" for what, verdict, off in rows]
     table = "\n".join(["| attack | verdict | succeeds |", "|---|---|---|", *lines])
     return Path(__file__).with_name("document.md").read_text().replace("{table}", table)
