@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 import itertools
 import threading
-from collections.abc import Coroutine
+from collections.abc import Coroutine, Iterator
 from pathlib import Path
 from textwrap import dedent
 from typing import Any, TypeVar
@@ -110,6 +110,16 @@ class Slots:
         """A slot of one's own, not started."""
         folder = self.folder / f"slot-{next(self._numbers)}"
         return Slot(None, tier, folder, ("numpy", *packages), sealed=sealed)
+
+    @contextlib.contextmanager
+    def running(self, slot: Slot | None = None) -> Iterator[Slot]:
+        """This slot, or one of one's own, started inside and closed at the end."""
+        slot = slot or self.new()
+        self.run(slot.start())
+        try:
+            yield slot
+        finally:
+            self.run(slot.close())
 
     def bundle(self, files: dict[str, str | bytes] | str) -> Path:
         """A bundle's folder; a text is its `policy.py`."""

@@ -46,9 +46,7 @@ def test_a_closed_slot_leaves_no_game(slots: Slots) -> None:
 
 
 def test_an_unjailed_killed_process_leaves_no_game_or_shared_memory(slots: Slots) -> None:
-    slot = slots.new("none")
-    slots.run(slot.start())
-    try:
+    with slots.running(slots.new("none")) as slot:
         slots.play_all(None, slot=slot, tier="none", env=ENV)
         (game,) = [pid for pid in family(pid_of(slot)) if _name(pid) == "vizdoom"]
         maps = Path(f"/proc/{game}/maps").read_text()
@@ -57,8 +55,6 @@ def test_an_unjailed_killed_process_leaves_no_game_or_shared_memory(slots: Slots
         os.kill(pid_of(slot), signal.SIGKILL)
         wait_until(lambda: not runs(game))
         assert not [path for path in shared if os.path.exists(path)]
-    finally:
-        slots.run(slot.close())
 
 
 def _name(pid: int) -> str:

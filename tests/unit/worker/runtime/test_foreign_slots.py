@@ -46,42 +46,30 @@ def returned(slots: Slots, slot: Slot, record: str) -> float:
 
 
 def test_a_process_that_has_played_a_hidden_episode_plays_no_train_episode(slots: Slots) -> None:
-    slot = slot_of(slots, "Keeper")
-    slots.run(slot.start())
-    try:
+    with slots.running(slot_of(slots, "Keeper")) as slot:
         assert [returned(slots, slot, "full") for _ in range(2)] == [1.0, 2.0]
         assert [returned(slots, slot, "actions") for _ in range(2)] == [3.0, 4.0]
         assert returned(slots, slot, "full") == 1.0
-    finally:
-        slots.run(slot.close())
 
 
 def test_a_process_replaced_in_a_hidden_episode_plays_no_train_episode(
     slots: Slots,
 ) -> None:
-    slot = slot_of(slots, "Keeper", kwargs={"dies_of": 0.89})
-    slots.run(slot.start())
-    try:
+    with slots.running(slot_of(slots, "Keeper", kwargs={"dies_of": 0.89})) as slot:
         # The policy's action ends the first process; random actions, which are smaller, play the episode again.
         (outcome,) = slots.play_all(PUSHES, slot=slot, env="acme/Keeper", record="actions")
         assert outcome.failure is not None
         assert outcome.failure.category == "killed"
         assert outcome.episode_return == 1.0
         assert returned(slots, slot, "full") == 1.0
-    finally:
-        slots.run(slot.close())
 
 
 @pytest.mark.parametrize("how", ["raise in close", "leave when pushed"])
 def test_an_environment_that_cannot_be_closed_plays_again(slots: Slots, how: str) -> None:
-    slot = slot_of(slots, "Bad", kwargs={"how": how})
-    slots.run(slot.start())
-    try:
+    with slots.running(slot_of(slots, "Bad", kwargs={"how": how})) as slot:
         (outcome,) = slots.play_all(PUSHES, slot=slot, env="acme/Bad", record="actions")
         assert outcome.failure is not None
         assert (outcome.failure.category, outcome.length) == ("killed", 8)
-    finally:
-        slots.run(slot.close())
 
 
 def test_pages_with_own_options_have_browser_and_fonts_fingerprinted(
@@ -96,23 +84,15 @@ def test_pages_with_own_options_have_browser_and_fonts_fingerprinted(
 
 
 def test_success_is_decided_by_the_last_step_or_by_any(slots: Slots) -> None:
-    slot = slot_of(slots, "Treasure", success="is_success")
-    slots.run(slot.start())
-    try:
+    with slots.running(slot_of(slots, "Treasure", success="is_success")) as slot:
         (outcome,) = slots.play_all(None, slot=slot, env="acme/Treasure")
         assert outcome.success is outcome.terminated
         assert set(outcome.reward_components) == {"reward_0", "reward_1"}
         assert outcome.episode_return == pytest.approx(sum(outcome.reward_components.values()))
-    finally:
-        slots.run(slot.close())
     (line,) = slots.play_all(None, env="toy/line")
     assert line.success is None
-    slot = slot_of(slots, "Bad", kwargs={"how": "success in an array"}, success="near")
-    slots.run(slot.start())
-    try:
+    with slots.running(slot_of(slots, "Bad", kwargs={"how": "success in an array"}, success="near")) as slot:
         assert slots.play_all(None, slot=slot, env="acme/Bad")[0].success is False
-    finally:
-        slots.run(slot.close())
 
 
 @pytest.mark.parametrize("env", ["gymnasium/FetchPush-v4", "gymnasium/parking-v0"])
@@ -157,13 +137,11 @@ def test_an_environment_that_breaks_its_description_is_refused(
     how, later, _ = how.partition(", later")
     # After the trial, steps are timed in episodes of other seeds.
     kwargs = {"how": how, "seeds_from": 2 if later else 0}
-    slot = slot_of(slots, "Bad", Limits(call_s=4.0), kwargs=kwargs)
-    slots.run(slot.start())
-    try:
-        with pytest.raises((WorkerError, SlotDiedError), match=why):
-            slots.run(slot.describe(["acme/Bad"]))
-    finally:
-        slots.run(slot.close())
+    with (
+        slots.running(slot_of(slots, "Bad", Limits(call_s=4.0), kwargs=kwargs)) as slot,
+        pytest.raises((WorkerError, SlotDiedError), match=why),
+    ):
+        slots.run(slot.describe(["acme/Bad"]))
     assert slots.play(None, env="toy/line").length > 0
 
 
@@ -229,16 +207,14 @@ def test_what_prevents_an_episode_is_reported_by_name_and_is_nobodys_result(
         else USUAL
     )
     again = {"environment_faults": AGAIN} if how.startswith(("hang", "hold")) else {}
-    slot = slot_of(slots, "Bad", limits, kwargs={"how": how}, reward_components={"fuel": "spent"})
-    slots.run(slot.start())
-    try:
+    with slots.running(
+        slot_of(slots, "Bad", limits, kwargs={"how": how}, reward_components={"fuel": "spent"})
+    ) as slot:
         # Also where the policy's actions come first, and random ones play the episode again.
         with pytest.raises(WorkerError, match=WRONG[how]):
             slots.play_all(PUSHES, slot=slot, env="acme/Bad", n=20 if how == "leak" else 1, **again)
         slots.run(slot.start())
         assert slots.play_all(None, slot=slot, env="toy/line")[0].length > 0
-    finally:
-        slots.run(slot.close())
 
 
 @pytest.mark.parametrize("how", ["hold", "hang"])
@@ -271,44 +247,32 @@ def test_an_environment_that_hangs_on_actions_gives_no_second_throw(
 
 
 def test_a_close_that_hangs_ends_the_process_at_the_next_episode(slots: Slots) -> None:
-    slot = slot_of(slots, "Bad", Limits(call_s=4.0), kwargs={"how": "hang in close"})
-    slots.run(slot.start())
-    try:
+    with slots.running(slot_of(slots, "Bad", Limits(call_s=4.0), kwargs={"how": "hang in close"})) as slot:
         assert slots.play_all(PUSHES, slot=slot, env="acme/Bad")[0].length == 8
         with pytest.raises(WorkerError, match="environment acme/Bad, close: it has not returned for 4 s"):
             slots.play_all(PUSHES, slot=slot, env="acme/Bad")
         slots.run(slot.start())
         assert slots.play_all(PUSHES, slot=slot, env="acme/Bad")[0].length == 8
-    finally:
-        slots.run(slot.close())
 
 
 def test_observations_beyond_bounds_are_played_and_the_operator_told(
     slots: Slots,
 ) -> None:
-    slot = slot_of(slots, "Bad", kwargs={"how": "outside"})
-    slots.run(slot.start())
-    try:
+    with slots.running(slot_of(slots, "Bad", kwargs={"how": "outside"})) as slot:
         (outcome,) = slots.play_all(PUSHES, slot=slot, env="acme/Bad")
         assert (outcome.length, outcome.failure) == (8, None)
         wait_until(
             lambda: any("environment acme/Bad, step 0, observation: element" in each for each in slot._stderr)
         )
-    finally:
-        slots.run(slot.close())
 
 
 @pytest.mark.parametrize("how", ["fork", "fork and wait"])
 def test_forks_of_an_environment_play_no_part(slots: Slots, how: str) -> None:
-    slot = slot_of(slots, "Bad", kwargs={"how": how})
-    slots.run(slot.start())
-    try:
+    with slots.running(slot_of(slots, "Bad", kwargs={"how": how})) as slot:
         for _ in range(2):
             (outcome,) = slots.play_all(PUSHES, slot=slot, env="acme/Bad")
             assert (outcome.length, outcome.failure) == (8, None)
             assert len(rows(outcome)) == 8
-    finally:
-        slots.run(slot.close())
 
 
 def test_memory_is_looked_at_from_outside_the_call(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -317,7 +281,7 @@ def test_memory_is_looked_at_from_outside_the_call(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(calls, "current", Call())
     calls.current.begin("my/env", "reset")
     assert (
-        guard.look(1000.0)
+        guard.check(1000.0)
         == "environment my/env, reset: its process has 65 MiB of memory, and 64 MiB are the limit; mend what it keeps"
         " from episode to episode, or raise the worker's --env-memory"
     )
@@ -330,26 +294,22 @@ def test_only_a_calls_running_time_counts(
     monkeypatch.setattr(calls, "current", Call())
     call = calls.current
     call.begin("my/env", "reset")
-    assert [guard.look(now) for now in (0.0, 100.0, 200.0, 300.0)] == [""] * 4
+    assert [guard.check(now) for now in (0.0, 100.0, 200.0, 300.0)] == [""] * 4
     call.done()
     for now in range(301, 320):
         call.what, call.step = "step", now
-        assert guard.look(float(now)) == ""
+        assert guard.check(float(now)) == ""
     call.step = 7
-    looks = [guard.look(400.0 + k / 2) for k in range(14)]
-    assert looks.index(hung("environment my/env, step 7", Limits(call_s=5.0))) > 10
+    told = [guard.check(400.0 + k / 2) for k in range(14)]
+    assert told.index(hung("environment my/env, step 7", Limits(call_s=5.0))) > 10
 
 
 @pytest.mark.parametrize("how", ["print", "threads", "close stdout"])
 def test_printing_and_threads_harm_nobody(slots: Slots, how: str) -> None:
-    slot = slot_of(slots, "Bad", kwargs={"how": how})
-    slots.run(slot.start())
-    try:
+    with slots.running(slot_of(slots, "Bad", kwargs={"how": how})) as slot:
         for _ in range(2):
             (outcome,) = slots.play_all(None, slot=slot, env="acme/Bad")
             assert outcome.length == 8
-    finally:
-        slots.run(slot.close())
 
 
 BROWSES = """
@@ -365,9 +325,7 @@ class Policy:
 
 
 def test_opaque_objects_are_encoded_by_their_family_both_ways(slots: Slots) -> None:
-    slot = slot_of(slots, "Browser")
-    slots.run(slot.start())
-    try:
+    with slots.running(slot_of(slots, "Browser")) as slot:
         (description,) = slots.run(slot.describe(["acme/Browser"]))
         assert "page.title" in description.task_text
         (outcome,) = slots.play_all(BROWSES, slot=slot, env="acme/Browser")
@@ -375,5 +333,3 @@ def test_opaque_objects_are_encoded_by_their_family_both_ways(slots: Slots) -> N
         assert rows(outcome)[1].obs["page"] == {"title": "goal", "links": ("goal", "start")}
         (random,) = slots.play_all(None, slot=slot, env="acme/Browser")
         assert random.length == 5
-    finally:
-        slots.run(slot.close())

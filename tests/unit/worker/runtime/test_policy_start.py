@@ -116,12 +116,8 @@ def test_a_policy_finds_its_process_as_if_new(slots: Slots, tier: str) -> None:
 
 def test_all_policies_of_a_slot_load_the_same_code(slots: Slots) -> None:
     """The first could otherwise tell that it is the first: its memory would hold what the compiler leaves behind."""
-    slot = slots.new()
-    slots.run(slot.start())
-    try:
+    with slots.running() as slot:
         found = [slots.play(LOOKS, slot=slot).stdout for _ in range(3)]
-    finally:
-        slots.run(slot.close())
     assert found[0]
     assert found == found[:1] * 3
 

@@ -378,15 +378,11 @@ LOOKING_UP = """
 
 def test_what_stands_above_a_policy_tells_nothing_of_those_before(slots: Slots) -> None:
     """How long the last one took, or that there was one."""
-    slot = slots.new()
-    slots.run(slot.start())
-    try:
+    with slots.running() as slot:
         seen = []
         for _ in range(3):
             seen.append(slots.play(LOOKING_UP, slot=slot).stdout)
             slots.play(HONEST, slot=slot)
-    finally:
-        slots.run(slot.close())
     assert b"env_meta" in seen[0]
     assert len(set(seen)) == 1
 

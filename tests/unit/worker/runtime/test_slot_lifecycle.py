@@ -188,13 +188,9 @@ def test_a_package_that_is_not_installed_is_named(tmp_path: Path) -> None:
 
 
 def test_an_allowed_package_can_be_imported_with_what_it_needs(slots: Slots) -> None:
-    slot = Slot(None, "bwrap", slots.folder / "with-yaml", ("numpy", "msgpack"))
-    slots.run(slot.start())
-    try:
+    with slots.running(Slot(None, "bwrap", slots.folder / "with-yaml", ("numpy", "msgpack"))) as slot:
         policy = "import msgpack\n" + HONEST
         assert slots.play(policy, slot=slot).failure is None
         failure = slots.play(policy).failure
         assert failure is not None
         assert failure.category == "import_error"
-    finally:
-        slots.run(slot.close())

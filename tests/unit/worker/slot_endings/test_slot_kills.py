@@ -13,7 +13,7 @@ from slots import HONEST, Slots, begun, family, make_job, misbehaving, pid_of, r
 from stateful_policy import PATIENT, essence, in_its_pause, place_of_env, stateful
 
 from evopolicy_common.errors import BrokenEnvironmentError, SandboxError, SlotDiedError, WorkerError
-from evopolicy_common.messages.episode import EpisodeOutcome
+from evopolicy_common.messages.episode import EpisodeOutcome, Tier
 from evopolicy_worker.slots.slot import Slot
 
 pytestmark = pytest.mark.slow
@@ -106,40 +106,36 @@ def test_a_policy_that_is_killed_again_and_again_is_played_elsewhere(slots: Slot
 
 
 def after(
-    slots: Slots, slot: Slot, number: int, place: int, source: str = "", **options: object
+    slots: Slots, number: int, place: int, source: str = "", *, tier: Tier = "bwrap", **options: object
 ) -> list[EpisodeOutcome]:
-    """The outcome of a job when one process of the slot gets that signal in the policy's pause.
+    """The outcome of a job when one process of its slot gets that signal in the policy's pause.
 
     `place`: in the slot's family, counted from the environment's process.
     """
 
-    async def work() -> tuple[EpisodeOutcome, ...]:
-        await slot.start()
-        task = await begun(slot, slots, source or stateful(), limits=PATIENT, **options)
+    async def work(slot: Slot) -> tuple[EpisodeOutcome, ...]:
+        task = await begun(slot, slots, source or stateful(), limits=PATIENT, tier=tier, **options)
         pids = family(pid_of(slot))
         await in_its_pause(slot, pids[-1])
         os.kill(pids[place_of_env(pids) + place], number)
         return await asyncio.wait_for(task, 100)
 
-    return list(slots.run(work()))
+    with slots.running(slots.new(tier)) as slot:
+        return list(slots.run(work(slot)))
 
 
 # Its two bubblewraps, the two parents of the zygote's as root, the zygote; the policy is the last.
 @pytest.mark.parametrize("place", range(1, 6 if os.geteuid() == 0 else 4))
 def test_every_end_of_the_sandbox_is_ours(slots: Slots, place: int) -> None:
-    slot = slots.new()
     with pytest.raises(SandboxError, match="sandbox"):
-        after(slots, slot, signal.SIGKILL, place)
-    slots.run(slot.close())
+        after(slots, signal.SIGKILL, place)
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGUSR1])
 def test_an_end_of_a_policys_parent_starts_the_policy_again(slots: Slots, number: int) -> None:
-    slot = slots.new()
     undisturbed = slots.play(stateful(0.0), limits=PATIENT)
-    (disturbed,) = after(slots, slot, number, 6 if os.geteuid() == 0 else 4)
+    (disturbed,) = after(slots, number, 6 if os.geteuid() == 0 else 4)
     assert essence(disturbed) == essence(undisturbed)
-    slots.run(slot.close())
 
 
 @pytest.mark.parametrize("tier", ["bwrap", "landlock"])
@@ -200,62 +196,47 @@ def test_an_episode_under_kills_and_stops_of_anything_is_the_same_episode(slots:
 def test_an_idle_sandboxs_end_costs_one_retry(
     slots: Slots,
 ) -> None:
-    slot = slots.new()
-
-    async def work() -> None:
-        await slot.start()
+    with slots.running() as slot:
         pids = family(pid_of(slot))
         os.kill(pids[place_of_env(pids) + 1], signal.SIGKILL)
-        await asyncio.sleep(0.3)
+        slots.run(asyncio.sleep(0.3))
         with pytest.raises(SandboxError):
-            await slot.play(make_job(), slots.bundle(HONEST), lambda episodes, steps: None)
-        await slot.close()
-
-    slots.run(work())
+            slots.play(HONEST, slot=slot)
 
 
-@pytest.mark.parametrize("tier", ["bwrap", "landlock"])
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGUSR1])
-def test_a_kill_of_the_environments_process_is_ours(slots: Slots, number: int, tier: str) -> None:
-    slot = slots.new(tier)  # type: ignore[arg-type]
+@pytest.mark.parametrize(
+    ("number", "place", "tier"),
+    [
+        *((number, 0, tier) for number in (signal.SIGKILL, signal.SIGUSR1) for tier in ("bwrap", "landlock")),
+        *((signal.SIGKILL, place, "bwrap") for place in (-2, -1)),
+    ],
+)
+def test_a_kill_of_the_environments_process_or_jail_is_ours(
+    slots: Slots, number: int, place: int, tier: Tier
+) -> None:
     with pytest.raises(SlotDiedError):
-        after(slots, slot, number, 0, tier=tier)
-    slots.run(slot.close())
-
-
-@pytest.mark.parametrize("place", [-2, -1])
-def test_a_kill_of_the_environments_jail_is_ours(slots: Slots, place: int) -> None:
-    slot = slots.new()
-    with pytest.raises(SlotDiedError):
-        after(slots, slot, signal.SIGKILL, place)
-    slots.run(slot.close())
+        after(slots, number, place, tier=tier)
 
 
 @pytest.mark.parametrize("tier", ["bwrap", "landlock"])
 def test_an_environment_that_crashes_on_a_policys_actions_is_the_policys_failure(
-    slots: Slots, tier: str
+    slots: Slots, tier: Tier
 ) -> None:
-    slot = slots.new(tier)  # type: ignore[arg-type]
     # It crashes in the second of three episodes of one policy.
     source = (
         stateful()
         .replace("self.n += 1", "self.n += 1 if self.e == 1 else 0")
         .replace("self.seen.update(bytes([", "self.e = episode_index; self.seen.update(bytes([")
     )
-    outcomes = after(slots, slot, signal.SIGSEGV, 0, source, tier=tier, first=0, n=3, policy_scope="submit")
+    outcomes = after(slots, signal.SIGSEGV, 0, source, tier=tier, first=0, n=3, policy_scope="submit")
     assert [outcome.index for outcome in outcomes] == [0, 1, 2]
     failures = [outcome.failure for outcome in outcomes]
     assert [failure and failure.category for failure in failures] == [None, "killed", None]
     (alone,) = slots.play_all(misbehaving(reset="raise ValueError"), seed=8, tier=tier)
     assert outcomes[1].episode_return == alone.episode_return
     assert [len(rows(outcome)) for outcome in outcomes] == [60] * 3
-    slots.run(slot.close())
 
 
 def test_an_environment_that_crashes_before_a_policys_first_action_is_ours(slots: Slots) -> None:
-    slot = slots.new()
-    with pytest.raises(
-        BrokenEnvironmentError, match="environment toy/line: its process ended while it played"
-    ):
-        after(slots, slot, signal.SIGSEGV, 0, stateful(at=1))
-    slots.run(slot.close())
+    with pytest.raises(BrokenEnvironmentError, match="environment toy/line: its process ended while it"):
+        after(slots, signal.SIGSEGV, 0, stateful(at=1))

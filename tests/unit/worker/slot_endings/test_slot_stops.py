@@ -77,11 +77,8 @@ def test_a_slot_whose_environment_is_stopped_for_good_is_given_up(
 ) -> None:
     monkeypatch.setattr("evopolicy_worker.slots.slot.STOPPED_S", 1.0)
     monkeypatch.setattr("evopolicy_worker.slots.slot._CHECK_S", 0.2)
-    slot = slots.new()
-    slots.run(slot.start())
-    with pytest.raises(SlotDiedError):
+    with slots.running() as slot, pytest.raises(SlotDiedError):
         stopped(slots, slot, "environment", 5.0, stateful(0.7), limits=TIGHT)
-    slots.run(slot.close())
 
 
 def test_where_a_policy_may_stop_itself_the_time_counts(slots: Slots) -> None:
