@@ -292,13 +292,7 @@ class Slot:
     def memory_bytes(self) -> int:
         """Resident memory of all of the slot's processes; each has its part of what several share, as a browser's
         do."""
-        if self._process is None:
-            return 0
-        # Where the kernel does not show it, what several share counts for each.
-        return sum(
-            proc.proportional_bytes(each.pid) or (proc.sizes(each.pid) or (0, 0))[1]
-            for each in proc.family(self._process.pid)
-        )
+        return 0 if self._process is None else _memory(self._process.pid)
 
     def cpu_s(self) -> float:
         """Processor time that the slot's live processes have used, seconds; policies that have ended are not in it."""
@@ -439,6 +433,12 @@ def _children(pid: int, tier: Tier) -> list[int]:
             pid = int(Path(f"/proc/{pid}/task/{pid}/children").read_text().split()[0])
             pids.append(pid)
     return pids
+
+
+def _memory(pid: int) -> int:
+    # Where the kernel does not show it, what several share counts for each.
+    sizes = (proc.proportional_bytes(each.pid) or proc.sizes(each.pid) for each in proc.family(pid))
+    return sum(size if isinstance(size, int) else (size or (0, 0))[1] for size in sizes)
 
 
 def bundle_files(folder: Path) -> messages.Files:

@@ -179,92 +179,86 @@ def test_the_filter_ends_for_every_number_and_allows_what_is_listed(
             assert verdict == bpf.ALLOW, numbers[number]
 
 
-def test_the_filter_lets_threads_be_made_and_nothing_else(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(seccomp.platform, "machine", lambda: "x86_64")
-    program = seccomp.policy_filter()
-    clone, fork, kill, prctl, mount = 56, 57, 62, 157, 165
-    assert allowed(program, clone, 0x3D0F00) == bpf.ALLOW  # what pthread_create asks for
-    assert allowed(program, clone, 0x1200011) & 0xFFFF == 11  # fork()
-    assert allowed(program, clone, 0x10010F00) & 0xFFFF == 11  # a thread in a new namespace
-    assert allowed(program, fork) & 0xFFFF == 11
-    assert allowed(program, kill, seccomp.PID_MARK, 15) == bpf.ALLOW
-    assert allowed(program, kill, 1, 15) & 0xFFFF == 1
-    assert allowed(program, prctl, 4, 1) & 0xFFFF == 1
-    assert allowed(program, mount) & 0xFFFF == 1
-    assert allowed(program, 0x40000000) == bpf.KILL_PROCESS
+PID, OPEN = seccomp.PID_MARK, {"sees_the_machines_files": True}
+ALLOWED, IGNORED = bpf.ALLOW, bpf.ERRNO
+"""`IGNORED`: it says that it has been done."""
+EPERM, EAGAIN, ENOMEM, EINVAL, ENOSYS, ENOTSUP = (bpf.ERRNO | number for number in (1, 11, 12, 22, 38, 95))
+SHARED, PRIVATE, ANONYMOUS, HUGE = 0x01, 0x02, 0x20, 0x40000
+BARRED = (9, 19, 20, 21, 22)
+"""Signals that a process may not send itself either: they could be another's."""
+FILTERED: list[tuple[Any, list[tuple[Any, ...]], int]] = [
+    # Threads may be made (what pthread_create asks for), and nothing else.
+    ("clone", [(0x3D0F00,)], ALLOWED),
+    # fork(), and a thread in a new namespace
+    ("clone", [(0x1200011,), (0x10010F00,)], EAGAIN),
+    ("fork", [()], EAGAIN),
+    ("prctl", [(4, 1)], EPERM),
+    (165, [()], EPERM),  # mount
+    (0x40000000, [()], bpf.KILL_PROCESS),
+    # Signals to itself, but for those that could be another's.
+    ("kill", [(PID, number) for number in range(65) if number not in BARRED], ALLOWED),
+    ("tgkill", [(PID, 5, number) for number in range(65) if number not in BARRED], ALLOWED),
+    ("kill", [(1, 15), *((PID, number) for number in BARRED)], EPERM),
+    (
+        "tgkill",
+        [*((1, 1, number) for number in range(65)), *((PID, 5, number) for number in BARRED)],
+        EPERM,
+    ),
+    ("prlimit64", [(0, 0, 0, 0x7F00DEADBEEF)], ALLOWED),
+    ("prlimit64", [(who, 0, new) for new in (0x7F00DEADBEEF, 1 << 40, 0x1000) for who in (0, PID)], EPERM),
+    # setrlimit, timer_create, tkill, … seccomp
+    *((number, [()], EPERM) for number in (160, 222, 200, 129, 297, 424, 101, 317)),
+    # Of a shared file nothing carries a message: private waits and wakes; others are polled or refused.
+    ("futex", [(0, number | more) for number in (0, 1, 9, 10, 13) for more in (128, 128 | 256)], ALLOWED),
+    ("futex", [(0, 0), (0, 9), (0, 9 | 256)], EAGAIN),
+    ("futex", [(0, wake) for wake in (1, 3, 4, 5, 10, 13)], EINVAL),
+    ("madvise", [(0, 0, 4)], ALLOWED),  # given back by an allocator
+    ("madvise", [(0, 0, 21)], EINVAL),  # out of memory for everybody
+    ("fadvise64", [()], IGNORED),
+    ("preadv2", [()], ENOSYS),
+    *((number, [()], EPERM) for number in (73, 99)),  # flock, sysinfo
+    # What is counted for the machine.
+    ("mmap", [(0, 4096, 3, flags) for flags in (PRIVATE, PRIVATE | ANONYMOUS, SHARED, 0x03)], ALLOWED),
+    ("mmap", [(0, 4096, 3, PRIVATE | ANONYMOUS | 0x20000)], ALLOWED),
+    ("mmap", [(0, 4096, 3, flags) for flags in (SHARED | ANONYMOUS, 0x03 | ANONYMOUS)], EPERM),
+    ("mmap", [(0, 1 << 21, 3, PRIVATE | ANONYMOUS | HUGE)], ENOMEM),
+    *((name, [()], ENOSYS) for name in ("statx", "statfs")),
+    ("pipe2", [()], EAGAIN),
+    ("getxattr", [()], ENOTSUP),
+    ("fsync", [()], IGNORED),
+]
+SEEING: list[tuple[Any, list[tuple[Any, ...]], int]] = [
+    ("truncate", [()], EPERM),
+    *((name, [()], IGNORED) for name in ("chmod", "utimensat")),
+    ("openat2", [()], ENOSYS),
+    # Reading, and writing where it may write at all; no cutting of what it reads.
+    ("open", [(0, 0), (0, 1 | 0o1000)], ALLOWED),
+    ("openat", [(0, 0, 0), (0, 0, 1 | 0o1000)], ALLOWED),
+    ("open", [(0, 0o1000)], EPERM),
+    ("openat", [(0, 0, 0o1000)], EPERM),
+]
+"""Where the machine's files are seen."""
 
 
-def test_the_filter_refuses_signals_that_look_like_anothers(
+@pytest.mark.parametrize(
+    ("call", "arguments", "verdict", "options"),
+    [
+        *((*row, {}) for row in FILTERED),
+        *((*row, OPEN) for row in SEEING),
+        *((name, [()], ALLOWED, {}) for name in ("truncate", "chmod", "utimensat", "openat2")),
+    ],
+)
+def test_the_filter_decides_by_call_and_arguments(
+    call: Any,
+    arguments: list[tuple[int, ...]],
+    verdict: int,
+    options: dict[str, bool],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(seccomp.platform, "machine", lambda: "x86_64")
-    program = seccomp.policy_filter()
-    own, kill, tgkill, prlimit = seccomp.PID_MARK, 62, 234, 302
-    for number in range(65):
-        allows = number not in (9, 19, 20, 21, 22)
-        assert (allowed(program, kill, own, number) == bpf.ALLOW) == allows
-        assert (allowed(program, tgkill, own, 5, number) == bpf.ALLOW) == allows
-        assert allowed(program, tgkill, 1, 1, number) & 0xFFFF == 1
-    assert allowed(program, prlimit, 0, 0, 0, 0x7F00DEADBEEF) == bpf.ALLOW
-    for new in (0x7F00DEADBEEF, 0x10000000000, 0x1000):
-        assert allowed(program, prlimit, 0, 0, new) & 0xFFFF == 1
-        assert allowed(program, prlimit, own, 0, new) & 0xFFFF == 1
-    for other in (160, 222, 200, 129, 297, 424, 101, 317):  # setrlimit, timer_create, tkill, … seccomp
-        assert allowed(program, other) & 0xFFFF == 1
-
-
-def test_the_filter_lets_nothing_of_a_shared_file_carry_a_message(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(seccomp.platform, "machine", lambda: "x86_64")
-    program = seccomp.policy_filter()
-    futex, madvise, fadvise, preadv2, flock, sysinfo = 202, 28, 221, 327, 73, 99
-    private, realtime = 128, 256
-    for command in (0, 1, 9, 10, 13):  # wait, wake, wait and wake by bits, wait for a PI lock and requeue
-        assert allowed(program, futex, 0, command | private) == bpf.ALLOW
-        assert allowed(program, futex, 0, command | private | realtime) == bpf.ALLOW
-    for wait in (0, 9, 9 | realtime):
-        assert allowed(program, futex, 0, wait) & 0xFFFF == 11  # look again: what a join of a thread does
-    for wake in (1, 3, 4, 5, 10, 13):
-        assert allowed(program, futex, 0, wake) & 0xFFFF == 22
-    assert allowed(program, madvise, 0, 0, 4) == bpf.ALLOW  # given back by an allocator
-    assert allowed(program, madvise, 0, 0, 21) & 0xFFFF == 22  # out of memory for everybody
-    assert allowed(program, fadvise) == bpf.ERRNO  # taken, and ignored
-    assert allowed(program, preadv2) & 0xFFFF == 38
-    for number in (flock, sysinfo):
-        assert allowed(program, number) & 0xFFFF == 1
-
-
-def test_the_filter_bars_what_is_counted_for_the_machine(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(seccomp.platform, "machine", lambda: "x86_64")
-    program = seccomp.policy_filter()
-    mmap, fsync, statx, statfs, pipe2, getxattr = 9, 74, 332, 137, 293, 191
-    shared, private, anonymous, huge = 0x01, 0x02, 0x20, 0x40000
-    for flags in (private, private | anonymous, shared, 0x03, private | anonymous | 0x20000):
-        assert allowed(program, mmap, 0, 4096, 3, flags) == bpf.ALLOW
-    for flags in (shared | anonymous, 0x03 | anonymous):
-        assert allowed(program, mmap, 0, 4096, 3, flags) & 0xFFFF == 1
-    assert allowed(program, mmap, 0, 1 << 21, 3, private | anonymous | huge) & 0xFFFF == 12
-    assert allowed(program, statx) & 0xFFFF == allowed(program, statfs) & 0xFFFF == 38
-    assert allowed(program, pipe2) & 0xFFFF == 11
-    assert allowed(program, getxattr) & 0xFFFF == 95
-    assert allowed(program, fsync) == bpf.ERRNO  # said to be done
-
-
-def test_where_the_machines_files_are_seen_none_is_changed_or_cut(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(seccomp.platform, "machine", lambda: "x86_64")
-    own, seen = seccomp.policy_filter(), seccomp.policy_filter(sees_the_machines_files=True)
-    truncate, chmod, utimensat, open_, openat, openat2 = 76, 90, 280, 2, 257, 437
-    for number in (truncate, chmod, utimensat, openat2):
-        assert allowed(own, number) == bpf.ALLOW
-    assert allowed(seen, truncate) & 0xFFFF == 1
-    assert allowed(seen, chmod) == allowed(seen, utimensat) == bpf.ERRNO
-    assert allowed(seen, openat2) & 0xFFFF == 38
-    reading, writing, cutting = 0, 1, 0o1000
-    for arguments in ((open_, 0), (openat, 0, 0)):
-        assert allowed(seen, *arguments, reading) == bpf.ALLOW
-        assert allowed(seen, *arguments, writing | cutting) == bpf.ALLOW  # where it may write at all
-        assert allowed(seen, *arguments, reading | cutting) & 0xFFFF == 1
+    program = seccomp.policy_filter(**options)
+    number = NUMBERS["x86_64"].get(call, call)
+    assert {allowed(program, number, *each) for each in arguments} == {verdict}
 
 
 def test_on_an_unknown_processor_there_is_no_filter_and_no_silence(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -5,12 +5,12 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from evopolicy_common.processes import proc
 from evopolicy_worker.episodes.policy_process import address_space
 from evopolicy_worker.slots.slot import _memory
 
@@ -19,15 +19,8 @@ from evopolicy_worker.slots.slot import _memory
 def test_memory_counts_children_whether_or_not_the_kernel_shows_what_is_shared(
     shown: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    read = Path.read_text
-
-    def refused(path: Path, *args: str) -> str:
-        if path.name == "smaps_rollup":
-            raise PermissionError(13, "Permission denied", str(path))
-        return read(path, *args)
-
     if not shown:
-        monkeypatch.setattr(Path, "read_text", refused)
+        monkeypatch.setattr(proc, "proportional_bytes", lambda pid: None)
     code = "held = bytearray(64 << 20); print(flush=True); input()"
     alone = _memory(os.getpid())
     with subprocess.Popen(
