@@ -8,7 +8,7 @@ import itertools
 import threading
 from collections.abc import Coroutine, Iterator
 from pathlib import Path
-from textwrap import dedent
+from textwrap import dedent, indent
 from typing import Any, TypeVar
 
 import msgspec
@@ -80,6 +80,17 @@ class Policy:
 def misbehaving(init: str = "pass", reset: str = "pass", act: str = "pass") -> str:
     """A policy with this code in its three places; in `act` at step 3 only."""
     return _MISBEHAVING.format(init=init, reset=reset, act=act)
+
+
+def acting(act: str = "return [0.0]", *, init: str = "pass", reset: str = "pass", before: str = "") -> str:
+    """A policy with these lines in its three methods, after the lines `before`."""
+    methods = (
+        ("__init__(self, *spaces)", init),
+        ("reset(self, episode_index)", reset),
+        ("act(self, obs)", act),
+    )
+    texts = (f"    def {head}:\n{indent(dedent(body).strip(), ' ' * 8)}\n" for head, body in methods)
+    return "\n".join((dedent(before), "class Policy:", *texts))
 
 
 class Slots:

@@ -26,7 +26,7 @@ import pytest
 import scipy.io
 from breakers import BREAKERS, PATIENT, Breaker
 from corpus import NO_SANDBOX, POLICIES, PROBE, PROBES, Probe, document
-from slots import HONEST, Slots, make_job, misbehaving, rows
+from slots import HONEST, Slots, acting, make_job, misbehaving, rows
 from undefended import harmed
 
 import evopolicy_worker
@@ -330,12 +330,8 @@ def test_a_policy_finds_nothing_in_memory_of_the_policies_before_it(slots: Slots
     assert words <= 3, shown
 
 
-USEFUL = """
-import ctypes, mmap, os, pathlib, queue, selectors, shutil, sys, tempfile, threading, time
-import numpy as np
-
-class Policy:
-    def __init__(self, *spaces):
+USEFUL = acting(
+    init="""
         with tempfile.NamedTemporaryFile() as file:
             file.write(b"x" * 100); file.flush(); os.fsync(file.fileno())
         np.save("table.npy", np.arange(1000.0))
@@ -353,13 +349,12 @@ class Policy:
         selector = selectors.DefaultSelector(); selector.register(os.eventfd(1), selectors.EVENT_READ)
         assert len(selector.select(1.0)) == 1
         time.sleep(0.001); sys.stdout.flush()
-
-    def reset(self, episode_index):
-        pass
-
-    def act(self, obs):
-        return [0.0]
-"""
+    """,
+    before="""
+        import ctypes, mmap, os, pathlib, queue, selectors, shutil, sys, tempfile, threading, time
+        import numpy as np
+    """,
+)
 
 
 @pytest.mark.parametrize("tier", ["bwrap", "landlock"])

@@ -9,7 +9,7 @@ from typing import Any
 
 import msgspec
 import pytest
-from slots import Slots, going_on, make_job, prefix, rows
+from slots import Slots, acting, going_on, make_job, prefix, rows
 from waiting import wait_until
 
 from evopolicy_common.catalogue import Entry
@@ -173,12 +173,7 @@ WRONG = {
     "custom space": "environment acme/Bad, observation_space: a space of type Opaque",
 }
 """A slot's error for an episode that an environment prevents."""
-POLICY = """
-class Policy:
-    def __init__(self, *spaces): pass
-    def reset(self, episode_index): pass
-    def act(self, obs): return [{action}]
-"""
+POLICY = acting("return [{action}]")
 PUSHES = POLICY.format(action=0.9)
 LUCKY = """
 import time

@@ -15,7 +15,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from slots import HONEST, QUICK, STUCK, Slots, going_on, make_job, prefix, rows
+from slots import HONEST, QUICK, STUCK, Slots, acting, going_on, make_job, prefix, rows
 
 from evopolicy_common.errors import SlotDiedError
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome, Job, PolicyFailure
@@ -25,21 +25,16 @@ from evopolicy_worker.slots.slot import Slot
 
 PATIENT = msgspec.structs.replace(QUICK, act_wall_s=30.0, episode_wall_s=60.0)
 
-CLOCKED = """
-import time
-
-class Policy:
-    def __init__(self, *spaces):
-        self.n = 0
-
-    def reset(self, episode_index):
-        self.n, self.e = 0, episode_index
-
-    def act(self, obs):
+CLOCKED = acting(
+    """
         self.n += 1
         AHEAD
         return [(time.time_ns() // 1000 % 1_000_000) / 1e6]
-"""
+    """,
+    init="self.n = 0",
+    reset="self.n, self.e = 0, episode_index",
+    before="import time",
+)
 SLOW = CLOCKED.replace("AHEAD", "time.sleep(0.03)")
 
 

@@ -6,7 +6,7 @@ import json
 import textwrap
 
 import pytest
-from slots import Slots, rows
+from slots import Slots, acting, rows
 
 NEWEST = """
     import json
@@ -34,13 +34,7 @@ NEWEST = """
     def make_policy(context: PolicyContext) -> Policy:
         return Controller(context)
 """
-EARLIER = """
-    import numpy as np
-    class Policy:
-        def __init__(self, *spaces): pass
-        def reset(self, episode_index): pass
-        def act(self, obs): return [float(obs[2]) - float(obs[0])]
-"""
+EARLIER = acting("return [float(obs[2]) - float(obs[0])]", before="import numpy as np")
 
 
 def test_a_policy_of_the_newest_form_plays_as_an_earlier_one(slots: Slots) -> None:

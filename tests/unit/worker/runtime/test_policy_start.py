@@ -13,47 +13,34 @@ from types import ModuleType
 
 import numpy as np
 import pytest
-from slots import HONEST, Slots
+from slots import HONEST, Slots, acting
 
 from evopolicy_worker.sandbox.jail import INSIDE
 
-SEES = """
-    import io, json, os, random, sys
-    import numpy as np
-
-    class Policy:
-        def __init__(self, *spaces):
-            streams = [[each.seekable(), each.line_buffering, each.encoding] for each in (sys.stdout, sys.stderr)]
-            first = next(iter(sys.path))
-            print(json.dumps([streams, first == os.getcwd(), os.environ["HOME"], os.environ["TMPDIR"],
-                "LD_BIND_NOW" in os.environ, "PWD" in os.environ, random.random(), np.random.rand(),
-                sorted(name for name in sys.modules if name.startswith("policy")),
-                [sum(each.__name__ == "Policy" for each in object.__subclasses__()),
-                    sorted(os.listdir(os.environ["HOME"])), os.listdir("."), os.listdir(os.environ["TMPDIR"])]]))
-
-        def reset(self, episode_index):
-            pass
-
-        def act(self, obs):
-            return [0.0]
-"""
+SEES = acting(
+    init="""
+        streams = [[each.seekable(), each.line_buffering, each.encoding] for each in (sys.stdout, sys.stderr)]
+        first = next(iter(sys.path))
+        print(json.dumps([streams, first == os.getcwd(), os.environ["HOME"], os.environ["TMPDIR"],
+            "LD_BIND_NOW" in os.environ, "PWD" in os.environ, random.random(), np.random.rand(),
+            sorted(name for name in sys.modules if name.startswith("policy")),
+            [sum(each.__name__ == "Policy" for each in object.__subclasses__()),
+                sorted(os.listdir(os.environ["HOME"])), os.listdir("."), os.listdir(os.environ["TMPDIR"])]]))
+    """,
+    before="import io, json, os, random, sys; import numpy as np",
+)
 
 
-LOOKS = """
-    import gc, sys
+LOOKS = acting(
+    init="""
+        print(HERE, id(self), id(object()), sys.getallocatedblocks(), sys.getrefcount("a constant of this file"))
+    """,
+    before="""
+        import gc, sys
 
-    HERE = [id(object()), id([]), id({}), sys.getrefcount(None), sys.getallocatedblocks(), len(gc.get_objects())]
-
-    class Policy:
-        def __init__(self, *spaces):
-            print(HERE, id(self), id(object()), sys.getallocatedblocks(), sys.getrefcount("a constant of this file"))
-
-        def reset(self, episode_index):
-            pass
-
-        def act(self, obs):
-            return [0.0]
-"""
+        HERE = [id(object()), id([]), id({}), sys.getrefcount(None), sys.getallocatedblocks(), len(gc.get_objects())]
+    """,
+)
 
 
 @pytest.fixture(scope="module")

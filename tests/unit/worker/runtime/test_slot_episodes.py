@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from slots import HONEST, Slots, make_job, misbehaving, rows
+from slots import HONEST, Slots, acting, make_job, misbehaving, rows
 
 from evopolicy_common.messages.environment import Case
 from evopolicy_common.processes.proc import descendants
@@ -43,20 +43,12 @@ def test_an_honest_policy_plays_the_whole_episode(slots: Slots, tier: str) -> No
 
 
 def test_the_same_episode_gives_the_same_bytes_in_every_slot(slots: Slots) -> None:
-    policy = """
-        import random
-        import numpy as np
-
-        class Policy:
-            def __init__(self, *spaces):
-                self.generator = np.random.default_rng()
-
-            def reset(self, episode_index):
-                print(episode_index, hash("text"))
-
-            def act(self, obs):
-                return [random.uniform(-1, 1) * np.random.rand() * self.generator.random()]
-    """
+    policy = acting(
+        "return [random.uniform(-1, 1) * np.random.rand() * self.generator.random()]",
+        init="self.generator = np.random.default_rng()",
+        reset='print(episode_index, hash("text"))',
+        before="import random; import numpy as np",
+    )
     first = slots.play(policy)
     again = slots.play(policy)
     other = slots.play(policy, tier="landlock")
@@ -82,19 +74,15 @@ def test_a_prepared_slot_has_its_simulators_before_the_first_job(slots: Slots) -
 
 
 def test_unseeded_numpy_generators_of_all_kinds_are_seeded(slots: Slots) -> None:
-    policy = """
-        import random
-        import numpy as np
-
-        class Policy:
-            def __init__(self, *spaces): pass
-            def reset(self, episode_index): pass
-            def act(self, obs):
-                r = np.random
-                return [r.default_rng().random(), r.default_rng().random(), r.RandomState().rand(),
-                        r.Generator(r.PCG64()).random(), float(r.SeedSequence().generate_state(1)[0]),
-                        random.random(), r.rand()]
-    """
+    policy = acting(
+        """
+            r = np.random
+            return [r.default_rng().random(), r.default_rng().random(), r.RandomState().rand(),
+                    r.Generator(r.PCG64()).random(), float(r.SeedSequence().generate_state(1)[0]),
+                    random.random(), r.rand()]
+        """,
+        before="import random; import numpy as np",
+    )
     one, two = (rows(slots.play(policy))[0].action for _ in range(2))
     assert one == two
     assert len(set(one)) == 7
@@ -161,13 +149,7 @@ def test_dicts_texts_and_ints_arrive_as_the_space_says(slots: Slots) -> None:
 
 @pytest.mark.parametrize("env", ["toy/line", "toy/maze"])
 def test_observations_can_be_asked_for_as_lists(slots: Slots, env: str) -> None:
-    policy = """
-        class Policy:
-            def __init__(self, *spaces): pass
-            def reset(self, episode_index): pass
-            def act(self, obs):
-                return {"obs": obs}
-    """
+    policy = acting('return {"obs": obs}')
     row = rows(slots.play(policy, env=env, observations="lists"))[0]
     assert row.action["obs"] == row.obs
     assert type(row.obs) in (list, dict)
@@ -287,20 +269,15 @@ def test_with_scope_submit_a_raising_policy_stays_and_a_dead_is_rebuilt(slots: S
 def test_modules_and_data_of_the_bundle_are_there_and_writable(slots: Slots) -> None:
     files: dict[str, str | bytes] = {
         "policy.py": (
-            """
-            from pathlib import Path
-            from helpers.gains import GAIN
-            import player
-
-            class Policy:
-                def __init__(self, *spaces):
+            acting(
+                init="""
                     data = Path("data/weights.bin").read_bytes()
                     Path("data/weights.bin").write_bytes(data + b"!")
                     Path("/tmp/note").write_text("mine")
                     print(GAIN, player.NAME, Path("data/weights.bin").read_bytes(), Path("/tmp/note").read_text())
-                def reset(self, episode_index): pass
-                def act(self, obs): return [0.0]
-        """
+                """,
+                before="from pathlib import Path; from helpers.gains import GAIN; import player",
+            )
         ),
         "helpers/__init__.py": "",
         "helpers/gains.py": "GAIN = 3",
@@ -338,42 +315,31 @@ def test_threads_and_numpy_work_in_the_sandbox(slots: Slots) -> None:
 
 def test_the_c_librarys_threads_can_be_joined(slots: Slots) -> None:
     # Their join waits on a word that is not private to the process, which the filter answers with "look again".
-    policy = """
-        import ctypes
-
-        class Policy:
-            def __init__(self, *spaces):
-                libc, thread = ctypes.CDLL(None), ctypes.c_ulong()
-                work = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)(lambda _: libc.usleep(20000))
-                libc.pthread_create(ctypes.byref(thread), None, work, None)
-                print(libc.pthread_join(thread, None))
-
-            def reset(self, episode_index): pass
-            def act(self, obs): return [0.0]
-    """
+    policy = acting(
+        init="""
+            libc, thread = ctypes.CDLL(None), ctypes.c_ulong()
+            work = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)(lambda _: libc.usleep(20000))
+            libc.pthread_create(ctypes.byref(thread), None, work, None)
+            print(libc.pthread_join(thread, None))
+        """,
+        before="import ctypes",
+    )
     outcome = slots.play(policy)
     assert (outcome.failure, outcome.stdout) == (None, b"0\n")
 
 
-LOOKING_UP = """
-    import sys
-
-    class Policy:
-        def __init__(self, *spaces):
-            frame = sys._getframe(1)
-            while frame is not None:
-                for name, value in sorted(frame.f_locals.items()):
-                    plain = isinstance(value, (int, float, str, bytes, list, tuple, dict, type(None)))
-                    if not name.startswith("__"):
-                        print(frame.f_code.co_name, name, value if plain else type(value).__name__)
-                frame = frame.f_back
-
-        def reset(self, episode_index):
-            pass
-
-        def act(self, obs):
-            return [0.0]
-"""
+LOOKING_UP = acting(
+    init="""
+        frame = sys._getframe(1)
+        while frame is not None:
+            for name, value in sorted(frame.f_locals.items()):
+                plain = isinstance(value, (int, float, str, bytes, list, tuple, dict, type(None)))
+                if not name.startswith("__"):
+                    print(frame.f_code.co_name, name, value if plain else type(value).__name__)
+            frame = frame.f_back
+    """,
+    before="import sys",
+)
 
 
 def test_what_stands_above_a_policy_tells_nothing_of_those_before(slots: Slots) -> None:

@@ -8,7 +8,7 @@ import signal
 
 import msgspec
 import pytest
-from slots import HONEST, QUICK, Slots, begun, family, pid_of, rows
+from slots import HONEST, QUICK, Slots, acting, begun, family, pid_of, rows
 from stateful_policy import PATIENT, in_its_pause
 
 from evopolicy_common.messages.episode import EpisodeOutcome
@@ -67,41 +67,8 @@ SELF_MADE = {
     "no address for its thread": "libc.syscall(334, 1, 32, 0, 0); run(b'\\x48\\x31\\xe4\\x50\\xc3')",
 }
 
-CLOCKED = """
-import ctypes, os, resource, signal, struct, sys, threading, time
-
-libc = ctypes.CDLL(None, use_errno=True)
-libc.mmap.restype = ctypes.c_void_p
-libc.mmap.argtypes = [ctypes.c_void_p, ctypes.c_size_t] + [ctypes.c_int] * 3 + [ctypes.c_long]
-
-def every(send):
-    for number in [9, 19, 20, 21, 22, *range(1, 65)]:
-        try:
-            send(number)
-        except (OSError, ValueError):
-            pass
-    time.sleep(0.05)
-
-def timer(number):
-    which = ctypes.c_int()
-    event = struct.pack("<qii48x", 0, number, 0)
-    if libc.syscall(222, 1, event, ctypes.byref(which)):
-        raise OSError(ctypes.get_errno(), "timer_create")
-    libc.syscall(223, which.value, 0, struct.pack("<qqqq", 0, 0, 0, 10_000_000), None)
-
-def run(code):
-    at = libc.mmap(None, 4096, 7, 0x22, -1, 0)
-    ctypes.memmove(at, code, len(code))
-    ctypes.CFUNCTYPE(None)(at)()
-
-class Policy:
-    def __init__(self, *spaces):
-        self.n = 0
-
-    def reset(self, episode_index):
-        pass
-
-    def act(self, obs):
+CLOCKED = acting(
+    """
         self.n += 1
         if self.n == 1:
             # Its luck.
@@ -109,7 +76,36 @@ class Policy:
         if self.n == AT:
             WAY
         return [0.0]
-"""
+    """,
+    init="self.n = 0",
+    before="""
+        import ctypes, os, resource, signal, struct, sys, threading, time
+
+        libc = ctypes.CDLL(None, use_errno=True)
+        libc.mmap.restype = ctypes.c_void_p
+        libc.mmap.argtypes = [ctypes.c_void_p, ctypes.c_size_t] + [ctypes.c_int] * 3 + [ctypes.c_long]
+
+        def every(send):
+            for number in [9, 19, 20, 21, 22, *range(1, 65)]:
+                try:
+                    send(number)
+                except (OSError, ValueError):
+                    pass
+            time.sleep(0.05)
+
+        def timer(number):
+            which = ctypes.c_int()
+            event = struct.pack("<qii48x", 0, number, 0)
+            if libc.syscall(222, 1, event, ctypes.byref(which)):
+                raise OSError(ctypes.get_errno(), "timer_create")
+            libc.syscall(223, which.value, 0, struct.pack("<qqqq", 0, 0, 0, 10_000_000), None)
+
+        def run(code):
+            at = libc.mmap(None, 4096, 7, 0x22, -1, 0)
+            ctypes.memmove(at, code, len(code))
+            ctypes.CFUNCTYPE(None)(at)()
+    """,
+)
 
 
 @pytest.mark.parametrize("tier", ["bwrap", "landlock"])

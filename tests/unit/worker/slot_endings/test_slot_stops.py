@@ -12,7 +12,7 @@ import sys
 import msgspec
 import pytest
 from machines.cgroups import limited, starved
-from slots import HONEST, QUICK, Slots, begun, family, misbehaving, pid_of
+from slots import HONEST, QUICK, Slots, acting, begun, family, misbehaving, pid_of
 from stateful_policy import PATIENT, essence, in_its_pause, place_of_env, stateful
 
 from evopolicy_common.errors import SlotDiedError
@@ -88,17 +88,8 @@ def test_where_a_policy_may_stop_itself_the_time_counts(slots: Slots) -> None:
     assert failure.category == "act_timeout"
 
 
-COMPUTES = """
-import time, threading
-
-class Policy:
-    def __init__(self, *spaces):
-        self.n = 0
-
-    def reset(self, episode_index):
-        pass
-
-    def act(self, obs):
+COMPUTES = acting(
+    """
         self.n += 1
         if self.n == 4:
             time.sleep(PAUSE)
@@ -107,7 +98,10 @@ class Policy:
             while time.thread_time() < end:
                 pass
         return [0.0]
-"""
+    """,
+    init="self.n = 0",
+    before="import time, threading",
+)
 
 
 def test_no_wall_limit_counts_time_without_a_processor(
