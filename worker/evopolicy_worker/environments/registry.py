@@ -147,12 +147,7 @@ def remembers(env_id: str) -> bool:
 
 def offered() -> list[str]:
     """Suite ids of shipped environments that this installation can play, in catalogue order. Imports no simulator."""
-    return [entry.id for entry in catalogue.entries().values() if offers(entry.id)]
-
-
-def offers(env_id: str) -> bool:
-    """Whether this installation has the packages that an environment needs."""
-    return not missing(env_id)
+    return [entry.id for entry in catalogue.entries().values() if not missing(entry.id)]
 
 
 def missing(env_id: str) -> str:

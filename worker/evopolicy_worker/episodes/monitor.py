@@ -53,24 +53,20 @@ class Output:
     def __init__(self, limit: int) -> None:
         self._limit = limit
         self._kept = bytearray()
-        self._open = True
+        self.open = True
+        """False once the policy has closed the stream."""
 
     def drain(self, fd: int) -> None:
         """Reads available output without waiting."""
         for _ in range(64):
-            if not self._open:
+            if not self.open:
                 return
             try:
                 data = os.read(fd, _PIECE)
             except BlockingIOError:
                 return
-            self._open = bool(data)
+            self.open = bool(data)
             self._kept += data[: self._limit - len(self._kept)]
-
-    @property
-    def open(self) -> bool:
-        """False once the policy has closed the stream."""
-        return self._open
 
     def take(self) -> bytes:
         """Returns the stored output and clears it."""

@@ -34,7 +34,7 @@ MAX_S = 1800.0
 """Maximum time for one video; below the hour of grace that a lease has beyond its episode's limits."""
 MAX_FAILURES = 3
 """Number of consecutive failures after which this slot makes no more videos of an environment."""
-_LOOK_S = 0.1
+_POLL_S = 0.1
 _PIECE = 1 << 20
 
 
@@ -110,7 +110,7 @@ class VideoRecorder:
                 return None
             if time.monotonic() > deadline:
                 raise WorkerError("it took too long")
-            readable, writable, _ = select.select([replies], [orders] if unsent else [], [], _LOOK_S)
+            readable, writable, _ = select.select([replies], [orders] if unsent else [], [], _POLL_S)
             if writable:
                 unsent = unsent[os.write(orders, unsent[:_PIECE]) :]
             if readable:

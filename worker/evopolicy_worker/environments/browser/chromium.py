@@ -51,7 +51,7 @@ START_S = 60.0
 REMEDY = "name the program of a Chromium that works with --browser PATH"
 _END_S = 10.0
 """How long its killed processes may take to end before the profile is removed all the same, seconds."""
-_LOOK_S = 0.005
+_POLL_S = 0.005
 _FOLDER = 5
 """The browser's descriptor of its profile."""
 
@@ -215,7 +215,7 @@ class Chromium:
                     os.kill(pid, signal.SIGKILL)
             with contextlib.suppress(ChildProcessError):
                 os.waitpid(self.pid, os.WNOHANG)
-            time.sleep(_LOOK_S)
+            time.sleep(_POLL_S)
         self.devtools.close()
         with contextlib.suppress(ChildProcessError):
             os.waitpid(self.pid, 0)

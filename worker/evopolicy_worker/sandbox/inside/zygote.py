@@ -155,21 +155,11 @@ def warm(modules: list[str]) -> None:
     player = module("player")
     player.programs = module("programs")
     np = player.np
-    for name in ("numpy.random", "numpy.linalg", "numpy.fft", *modules):
+    standard = ("math", "collections", "dataclasses", "typing", "heapq", "itertools", "functools", "pathlib")
+    for name in ("numpy.random", "numpy.linalg", "numpy.fft", *modules, *standard):
         importlib.import_module(name)
     np.random.default_rng(0).standard_normal(2)
     np.dot(np.eye(3), np.ones(3))
-    for name in (
-        "math",
-        "collections",
-        "dataclasses",
-        "typing",
-        "heapq",
-        "itertools",
-        "functools",
-        "pathlib",
-    ):
-        importlib.import_module(name)
     # The filter refuses `epoll`, whose watches are kernel memory that no limit counts.
     vars(selectors)["DefaultSelector"] = selectors.PollSelector
     traceback.format_exception(ValueError("warm"))
