@@ -344,7 +344,7 @@ def test_a_browser_whose_memory_has_grown_is_replaced(
     limits = Path(f"/proc/{first}/limits").read_text().splitlines()
     (data,) = [line.split()[3] for line in limits if line.startswith("Max data size")]
     assert int(data) <= 4 << 30
-    monkeypatch.setattr(page_module, "_LOOK_EVERY", 1)
+    monkeypatch.setattr(page_module, "_CHECK_EVERY", 1)
     browser.keep_small()
     assert browser.browser.pid == first
     monkeypatch.setattr(page_module, "MAX_MB", 1)
