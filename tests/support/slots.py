@@ -208,6 +208,11 @@ def rows(outcome: EpisodeOutcome) -> list[Row]:
     return list(decode(outcome.trajectory.inline).rows())
 
 
+def category_of(outcome: EpisodeOutcome) -> str | None:
+    """The category of the policy's failure; None without one."""
+    return None if outcome.failure is None else outcome.failure.category
+
+
 def going_on(job: Job, slot: Slot) -> Job:
     """The job as it is leased the next time."""
     back = slot.begun

@@ -26,7 +26,7 @@ import pytest
 import scipy.io
 from breakers import BREAKERS, PATIENT, Breaker
 from corpus import NO_SANDBOX, POLICIES, PROBE, PROBES, Probe, document
-from slots import HONEST, Slots, acting, make_job, misbehaving, rows
+from slots import HONEST, Slots, acting, category_of, make_job, misbehaving, rows
 from undefended import harmed
 
 import evopolicy_worker
@@ -172,7 +172,7 @@ def test_without_its_defence_each_attack_succeeds(
 @pytest.mark.parametrize(("attack", "packages"), with_packages(BREAKERS))
 def test_a_breaker_gets_its_verdict(slots: Slots, attack: Breaker, packages: tuple[str, ...]) -> None:
     outcome = slots.play(attack.source, limits=attack.limits, packages=packages)
-    assert (outcome.failure.category if outcome.failure else None) == attack.verdict, outcome.failure
+    assert category_of(outcome) == attack.verdict, outcome.failure
     assert outcome.length == 60
     assert len(outcome.stdout) <= 65536
     if outcome.failure is not None and attack.off is not None:

@@ -6,7 +6,7 @@ import json
 import textwrap
 
 import pytest
-from slots import Slots, acting, rows
+from slots import Slots, acting, category_of, rows
 
 NEWEST = """
     import json
@@ -102,8 +102,7 @@ def test_an_action_that_the_published_software_refuses_is_a_failure(
 
 def test_a_fault_in_make_policy_is_an_init_error(slots: Slots) -> None:
     failed = slots.play("def make_policy(context):\n    return context.nothing\n", first=0)
-    assert failed.failure is not None
-    assert failed.failure.category == "init_error"
+    assert category_of(failed) == "init_error"
     without = slots.play("def make_policy(context):\n    return object()\n", first=0)
     assert without.failure is not None
     assert (without.failure.category, "act" in without.failure.message) == ("init_error", True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import msgspec
 import pytest
-from slots import HONEST, QUICK, Slots, misbehaving, rows
+from slots import HONEST, QUICK, Slots, category_of, misbehaving, rows
 
 from evopolicy_common.messages.episode import EpisodeOutcome, ResourceLimits
 from evopolicy_worker import environments
@@ -27,58 +27,45 @@ def played_on_with_random_actions(outcome: EpisodeOutcome, step: int) -> bool:
     )
 
 
+FAILS = {
+    "act_error": {
+        "raise ValueError('of no use')": "ValueError: of no use",
+        "sys.exit(0)": "SystemExit",
+        "raise KeyboardInterrupt": "KeyboardInterrupt",
+        "self.act(obs) if False else (lambda f: f(f))(lambda f: f(f))": "recursion",
+        "return [None] * 2000": "2,001 values; 1,025 are the limit",
+        "return np.zeros(5000)": "40,000 bytes; 16,400 are the limit",
+        "raise ValueError('\\ud800')": "ValueError: \\ud800",
+        "raise type('E', (OSError,), {'errno': property(lambda s: 1 / 0)})": "cannot be shown",
+    },
+    "killed": {
+        "os._exit(7)": "exited with status 7",
+        "import ctypes; ctypes.string_at(0)": "SIGSEGV",
+        "os.abort()": "SIG",
+    },
+    "oom": {"bytearray(1 << 30)": "268,435,456 bytes", "np.ones(1 << 28)": "268,435,456 bytes"},
+    "file_limit": {
+        "open('/tmp/big', 'wb').write(bytes(8 << 20))": "4,194,304 bytes",
+        "[open(f'/tmp/{k}', 'wb').write(bytes(1 << 20)) for k in range(8)]": "No space left",
+        "self.f = [open('/dev/null') for _ in range(999)]": "256 open descriptors",
+    },
+    "process_limit": {
+        "[threading.Thread(target=time.sleep, args=(9,)).start() for _ in range(99)]": "8 threads",
+        "os.fork()": "may be started",
+        "import subprocess; subprocess.run(['/bin/true'])": "no process",
+    },
+}
+"""What a failure in `act` says, by its category."""
+
+
 @pytest.mark.parametrize(
     ("source", "category", "step", "words"),
     [
         (misbehaving(reset="raise KeyError('left')"), "reset_error", None, "KeyError: 'left'"),
-        (misbehaving(act="raise ValueError('of no use')"), "act_error", 3, "ValueError: of no use"),
-        (misbehaving(act="sys.exit(0)"), "act_error", 3, "SystemExit"),
-        (misbehaving(act="raise KeyboardInterrupt"), "act_error", 3, "KeyboardInterrupt"),
-        (
-            misbehaving(act="self.act(obs) if False else (lambda f: f(f))(lambda f: f(f))"),
-            "act_error",
-            3,
-            "recursion",
-        ),
-        (misbehaving(act="os._exit(7)"), "killed", 3, "exited with status 7"),
-        (misbehaving(act="import ctypes; ctypes.string_at(0)"), "killed", 3, "SIGSEGV"),
-        (misbehaving(act="os.abort()"), "killed", 3, "SIG"),
-        (misbehaving(act="bytearray(1 << 30)"), "oom", 3, "268,435,456 bytes"),
-        (misbehaving(act="np.ones(1 << 28)"), "oom", 3, "268,435,456 bytes"),
-        (misbehaving(act="open('/tmp/big', 'wb').write(bytes(8 << 20))"), "file_limit", 3, "4,194,304 bytes"),
-        (
-            misbehaving(act="[open(f'/tmp/{k}', 'wb').write(bytes(1 << 20)) for k in range(8)]"),
-            "file_limit",
-            3,
-            "No space left",
-        ),
-        (
-            misbehaving(act="self.f = [open('/dev/null') for _ in range(999)]"),
-            "file_limit",
-            3,
-            "256 open descriptors",
-        ),
-        (
-            misbehaving(act="[threading.Thread(target=time.sleep, args=(9,)).start() for _ in range(99)]"),
-            "process_limit",
-            3,
-            "8 threads",
-        ),
-        (misbehaving(act="os.fork()"), "process_limit", 3, "may be started"),
-        (misbehaving(act="return [None] * 2000"), "act_error", 3, "2,001 values; 1,025 are the limit"),
-        (misbehaving(act="return np.zeros(5000)"), "act_error", 3, "40,000 bytes; 16,400 are the limit"),
-        (misbehaving(act="raise ValueError('\\ud800')"), "act_error", 3, "ValueError: \\ud800"),
-        (
-            misbehaving(act="raise type('E', (OSError,), {'errno': property(lambda s: 1 / 0)})"),
-            "act_error",
-            3,
-            "cannot be shown",
-        ),
-        (
-            misbehaving(act="import subprocess; subprocess.run(['/bin/true'])"),
-            "process_limit",
-            3,
-            "no process",
+        *(
+            (misbehaving(act=act), category, 3, words)
+            for category, acts in FAILS.items()
+            for act, words in acts.items()
         ),
     ],
 )
@@ -152,8 +139,7 @@ def test_a_bundle_without_a_policy_is_reported_at_index_0(
 
 def test_a_bundle_without_a_policy_is_a_later_episodes_own_failure(slots: Slots) -> None:
     for later in (slots.play("1 / 0", first=2), slots.play("1 / 0", first=0, record="actions")):
-        assert later.failure is not None
-        assert later.failure.category == "import_error"
+        assert category_of(later) == "import_error"
         assert later.length == 60
     assert played_on_with_random_actions(slots.play("1 / 0", first=2), 0)
 

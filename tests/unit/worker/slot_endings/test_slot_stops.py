@@ -12,7 +12,7 @@ import sys
 import msgspec
 import pytest
 from machines.cgroups import limited, starved
-from slots import HONEST, QUICK, Slots, acting, begun, family, misbehaving, pid_of
+from slots import HONEST, QUICK, Slots, acting, begun, category_of, family, misbehaving, pid_of
 from stateful_policy import PATIENT, essence, in_its_pause, place_of_env, stateful
 
 from evopolicy_common.errors import SlotDiedError
@@ -166,7 +166,7 @@ def test_a_policy_killed_for_its_own_memory_has_failed(
     slot._stderr.clear()
     with limited(limit) as group:
         (outcome,) = slots.run(work())
-    assert (outcome.failure.category if outcome.failure else None) == category
+    assert category_of(outcome) == category
     if outcome.failure is not None:
         assert outcome.failure.limit == PATIENT.memory_bytes
     else:
