@@ -518,7 +518,7 @@ class Supervisor:
                 task.cancel()
 
     async def _withdraw_poll(self, lease: asyncio.Task[None]) -> None:
-        """Withdraws the waiting poll, which could otherwise be answered with leases that nothing here would receive."""
+        """Withdraws the waiting poll, whose answer could bring leases that this worker would lose."""
         request = LeaseRequest(worker=self._options.name, session=self._session, n=0, wait_s=0.0)
         with contextlib.suppress(EvopolicyError):
             await self._ask.once("lease", request, Leases)

@@ -458,15 +458,15 @@ def _recorded_actions(spec: EpisodeSpec) -> list[Returned] | None:
 
 
 def _verdict_of_submit(job: Job, spec: EpisodeSpec, failure: PolicyFailure) -> bool:
-    """Whether the failure says that the whole submit yields no Policy: there is nothing to play then.
+    """Whether the failure means that the submit yields no Policy, so that no episode is played.
 
-    Hidden episodes are played in any case: a return of nothing would beat every policy where steps cost.
+    Hidden episodes are played in any case: a return of 0 would beat every policy where steps cost.
     """
     return spec.index == 0 and job.record == "full" and failure.category in NO_POLICY
 
 
 def _share(job: Job) -> int:
-    """Bytes that one episode of the job may say."""
+    """Limit of one episode's stored output, bytes."""
     return max(1024, MAX_JOB_OUTPUT_BYTES // len(job.episodes))
 
 
@@ -477,7 +477,7 @@ def _within_share(job: Job) -> ResourceLimits:
 
 
 def _brief(outcome: EpisodeOutcome, share: int) -> EpisodeOutcome:
-    """The outcome with no more of a traceback than its share; of that the end tells most."""
+    """The outcome with the end of its traceback, within its share of the job's output."""
     failure = outcome.failure
     if failure is None or 4 * len(failure.traceback) <= share // 3:
         return outcome

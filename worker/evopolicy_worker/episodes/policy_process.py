@@ -38,13 +38,13 @@ _GRACE_S = 1.0
 _SEAL_S = 60.0
 """Time limit for our own work before the bundle is imported."""
 _EXIT_S = 5.0
-"""For a process that is ending to be gone."""
+"""Longest wait for a process that is ending."""
 _LARGE_SHARE = 0.125
 """Share of its memory limit above which a policy that ended silently, while the system ran out of memory, counts as
 ended for its own memory use."""
 _ROUND_BYTES = 1 << 20
 _SHIM_BROKEN = 70
-"""The status with which `inside/zygote.py` ends a process that it should never come back from."""
+"""Exit status of a policy's process in which `inside/zygote.py` goes on after the policy."""
 _ARRAY_HEAD_BYTES = 8 + 4 * 64
 """Before an array's own bytes: its type and its shape, which numpy lets have 64 axes."""
 _USUAL_ACTION_BYTES = 256
@@ -108,7 +108,7 @@ class BundleFiles(NamedTuple):
 
 
 class Ended(NamedTuple):
-    """The remains of a policy after its end."""
+    """What a policy leaves at its end: output, and processor time in seconds."""
 
     stdout: bytes
     stderr: bytes
@@ -164,7 +164,7 @@ class PolicyProcess:
         try:
             return self._request(player.COMPILE, "init", self._limits.init_wall_s)
         except PolicyFailedError:
-            # As the process that plays will find again, and report.
+            # The process that plays finds and reports it again.
             return b""
 
     def load(self, code: bytes) -> None:
@@ -397,7 +397,7 @@ class PolicyProcess:
         return self._failed(category, message, report.traceback, limit, used)
 
     def _broken(self, how: str, limit: float | None = None, used: float | None = None) -> PolicyFailedError:
-        """It did what no honest policy process does on its pipes."""
+        """The failure of a process that broke the rules of its pipes, which is ended."""
         self._bury()
         text = f"the policy's process was ended: {how}"
         return self._failed(self._fatal("killed"), text, limit=limit, used=used)

@@ -91,7 +91,7 @@ class DevTools:
             self._receive(deadline)
 
     def close(self) -> None:
-        """Closes both ends, on which the browser ends."""
+        """Closes both ends; the browser then ends."""
         for descriptor in (self._commands, self._replies):
             os.close(descriptor)
 

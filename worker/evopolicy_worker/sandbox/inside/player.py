@@ -74,7 +74,7 @@ def play(init: dict[str, Any]) -> NoReturn:
     action_bytes, home = init["action_bytes"], init["home"]
     reset_floats()
     seed_generators(bytes.fromhex(init["seed"]))
-    # From here on what this process says may be the policy's.
+    # The policy may have forged every later reply.
     reply(OK, b"")
     header = bytearray(REQUEST_HEADER.size)
     read_exactly(header)
@@ -111,8 +111,8 @@ def play(init: dict[str, Any]) -> NoReturn:
 
 
 def compiled(path: str) -> bytes:
-    """The file's code for other processes, in which it is the same as if they had compiled it; nothing where they are
-    to compile it themselves, because that fails or warns. Runs none of it."""
+    """The file's code, for other processes; empty where compiling it fails or warns, which each of them then finds and
+    reports itself. Runs none of it."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")
@@ -146,7 +146,7 @@ def source_of(path: str) -> bytes:
 
 
 def live_in(folder: str) -> None:
-    """Home, temporary files and modules are in this folder, which need not be there yet."""
+    """Sets home, temporary folder and module search path to this folder, which need not exist yet."""
     os.environ.pop("PWD", None)
     os.environ["HOME"] = folder
     os.environ["TMPDIR"] = folder + "/tmp"
@@ -161,7 +161,7 @@ def live_in(folder: str) -> None:
 
 
 def rehearse() -> None:
-    """Does, before there is a policy, what every policy's process will do.
+    """Does once, before any policy exists, what every policy's process does.
 
     The interpreter adapts its code and fills its tables while it runs. It writes to memory that processes share until
     then, and each policy's process would have its own copies made.
@@ -408,7 +408,7 @@ def read_text(body: Any, at: Any) -> str:
 class TooLargeError(ValueError):
     """An action of more bytes than it may have: how many, as far as they were counted."""
 
-    # As the agent is to read it: without the name of a module that is none of its own.
+    # A traceback, which the agent reads, then shows no module of ours.
     __module__ = "builtins"
 
     def __init__(self, message: str, used: int) -> None:

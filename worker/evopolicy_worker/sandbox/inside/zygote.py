@@ -76,7 +76,7 @@ def main() -> None:
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     control = socket.socket(fileno=int(sys.argv[1]))
     config = json.loads(control.recv(1 << 18))
-    # It has done what it was for, with this program and its libraries.
+    # It was for this program and its libraries, which are loaded by now.
     os.environ.pop("LD_BIND_NOW", None)
     try:
         if config["become_nobody"]:
@@ -413,7 +413,7 @@ def write_bundle(init: dict[str, Any], data: memoryview) -> None:
 
 
 def seal(config: dict[str, Any], init: dict[str, Any]) -> None:
-    """From here on this process can do less than any other; nothing of it can be undone."""
+    """Gives up rights of this process, for good."""
     if config["limits"]:
         for name, value in init["limits"].items():
             kind = getattr(resource, name)
