@@ -83,6 +83,11 @@ def number(value: float | None) -> str:
     return "–" if value is None else f"{value:.4g}"
 
 
+def counted(n: int, what: str) -> str:
+    """A number of things: `1 run`, `2,000 runs`."""
+    return f"{n:,} {what}{'s' * (n != 1)}"
+
+
 def duration(seconds: float | None) -> str:
     """How long something takes, such as `5 min`; a dash for None."""
     if seconds is None:

@@ -119,48 +119,40 @@ class _Loaded(msgspec.Struct, frozen=True):
 
 @cache
 def _load() -> _Loaded:
-    shipped = msgspec.convert(
-        _table(files(__package__).joinpath("catalogue.toml").read_text("utf-8")), _Shipped
-    )
+    here = files(__package__)
+    shipped = msgspec.convert(tomllib.loads((here / "catalogue.toml").read_text("utf-8")), _Shipped)
     found = {entry.id: entry for entry in shipped.environment}
     grouped = {suite.name: suite for suite in shipped.suite}
     titles = dict(shipped.families)
-    folder = files(__package__).joinpath("families")
-    names = sorted(item.name for item in folder.iterdir()) if folder.is_dir() else []
-    for name in names:
-        if name.endswith(".toml"):
-            family = msgspec.convert(_table(folder.joinpath(name).read_text("utf-8")), _Family)
-            rows = {entry.id: entry for entry in family.entries()}
-            titles.setdefault(family.family, family.title)
-            grouped[family.family] = Suite(name=family.family, title=family.title, environments=tuple(rows))
-            grouped |= {suite.name: suite for suite in family.suite}
-            found = {**found, **{env_id: row for env_id, row in rows.items() if env_id not in found}}
+    places = [item for item in (here / "families").iterdir() if item.name.endswith(".toml")]
+    for place in sorted(places, key=lambda item: item.name):
+        family = msgspec.convert(tomllib.loads(place.read_text("utf-8")), _Family)
+        rows = {entry.id: entry for entry in family.entries()}
+        titles.setdefault(family.family, family.title)
+        grouped[family.family] = Suite(name=family.family, title=family.title, environments=tuple(rows))
+        grouped |= {suite.name: suite for suite in family.suite}
+        found |= {env_id: row for env_id, row in rows.items() if env_id not in found}
     for name, suite in grouped.items():
         parts = [grouped[each].environments if each in grouped else (each,) for each in suite.environments]
-        grouped[name] = msgspec.structs.replace(
-            suite, environments=tuple(itertools.chain.from_iterable(parts))
-        )
+        members = tuple(itertools.chain.from_iterable(parts))
+        grouped[name] = msgspec.structs.replace(suite, environments=members)
     core16 = grouped["core16"]
+    played: dict[str, tuple[str, ...]] = {each: (each, *worlds.ids(each)) for each in core16.environments}
     with_worlds: dict[str, Entry] = {}
     for env_id, row in found.items():
         with_worlds[env_id] = row
-        for n, world in enumerate(worlds.ids(env_id) if env_id in core16.environments else (), 1):
+        for n, world in enumerate(played.get(env_id, ())[1:], 1):
             with_worlds[world] = msgspec.structs.replace(
                 row, id=world, title=f"{row.label}, world {n}", published_steps=None, demand=None, world=n
             )
     found = with_worlds
+    all_played = tuple(itertools.chain.from_iterable(played.values()))
+    title = "Core16 and its worlds"
     grouped["core16-worlds"] = msgspec.structs.replace(
-        core16,
-        name="core16-worlds",
-        title="Core16 and its worlds",
-        environments=tuple(each for env_id in core16.environments for each in (env_id, *worlds.ids(env_id))),
+        core16, name="core16-worlds", title=title, environments=all_played
     )
     prefixes = frozenset(env_id.partition("/")[0] for env_id in found)
     return _Loaded(found, grouped, titles, prefixes)
-
-
-def _table(text: str) -> dict[str, Any]:
-    return tomllib.loads(text)
 
 
 @cache
@@ -251,34 +243,29 @@ def source_of(env_id: str) -> str:
 
 def known(env_id: str) -> Entry | None:
     """The entry of an environment, without asking a worker; None if it is unknown here."""
-    entry = _load().entries.get(env_id)
-    if entry is None and env_id in _added:
-        entry = _added[env_id][0]
-    if entry is None and is_foreign(env_id):
-        if ":" in env_id and "/" not in env_id:
-            return Entry(id=env_id, gymnasium_id=env_id)
-        entry = plugins().get(env_id, (None, ""))[0]
-    return entry
+    if env_id in _load().entries:
+        return _load().entries[env_id]
+    if env_id in _added:
+        return _added[env_id][0]
+    if not is_foreign(env_id):
+        return None
+    if ":" in env_id and "/" not in env_id:
+        return Entry(id=env_id, gymnasium_id=env_id)
+    return plugins().get(env_id, (None, ""))[0]
 
 
 def is_foreign(env_id: str) -> bool:
     """Whether an id can belong to an environment that does not ship: `module:Id`, or an id with a prefix of its own."""
     prefix, slash, _ = env_id.partition("/")
-    return (
-        valid_id(env_id)
-        and "@" not in env_id
-        and (":" in prefix or (bool(slash) and prefix not in _load().prefixes))
-    )
+    own = ":" in prefix or (bool(slash) and prefix not in _load().prefixes)
+    return own and valid_id(env_id) and "@" not in env_id
 
 
 def entry(env_id: str) -> Entry:
     """The entry of `env_id`, perhaps with only its id if foreign. Raises ConfigError with similar names for a wrong
     id."""
-    entry = known(env_id)
-    if entry is not None:
-        return entry
-    if is_foreign(env_id):
-        return Entry(id=env_id)
+    if found := known(env_id) or (Entry(id=env_id) if is_foreign(env_id) else None):
+        return found
     raise ConfigError(f"no environment {env_id!r} in the catalogue{near(env_id)}")
 
 
@@ -323,9 +310,8 @@ def resolve(patterns: Iterable[str]) -> list[str]:
             wanted.update(dict.fromkeys(foreign))
         else:
             raise ConfigError(f"no environment or suite matches {pattern!r}{near(pattern)}")
-    return [env_id for env_id in _load().entries if env_id in wanted] + [
-        each for each in wanted if not is_shipped(each)
-    ]
+    shipped = [env_id for env_id in _load().entries if env_id in wanted]
+    return shipped + [each for each in wanted if not is_shipped(each)]
 
 
 def near(name: str, others: Iterable[str] = ()) -> str:

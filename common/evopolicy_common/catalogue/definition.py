@@ -10,6 +10,7 @@ import difflib
 import math
 import re
 import tomllib
+from collections import Counter
 from pathlib import Path
 from typing import Any, Literal
 
@@ -143,11 +144,9 @@ def read_file(path: Path) -> tuple[Entry, ...]:
                 f"environment file {path}: {error}; several environments are [[environment]] tables"
             ) from error
     entries = tuple(_entry(path, each) for each in tables)
-    doubled = sorted({each.id for each in entries if [one.id for one in entries].count(each.id) > 1})
-    if doubled:
-        raise ConfigError(
-            f"environment file {path} defines {', '.join(doubled)} more than once: keep one of each"
-        )
+    if doubled := sorted(name for name, n in Counter(each.id for each in entries).items() if n > 1):
+        names = ", ".join(doubled)
+        raise ConfigError(f"environment file {path} defines {names} more than once: keep one of each")
     return entries
 
 
@@ -158,10 +157,8 @@ def _entry(path: Path, table: dict[str, Any]) -> Entry:
     for name in fields:
         if name not in known:
             near = difflib.get_close_matches(name, known, n=1)
-            raise ConfigError(
-                f"{where}: unknown key {name!r}"
-                + (f"; near: {near[0]}" if near else f"; keys are {', '.join(known)}")
-            )
+            more = f"near: {near[0]}" if near else f"keys are {', '.join(known)}"
+            raise ConfigError(f"{where}: unknown key {name!r}; {more}")
     task_file = fields.pop("task_file", None)
     if task_file is not None:
         fields["task"] = _task(where, path, fields, task_file)
@@ -170,9 +167,8 @@ def _entry(path: Path, table: dict[str, Any]) -> Entry:
     except msgspec.ValidationError as error:
         raise ConfigError(f"{where}: {error}") from error
     entry = msgspec.structs.replace(entry, data=_data(where, path, entry.data))
-    for wrong, why in _faults(entry):
-        if wrong:
-            raise ConfigError(f"{where}: {why}")
+    if why := _fault(entry):
+        raise ConfigError(f"{where}: {why}")
     return entry
 
 
@@ -209,11 +205,8 @@ def _data(where: str, path: Path, names: tuple[str, ...]) -> tuple[str, ...]:
     for name in names:
         place = folder / name
         real = place.resolve() if "\0" not in name else folder
-        if (
-            real == folder
-            or not real.is_relative_to(folder)
-            or any(part.startswith(".") for part in Path(name).parts)
-        ):
+        hidden = any(part.startswith(".") for part in Path(name).parts)
+        if real == folder or not real.is_relative_to(folder) or hidden:
             raise ConfigError(
                 f"{where}: data {name[:80]!r}: name files and folders in the environment file's folder, relative to it"
                 " and without a dot at the beginning"
@@ -224,60 +217,39 @@ def _data(where: str, path: Path, names: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(found)
 
 
-def _faults(entry: Entry) -> list[tuple[bool, str]]:
-    """Possible faults of a foreign definition: whether each is present, and its error text."""
-    unknown = sorted(entry.reward_weights.keys() - set(entry.reward_vector))
+def _fault(entry: Entry) -> str:
+    """What is wrong with a foreign definition; empty if nothing is."""
     names = (entry.success, *entry.reward_components, *entry.reward_vector, *entry.info_strings)
-    long_name = next((name for name in names if len(name) > _MAX_ID or not name.isprintable()), "")
+    long_name = next((name for name in names if len(name) > _MAX_ID or not name.isprintable()), None)
     long_text = next((text for text in entry.reward_components.values() if len(text) > _MAX_REWARD_TEXT), "")
-    return [
-        (
-            not valid_id(entry.id) or "@" in entry.id,  # worlds ship
-            f"id {entry.id[:80]!r}: letters, digits, '_', '.', '-', parts joined by '/' or ':', {_MAX_ID}"
-            " characters at most",
-        ),
-        (
-            not entry.gymnasium_id,
-            "gymnasium_id is missing: what gymnasium.make takes, such as my_pkg:MyEnv-v0",
-        ),
-        (
-            not 0 <= entry.max_episode_steps <= MAX_STEPS,
-            f"max_episode_steps is {entry.max_episode_steps}: 1 to {MAX_STEPS:,}, or 0 for what Gymnasium registers",
-        ),
-        (
-            len(entry.task) > MAX_TASK_CHARACTERS,
-            f"the task text has {len(entry.task):,} characters; {MAX_TASK_CHARACTERS:,} are the limit",
-        ),
-        (
-            not all(re.fullmatch(r"[a-z0-9_]{1,40}", name) for name in (entry.family,)),
-            f"family {entry.family[:80]!r}: lowercase letters, digits and '_', 40 at most",
-        ),
-        (
-            bool(long_name),
-            (
-                f"key of info {long_name[:80]!r}: one line of {_MAX_ID} characters at most, in success,"
-                " reward_components, reward_vector and info_strings"
-            ),
-        ),
-        (
-            bool(long_text),
-            f"reward_components, text {long_text[:80]!r}…: {_MAX_REWARD_TEXT:,} characters at most; shorten it",
-        ),
-        (bool(unknown), f"reward_weights names {', '.join(unknown)}, which reward_vector does not have"),
-        (
-            not all(map(math.isfinite, entry.reward_weights.values())),
-            f"reward_weights {entry.reward_weights}: weights have to be finite numbers",
-        ),
-        (
-            len(entry.title) > _MAX_ID or not entry.title.isprintable(),
-            f"title {entry.title[:80]!r}: one line of {_MAX_ID} characters at most",
-        ),
-        (not _is_plain(entry.kwargs), "kwargs: finite numbers, texts, lists and tables only, no dates"),
-        (
-            not all(_is_plain(each.kwargs) for each in entry.wrappers),
-            "wrappers.kwargs: finite numbers, texts, lists and tables only",
-        ),
-    ]
+    if not valid_id(entry.id) or "@" in entry.id:  # worlds ship
+        rule = f"letters, digits, '_', '.', '-', parts joined by '/' or ':', {_MAX_ID} characters at most"
+        return f"id {entry.id[:80]!r}: {rule}"
+    if not entry.gymnasium_id:
+        return "gymnasium_id is missing: what gymnasium.make takes, such as my_pkg:MyEnv-v0"
+    if not 0 <= (steps := entry.max_episode_steps) <= MAX_STEPS:
+        return f"max_episode_steps is {steps}: 1 to {MAX_STEPS:,}, or 0 for what Gymnasium registers"
+    if len(entry.task) > MAX_TASK_CHARACTERS:
+        return f"the task text has {len(entry.task):,} characters; {MAX_TASK_CHARACTERS:,} are the limit"
+    if not re.fullmatch(r"[a-z0-9_]{1,40}", entry.family):
+        return f"family {entry.family[:80]!r}: lowercase letters, digits and '_', 40 at most"
+    if long_name is not None:
+        where = "success, reward_components, reward_vector and info_strings"
+        return f"key of info {long_name[:80]!r}: one line of {_MAX_ID} characters at most, in {where}"
+    if long_text:
+        limit = f"{_MAX_REWARD_TEXT:,} characters at most"
+        return f"reward_components, text {long_text[:80]!r}…: {limit}; shorten it"
+    if unknown := sorted(entry.reward_weights.keys() - set(entry.reward_vector)):
+        return f"reward_weights names {', '.join(unknown)}, which reward_vector does not have"
+    if not all(map(math.isfinite, entry.reward_weights.values())):
+        return f"reward_weights {entry.reward_weights}: weights have to be finite numbers"
+    if len(entry.title) > _MAX_ID or not entry.title.isprintable():
+        return f"title {entry.title[:80]!r}: one line of {_MAX_ID} characters at most"
+    if not _is_plain(entry.kwargs):
+        return "kwargs: finite numbers, texts, lists and tables only, no dates"
+    if not all(_is_plain(each.kwargs) for each in entry.wrappers):
+        return "wrappers.kwargs: finite numbers, texts, lists and tables only"
+    return ""
 
 
 def _is_plain(value: Any) -> bool:

@@ -86,10 +86,7 @@ def family_of(env_id: str) -> str:
     """The family, a key of `installs()`, that must be installed to play an environment; empty when nothing must."""
     entry = catalogue.known(env_id)
     adapter = "" if entry is None else entry.adapter
-    return next(
-        (name for name, each in installs().items() if adapter in (each.adapters or (name,))),
-        "",
-    )
+    return next((name for name, each in installs().items() if adapter in (each.adapters or (name,))), "")
 
 
 def apart(families: Iterable[str] = ()) -> list[str]:
@@ -107,8 +104,7 @@ def is_here(family: str) -> bool:
 @cache
 def own() -> str:
     """This interpreter's installation as `NAME@DIGEST`: the families for which `setup` made it, joined with `+`, or
-    else
-    `base`; and 12 hex digits of the SHA-256 of the names and versions of all packages in it. Tells no path."""
+    else `base`; and 12 hex digits of the SHA-256 of the names and versions of all packages in it. Tells no path."""
     here = read(Path(sys.prefix))
     found = {
         each.name.removesuffix(".dist-info")
@@ -133,8 +129,7 @@ def advice(env_id: str) -> str:
 
 def root() -> Path:
     """The folder with an entry for each virtual environment of this user."""
-    named = os.environ.get(FOLDER_VARIABLE)
-    if named:
+    if named := os.environ.get(FOLDER_VARIABLE):
         return Path(named).absolute()
     data = os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share"
     return Path(data, "evopolicy", "installs")
@@ -183,8 +178,11 @@ def divided(env_ids: Iterable[str]) -> dict[str, list[str]]:
         if not playing:
             lacking.setdefault(family, []).append(env_id)
             continue
-        _check_version(family, playing[0])
-        found.setdefault(playing[0].python, []).append(env_id)
+        one = playing[0]
+        if one.version != (ours := evopolicy_common.__version__):
+            again = f"make it again with `{setup_line(family)}`"
+            raise ConfigError(f"{one.folder} has evopolicy {one.version}, and this is {ours}: {again}")
+        found.setdefault(one.python, []).append(env_id)
     if lacking:
         remedies = "; ".join(
             f"{env_ids[0]}{f' and {len(env_ids) - 1} more' * (len(env_ids) > 1)}: {setup_line(family)}"
@@ -192,11 +190,3 @@ def divided(env_ids: Iterable[str]) -> dict[str, list[str]]:
         )
         raise ConfigError(f"not installed on this machine: {remedies}")
     return found
-
-
-def _check_version(family: str, found: Made) -> None:
-    if found.version != evopolicy_common.__version__:
-        raise ConfigError(
-            f"{found.folder} has evopolicy {found.version}, and this is {evopolicy_common.__version__}: make it again"
-            f" with `{setup_line(family)}`"
-        )

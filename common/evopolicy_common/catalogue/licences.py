@@ -34,9 +34,8 @@ class Licence(msgspec.Struct, frozen=True, kw_only=True):
 @cache
 def packages() -> tuple[Licence, ...]:
     """Of all parts, by name and version."""
-    return msgspec.json.decode(
-        files(__package__).joinpath("licences.json").read_bytes(), type=tuple[Licence, ...]
-    )
+    data = files(__package__).joinpath("licences.json").read_bytes()
+    return msgspec.json.decode(data, type=tuple[Licence, ...])
 
 
 @cache

@@ -12,7 +12,7 @@ import fcntl
 import os
 import sys
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Iterable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -27,6 +27,7 @@ from evopolicy_common.processes.notices import notify_if_slow, notify_of_many_sl
 from evopolicy_common.processes.preflight import LOCAL, check_installed, check_scratch, check_writable
 from evopolicy_common.processes.scratch import scratch_folder
 from evopolicy_common.records.blobs import write_atomically
+from evopolicy_common.records.open_run import is_held
 from evopolicy_common.wire import credentials, transport
 from evopolicy_common.wire.operator_client import OperatorClient
 from evopolicy_common.wire.ready import Ready, read_ready
@@ -102,15 +103,12 @@ async def _start_workers(
     for python, env_ids in divided.items():
         # --unsandboxed: whoever starts this cluster also chooses the tiers of its runs.
         program = [*_module("evopolicy_worker.cli", python), "--grace", "1", "--unsandboxed", *credentials]
-        program += options
-        for env_id in env_ids:
-            program += ["--env", catalogue.source_of(env_id)]
-        for tier in sorted(wanted.tiers):
-            program += ["--need-tier", tier]
+        program += [*options, *_options([("--env", catalogue.source_of(env_id)) for env_id in env_ids])]
+        program += _options([("--need-tier", tier) for tier in sorted(wanted.tiers)])
         own = "" if python == sys.executable else f"-{Path(python).parents[1].name}"
         for k, suffix in enumerate(suffixes):
             slots = max(1, -(-(wanted.slots - k) // len(suffixes)))
-            await processes.keep_up(f"worker{own}{suffix}", [*program, "--slots", str(max(1, slots))])
+            await processes.keep_up(f"worker{own}{suffix}", [*program, "--slots", str(slots)])
 
 
 @contextlib.asynccontextmanager
@@ -153,30 +151,24 @@ async def local_cluster(
                 stale.unlink(missing_ok=True)
         ready_file.unlink(missing_ok=True)
         folders.callback(ready_file.unlink, missing_ok=True)
-        if (root / PROCESSES).exists() and not _is_held(root / PROCESSES):
+        if (root / PROCESSES).exists() and not is_held(root / PROCESSES):
             write_atomically(root / WORKERS_ENDED, b"", mode=0o600)
         lock = ready_file.with_suffix(".lock")
         lock_fd = _locked(lock)
         folders.callback(os.close, lock_fd)
         folders.callback(lock.unlink, missing_ok=True)
-        coordinator = [
-            *_module("evopolicy_coordinator.cli"),
-            *("--state", str(root), "--ready-file", str(ready_file), "--trust-workers"),
-        ]
-        if data is not None:
-            coordinator += ["--data", str(data.absolute())]
-        if audit:
-            coordinator += ["--audit", str(audit)]
+        packages = _options([("--policy-package", name) for name in policy_packages])
+        own = {
+            "--data": data and data.absolute(),
+            "--audit": audit or None,
+            "--hidden-isolation": hidden_isolation,
+        }
+        place = ("--state", str(root), "--ready-file", str(ready_file), "--trust-workers")
+        coordinator = [*_module("evopolicy_coordinator.cli"), *place, *_options(own.items()), *packages]
         if unjailed and state is not None:
             coordinator += ["--unjailed-agents"]
-        packages = [word for name in policy_packages for word in ("--policy-package", name)]
-        coordinator += packages
-        given = {"--browser": browser, "--env-timeout": env_timeout, "--env-memory": env_memory}
-        worker_options = packages + [
-            word for name, value in given.items() if value is not None for word in (name, str(value))
-        ]
-        if hidden_isolation is not None:
-            coordinator += ["--hidden-isolation", hidden_isolation]
+        limits = {"--browser": browser, "--env-timeout": env_timeout, "--env-memory": env_memory}
+        worker_options = [*packages, *_options(limits.items())]
         processes = _Processes(root / "logs", kind, lock_fd)
         start = partial(_start_workers, processes, bool(audit), worker_options)
         try:
@@ -190,9 +182,8 @@ async def local_cluster(
                         ready = await read_ready(ready_file, processes.failed)
             except TimeoutError as error:
                 why = last_words(processes.log("coordinator")) or "no output"
-                raise ConfigError(
-                    f"the local coordinator did not start within {START_TIMEOUT_S:g} s: {why}"
-                ) from error
+                text = f"the local coordinator did not start within {START_TIMEOUT_S:g} s: {why}"
+                raise ConfigError(text) from error
             # Not earlier: the folder could have been another command's.
             lock.rename(root / PROCESSES)
             kept = None if state is None else root / "open"
@@ -212,7 +203,7 @@ async def _end_permits_of_killed(kept: Path, operator_file: Path) -> None:
     The kernel ends a jailed agent with its agent supervisor, and the supervisor with its command.
     """
     watched = {path.name: path.read_text().splitlines() for path in kept.iterdir()}
-    gone = [run for run, locks in watched.items() if not any(_is_held(Path(lock)) for lock in locks)]
+    gone = [run for run, locks in watched.items() if not any(is_held(Path(lock)) for lock in locks)]
     if not gone:
         return
     async with transport.connect(credentials.find("operator", (), operator_file)) as link:
@@ -229,20 +220,6 @@ def _locked(new: Path) -> int:
     fd = os.open(new, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
     fcntl.flock(fd, fcntl.LOCK_EX)
     return fd
-
-
-def _is_held(lock: Path) -> bool:
-    try:
-        fd = os.open(lock, os.O_RDONLY | os.O_CLOEXEC)
-    except OSError:
-        return False
-    try:
-        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return True
-    finally:
-        os.close(fd)
-    return False
 
 
 async def unless_failed(work: asyncio.Task[None], failed: asyncio.Future[None] | None) -> None:
@@ -317,6 +294,10 @@ class _Processes:
             error = restarting.exception()
             assert error is not None
             self.failed.set_exception(error)
+
+
+def _options(given: Iterable[tuple[str, object | None]]) -> list[str]:
+    return [word for name, value in given if value is not None for word in (name, str(value))]
 
 
 def _module(name: str, python: str = sys.executable) -> list[str]:

@@ -34,10 +34,8 @@ _SETTINGS = (
     (
         "kernel/apparmor_restrict_unprivileged_userns",
         "1",
-        (
-            "sudo sysctl -w kernel.apparmor_restrict_unprivileged_userns=0, or an AppArmor profile for bwrap with"
-            " `userns,`"
-        ),
+        "sudo sysctl -w kernel.apparmor_restrict_unprivileged_userns=0, or an AppArmor profile for bwrap with"
+        " `userns,`",
     ),
 )
 """Files below `/proc/sys`, the value that forbids user namespaces, and the remedy. Without a file in
@@ -45,33 +43,22 @@ _SETTINGS = (
 _CONTAINER_MARKS = ("/.dockerenv", "/run/.containerenv")
 
 
-def install(what: str, os_release: Path | None = None) -> str:
+def install(what: str) -> str:
     """The command that installs `bubblewrap`, `egl` or `chromium` here; two examples on an unknown distribution."""
-    family = _family(os_release)
-    if family is None:
-        return f"{_command('debian', what)} (Debian, Ubuntu), {_command('fedora', what)} (Fedora)"
-    return _command(family, what)
-
-
-def _command(family: str, what: str) -> str:
-    return f"{_INSTALL[family]} {_PACKAGES[what].get(family, what)}"
-
-
-def _family(os_release: Path | None) -> str | None:
     try:
-        if os_release is None:
-            release = platform.freedesktop_os_release()
-        else:
-            pairs = (line.partition("=") for line in os_release.read_text().splitlines())
-            release = {name: value.strip('"') for name, _, value in pairs}
+        release = platform.freedesktop_os_release()
     except OSError:
-        return None
+        release = {}
     for name in (release.get("ID", ""), *release.get("ID_LIKE", "").split()):
         family = name.partition("-")[0]
         family = _KIN.get(family, family)
         if family in _INSTALL:
-            return family
-    return None
+            return _command(family, what)
+    return f"{_command('debian', what)} (Debian, Ubuntu), {_command('fedora', what)} (Fedora)"
+
+
+def _command(family: str, what: str) -> str:
+    return f"{_INSTALL[family]} {_PACKAGES[what].get(family, what)}"
 
 
 def permit_namespaces(settings: Path = Path("/proc/sys")) -> str:

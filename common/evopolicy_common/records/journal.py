@@ -153,33 +153,17 @@ GATEWAY_SIDE = (
 
 def result_of(finished: RunFinished) -> Result:
     """The part of a finished run that its last entry commits to."""
+    same = {name: getattr(finished, name) for name in Result.__struct_fields__ if name not in _OWN}
     return Result(
-        run=finished.run,
-        status=finished.status,
-        best_submit_index=finished.best_submit_index,
-        final_score=finished.final_score,
-        heldout_returns=finished.heldout_returns,
-        random_heldout_returns=finished.random_heldout_returns,
-        heldout_successes=finished.heldout_successes,
+        **same,
         validation_ineligible=tuple(sorted(finished.validation_ineligible)),
-        policy_failures=finished.policy_failures,
-        budget_used=finished.budget_used,
-        infrastructure_retries=finished.infrastructure_retries,
-        nondeterministic_results=finished.nondeterministic_results,
-        submits=tuple(
-            SubmitResult(
-                submit_index=submit.submit_index,
-                status=submit.status,
-                bundle=submit.bundle,
-                env_instances=submit.env_instances,
-                mean_return=submit.mean_return,
-                val_mean=submit.val_mean,
-                tree=submit.tree,
-            )
-            for submit in finished.submits
-        ),
+        submits=msgspec.convert(finished.submits, tuple[SubmitResult, ...], from_attributes=True),
         record=_record(finished),
     )
+
+
+_OWN = ("validation_ineligible", "submits", "record")
+"""Fields of `Result` that are not those of `RunFinished` of the same name."""
 
 
 def _record(finished: RunFinished) -> dict[str, Any]:

@@ -5,6 +5,10 @@ Paths are relative to the run's folder.
 
 from __future__ import annotations
 
+import fcntl
+import os
+from pathlib import Path
+
 import msgspec
 
 from evopolicy_common.messages.episode import PolicyFailure
@@ -22,6 +26,23 @@ UNWATCHED = f"{STATE}/unwatched"
 JOURNAL = f"{STATE}/journal.jsonl"
 """One `AnyEntry` a line."""
 BUNDLES = f"{STATE}/bundles"
+
+
+def is_held(lock: Path) -> bool:
+    """Whether a process holds a lock file, or may hold it as this user cannot ask; False without the file."""
+    try:
+        fd = os.open(lock, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW)
+    except FileNotFoundError:
+        return False
+    except OSError:
+        return True
+    try:
+        fcntl.flock(fd, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except OSError:
+        return True
+    finally:
+        os.close(fd)
+    return False
 
 
 class OpenedRun(msgspec.Struct, frozen=True, kw_only=True):

@@ -65,27 +65,12 @@ PATTERNS: tuple[tuple[re.Pattern[bytes], str, tuple[bytes, ...]], ...] = (
             rb"|A[KS]IA[A-Z0-9]{16}\b)"
         ),
         "an API key",
-        (
-            *(
-                b"sk-",
-                b"pk-",
-                b"rk-",
-                b"_live_",
-                b"_test_",
-                b"AIza",
-                b"AKIA",
-                b"ASIA",
-                b"hf_",
-                b"xox",
-                b"glpat-",
-            ),
-            *(b"ghp_", b"gho_", b"ghu_", b"ghs_", b"ghr_", b"github_pat_"),
+        tuple(
+            b"sk- pk- rk- _live_ _test_ AIza AKIA ASIA hf_ xox glpat- ghp_ gho_ ghu_ ghs_ ghr_ github_pat_".split()
         ),
     ),
     (
-        re.compile(
-            _START + rb"eyJ[A-Za-z0-9_-]{10,1024}\.[A-Za-z0-9_-]{10,2048}\.[A-Za-z0-9_-]{5,}",
-        ),
+        re.compile(_START + rb"eyJ[A-Za-z0-9_-]{10,1024}\.[A-Za-z0-9_-]{10,2048}\.[A-Za-z0-9_-]{5,}"),
         "a JSON web token",
         (b"eyJ",),
     ),
@@ -298,12 +283,11 @@ def read_passed(folder: Path) -> Passed | None:
     a damaged file."""
     path = folder / PASSED
     try:
-        kept = msgspec.json.decode(read_regular(path, _MAX_FILE_BYTES), type=Passed)
+        return msgspec.json.decode(read_regular(path, _MAX_FILE_BYTES), type=Passed)
     except FileNotFoundError:
         return None
     except (OSError, *DECODE_ERRORS) as error:
         raise ConfigError(f"{path}: {error}; restore it, as it finds keys in what is published") from error
-    return kept
 
 
 def _digest(value: bytes, key: bytes) -> str:

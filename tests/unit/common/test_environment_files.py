@@ -73,58 +73,50 @@ def test_a_file_may_define_several(tmp_path: Path) -> None:
         read_file(tmp_path / "many.toml")
 
 
+BARE = 'gymnasium_id = "a:B-v0"\n'
+LONG = "x" * 2000
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("max_steps = 3", "unknown key 'max_steps'; near: max_episode_steps"),
+        ('adapter = "toy"', "unknown key 'adapter'"),
+        ('max_episode_steps = "3"', "Expected `int`, got `str` - at `\\$.max_episode"),
+        ("max_episode_steps = -1", "max_episode_steps is -1"),
+        ('wrappers = ["ClipAction"]', "at `\\$.wrappers"),
+        ("[kwargs]\nday = 2026-01-01", "kwargs: finite numbers, texts"),
+        ("reward_weights = {speed = 1.0}", "reward_weights names speed"),
+        ('reward_vector = ["a"]\nreward_weights = {a = nan}', "reward_weights .*: weights have to be finite"),
+        ("[kwargs]\nreach = inf", "kwargs: finite numbers"),
+        ("[kwargs]\nseed = 99999999999999999999", "kwargs: finite"),
+        ('title = "a\\nb"', "title 'a.*b': one line"),
+        (f'success = "{LONG}"', "key of info 'xx.*one line of 120"),
+        (f'reward_components = {{fuel = "{LONG}"}}', "text 'xx.*1,000 characters at most"),
+        ("task_file = 3", "task_file is 3: the name of a text file"),
+        ('family = "../x"', "family '../x': lowercase"),
+        ('task_file = "none.md"', "task_file 'none.md' cannot be read"),
+    ],
+)
+def test_what_is_wrong_in_an_environment_is_named(tmp_path: Path, text: str, why: str) -> None:
+    refused(tmp_path / "wrong.toml", f'id = "acme/x"\n{BARE}{text}', why)
+
+
 @pytest.mark.parametrize(
     ("text", "why"),
     [
         ("id = ", "is not TOML"),
-        (
-            'id = "acme/x"\ngymnasium_id = "a:B-v0"\nmax_steps = 3',
-            "unknown key 'max_steps'; near: max_episode_steps",
-        ),
-        ('id = "acme/x"\ngymnasium_id = "a:B-v0"\nadapter = "toy"', "unknown key 'adapter'"),
-        (
-            'id = "acme/x"\ngymnasium_id = "a:B-v0"\nmax_episode_steps = "3"',
-            "Expected `int`, got `str` - at `\\$.max_episode",
-        ),
-        ('id = "acme/x"\ngymnasium_id = "a:B-v0"\nmax_episode_steps = -1', "max_episode_steps is -1"),
-        ('id = "acme/x"\ngymnasium_id = "a:B-v0"\nwrappers = ["ClipAction"]', "at `\\$.wrappers"),
-        (
-            'id = "acme/x"\ngymnasium_id = "a:B-v0"\n[kwargs]\nday = 2026-01-01',
-            "kwargs: finite numbers, texts",
-        ),
-        (
-            'id = "acme/x"\ngymnasium_id = "a:B-v0"\nreward_weights = {speed = 1.0}',
-            "reward_weights names speed",
-        ),
-        (
-            'id = "acme/x"\ngymnasium_id = "a:B-v0"\nreward_vector = ["a"]\nreward_weights = {a = nan}',
-            "reward_weights .*: weights have to be finite",
-        ),
-        ('id = "acme/x"\ngymnasium_id = "a:B-v0"\n[kwargs]\nreach = inf', "kwargs: finite numbers"),
-        ('id = "acme/x"\ngymnasium_id = "a:B-v0"\n[kwargs]\nseed = 99999999999999999999', "kwargs: finite"),
-        ('id = "acme/x"\ngymnasium_id = "a:B-v0"\ntitle = "a\\nb"', "title 'a.*b': one line"),
-        (
-            f'id = "acme/x"\ngymnasium_id = "a:B-v0"\nsuccess = "{"x" * 200}"',
-            "key of info 'xx.*one line of 120",
-        ),
-        (
-            f'id = "acme/x"\ngymnasium_id = "a:B-v0"\nreward_components = {{fuel = "{"x" * 2000}"}}',
-            "text 'xx.*1,000 characters at most",
-        ),
-        ('id = "acme/x"\ngymnasium_id = "a:B-v0"\ntask_file = 3', "task_file is 3: the name of a text file"),
-        ('id = "acme/x"\ngymnasium_id = "a:B-v0"\nfamily = "../x"', "family '../x': lowercase"),
-        (
-            'id = "acme/x"\ngymnasium_id = "a:B-v0"\ntask_file = "none.md"',
-            "task_file 'none.md' cannot be read",
-        ),
         ('id = "acme/x"', "gymnasium_id is missing"),
-        ('id = "../x"\ngymnasium_id = "a:B-v0"', "id '../x': letters, digits"),
-        ('id = "acme/x@w1"\ngymnasium_id = "a:B-v0"', "id 'acme/x@w1': letters, digits"),
-        ('id = "gym/acrobot"\ngymnasium_id = "a:B-v0"', "ids that begin with gym/ ship with evopolicy"),
+        (f'id = "../x"\n{BARE}', "id '../x': letters, digits"),
+        (f'id = "acme/x@w1"\n{BARE}', "id 'acme/x@w1': letters, digits"),
+        (f'id = "gym/acrobot"\n{BARE}', "ids that begin with gym/ ship with evopolicy"),
     ],
 )
 def test_what_is_wrong_in_a_file_is_named(tmp_path: Path, text: str, why: str) -> None:
-    path = tmp_path / "wrong.toml"
+    refused(tmp_path / "wrong.toml", text, why)
+
+
+def refused(path: Path, text: str, why: str) -> None:
     path.write_text(text)
     with pytest.raises(ConfigError, match=why) as caught:
         catalogue.add(path)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import re
 
 import pytest
 from rich.live import Live
@@ -12,7 +11,7 @@ from rich.table import Table
 from rich.text import Text
 
 from evopolicy_common.cli.conventions import fail, setup_logging, setup_notices
-from evopolicy_common.console import Terminal, filled_table, table
+from evopolicy_common.console import Terminal, filled_table
 from evopolicy_common.logs import structlog
 from evopolicy_common.terminal import harmless, one_line, say, say_json, say_lines
 
@@ -125,20 +124,6 @@ def test_printable_text_stays_as_it_is() -> None:
     assert harmless(text) == text
 
 
-def test_a_table_cuts_nothing_on_a_narrow_terminal() -> None:
-    out = io.StringIO()
-    made = table("worker", "environments", "state")
-    names = " ".join(f"gymnasium/MiniGrid-ObstructedMaze-{number}Q-v1" for number in range(3))
-    made.add_row("a-worker-with-a-name-of-thirty-eight-l", names, "active")
-    Terminal(file=out, width=40).print(made)
-    shown = out.getvalue()
-    assert "…" not in shown
-    assert max(map(len, shown.splitlines())) <= 40
-    columns = ["".join(line[a:b].strip() for line in shown.splitlines()[1:]) for a, b in cells(shown)]
-    assert "a-worker-with-a-name-of-thirty-eight-l" in columns[0]
-    assert names.replace(" ", "") == columns[1].replace(" ", "")
-
-
 def test_a_narrow_table_breaks_no_short_word_and_has_no_empty_column() -> None:
     out = io.StringIO()
     rows = [
@@ -149,9 +134,3 @@ def test_a_narrow_table_breaks_no_short_word_and_has_no_empty_column() -> None:
     shown = out.getvalue()
     assert "remedy" not in shown
     assert {"coordinator", "cryptography,", "matplotlib"} <= set(shown.split())
-
-
-def cells(shown: str) -> list[tuple[int, int]]:
-    """Where the columns of a table without lines begin and end, by its headings."""
-    starts = [found.start() for found in re.finditer(r"\S+", shown.splitlines()[0])]
-    return list(zip(starts, [*starts[1:], 1000], strict=True))

@@ -8,21 +8,18 @@ accepts plain relative paths only.
 
 from __future__ import annotations
 
-import functools
 import itertools
 import os
 import stat
-from collections.abc import Callable, Collection
-from pathlib import Path, PurePosixPath
-from typing import TypeVar
+from collections.abc import Collection, Iterator
+from pathlib import Path
+from typing import BinaryIO
 
 import msgspec
 
 from evopolicy_common.errors import DECODE_ERRORS, BundleError
 from evopolicy_common.records.blobs import digest_of
 from evopolicy_common.regular_files import open_regular
-
-T = TypeVar("T")
 
 MAX_FILES = 2000
 MAX_ENTRIES = 5000
@@ -31,6 +28,8 @@ MAX_BYTES = 64 << 20
 """Sum of the files' sizes, bytes."""
 MAX_DEPTH = 16
 MAX_PATH_BYTES = 240
+FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
+"""Opens a folder, and nothing else in its place."""
 IGNORED_FOLDERS = frozenset(
     {"__pycache__", ".git", ".mypy_cache", ".ruff_cache", ".pytest_cache", ".ipynb_checkpoints"}
 )
@@ -66,16 +65,96 @@ def snapshot(folder: Path, leave_out: Collection[str] = ()) -> Bundle:
     Raises BundleError with the path, the value and the limit for links, devices, sockets, file names that are not
     portable, and exceeded limits. Nothing outside `folder` is read, even if `folder` changes meanwhile.
     """
-    reader = _Reader(leave_out)
     try:
-        root = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+        root = os.open(folder, FOLDER)
     except OSError as error:
         raise BundleError(f"{folder.name}/ is not a folder that can be read: {error.strerror}") from error
+    files: list[BundleFile] = []
+    left = MAX_BYTES
     try:
-        reader.collect(root, PurePosixPath())
+        for path, file in walk(root, leave_out, MAX_ENTRIES):
+            if isinstance(file, str):
+                raise BundleError(f"{path or 'system/'} {file}")
+            with file:
+                info = os.fstat(file.fileno())
+                data = file.read(left + 1) if info.st_size <= left else b""
+            if len(files) == MAX_FILES:
+                raise BundleError(f"system/ holds more than {MAX_FILES} files; pack data into fewer")
+            size = max(info.st_size, len(data))
+            if size > left:
+                raise BundleError(
+                    f"{path} has {size:,} bytes; all files of system/ together may have {MAX_BYTES:,}"
+                    f" and {left:,} are left: make it smaller or remove it"
+                )
+            left -= size
+            files.append(BundleFile(path, bool(info.st_mode & stat.S_IXUSR), data))
     finally:
         os.close(root)
-    return pack(reader.files)
+    return pack(files)
+
+
+_KINDS = {
+    stat.S_IFDIR: f"folder that nests deeper than {MAX_DEPTH}",
+    stat.S_IFLNK: "symbolic link",
+    stat.S_IFIFO: "named pipe",
+    stat.S_IFSOCK: "socket",
+    stat.S_IFCHR: "character device",
+    stat.S_IFBLK: "block device",
+}
+
+
+def walk(root: int, leave_out: Collection[str], most: int) -> Iterator[tuple[str, BinaryIO | str]]:
+    """The regular files below an open folder, open, by path; the reason in place of one that is left out.
+
+    Neither follows a link nor opens anything but regular files and folders. `leave_out`: entries of the folder itself
+    to pass over, as files and folders that tools make are. `most`: files and folders to look at.
+    """
+    left = most
+
+    def below(fd: int, base: str, depth: int) -> Iterator[tuple[str, BinaryIO | str]]:
+        nonlocal left
+        with os.scandir(fd) as entries:
+            names = sorted(entry.name for entry in itertools.islice(entries, left + 1))
+        if len(names) > left:
+            yield base, f"holds more than {most} files and folders; remove some"
+            return
+        left -= len(names)
+        for name in names:
+            path = f"{base}/{name}" if base else name
+            if not base and name in leave_out:
+                continue
+            try:
+                check_path(path)
+                mode = os.stat(name, dir_fd=fd, follow_symlinks=False).st_mode
+                is_folder = stat.S_ISDIR(mode)
+                if name in (IGNORED_FOLDERS if is_folder else ()) or (
+                    stat.S_ISREG(mode) and name.endswith(COMPILED)
+                ):
+                    continue
+                if stat.S_ISREG(mode):
+                    # Not followed: a hostile agent may replace the entry with a link after the stat.
+                    file = open_regular(name, fd)
+                    if linked := os.fstat(file.fileno()).st_nlink > 1:
+                        file.close()
+                    yield path, "is a hard link to another file; copy the file instead" if linked else file
+                    continue
+                if not is_folder or depth == MAX_DEPTH:
+                    kind = _KINDS.get(stat.S_IFMT(mode), "special file")
+                    yield path, f"is a {kind}, and only regular files and folders may be here: remove it"
+                    continue
+                inner = os.open(name, FOLDER, dir_fd=fd)
+            except OSError as error:
+                yield path, f"cannot be read: {error.strerror}; was it changed meanwhile?"
+                continue
+            except BundleError as error:
+                yield ascii(path)[1:-1][:MAX_PATH_BYTES], f"has a name that cannot be taken: {error}"[:400]
+                continue
+            try:
+                yield from below(inner, path, depth + 1)
+            finally:
+                os.close(inner)
+
+    return below(root, "", 0)
 
 
 def pack(files: list[BundleFile]) -> Bundle:
@@ -102,88 +181,15 @@ def unpack(bundle: Bundle, folder: Path) -> None:
     _check(bundle.files)
     folder.mkdir(parents=True)
     for file in bundle.files:
-        path = folder / file.path
-        path.parent.mkdir(parents=True, exist_ok=True)
-        fd = os.open(
-            path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o755 if file.executable else 0o644
-        )
-        with os.fdopen(fd, "wb") as out:
-            out.write(file.data)
+        write_new(folder / file.path, file.data, 0o755 if file.executable else 0o644)
 
 
-class _Reader:
-    """Reads a folder tree under the limits."""
-
-    def __init__(self, leave_out: Collection[str]) -> None:
-        self.files: list[BundleFile] = []
-        self._leave_out = leave_out
-        self._left = MAX_BYTES
-        self._entries_left = MAX_ENTRIES
-
-    def collect(self, fd: int, base: PurePosixPath) -> None:
-        if len(base.parts) > MAX_DEPTH:
-            raise BundleError(f"{base}: folders nest deeper than {MAX_DEPTH}; flatten them")
-        with os.scandir(fd) as entries:
-            names = sorted(entry.name for entry in itertools.islice(entries, self._entries_left + 1))
-        self._entries_left -= len(names)
-        if self._entries_left < 0:
-            raise BundleError(f"system/ holds more than {MAX_ENTRIES} files and folders; remove some")
-        for name in names:
-            path = base / name
-            if name in self._leave_out and not base.parts:
-                continue
-            check_path(_text(path))
-            mode = os.stat(name, dir_fd=fd, follow_symlinks=False).st_mode
-            if stat.S_ISDIR(mode):
-                if name not in IGNORED_FOLDERS:
-                    # O_NOFOLLOW: a hostile agent may replace the entry with a link between the stat and the open.
-                    flags = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
-                    child = _opened(path, functools.partial(os.open, name, flags, dir_fd=fd))
-                    try:
-                        self.collect(child, path)
-                    finally:
-                        os.close(child)
-            elif not stat.S_ISREG(mode):
-                raise BundleError(
-                    f"{path} is a {_kind(mode)}; system/ may hold regular files and folders only: remove it"
-                )
-            elif not name.endswith(COMPILED):
-                self.files.append(self._read(name, fd, path))
-
-    def _read(self, name: str, folder_fd: int, path: PurePosixPath) -> BundleFile:
-        if len(self.files) >= MAX_FILES:
-            raise BundleError(f"system/ holds more than {MAX_FILES} files; pack data into fewer")
-        with _opened(path, functools.partial(open_regular, name, folder_fd)) as file:
-            info = os.fstat(file.fileno())
-            if info.st_nlink > 1:
-                raise BundleError(f"{path} is a hard link to another file; copy the file instead")
-            data = file.read(self._left + 1) if info.st_size <= self._left else b""
-            size = max(info.st_size, len(data))
-        if size > self._left:
-            raise BundleError(
-                f"{path} has {size:,} bytes; all files of system/ together may have {MAX_BYTES:,}"
-                f" and {self._left:,} are left: make it smaller or remove it"
-            )
-        self._left -= len(data)
-        return BundleFile(_text(path), bool(info.st_mode & stat.S_IXUSR), data)
-
-
-def _opened(path: PurePosixPath, opened: Callable[[], T]) -> T:
-    try:
-        return opened()
-    except OSError as error:
-        raise BundleError(
-            f"{path} cannot be read: {error.strerror}; was it changed during the submit?"
-        ) from error
-
-
-def _text(path: PurePosixPath) -> str:
-    try:
-        text = str(path)
-        text.encode("utf-8")
-    except UnicodeEncodeError as error:
-        raise BundleError(f"file name {str(path)!a} is not UTF-8; rename it") from error
-    return text
+def write_new(path: Path, data: bytes, mode: int) -> None:
+    """Writes a file that must not exist, and makes its folders."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, mode)
+    with os.fdopen(fd, "wb") as out:
+        out.write(data)
 
 
 def _check(files: tuple[BundleFile, ...]) -> None:
@@ -202,22 +208,15 @@ def _check(files: tuple[BundleFile, ...]) -> None:
 
 
 def check_path(path: str) -> None:
-    """Raises BundleError for anything but a plain relative path of a bearable length."""
+    """Raises BundleError for anything but a plain relative path in UTF-8 of a bearable length."""
     parts = path.split("/")
-    if path.startswith("/") or any(part in ("", ".", "..") for part in parts) or "\0" in path or "\\" in path:
+    if any(part in ("", ".", "..") for part in parts) or "\0" in path or "\\" in path:
         raise BundleError(f"{path!a} is not a plain relative path; rename it")
-    if len(path.encode("utf-8", "surrogateescape")) > MAX_PATH_BYTES or len(parts) > MAX_DEPTH + 1:
+    try:
+        size = len(path.encode())
+    except UnicodeEncodeError as error:
+        raise BundleError(f"{path!a} is not UTF-8; rename it") from error
+    if size > MAX_PATH_BYTES or len(parts) > MAX_DEPTH + 1:
         raise BundleError(
             f"{path[:80]!a}… is longer than {MAX_PATH_BYTES} bytes or nests too deep; rename it"
         )
-
-
-def _kind(mode: int) -> str:
-    kinds = {
-        stat.S_IFLNK: "symbolic link",
-        stat.S_IFIFO: "named pipe",
-        stat.S_IFSOCK: "socket",
-        stat.S_IFCHR: "character device",
-        stat.S_IFBLK: "block device",
-    }
-    return kinds.get(stat.S_IFMT(mode), "special file")

@@ -25,16 +25,9 @@ import msgspec
 
 from evopolicy_common.errors import DECODE_ERRORS, BundleError, ConfigError, StorageError
 from evopolicy_common.records.blobs import BlobStore, digest_of, sync_filesystem, write_atomically
-from evopolicy_common.records.policies.bundles import (
-    COMPILED,
-    IGNORED_FOLDERS,
-    MAX_DEPTH,
-    Bundle,
-    BundleFile,
-    check_path,
-)
+from evopolicy_common.records.policies.bundles import FOLDER, Bundle, BundleFile, check_path, walk, write_new
 from evopolicy_common.records.secrets import Passed, found
-from evopolicy_common.regular_files import open_regular, read_regular
+from evopolicy_common.regular_files import read_regular
 
 TREES = "trees"
 """In a run's folder."""
@@ -92,27 +85,23 @@ def name_of(folder: Path, index: int) -> str:
 def changes(folder: Path, index: int) -> str:
     """Files outside `system/` in which the workspace differs from that at the submit before, in words; empty where
     there are none, or no tree. `folder`: the run's."""
-    found: list[dict[str, str]] = []
-    omitted = 0
-    for number in (index - 1, index):
-        try:
-            tree = read(folder, name_of(folder, number))[0] if number >= 0 else Tree(files=())
-        except ConfigError:
-            return ""
-        omitted = tree.n_omitted
-        found.append({file.path: file.blob for file in tree.files if not file.path.startswith("system/")})
-    old, new = found
+    try:
+        trees = [read(folder, name_of(folder, n))[0] for n in (index - 1, index) if n >= 0]
+    except ConfigError:
+        return ""
+    old, new = ({file.path: file.blob for file in tree.files} for tree in [Tree(files=()), *trees][-2:])
+    outside = [path for path in {**old, **new} if not path.startswith("system/")]
     parts = {
-        "new": [path for path in new if path not in old],
-        "changed": [path for path in new if path in old and new[path] != old[path]],
-        "removed": [path for path in old if path not in new],
+        "new": [path for path in outside if path not in old],
+        "changed": [path for path in outside if path in old and path in new and new[path] != old[path]],
+        "removed": [path for path in outside if path not in new],
     }
     words = [
         f"{what} {', '.join(paths[:MAX_NAMED])}{' …' * (len(paths) > MAX_NAMED)}"
         for what, paths in parts.items()
         if paths
     ]
-    return "; ".join([*words, *([f"{omitted} not recorded"] if omitted else [])])
+    return "; ".join([*words, *([f"{trees[-1].n_omitted} not recorded"] if trees[-1].n_omitted else [])])
 
 
 def submit_number(name: str) -> int | None:
@@ -152,7 +141,7 @@ def restore(folder: Path, tree: Tree, workspace: Path) -> None:
             if blobs.size(file.blob) != file.size:
                 raise ValueError(f"its content has not {file.size:,} bytes")
             data = blobs.read(file.blob)
-            _write(workspace / file.path, data, 0o755 if file.executable else 0o644)
+            write_new(workspace / file.path, data, 0o755 if file.executable else 0o644)
         except (OSError, ValueError, StorageError) as error:
             raise StorageError(f"cannot restore {file.path}: {error}") from error
 
@@ -178,15 +167,8 @@ def copy_history(
                 omitted[prefix + path] = "the history is too large"
                 continue
             most -= len(data)
-            _write(to / prefix / path, data, 0o444)
+            write_new(to / prefix / path, data, 0o444)
     return omitted
-
-
-def _write(path: Path, data: bytes, mode: int) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, mode)
-    with os.fdopen(fd, "wb") as out:
-        out.write(data)
 
 
 class Recorder:
@@ -276,47 +258,10 @@ def _of(bundle: Bundle | None) -> Iterator[tuple[str, BundleFile]]:
 
 
 def _walk(root: Path, leave_out: Collection[str], most: int) -> Iterator[tuple[str, BinaryIO | str]]:
-    """The regular files below `root`, open, by path; the reason in place of one that is left out. No link is
-    followed. `most`: files and folders to look at."""
-    flags = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
-    left = most
-
-    def below(fd: int, base: str, depth: int) -> Iterator[tuple[str, BinaryIO | str]]:
-        nonlocal left
-        with os.scandir(fd) as entries:
-            names = sorted(entry.name for entry in itertools.islice(entries, left + 1))
-        if len(names) > left:
-            yield base or ".", f"more than {most} files and folders"
-            return
-        left -= len(names)
-        for name in names:
-            path = f"{base}/{name}" if base else name
-            if (not base and name in leave_out) or name in IGNORED_FOLDERS or name.endswith(COMPILED):
-                continue
-            try:
-                check_path(path)
-                path.encode()
-                if not stat.S_ISDIR(os.stat(name, dir_fd=fd, follow_symlinks=False).st_mode):
-                    file = open_regular(name, fd)
-                    if linked := os.fstat(file.fileno()).st_nlink > 1:
-                        file.close()
-                    yield path, "a hard link" if linked else file
-                    continue
-                if depth == MAX_DEPTH:
-                    yield path, f"folders nest deeper than {MAX_DEPTH}"
-                    continue
-                inner = os.open(name, flags, dir_fd=fd)
-            except (OSError, BundleError, UnicodeError) as error:
-                yield ascii(path)[1:-1][:240], str(getattr(error, "strerror", None) or error)[:240]
-                continue
-            try:
-                yield from below(inner, path, depth + 1)
-            finally:
-                os.close(inner)
-
+    """As `walk`; nothing where there is no such folder."""
     with contextlib.suppress(OSError):
-        top = os.open(root, flags)
+        top = os.open(root, FOLDER)
         try:
-            yield from below(top, "", 0)
+            yield from walk(top, leave_out, most)
         finally:
             os.close(top)

@@ -37,17 +37,23 @@ def test_links_pipes_and_what_is_not_there_lead_nowhere(tmp_path: Path) -> None:
     assert names(tmp_path / "nothing") == []
 
 
-def test_folders_that_nest_without_end_are_left_and_can_be_removed(tmp_path: Path) -> None:
-    root = tmp_path / "root"
+def nested(root: Path, *, files: bool) -> int:
+    """Two thousand folders, each in the one before, perhaps each with a file; the innermost one, open."""
     root.mkdir()
     here = os.open(root, os.O_RDONLY)
     for _ in range(2000):
-        os.close(os.open("file", os.O_WRONLY | os.O_CREAT, dir_fd=here))
+        if files:
+            os.close(os.open("file", os.O_WRONLY | os.O_CREAT, dir_fd=here))
         os.mkdir("d", dir_fd=here)
         inner = os.open("d", os.O_RDONLY, dir_fd=here)
         os.close(here)
         here = inner
-    os.close(here)
+    return here
+
+
+def test_folders_that_nest_without_end_are_left_and_can_be_removed(tmp_path: Path) -> None:
+    root = tmp_path / "root"
+    os.close(nested(root, files=True))
     assert len(names(root)) == MAX_DEPTH + 1
     remove_tree(root)
     assert not root.exists()
@@ -87,13 +93,7 @@ def test_what_would_serve_other_users_is_taken_from_a_folder(tmp_path: Path) -> 
     assert not {"pipe", "socket"} & found.keys()
     loose = stat.S_ISUID | stat.S_ISGID | stat.S_IWOTH
     assert [name for name, mode in found.items() if mode & loose and not stat.S_ISLNK(mode)] == []
-    expected = {
-        "program": 0o755,
-        "open": 0o1775,
-        "open/inner/notes": 0o664,
-        "shut": 0o700,
-        "policy.py": 0o644,
-    }
+    expected = dict(zip(modes, (0o755, 0o1775, 0o664, 0o700, 0o644), strict=True))
     assert {name: stat.S_IMODE(found[name]) for name in expected} == expected
     assert stat.S_IMODE(outside.stat().st_mode) == 0o666
     assert keep_to_owner(tmp_path / "nothing") == 0
@@ -130,13 +130,7 @@ def test_files_of_other_owners_become_the_folders_owners(tmp_path: Path) -> None
 
 def test_modes_are_taken_from_folders_that_nest_without_end(tmp_path: Path) -> None:
     root = tmp_path / "root"
-    root.mkdir()
-    here = os.open(root, os.O_RDONLY)
-    for _ in range(2000):
-        os.mkdir("d", dir_fd=here)
-        inner = os.open("d", os.O_RDONLY, dir_fd=here)
-        os.close(here)
-        here = inner
+    here = nested(root, files=False)
     os.fchmod(here, 0o777)
     os.close(os.open("last", os.O_WRONLY | os.O_CREAT, 0o4755, dir_fd=here))
     assert keep_to_owner(root) == 0

@@ -15,6 +15,7 @@ import pytest
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.local import cluster as local_cluster
 from evopolicy_common.processes.child_process import ChildProcess, last_words
+from evopolicy_common.records import open_run
 
 SOON_S = 0.2
 STUBBORN = "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print('up', flush=True); time.sleep(1000)"  # noqa: E501
@@ -36,19 +37,23 @@ if not os.path.exists(mark):
 """
 
 
+@pytest.fixture(autouse=True)
+def _quickly(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(local_cluster, "_RESTART_PAUSE_S", 0.0)
+    monkeypatch.setattr(local_cluster, "END_GRACE_S", SOON_S)
+
+
 def programs(monkeypatch: pytest.MonkeyPatch, coordinator: str, worker: str = STUBBORN) -> None:
     """These in place of the coordinator's and the worker's."""
     code = {"evopolicy_coordinator.cli": coordinator, "evopolicy_worker.cli": worker}
     monkeypatch.setattr(
         local_cluster, "_module", lambda name, python=sys.executable: [python, "-c", code[name]]
     )
-    monkeypatch.setattr(local_cluster, "_RESTART_PAUSE_S", 0.0)
 
 
 def noted(monkeypatch: pytest.MonkeyPatch) -> dict[str, list[str]]:
     """The arguments of each program that a cluster of obedient programs starts, by the name of its log."""
     programs(monkeypatch, SERVES)
-    monkeypatch.setattr(local_cluster, "END_GRACE_S", SOON_S)
     started: dict[str, list[str]] = {}
     start = ChildProcess.start
 
@@ -81,7 +86,6 @@ def test_a_local_coordinator_that_does_not_start_is_reported_and_killed(
 ) -> None:
     programs(monkeypatch, STUBBORN)
     monkeypatch.setattr(local_cluster, "START_TIMEOUT_S", SOON_S)
-    monkeypatch.setattr(local_cluster, "END_GRACE_S", SOON_S)
     started: list[ChildProcess] = []
     start = ChildProcess.start
 
@@ -106,19 +110,15 @@ def test_a_dead_coordinator_restarts_and_refused_options_end_the_command(
     assert (tmp_path / "died").exists()
 
 
-def test_what_a_killed_command_left_in_the_state_folder_is_removed(
+async def test_what_a_killed_command_left_in_the_state_folder_is_removed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "test-999999999.json").write_text("{}")
     others = tmp_path / f"test-{os.getppid()}.json"
     others.write_text("{}")
     programs(monkeypatch, SERVES)
-
-    async def main() -> None:
-        async with local_cluster.local_cluster("test", state=tmp_path):
-            pass
-
-    asyncio.run(main())
+    async with local_cluster.local_cluster("test", state=tmp_path):
+        pass
     assert list(tmp_path.glob("*.json")) == [others]
 
 
@@ -131,7 +131,7 @@ def test_workers_count_as_ended_once_no_process_of_the_last_command_lives(
         async def main() -> bool:
             async with local_cluster.local_cluster("test", state=tmp_path) as cluster:
                 await cluster.start_workers(["toy/line"], slots=1)
-                assert local_cluster._is_held(lock)
+                assert open_run.is_held(lock)
                 return ended.exists()
 
         return asyncio.run(main())
@@ -140,7 +140,6 @@ def test_workers_count_as_ended_once_no_process_of_the_last_command_lives(
     assert bring_up(tmp_path) == "in use"
     assert not lock.exists()  # the folder may be that of a living command
     programs(monkeypatch, SERVES)
-    monkeypatch.setattr(local_cluster, "END_GRACE_S", SOON_S)
     assert not says_so()
     assert says_so()
     ended.unlink()
@@ -153,7 +152,6 @@ async def test_a_worker_keeps_the_lock_of_its_command(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     programs(monkeypatch, SERVES)
-    monkeypatch.setattr(local_cluster, "END_GRACE_S", SOON_S)
 
     async with local_cluster.local_cluster("test", state=tmp_path) as cluster:
         await cluster.start_workers(["toy/line"], slots=1)
@@ -163,22 +161,23 @@ async def test_a_worker_keeps_the_lock_of_its_command(
             assert tmp_path / local_cluster.PROCESSES in held, child.log
 
 
-def test_a_worker_that_dies_again_and_again_is_given_up(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    programs(monkeypatch, SERVES, "raise SystemExit('no room')")
-    assert bring_up(tmp_path) == "worker keeps ending: no room"
+NO_MODULE = "worker does not start: ModuleNotFoundError: No module named 'no_such_module'; see "
 
 
-def test_a_worker_whose_modules_are_missing_is_given_up_at_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("worker", "starts", "why"),
+    [
+        ("raise SystemExit('no room')", local_cluster._MAX_DEATHS, "worker keeps ending: no room"),
+        ("import no_such_module", 1, NO_MODULE),
+    ],
+)
+def test_a_worker_that_cannot_be_kept_running_is_given_up(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, worker: str, starts: int, why: str
 ) -> None:
-    starts = tmp_path / "starts"
-    programs(monkeypatch, SERVES, f"open({str(starts)!r}, 'a').write('.'); import no_such_module")
-    assert bring_up(tmp_path).startswith(
-        "worker does not start: ModuleNotFoundError: No module named 'no_such_module'; see "
-    )
-    assert starts.read_text() == "."
+    mark = tmp_path / "starts"
+    programs(monkeypatch, SERVES, f"open({str(mark)!r}, 'a').write('.'); {worker}")
+    assert bring_up(tmp_path).startswith(why)
+    assert len(mark.read_text()) == starts
 
 
 async def test_a_worker_that_dies_now_and_then_is_started_again_however_often(
@@ -195,74 +194,52 @@ async def test_a_worker_that_dies_now_and_then_is_started_again_however_often(
             await asyncio.sleep(0.02)
 
 
-def test_workers_divide_the_slots_of_an_audited_cluster(
+async def started(state: Path | None, env_ids: Sequence[str], slots: int, **more: Any) -> None:
+    async with local_cluster.local_cluster("test", state=state, **more) as cluster:
+        await cluster.start_workers(env_ids, slots=slots)
+
+
+async def test_workers_divide_the_slots_of_an_audited_cluster(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    started = noted(monkeypatch)
-
-    async def main() -> None:
-        async with local_cluster.local_cluster(
-            "test",
-            data=Path("d"),
-            audit=0.5,
-            policy_packages=["scipy"],
-            browser=Path("/opt/chrome"),
-            env_timeout=2.5,
-            env_memory=512,
-        ) as cluster:
-            await cluster.start_workers(["toy/line", "toy/maze"], slots=5)
-
+    noted_by = noted(monkeypatch)
     monkeypatch.chdir(tmp_path)
-    asyncio.run(main())
-    assert started["test-coordinator"][4:] == [
-        "--trust-workers",
-        "--data",
-        str(tmp_path / "d"),
-        "--audit",
-        "0.5",
-        "--policy-package",
-        "scipy",
-    ]
-    own = " ".join(started["test-worker"])
+    more = {"browser": Path("/opt/chrome"), "env_timeout": 2.5, "env_memory": 512}
+    given = {"data": Path("d"), "audit": 0.5, "policy_packages": ["scipy"], **more}
+    await started(None, ["toy/line", "toy/maze"], 5, **given)
+    expected = f"--trust-workers --data {tmp_path}/d --audit 0.5 --policy-package scipy"
+    assert " ".join(noted_by["test-coordinator"]).endswith(expected)
+    own = " ".join(noted_by["test-worker"])
     assert "--policy-package scipy --browser /opt/chrome --env-timeout 2.5 --env-memory 512" in own
-    assert started["test-worker"][-6:] == ["--env", "toy/line", "--env", "toy/maze", "--slots", "3"]
-    assert started["test-worker-2"][-2:] == ["--slots", "2"]
+    assert own.endswith("--env toy/line --env toy/maze --slots 3")
+    assert noted_by["test-worker-2"][-2:] == ["--slots", "2"]
 
 
-def test_each_virtual_environments_worker_has_all_slots(
+async def test_each_virtual_environments_worker_has_all_slots(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    started = noted(monkeypatch)
+    noted_by = noted(monkeypatch)
     other = tmp_path / "toys" / "bin" / "python"
     other.parent.mkdir(parents=True)
     other.symlink_to(sys.executable)
-    monkeypatch.setattr(
-        local_cluster.installs,
-        "divided",
-        lambda env_ids: {sys.executable: env_ids[:1], str(other): env_ids[1:]},
-    )
-
-    async def main() -> None:
-        async with local_cluster.local_cluster("test", state=tmp_path) as cluster:
-            await cluster.start_workers(["toy/line", "toy/maze"], slots=2)
-
-    asyncio.run(main())
-    assert started["test-worker"][-4:] == ["--env", "toy/line", "--slots", "2"]
-    assert started["test-worker-toys"][-4:] == ["--env", "toy/maze", "--slots", "2"]
+    divided = {sys.executable: ["toy/line"], str(other): ["toy/maze"]}
+    monkeypatch.setattr(local_cluster.installs, "divided", lambda env_ids: divided)
+    await started(tmp_path, ["toy/line", "toy/maze"], 2)
+    assert noted_by["test-worker"][-4:] == ["--env", "toy/line", "--slots", "2"]
+    assert noted_by["test-worker-toys"][-4:] == ["--env", "toy/maze", "--slots", "2"]
 
 
-def test_workers_are_started_beside_the_coordinator(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    started = noted(monkeypatch)
+async def test_workers_are_started_beside_the_coordinator(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    noted_by = noted(monkeypatch)
     workers = local_cluster.Workers(["toy/line"], 2, {"bwrap"})
-
-    async def main() -> None:
-        async with local_cluster.local_cluster("test", state=tmp_path, workers=workers):
-            pass
-
-    asyncio.run(main())
-    ready = started["test-coordinator"][started["test-coordinator"].index("--ready-file") + 1]
-    assert started["test-worker"][started["test-worker"].index("--ready-file") + 1] == ready
-    assert started["test-worker"][-6:] == ["--env", "toy/line", "--need-tier", "bwrap", "--slots", "2"]
+    async with local_cluster.local_cluster("test", state=tmp_path, workers=workers):
+        pass
+    coordinator, worker = noted_by["test-coordinator"], noted_by["test-worker"]
+    place = coordinator[coordinator.index("--ready-file") + 1]
+    assert worker[worker.index("--ready-file") + 1] == place
+    assert worker[-6:] == ["--env", "toy/line", "--need-tier", "bwrap", "--slots", "2"]
 
 
 def test_a_childs_error_is_told_although_another_process_wrote_later(tmp_path: Path) -> None:

@@ -47,13 +47,10 @@ def test_scipy_is_shown_with_its_libraries_and_numpy_and_nothing_else() -> None:
     assert versions["policy"] == "scipy"
 
 
-def test_without_packages_a_fingerprint_says_nothing_of_them() -> None:
-    assert policy_versions([]) == {}
-
-
 def test_a_fingerprint_tells_the_packages_that_a_runs_policies_imported() -> None:
     assert packages_in(policy_versions(["scipy"])) == ("scipy",)
     assert packages_in({"numpy": "2"}) == ()
+    assert policy_versions([]) == {}
 
 
 def test_a_distribution_is_imported_by_the_names_of_its_modules(site: Path) -> None:
@@ -62,9 +59,8 @@ def test_a_distribution_is_imported_by_the_names_of_its_modules(site: Path) -> N
 
 
 def test_requirements_come_along_and_those_of_extras_or_not_installed_do_not(site: Path) -> None:
-    install(
-        site, "own-tool", "own_tool/__init__.py", requires=("own-part>=1", "absent", "rich; extra == 'x'")
-    )
+    requires = ("own-part>=1", "absent", "rich; extra == 'x'")
+    install(site, "own-tool", "own_tool/__init__.py", requires=requires)
     install(site, "own-part", "own_part.py")
     assert sorted(files_of(["own-tool"])) == ["own_part.py", "own_tool"]
     assert sorted(files_of(["own-tool"], metadata_too=True))[:2] == ["own_part-1.0.dist-info", "own_part.py"]
@@ -105,15 +101,13 @@ def test_a_worker_with_other_packages_is_refused_with_the_option_to_give() -> No
 
     def worker(names: tuple[str, ...]) -> Register:
         found = Fingerprint(code_version="1", python=sys.version[:4], packages=policy_versions(names), cpu="")
-        return Register(
-            token="", worker="w", protocol=1, slots=1, tiers=(), environments=(), fingerprint=found, host=""
-        )
+        given = {"tiers": (), "environments": (), "fingerprint": found}
+        return Register(token="", worker="w", protocol=1, slots=1, **given)
 
     check_packages(worker(()), ("numpy",))
     check_packages(worker(("scipy",)), ("numpy", "scipy"))
     with pytest.raises(RefusedError, match="start the worker with --policy-package scipy"):
         check_packages(worker(()), ("numpy", "scipy"))
-    with pytest.raises(
-        RefusedError, match="scipy besides numpy, in this cluster none: start the worker without"
-    ):
+    others = "scipy besides numpy, in this cluster none: start the worker without"
+    with pytest.raises(RefusedError, match=others):
         check_packages(worker(("scipy",)), ("numpy",))

@@ -33,16 +33,10 @@ META = CheckpointMeta(
 
 
 def test_a_bundle_returns_from_its_checkpoint_with_metadatas_names(tmp_path: Path) -> None:
-    bundle = pack(
-        [
-            BundleFile("policy.py", False, b"class Policy: ...\n"),
-            BundleFile("run.sh", True, b"true\n"),
-            BundleFile("_meta.json", True, b"\xff mine"),
-            BundleFile("metrics.json", False, b"{}"),
-            BundleFile("deep/metrics.json", False, b"[]"),
-            BundleFile("system/policy.py", False, b"1"),
-        ]
-    )
+    contents = {"policy.py": b"class Policy: ...\n", "run.sh": b"true\n", "_meta.json": b"\xff mine"}
+    contents |= {"metrics.json": b"{}", "deep/metrics.json": b"[]", "system/policy.py": b"1"}
+    executable = ("run.sh", "_meta.json")
+    bundle = pack([BundleFile(path, path in executable, data) for path, data in contents.items()])
     folder = tmp_path / "submit_002"
     checkpoints.write(folder, META, bundle, measured(bundle))
     assert checkpoints.bundle_of(folder) == bundle

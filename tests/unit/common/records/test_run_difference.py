@@ -37,12 +37,24 @@ def make_run(root: Path, name: str, **changes: Any) -> Path:
     return folder
 
 
+def pair(root: Path, **changes: Any) -> tuple[Path, Path]:
+    """Two runs, of which `changes` concern the second."""
+    return make_run(root, "a"), make_run(root, "bcd", **changes)
+
+
+def diff(*args: object, code: int = 1) -> str:
+    """The output of the command, which ends with `code`."""
+    done = CliRunner().invoke(app, ["diff", *map(str, args)])
+    assert done.exit_code == code, done.output
+    return done.stdout
+
+
 def test_times_logs_and_names_make_no_difference(tmp_path: Path) -> None:
-    assert differences(make_run(tmp_path, "a"), make_run(tmp_path, "bcd")) == []
+    assert differences(*pair(tmp_path)) == []
 
 
 def test_a_return_a_file_and_a_byte_each_make_one(tmp_path: Path) -> None:
-    left, right = make_run(tmp_path, "a"), make_run(tmp_path, "b", returns=[2.0])
+    left, right = pair(tmp_path, returns=[2.0])
     (right / "workspace/system/policy.py").write_text("class Policy: 1")
     (right / "extra").touch()
     (left / "workspace/feedback/submit_000/episodes/ep_000/error.txt").write_text(
@@ -59,7 +71,7 @@ def test_a_return_a_file_and_a_byte_each_make_one(tmp_path: Path) -> None:
 
 
 def test_other_isolation_and_hidden_cases_make_a_difference(tmp_path: Path) -> None:
-    left, right = make_run(tmp_path, "a"), make_run(tmp_path, "b")
+    left, right = pair(tmp_path)
     for folder, isolation, cases in ((left, "exclusive", "shared"), (right, "waived", "per_run")):
         record = json.loads((folder / "run.json").read_text())
         record |= {"hidden_isolation": isolation, "experiment_dimensions": {"hidden_cases": cases}}
@@ -76,7 +88,7 @@ def test_a_field_that_is_missing_is_a_difference(tmp_path: Path) -> None:
 
 
 def test_json_without_end_of_nesting_is_a_difference_and_no_crash(tmp_path: Path) -> None:
-    left, right = make_run(tmp_path, "a"), make_run(tmp_path, "b")
+    left, right = pair(tmp_path)
     for folder, deepest in ((left, "1"), (right, "2")):
         # The first is too deep to be read, the second to be compared.
         for name, opens, closes in (
@@ -89,32 +101,24 @@ def test_json_without_end_of_nesting_is_a_difference_and_no_crash(tmp_path: Path
 
 
 def test_file_names_neither_steer_the_terminal_nor_forge_lines(tmp_path: Path) -> None:
-    left, right = make_run(tmp_path, "a"), make_run(tmp_path, "b")
+    left, right = pair(tmp_path)
     for name in (b"x\nno difference (times and logs aside)", b"\x1b]8;;evil\x1b\\", b"\xff[x]"):
         with open(bytes(left) + b"/" + name, "wb"):
             pass
-    invoked = CliRunner().invoke(app, ["diff", str(left), str(right)])
-    assert invoked.exit_code == 1
-    assert len(invoked.output.splitlines()) == 3
-    assert "\x1b" not in invoked.output
-    invoked = CliRunner().invoke(app, ["diff", "--json", str(left), str(right)])
-    assert invoked.exit_code == 1
-    assert len(json.loads(invoked.output)) == 3
+    output = diff(left, right)
+    assert len(output.splitlines()) == 3
+    assert "\x1b" not in output
+    assert len(json.loads(diff("--json", left, right))) == 3
 
 
-def test_the_list_of_omissions_has_reasons_and_covers_all_differences(
-    tmp_path: Path,
-) -> None:
-    done = CliRunner().invoke(app, ["diff", "--left-out"])
-    assert done.exit_code == 0, done.output
-    lines = done.output.splitlines()
-    assert "run.json, timing: times" in lines
-    assert "summary.json, submit_started_at: a time" in lines
+def test_the_list_of_omissions_has_reasons_and_covers_all_differences(tmp_path: Path) -> None:
+    lines = diff("--left-out", code=0).splitlines()
+    assert {"run.json, timing: times", "summary.json, submit_started_at: a time"} <= {*lines}
     assert all(": " in line for line in lines)
-    left, right = make_run(tmp_path, "a"), make_run(tmp_path, "b")
-    assert CliRunner().invoke(app, ["diff", str(left), str(right)]).exit_code == 0
+    left, right = pair(tmp_path)
+    diff(left, right, code=0)
     (right / "extra").touch()
-    assert CliRunner().invoke(app, ["diff", str(left), str(right)]).exit_code == 1
+    diff(left, right)
 
 
 def test_people_see_scores_first_and_folders_for_files(tmp_path: Path) -> None:
@@ -138,6 +142,5 @@ def test_people_see_scores_first_and_folders_for_files(tmp_path: Path) -> None:
         f"workspace/feedback/submit_001: only in {left} (30 files)",
         f"extra: only in {right}",
     ]
-    printed = CliRunner().invoke(app, ["diff", str(left), str(right)]).stdout
-    assert printed.startswith("run.json: outcome.final_score: 1.0 and 7.0\n")
-    assert json.loads(CliRunner().invoke(app, ["diff", str(left), str(right), "--json"]).stdout) == found
+    assert diff(left, right).startswith("run.json: outcome.final_score: 1.0 and 7.0\n")
+    assert json.loads(diff(left, right, "--json")) == found

@@ -22,29 +22,12 @@ from evopolicy_common.records.run_record import (
 )
 from evopolicy_common.records.summary import SCHEMA_VERSION, Summary, decode_summary, utc_text
 
-FIELDS = [
-    "schema_version",
-    "submit_index",
-    "env",
-    "status",
-    "n_episodes",
-    "first_global_episode",
-    "env_instances",
-    "remaining_budget",
-    "submit_started_at",
-    "submit_completed_at",
-    "wall_time_seconds",
-    "returns",
-    "mean_return",
-    "std_return",
-    "min_return",
-    "max_return",
-    "episode_lengths",
-    "mean_episode_length",
-    "timeouts",
-    "errors",
-]
-
+NAMES = """
+schema_version submit_index env status n_episodes first_global_episode env_instances remaining_budget submit_started_at
+submit_completed_at wall_time_seconds returns mean_return std_return min_return max_return episode_lengths
+mean_episode_length timeouts errors
+"""
+FIELDS = NAMES.split()
 NOT_OK = Summary(
     schema_version=SCHEMA_VERSION,
     submit_index=3,
@@ -57,15 +40,7 @@ NOT_OK = Summary(
     submit_started_at=utc_text(0.0),
     submit_completed_at=utc_text(1.25),
     wall_time_seconds=1.25,
-    returns=None,
-    mean_return=None,
-    std_return=None,
-    min_return=None,
-    max_return=None,
-    episode_lengths=None,
-    mean_episode_length=None,
-    timeouts=None,
-    errors=None,
+    **dict.fromkeys(FIELDS[11:]),  # type: ignore[arg-type]
 )
 
 RECORD = RunRecord(

@@ -91,22 +91,16 @@ def test_the_policy_is_the_submitted_bundles(run: Path) -> None:
 def test_what_is_not_the_agents_to_show_is_omitted(run: Path, how: str) -> None:
     home, workspace = run / ".gateway" / "agent" / "home", run / "workspace"
     passed = Passed(key="ab" * 32).with_values(["a-value-without-a-known-look"])
-    match how:
-        case "link":
-            (workspace / "x").symlink_to(home / "auth.json")
-        case "linked folder":
-            (workspace / "x").symlink_to(home)
-        case "hard link":
-            os.link(home / "auth.json", workspace / "x")
-        case "pipe":
-            os.mkfifo(workspace / "x")
-        case "key":
-            (workspace / "x").write_text(f'{{"token": "{KEY}"}}')
-        case "passed value":
-            (workspace / "x").write_text("login a-value-without-a-known-look")
-        case _:
-            (workspace / "history").mkdir()
-            (workspace / "history" / "x").write_text("forged")
+    x = workspace / "x"
+    {
+        "link": lambda: x.symlink_to(home / "auth.json"),
+        "linked folder": lambda: x.symlink_to(home),
+        "hard link": lambda: os.link(home / "auth.json", x),
+        "pipe": lambda: os.mkfifo(x),
+        "key": lambda: x.write_text(f'{{"token": "{KEY}"}}'),
+        "passed value": lambda: x.write_text("login a-value-without-a-known-look"),
+        "history": lambda: (workspace / "history").mkdir(),
+    }[how]()
     tree = recorded(run, passed=passed)
     assert paths(tree) == ["notes.md", "system/policy.py"]
     assert list(tree.omitted) == ["history" if how == "history" else "x"]
