@@ -460,7 +460,7 @@ async def answering(folder: Path, double: Double) -> AsyncIterator[Credentials]:
     await double.start(folder / "coordinator")
     try:
         async with transport.serve(config, double.on_queries) as server:
-            server.declare([keys.gateway_expr(CLUSTER)])
+            server.declare([keys.requests(CLUSTER)["gateway"]])
             yield Credentials(
                 cluster=CLUSTER,
                 role="gateway",

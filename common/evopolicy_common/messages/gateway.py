@@ -55,12 +55,17 @@ Profile = Literal["own", "published", "published-data"]
 cases in the paper, `published-data` with that of the published case files."""
 
 
-class OpenRun(Message, frozen=True, kw_only=True, tag="open_run"):
-    """The gateway's first request, after every start of either side."""
+class FromGateway(Message, frozen=True, kw_only=True):
+    """A request of a run's gateway."""
 
     run: Word
     token: Word
     """The run's capability; sent with every request and checked each time."""
+
+
+class OpenRun(FromGateway, frozen=True, kw_only=True, tag="open_run"):
+    """The gateway's first request, after every start of either side."""
+
     asks_permit: bool = False
     """The gateway sends `RequestPermit` before its agent starts. Otherwise the agent may already be on any machine."""
     reads_rendered: bool = False
@@ -68,14 +73,12 @@ class OpenRun(Message, frozen=True, kw_only=True, tag="open_run"):
     not."""
 
 
-class RequestPermit(Message, frozen=True, kw_only=True, tag="request_permit"):
+class RequestPermit(FromGateway, frozen=True, kw_only=True, tag="request_permit"):
     """Requests a permit for the run's agent to be alive on a kernel: a long poll, safe to send again.
 
     The permit lasts until the run is closed or cancelled, or an operator vouches that the agent has ended.
     """
 
-    run: Word
-    token: Word
     boot_id: Word
     """Boot id of the agent's kernel (`host.boot_id`); empty: unknown, which counts as every kernel."""
     host: Word = ""
@@ -155,11 +158,8 @@ class RunOpened(Message, frozen=True, kw_only=True, tag="run_opened"):
         return self.max_steps or self.env.max_episode_steps
 
 
-class StateRequest(Message, frozen=True, kw_only=True, tag="state"):
+class StateRequest(FromGateway, frozen=True, kw_only=True, tag="state"):
     """Requests the run's state; answered at once."""
-
-    run: Word
-    token: Word
 
 
 class StateReply(Message, frozen=True, kw_only=True, tag="state_reply"):
@@ -168,11 +168,9 @@ class StateReply(Message, frozen=True, kw_only=True, tag="state_reply"):
     state: RunState
 
 
-class Submit(Message, frozen=True, kw_only=True, tag="submit"):
+class Submit(FromGateway, frozen=True, kw_only=True, tag="submit"):
     """Evaluate a bundle on train cases. Safe to send again with the same key."""
 
-    run: Word
-    token: Word
     key: Word
     """Idempotency key: each key is accepted once."""
     env_instances: Many[Int]
@@ -197,11 +195,9 @@ class SubmitAccepted(Message, frozen=True, kw_only=True, tag="submit_accepted"):
     """Budget left after this submit, episodes."""
 
 
-class ResultsRequest(Message, frozen=True, kw_only=True, tag="results"):
+class ResultsRequest(FromGateway, frozen=True, kw_only=True, tag="results"):
     """A long poll for the results of a submit since `cursor`."""
 
-    run: Word
-    token: Word
     submit_index: Int
     cursor: Int
     """0 for the first request, then the `cursor` of the last page."""
@@ -256,11 +252,9 @@ class ResultsPage(Message, frozen=True, kw_only=True, tag="results_page"):
     """Whether the next page has episodes already."""
 
 
-class CloseRun(Message, frozen=True, kw_only=True, tag="close_run"):
+class CloseRun(FromGateway, frozen=True, kw_only=True, tag="close_run"):
     """No more submits will follow. Sent after the agent and all its children have ended; finalisation waits for it."""
 
-    run: Word
-    token: Word
     reason: Text
     """`budget_spent`, `agent_stopped`, `agent_failed`, `silent`, `wall_limit`, `model_budget_spent`,
     `disk_limit`, `cancelled`."""

@@ -19,12 +19,10 @@ from evopolicy_common.messages.environment import (
     StepLimit,
 )
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome, Record, ResourceLimits, Tier
-from evopolicy_common.messages.gateway import (
-    SubmitStatus,
-)
+from evopolicy_common.messages.gateway import SubmitStatus
 from evopolicy_common.messages.journal import Committed
 from evopolicy_common.messages.run_settings import HiddenIsolation, RunSettings
-from evopolicy_common.messages.status import StatusReply, StatusRequest
+from evopolicy_common.messages.status import FromOperator, StatusReply, StatusRequest
 from evopolicy_common.messages.worker import (
     BlobAck,
     BlobChunk,
@@ -36,10 +34,9 @@ from evopolicy_common.messages.worker import (
 )
 
 
-class CreateRun(Message, frozen=True, kw_only=True, tag="create_run"):
+class CreateRun(FromOperator, frozen=True, kw_only=True, tag="create_run"):
     """Open a run. Safe to send again with the same key."""
 
-    token: Word
     key: Word
     """Idempotency key: creating twice with one key returns the same run."""
     settings: RunSettings
@@ -132,10 +129,9 @@ class SubmitRecord(msgspec.Struct, frozen=True, kw_only=True):
     """Digest of the workspace at the submit; empty: not recorded."""
 
 
-class WaitRun(Message, frozen=True, kw_only=True, tag="wait_run"):
+class WaitRun(FromOperator, frozen=True, kw_only=True, tag="wait_run"):
     """A long poll for a finished run; answered with `RunProgress` until then."""
 
-    token: Word
     run: Word
     wait_s: Number
 
@@ -176,10 +172,9 @@ class PlayedAs(msgspec.Struct, frozen=True, kw_only=True):
     hidden_evaluation: HiddenEvaluation = "submit"
 
 
-class Evaluate(Message, frozen=True, kw_only=True, tag="evaluate"):
+class Evaluate(FromOperator, frozen=True, kw_only=True, tag="evaluate"):
     """Play cases outside any run: `evopolicy try`, `evopolicy random`."""
 
-    token: Word
     key: Word
     env: Word
     bundle: Word | None
@@ -199,10 +194,9 @@ class Evaluate(Message, frozen=True, kw_only=True, tag="evaluate"):
     """As `RunSettings.definition`."""
 
 
-class DescribeEnvironment(Message, frozen=True, kw_only=True, tag="describe_environment"):
+class DescribeEnvironment(FromOperator, frozen=True, kw_only=True, tag="describe_environment"):
     """Requests what a cluster has for replaying a finished run's episodes."""
 
-    token: Word
     env: Word
     run: Word = ""
     n_validation: Int | None = None
@@ -227,10 +221,9 @@ class EnvironmentState(Message, frozen=True, kw_only=True, tag="environment_stat
     """The result of the finished run (`records.journal.Result`, JSON); empty without one, and from earlier versions."""
 
 
-class RecordedRequest(Message, frozen=True, kw_only=True, tag="recorded"):
+class RecordedRequest(FromOperator, frozen=True, kw_only=True, tag="recorded"):
     """Requests the stored outcomes of a finished run's episodes; answered with an `EvaluationPage`."""
 
-    token: Word
     run: Word
     split: Split
     submit_index: Int
@@ -238,10 +231,9 @@ class RecordedRequest(Message, frozen=True, kw_only=True, tag="recorded"):
     cursor: Int
 
 
-class FurtherCasesRequest(Message, frozen=True, kw_only=True, tag="further_cases"):
+class FurtherCasesRequest(FromOperator, frozen=True, kw_only=True, tag="further_cases"):
     """Requests hidden cases for a re-score of a finished run, disjoint from its three splits."""
 
-    token: Word
     run: Word
     name: Word
     """Of the re-score: runs of one environment get the same cases under the same name."""
@@ -256,10 +248,9 @@ class FurtherCases(Message, frozen=True, kw_only=True, tag="further_cases_reply"
     """The epoch of the secret that the cases derive from."""
 
 
-class Rescore(Message, frozen=True, kw_only=True, tag="rescore"):
+class Rescore(FromOperator, frozen=True, kw_only=True, tag="rescore"):
     """Plays a finished run's checkpoint on further hidden cases; answered with `EvaluationStarted`."""
 
-    token: Word
     key: Word
     run: Word
     submit_index: Int
@@ -280,10 +271,9 @@ class EvaluationStarted(Message, frozen=True, kw_only=True, tag="evaluation_star
     """Number of its episodes; 0 when it has ended before this request."""
 
 
-class EvaluationPoll(Message, frozen=True, kw_only=True, tag="evaluation_poll"):
+class EvaluationPoll(FromOperator, frozen=True, kw_only=True, tag="evaluation_poll"):
     """A long poll for outcomes of an evaluation from `cursor` on."""
 
-    token: Word
     evaluation: Word
     cursor: Int
     wait_s: Number
@@ -301,36 +291,32 @@ class EvaluationPage(Message, frozen=True, kw_only=True, tag="evaluation_page"):
     """As in `RunProgress`."""
 
 
-class CancelRun(Message, frozen=True, kw_only=True, tag="cancel_run"):
+class CancelRun(FromOperator, frozen=True, kw_only=True, tag="cancel_run"):
     """Ends a run or an evaluation without a score."""
 
-    token: Word
     run: Word
 
 
-class AgentGone(Message, frozen=True, kw_only=True, tag="agent_gone"):
+class AgentGone(FromOperator, frozen=True, kw_only=True, tag="agent_gone"):
     """The operator declares a run's agent dead, which ends its permit. For machines that are lost for good."""
 
-    token: Word
     run: Word
     boot_id: Word = ""
     """Boot id of the kernel that it is gone from; empty: from every kernel. The run may continue elsewhere."""
 
 
-class RepinRun(Message, frozen=True, kw_only=True, tag="repin_run"):
+class RepinRun(FromOperator, frozen=True, kw_only=True, tag="repin_run"):
     """Lets a run continue with workers of another fingerprint class; the reason is recorded in the run."""
 
-    token: Word
     run: Word
     fingerprint_class: Word
     """As `WorkerStatus.classes` shows it for the run's environment, or `WorkerStatus.fingerprint`."""
     reason: Text
 
 
-class SetWorker(Message, frozen=True, kw_only=True, tag="set_worker"):
+class SetWorker(FromOperator, frozen=True, kw_only=True, tag="set_worker"):
     """Takes a worker out of service, or puts it back."""
 
-    token: Word
     worker: Word
     state: Literal["active", "paused", "draining"]
     """paused: it gets no more work and stays. draining: it gets no more work, and exits once its jobs are done."""
@@ -340,11 +326,10 @@ class Done(Message, frozen=True, kw_only=True, tag="ok"):
     """The request was carried out."""
 
 
-class Claim(Message, frozen=True, kw_only=True, tag="claim"):
+class Claim(FromOperator, frozen=True, kw_only=True, tag="claim"):
     """One run of a sweep, for this host to play: taken, renewed, released or settled, so that no run is played
     twice."""
 
-    token: Word
     suite: Word
     """The sweep's name."""
     name: Word
@@ -375,17 +360,15 @@ class ClaimState(Message, frozen=True, kw_only=True, tag="claim_state"):
     """The run's result, once the claim is settled."""
 
 
-class Disclose(Message, frozen=True, kw_only=True, tag="disclose"):
+class Disclose(FromOperator, frozen=True, kw_only=True, tag="disclose"):
     """Declares the cases of finished runs public; answered with `Done` once the journal records it."""
 
-    token: Word
     runs: Many[Word]
 
 
-class JournalRequest(Message, frozen=True, kw_only=True, tag="journal"):
+class JournalRequest(FromOperator, frozen=True, kw_only=True, tag="journal"):
     """Requests entries of the journal from `cursor` on."""
 
-    token: Word
     cursor: Int
 
 
@@ -397,10 +380,9 @@ class JournalPage(Message, frozen=True, kw_only=True, tag="journal_page"):
     finished: bool
 
 
-class OpeningRequest(Message, frozen=True, kw_only=True, tag="opening"):
+class OpeningRequest(FromOperator, frozen=True, kw_only=True, tag="opening"):
     """Requests what the coordinator committed to for a run whose cases were disclosed."""
 
-    token: Word
     run: Word
 
 
@@ -412,10 +394,9 @@ class RunOpening(Message, frozen=True, kw_only=True, tag="run_opening"):
     result: Bytes
 
 
-class SignRequest(Message, frozen=True, kw_only=True, tag="sign"):
+class SignRequest(FromOperator, frozen=True, kw_only=True, tag="sign"):
     """Requests a signature of a manifest of published results with the coordinator's key."""
 
-    token: Word
     digest: Word
     """SHA-256 of the manifest, 64 hex digits."""
 
@@ -427,10 +408,9 @@ class Signed(Message, frozen=True, kw_only=True, tag="signed"):
     signature: Word
 
 
-class EnvironmentsRequest(Message, frozen=True, kw_only=True, tag="environments"):
+class EnvironmentsRequest(FromOperator, frozen=True, kw_only=True, tag="environments"):
     """Requests the environments that the workers offer, page by page."""
 
-    token: Word
     cursor: Int = 0
 
 
@@ -458,10 +438,9 @@ class EnvironmentsReply(Message, frozen=True, kw_only=True, tag="environments_re
     """With the last page: by environment, the workers on which it failed, with the reasons."""
 
 
-class ApproveEnvironment(Message, frozen=True, kw_only=True, tag="approve_environment"):
+class ApproveEnvironment(FromOperator, frozen=True, kw_only=True, tag="approve_environment"):
     """Lets runs use one definition of an environment that does not ship."""
 
-    token: Word
     env: Word
     digest: Word
 

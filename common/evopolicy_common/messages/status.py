@@ -11,10 +11,16 @@ from evopolicy_common.messages.episode import Tier
 from evopolicy_common.messages.worker import Message
 
 
-class StatusRequest(Message, frozen=True, kw_only=True, tag="status"):
+class FromOperator(Message, frozen=True, kw_only=True):
+    """A request of an operator."""
+
+    token: Word = ""
+    """The operators' token, which `OperatorClient` fills in."""
+
+
+class StatusRequest(FromOperator, frozen=True, kw_only=True, tag="status"):
     """Requests the cluster's status."""
 
-    token: Word
     max_age_s: Number = 0.0
     """A reply that the coordinator made at most this many seconds ago will do: any number of watchers cost one."""
 

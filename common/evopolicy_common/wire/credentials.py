@@ -56,8 +56,7 @@ class Credentials(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
 
 def default_state_dir() -> Path:
     """The coordinator's default state folder: `$EVOPOLICY_STATE`, or one in the user's state home."""
-    named = os.environ.get("EVOPOLICY_STATE")
-    return Path(named) if named else state_home() / "coordinator"
+    return Path(os.environ.get("EVOPOLICY_STATE") or state_home() / "coordinator")
 
 
 def local_state_dir() -> Path:
@@ -69,11 +68,6 @@ _MOST_BYTES = 1 << 20
 """Of a credentials file or a key."""
 SWEEP_STATE = ".cluster"
 """The state folder of `evopolicy suite --local`, in the sweep's folder."""
-
-
-def registry_dir() -> Path:
-    """Folder in which this user's commands find this machine's clusters by endpoint."""
-    return state_home() / "clusters"
 
 
 def write(credentials: Credentials, path: Path) -> None:
@@ -96,11 +90,7 @@ def read(path: Path) -> Credentials:
     if found.tls is None:
         return found
     folder = Path(os.path.abspath(path.parent))
-    tls = TlsFiles(
-        root_ca=str(folder / found.tls.root_ca),
-        certificate=str(folder / found.tls.certificate),
-        private_key=str(folder / found.tls.private_key),
-    )
+    tls = TlsFiles(**{name: str(folder / place) for name, place in msgspec.structs.asdict(found.tls).items()})
     for name in (tls.root_ca, tls.certificate):
         if not Path(name).is_file():
             raise ConfigError(f"{name}, which {path} names, is missing: copy the whole folder")
@@ -149,7 +139,7 @@ def stays_on_machine(endpoint: str) -> bool:
 def publish(endpoints: tuple[str, ...], folder: Path) -> None:
     """Registers `folder` as the place of the credentials of these endpoints, for this user's commands. Raises
     ConfigError where the registry cannot be made."""
-    registry = registry_dir()
+    registry = state_home() / "clusters"
     try:
         registry.mkdir(parents=True, exist_ok=True, mode=0o700)
     except OSError as error:
@@ -177,16 +167,14 @@ def find(role: Role, connect: tuple[str, ...] = (), file: Path | None = None) ->
         if not file.exists():
             raise ConfigError(f"{file.parent} has no {role} credentials (roles there: {held})")
     if file is None:
-        folder = next(filter(None, map(_folder_of, connect)), None)
-        file = (folder or default_state_dir() / "credentials") / f"{role}.json"
+        known = (entry for entry in map(_registered, connect) if entry.exists())
+        folder = next((Path(entry.read_text()) for entry in known), default_state_dir() / "credentials")
+        file = folder / f"{role}.json"
         if not file.exists():
             where = f" for {', '.join(connect)}" if connect else ""
-            local = ""
-            if role == "operator" and not connect:
-                local = (
-                    ". A run on this machine alone needs none: evopolicy local --env gym/acrobot --agent"
-                    " llm:openai/MODEL"
-                )
+            alone = role == "operator" and not connect
+            local = ". A run on this machine alone needs none: evopolicy local --env gym/acrobot --agent"
+            local = f"{local} llm:openai/MODEL" * alone
             raise ConfigError(
                 f"no {role} credentials{where}: looked at {file}. Start evopolicy-coordinator on this machine, or name"
                 f" a folder that `evopolicy-coordinator certs issue {role} NAME` wrote with --credentials{local}"
@@ -216,14 +204,9 @@ def no_state(root: Path, missing: str) -> ConfigError:
 
 def state_home() -> Path:
     """Folder of this user's persistent files when a command is given no other."""
-    home = os.environ.get("XDG_STATE_HOME")
-    return (Path(home) if home else Path.home() / ".local" / "state") / "evopolicy"
+    return Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state", "evopolicy")
 
 
 def _registered(endpoint: str) -> Path:
-    return registry_dir() / digest_of(endpoint.encode())[:32]
-
-
-def _folder_of(endpoint: str) -> Path | None:
-    path = _registered(endpoint)
-    return Path(path.read_text()) if path.exists() else None
+    """The file by which this user's commands find a cluster of this machine."""
+    return state_home() / "clusters" / digest_of(endpoint.encode())[:32]

@@ -95,14 +95,13 @@ class _Server(uvicorn.Server):
 class TimedProtocol(H11Protocol):
     """One connection."""
 
-    _headers_timer: asyncio.TimerHandle | None = None
-    _answer_timer: asyncio.TimerHandle | None = None
     _made_at = 0.0
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
+        self._timers: dict[str, asyncio.TimerHandle] = {}
         self._made_at = self.loop.time()
-        self._start_headers_timer()
+        self._start_timer("headers", HEADERS_WAIT_S)
         others = [each for each in self.connections if isinstance(each, TimedProtocol) and each is not self]
         alive = [each for each in others if not each.transport.is_closing()]
         idle = [each for each in alive if each.cycle is None or each.cycle.response_complete]
@@ -113,9 +112,9 @@ class TimedProtocol(H11Protocol):
     def data_received(self, data: bytes) -> None:
         super().data_received(data)
         if self.conn.their_state is h11.IDLE:
-            self._start_headers_timer()
+            self._start_timer("headers", HEADERS_WAIT_S)
         else:
-            self._stop_headers_timer()
+            self._stop_timer("headers")
 
     def on_response_complete(self) -> None:
         # Read before the next request, which may have arrived already, changes the state.
@@ -124,15 +123,15 @@ class TimedProtocol(H11Protocol):
         if unread:
             # The request has its answer, so the rest of its body will never be read.
             self.transport.close()
-            self._start_headers_timer()
+            self._start_timer("headers", HEADERS_WAIT_S)
 
     def pause_writing(self) -> None:
         super().pause_writing()
-        self._answer_timer = self.loop.call_later(ANSWER_WAIT_S, self._cut_off)
+        self._start_timer("answer", ANSWER_WAIT_S)
 
     def resume_writing(self) -> None:
         super().resume_writing()
-        self._stop_answer_timer()
+        self._stop_timer("answer")
 
     def timeout_keep_alive_handler(self) -> None:
         # A client that has not read its answer by now is not going to.
@@ -142,24 +141,18 @@ class TimedProtocol(H11Protocol):
             super().timeout_keep_alive_handler()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        self._stop_headers_timer()
-        self._stop_answer_timer()
+        self._stop_timer("headers")
+        self._stop_timer("answer")
         super().connection_lost(exc)
 
     def _cut_off(self) -> None:
         self.transport.abort()
 
-    def _start_headers_timer(self) -> None:
+    def _start_timer(self, name: str, wait_s: float) -> None:
         # Once per request: a client that sends single bytes gains no time.
-        if self._headers_timer is None:
-            self._headers_timer = self.loop.call_later(HEADERS_WAIT_S, self._cut_off)
+        if name not in self._timers:
+            self._timers[name] = self.loop.call_later(wait_s, self._cut_off)
 
-    def _stop_headers_timer(self) -> None:
-        if self._headers_timer is not None:
-            self._headers_timer.cancel()
-            self._headers_timer = None
-
-    def _stop_answer_timer(self) -> None:
-        if self._answer_timer is not None:
-            self._answer_timer.cancel()
-            self._answer_timer = None
+    def _stop_timer(self, name: str) -> None:
+        if timer := self._timers.pop(name, None):
+            timer.cancel()

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import re
 
+from evopolicy_common.wire.credentials import Role
+
 _ROOT = "evopolicy/v1"
+_PLACES: dict[Role, str] = {"worker": "work", "gateway": "gw", "operator": "ops"}
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,62}")
 
 
@@ -19,7 +22,7 @@ def worker_key(cluster: str, verb: str) -> str:
 
 
 def liveliness_key(cluster: str, worker: str) -> str:
-    """Key of a worker's liveliness token: a hint to check its leases now, never a fact."""
+    """Key of a worker's liveliness token, a hint to check its leases now and never a fact; with `*`, of all of them."""
     return f"{_ROOT}/{cluster}/worker/{worker}/live"
 
 
@@ -33,21 +36,6 @@ def operator_key(cluster: str, verb: str) -> str:
     return f"{_ROOT}/{cluster}/ops/{verb}"
 
 
-def worker_expr(cluster: str) -> str:
-    """All keys of workers' requests."""
-    return f"{_ROOT}/{cluster}/work/**"
-
-
-def gateway_expr(cluster: str) -> str:
-    """All keys of requests of all runs' gateways."""
-    return f"{_ROOT}/{cluster}/gw/**"
-
-
-def operator_expr(cluster: str) -> str:
-    """All keys of operators' requests."""
-    return f"{_ROOT}/{cluster}/ops/**"
-
-
-def liveliness_expr(cluster: str) -> str:
-    """All workers' liveliness tokens."""
-    return f"{_ROOT}/{cluster}/worker/*/live"
+def requests(cluster: str) -> dict[Role, str]:
+    """By role, the expression of all keys of its requests."""
+    return {role: f"{_ROOT}/{cluster}/{place}/**" for role, place in _PLACES.items()}

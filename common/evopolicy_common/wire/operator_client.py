@@ -41,9 +41,9 @@ from evopolicy_common.messages.operator import (
     Signed,
     SignRequest,
 )
-from evopolicy_common.messages.status import StatusReply, StatusRequest
+from evopolicy_common.messages.status import FromOperator, StatusReply, StatusRequest
 from evopolicy_common.refusals import Refusal
-from evopolicy_common.wire.requests import operator_requests
+from evopolicy_common.wire.requests import Wanted, operator_requests
 from evopolicy_common.wire.transport import Link
 
 WAIT_S = 3.0
@@ -65,12 +65,17 @@ class OperatorClient:
         self.own = own
         self._requests = operator_requests(link)
 
+    async def _ask(
+        self, verb: str, message: FromOperator, wanted: type[Wanted], *, timeout_s: float | None = TIMEOUT_S
+    ) -> Wanted:
+        message = replace(message, token=self._token)
+        return await self._requests.until_answered(verb, message, wanted, timeout_s=timeout_s)
+
     # The cluster.
 
     async def status(self, max_age_s: float = 0.0) -> StatusReply:
         """The cluster's status, made at most `max_age_s` seconds ago."""
-        message = StatusRequest(token=self._token, max_age_s=max_age_s)
-        return await self._requests.until_answered("status", message, StatusReply, timeout_s=TIMEOUT_S)
+        return await self._ask("status", StatusRequest(max_age_s=max_age_s), StatusReply)
 
     async def environments(
         self,
@@ -79,29 +84,24 @@ class OperatorClient:
         those that failed, with the reasons by worker."""
         offered: list[OfferedEnvironment] = []
         while True:
-            message = EnvironmentsRequest(token=self._token, cursor=len(offered))
-            page = await self._requests.until_answered(
-                "environments", message, EnvironmentsReply, timeout_s=TIMEOUT_S
-            )
+            message = EnvironmentsRequest(cursor=len(offered))
+            page = await self._ask("environments", message, EnvironmentsReply)
             offered += page.environments
             if page.finished:
                 return offered, page.undescribed, page.failed
 
     async def approve(self, env: str, digest: str) -> None:
         """Lets runs use this definition of an environment that does not ship."""
-        await self._done("approve", ApproveEnvironment(token=self._token, env=env, digest=digest))
+        await self._ask("approve", ApproveEnvironment(env=env, digest=digest), Done)
 
     async def set_worker(self, worker: str, state: Literal["active", "paused", "draining"]) -> None:
-        await self._done("worker", SetWorker(token=self._token, worker=worker, state=state))
+        await self._ask("worker", SetWorker(worker=worker, state=state), Done)
 
     async def describe(self, message: DescribeEnvironment) -> EnvironmentState:
         """Data for replaying a finished run's episodes. Waits for a worker that describes the environment now."""
-        request = replace(message, token=self._token)
         until = time.monotonic() + DESCRIPTION_S
         while True:
-            reply = await self._requests.until_answered(
-                "describe", request, EnvironmentState, timeout_s=TIMEOUT_S
-            )
+            reply = await self._ask("describe", message, EnvironmentState)
             if not reply.awaited or time.monotonic() > until:
                 return reply
             await asyncio.sleep(DESCRIPTION_PAUSE_S)
@@ -110,16 +110,15 @@ class OperatorClient:
 
     async def cancel(self, run: str) -> None:
         """Ends a run without a score."""
-        await self._done("cancel", CancelRun(token=self._token, run=run))
+        await self._ask("cancel", CancelRun(run=run), Done)
 
     async def agent_gone(self, run: str, boot_id: str = "") -> None:
         """Ends the permit of a run's agent that is no longer alive, or no longer on the kernel `boot_id`."""
-        await self._done("agent_gone", AgentGone(token=self._token, run=run, boot_id=boot_id))
+        await self._ask("agent_gone", AgentGone(run=run, boot_id=boot_id), Done)
 
     async def repin(self, run: str, fingerprint_class: str, reason: str) -> None:
         """Lets a run continue with workers of another fingerprint class."""
-        message = RepinRun(token=self._token, run=run, fingerprint_class=fingerprint_class, reason=reason)
-        await self._done("repin", message)
+        await self._ask("repin", RepinRun(run=run, fingerprint_class=fingerprint_class, reason=reason), Done)
 
     async def recorded(
         self, run: str, split: Split, submit_index: int, *, timeout_s: float | None = None
@@ -128,52 +127,42 @@ class OperatorClient:
 
         Raises RefusedError for a run that is unfinished or no longer known.
         """
-        cursor = 0
-        while True:
-            message = RecordedRequest(
-                token=self._token, run=run, split=split, submit_index=submit_index, cursor=cursor
-            )
-            page = await self._requests.until_answered(
-                "recorded", message, EvaluationPage, timeout_s=timeout_s
-            )
-            cursor = page.cursor
+        cursor, finished = 0, False
+        while not finished:
+            message = RecordedRequest(run=run, split=split, submit_index=submit_index, cursor=cursor)
+            page = await self._ask("recorded", message, EvaluationPage, timeout_s=timeout_s)
+            cursor, finished = page.cursor, page.finished
             for outcome in page.outcomes:
                 yield outcome
-            if page.finished:
-                return
 
     # Publication.
 
     async def disclose(self, runs: tuple[str, ...]) -> None:
         """Makes the cases of finished runs public. Raises RefusedError while any run with the same secret is open."""
-        await self._done("disclose", Disclose(token=self._token, runs=runs))
+        await self._ask("disclose", Disclose(runs=runs), Done)
 
     async def journal(self) -> list[bytes]:
         """All entries of the coordinator's journal."""
         entries: list[bytes] = []
         while True:
-            message = JournalRequest(token=self._token, cursor=len(entries))
-            page = await self._requests.until_answered("journal", message, JournalPage, timeout_s=TIMEOUT_S)
+            page = await self._ask("journal", JournalRequest(cursor=len(entries)), JournalPage)
             entries += page.entries
             if page.finished:
                 return entries
 
     async def opening(self, run: str) -> RunOpening:
         """The committed document of a disclosed run."""
-        message = OpeningRequest(token=self._token, run=run)
-        return await self._requests.until_answered("opening", message, RunOpening, timeout_s=TIMEOUT_S)
+        return await self._ask("opening", OpeningRequest(run=run), RunOpening)
 
     async def sign(self, digest: str) -> Signed:
         """The coordinator's signature of the manifest whose SHA-256 is `digest`."""
-        message = SignRequest(token=self._token, digest=digest)
-        return await self._requests.until_answered("sign", message, Signed, timeout_s=TIMEOUT_S)
+        return await self._ask("sign", SignRequest(digest=digest), Signed)
 
     # Episodes outside any run.
 
     async def further_cases(self, run: str, name: str, n: int) -> FurtherCases:
         """`n` hidden cases for the re-score `name` of a finished run, disjoint from its splits."""
-        message = FurtherCasesRequest(token=self._token, run=run, name=name, n=n)
-        return await self._requests.until_answered("further", message, FurtherCases, timeout_s=TIMEOUT_S)
+        return await self._ask("further", FurtherCasesRequest(run=run, name=name, n=n), FurtherCases)
 
     async def evaluate(
         self, message: Evaluate | Rescore
@@ -183,16 +172,12 @@ class OperatorClient:
         Yields `(outcome, total, "")` or `(None, total, waits_for)`; `total` is the number of episodes. Cancels the
         evaluation when the caller stops before its end. Raises RefusedError when somebody else cancels it.
         """
-        request = replace(message, token=self._token)
-        started = await self._requests.until_answered(
-            "evaluate", request, EvaluationStarted, timeout_s=TIMEOUT_S
-        )
+        started = await self._ask("evaluate", message, EvaluationStarted)
+        token, name = self._token, started.evaluation
         cursor, finished = 0, False
         try:
             while not finished:
-                poll = EvaluationPoll(
-                    token=self._token, evaluation=started.evaluation, cursor=cursor, wait_s=WAIT_S
-                )
+                poll = EvaluationPoll(token=token, evaluation=name, cursor=cursor, wait_s=WAIT_S)
                 page = await self._requests.until_answered("poll", poll, EvaluationPage, wait_s=WAIT_S)
                 cursor, finished = page.cursor, page.finished
                 for outcome in page.outcomes:
@@ -203,16 +188,13 @@ class OperatorClient:
                     yield None, page.total, page.waits_for
             # One that ended before this request has no number of episodes; an interrupted command cancelled it.
             if cursor < started.episodes:
-                raise RefusedError(
-                    Refusal.RUN_CANCELLED,
-                    f"an operator cancelled evaluation {started.evaluation} after {cursor} of {started.episodes}"
-                    " episodes; repeat the command",
-                )
+                done = f"{cursor} of {started.episodes} episodes"
+                text = f"an operator cancelled evaluation {name} after {done}; repeat the command"
+                raise RefusedError(Refusal.RUN_CANCELLED, text)
         finally:
             if not finished:
-                cancel = CancelRun(token=self._token, run=started.evaluation)
                 with contextlib.suppress(EvopolicyError):
-                    await self._requests.once("cancel", cancel, Done)
+                    await self._requests.once("cancel", CancelRun(token=token, run=name), Done)
 
     # Blobs.
 
@@ -227,8 +209,3 @@ class OperatorClient:
     async def fetch(self, ref: BlobRef) -> bytes:
         """The bytes that `ref` names, checked against the digest."""
         return await self._requests.fetch(_SENDER, self._token, ref)
-
-    async def _done(
-        self, verb: str, message: AgentGone | ApproveEnvironment | CancelRun | Disclose | RepinRun | SetWorker
-    ) -> None:
-        await self._requests.until_answered(verb, message, Done, timeout_s=TIMEOUT_S)

@@ -4,7 +4,7 @@ Rules that this module owns:
 - Zenoh's callbacks run on its threads and only pass work to the event loop.
 - Nothing is sent from the event loop: a send to a frozen peer blocks for seconds, and would expire all leases.
 - Every declaration is held by an object, since dropping it undeclares it.
-- Scouting is off and the admin space is closed; `access_control` below grants the rights.
+- Scouting is off and the admin space is closed; `_access_control` below grants the rights.
 - Machines connect over mutual TLS: each has a certificate, a user name and a password of its own. It has rights only if
   the certificate's common name and the user name both equal its identity.
 - No process forks while it has a session open.
@@ -349,7 +349,9 @@ def server_config(
     `passwords` is a file with one line `user:password` each; `users` maps each role to its user name, and roles have
     rights.
     """
-    return _router_config(listen, passwords, access_control(cluster, users))
+    subjects = [{"id": role, "usernames": [user]} for role, user in users.items()]
+    rights = _access_control(cluster, subjects, [(role, role) for role in users])
+    return _config(_router(listen, passwords, rights))
 
 
 def tls_server_config(
@@ -364,26 +366,14 @@ def tls_server_config(
     `machines` are roles and identities: common names of certificates and, as user names, entries of the file
     `passwords`.
     """
-    settings = _router_config(listen, passwords, machine_access_control(cluster, machines))
-    for key, value in _tls(tls, "listen").items():
-        settings.insert_json5(key, json.dumps(value))
-    return settings
-
-
-def access_control(cluster: str, users: dict[Role, str]) -> dict[str, Any]:
-    """Zenoh's access rules: each role sends requests on its own keys and receives the replies, and nothing else.
-
-    `declare_queryable` goes out to clients only: if it were accepted from them, one gateway could answer another's
-    queries.
-    """
-    subjects = [{"id": role, "usernames": [user]} for role, user in users.items()]
-    return _access_control(cluster, subjects, [(role, role) for role in users])
+    rights = machine_access_control(cluster, machines)
+    return _config({**_router(listen, passwords, rights), **_tls(tls, "listen")})
 
 
 def machine_access_control(
     cluster: str, machines: Iterable[tuple[MachineRole, str]], uplink: str | None = None
 ) -> dict[str, Any]:
-    """`access_control` of a session over TLS: each machine has one name, in its certificate and as its user name.
+    """The access rules of a session over TLS: each machine has one name, in its certificate and as its user name.
 
     A `router` is a site's own `zenohd`, which speaks for all roles behind it and has to apply these rules to them.
     `uplink`: the common name of the peer that such a router connects to; requests go there and replies come from it.
@@ -440,19 +430,24 @@ def site_router_settings(
 def _access_control(
     cluster: str, subjects: list[dict[str, Any]], roles: list[tuple[str, MachineRole]]
 ) -> dict[str, Any]:
-    expressions: dict[Role, str] = {
-        "worker": keys.worker_expr(cluster),
-        "gateway": keys.gateway_expr(cluster),
-        "operator": keys.operator_expr(cluster),
-    }
-    rules = []
-    for role, expression in expressions.items():
-        rules.append(_rule(f"{role}_asks", ["query"], "ingress", expression))
-        rules.append(_rule(f"{role}_hears", ["reply", "declare_queryable"], "egress", expression))
-    rules.append(_rule("worker_lives", ["liveliness_token"], "ingress", keys.liveliness_expr(cluster)))
-    granted: dict[MachineRole, list[str]] = {role: [f"{role}_asks", f"{role}_hears"] for role in expressions}
-    granted["worker"].append("worker_lives")
-    granted["router"] = [str(rule["id"]) for rule in rules]
+    """Zenoh's access rules: each role sends requests on its own keys and receives the replies, and nothing else.
+
+    `declare_queryable` goes out to clients only: if it were accepted from them, one gateway could answer another's
+    queries.
+    """
+    rules: list[dict[str, Any]] = []
+    granted: dict[MachineRole, list[str]] = {}
+
+    def allow(role: MachineRole, name: str, messages: list[str], flow: str, key: str) -> None:
+        rule = {"id": name, "permission": "allow", "messages": messages, "flows": [flow], "key_exprs": [key]}
+        rules.append(rule)
+        granted.setdefault(role, []).append(name)
+        granted.setdefault("router", []).append(name)
+
+    for role, expression in keys.requests(cluster).items():
+        allow(role, f"{role}_asks", ["query"], "ingress", expression)
+        allow(role, f"{role}_hears", ["reply", "declare_queryable"], "egress", expression)
+    allow("worker", "worker_lives", ["liveliness_token"], "ingress", keys.liveliness_key(cluster, "*"))
     return {
         "enabled": True,
         "default_permission": "deny",
@@ -462,16 +457,14 @@ def _access_control(
     }
 
 
-def _router_config(listen: Iterable[str], passwords: Path, rights: dict[str, Any]) -> zenoh.Config:
-    return _config(
-        {
-            **_COMMON,
-            "mode": "router",
-            "listen/endpoints": list(listen),
-            "transport/auth/usrpwd/dictionary_file": str(passwords),
-            "access_control": rights,
-        }
-    )
+def _router(listen: Iterable[str], passwords: Path, rights: dict[str, Any]) -> dict[str, Any]:
+    return {
+        **_COMMON,
+        "mode": "router",
+        "listen/endpoints": list(listen),
+        "transport/auth/usrpwd/dictionary_file": str(passwords),
+        "access_control": rights,
+    }
 
 
 _COMMON: dict[str, Any] = {
@@ -483,16 +476,6 @@ _COMMON: dict[str, Any] = {
     # Zenoh itself reconnects to a lost router, often enough that its clients are back within a second.
     "connect/retry": {"period_init_ms": 50, "period_max_ms": 500, "period_increase_factor": 1.5},
 }
-
-
-def _rule(name: str, messages: list[str], flow: str, expression: str) -> dict[str, Any]:
-    return {
-        "id": name,
-        "permission": "allow",
-        "messages": messages,
-        "flows": [flow],
-        "key_exprs": [expression],
-    }
 
 
 def _tls(tls: TlsFiles | None, side: str) -> dict[str, Any]:

@@ -30,8 +30,8 @@ _PAUSE_S = 0.25
 
 def declare_all(server: Server, cluster: str, on_liveliness: Callable[[str, bool], None]) -> None:
     """Declares the keys that a coordinator's session answers, and the liveliness tokens that it watches."""
-    server.declare((keys.worker_expr(cluster), keys.gateway_expr(cluster), keys.operator_expr(cluster)))
-    server.watch_liveliness(keys.liveliness_expr(cluster), on_liveliness)
+    server.declare(keys.requests(cluster).values())
+    server.watch_liveliness(keys.liveliness_key(cluster, "*"), on_liveliness)
 
 
 @contextlib.asynccontextmanager

@@ -46,14 +46,11 @@ class Site:
             "operator": self.certs.root / "operator-desk",
         }
         self.elsewhere = self.certs.issue("worker", "elsewhere")
-        write_router_config(
-            self.certs.state,
-            "site",
-            self.folder,
-            listen=(self.endpoint,),
-            connect=(self.certs.endpoint,),
-            admit=("worker/here", "gateway/desk", "operator/desk"),
-        )
+        self.configure("worker/here", "gateway/desk", "operator/desk")
+
+    def configure(self, *admit: str) -> None:
+        places = {"listen": (self.endpoint,), "connect": (self.certs.endpoint,)}
+        write_router_config(self.certs.state, "site", self.folder, **places, admit=admit)
 
     @contextlib.asynccontextmanager
     async def up(self, alive: list[tuple[str, bool]] | None = None) -> AsyncIterator[list[str]]:
@@ -73,12 +70,10 @@ class Site:
             CLUSTER, [self.certs.endpoint], machines.passwords, listed, machines.tls
         )
         async with transport.serve(config, answer) as server, open_router(self.folder):
-            server.declare(
-                [keys.worker_expr(CLUSTER), keys.gateway_expr(CLUSTER), keys.operator_expr(CLUSTER)]
-            )
+            server.declare(keys.requests(CLUSTER).values())
             if alive is not None:
                 server.watch_liveliness(
-                    keys.liveliness_expr(CLUSTER), lambda key, up: alive.append((key, up))
+                    keys.liveliness_key(CLUSTER, "*"), lambda key, up: alive.append((key, up))
                 )
             yield asked
 
@@ -136,7 +131,7 @@ async def test_no_machine_answers_or_overhears_another_behind_the_same_router(si
     async with (
         site.up(),
         site.link("gateway") as honest,
-        eavesdropping(found, keys.gateway_expr(CLUSTER)) as overheard,
+        eavesdropping(found, keys.requests(CLUSTER)["gateway"]) as overheard,
     ):
         assert await answered(honest, OWN_KEY["gateway"], attempts=300)
         for _ in range(20):
@@ -159,24 +154,9 @@ async def test_a_workers_liveliness_is_seen_through_the_router_and_no_one_elses(
 async def test_a_router_behind_another_one_passes_on_as_far_as_roles_allow(site: Site) -> None:
     far = site.certs.issue("router", "far")
     endpoint = f"tls/127.0.0.1:{free_port()}"
-    write_router_config(
-        site.certs.state,
-        "far",
-        far,
-        listen=(endpoint,),
-        connect=(site.endpoint,),
-        uplink="router/site",
-        admit=("worker/elsewhere",),
-    )
-    write_router_config(
-        site.certs.state,
-        "site",
-        site.folder,
-        listen=(site.endpoint,),
-        connect=(site.certs.endpoint,),
-        admit=("router/far", "worker/here"),
-    )
-
+    rules = {"uplink": "router/site", "admit": ("worker/elsewhere",)}
+    write_router_config(site.certs.state, "far", far, listen=(endpoint,), connect=(site.endpoint,), **rules)
+    site.configure("router/far", "worker/here")
     alive: list[tuple[str, bool]] = []
     found = credentials.find("worker", (endpoint,), site.elsewhere)
     async with site.up(alive), open_router(far), transport.connect(found, timeout_s=30.0) as link:

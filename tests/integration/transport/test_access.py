@@ -27,14 +27,14 @@ OWN_KEY = {
 
 
 def credentials(folder: Path, role: Role, password: str | None = None) -> Credentials:
-    return Credentials(
-        cluster=CLUSTER,
-        role=role,
-        endpoints=(f"unixsock-stream/{folder}/sock",),
-        user=role,
-        password=password or PASSWORDS[role],
-        token="",
-    )
+    place, word = (f"unixsock-stream/{folder}/sock",), password or PASSWORDS[role]
+    return Credentials(cluster=CLUSTER, role=role, endpoints=place, user=role, password=word, token="")
+
+
+def config_of(folder: Path) -> zenoh.Config:
+    (folder / "passwords").write_text("".join(f"{user}:{word}\n" for user, word in PASSWORDS.items()))
+    users: dict[Role, str] = {role: role for role in PASSWORDS}
+    return transport.server_config(CLUSTER, [f"unixsock-stream/{folder}/sock"], folder / "passwords", users)
 
 
 @contextlib.asynccontextmanager
@@ -47,12 +47,8 @@ async def coordinator(folder: Path) -> AsyncIterator[list[str]]:
             asked.append(query.key)
             query.reply(b"coordinator")
 
-    (folder / "passwords").write_text("".join(f"{user}:{word}\n" for user, word in PASSWORDS.items()))
-    config = transport.server_config(
-        CLUSTER, [f"unixsock-stream/{folder}/sock"], folder / "passwords", {role: role for role in PASSWORDS}
-    )
-    async with transport.serve(config, answer) as server:
-        server.declare([keys.worker_expr(CLUSTER), keys.gateway_expr(CLUSTER), keys.operator_expr(CLUSTER)])
+    async with transport.serve(config_of(folder), answer) as server:
+        server.declare(keys.requests(CLUSTER).values())
         yield asked
 
 
@@ -97,7 +93,7 @@ async def test_one_gateway_cannot_answer_or_overhear_another(tmp_path: Path) -> 
     async with (
         coordinator(tmp_path),
         transport.connect(own) as honest,
-        eavesdropping(own, keys.gateway_expr(CLUSTER)) as overheard,
+        eavesdropping(own, keys.requests(CLUSTER)["gateway"]) as overheard,
     ):
         await asyncio.sleep(0.3)
         for _ in range(20):
@@ -108,15 +104,9 @@ async def test_one_gateway_cannot_answer_or_overhear_another(tmp_path: Path) -> 
 async def test_only_a_worker_can_claim_to_be_alive(tmp_path: Path) -> None:
     seen: list[tuple[str, bool]] = []
     key = keys.liveliness_key(CLUSTER, "w1")
-    (tmp_path / "passwords").write_text("".join(f"{user}:{word}\n" for user, word in PASSWORDS.items()))
-    config = transport.server_config(
-        CLUSTER,
-        [f"unixsock-stream/{tmp_path}/sock"],
-        tmp_path / "passwords",
-        {role: role for role in PASSWORDS},
-    )
-    async with transport.serve(config, lambda queries: None) as server:
-        server.watch_liveliness(keys.liveliness_expr(CLUSTER), lambda name, alive: seen.append((name, alive)))
+    async with transport.serve(config_of(tmp_path), lambda queries: None) as server:
+        all_workers = keys.liveliness_key(CLUSTER, "*")
+        server.watch_liveliness(all_workers, lambda name, alive: seen.append((name, alive)))
         async with transport.connect(credentials(tmp_path, "gateway")) as link:
             link.declare_alive(key)
             await asyncio.sleep(0.2)

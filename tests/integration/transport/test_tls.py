@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import datetime as dt
 import json
+import shutil
 from collections.abc import AsyncIterator
 from functools import partial
 from pathlib import Path
@@ -114,16 +115,14 @@ def refused_clients(certs: OwnCerts, tmp_path: Path) -> dict[str, Credentials]:
     assert honest.tls is not None
     stranger = of(foreign.issue("worker", "honest"))
     assert stranger.tls is not None
+    trusting = msgspec.structs.replace(stranger.tls, root_ca=honest.tls.root_ca)
+    others = of(folder(certs, "worker-other")).password
     return {
         "a certificate of another authority": with_certificate_of(honest, stranger),
-        "that, and trust in ours": msgspec.structs.replace(
-            honest, tls=msgspec.structs.replace(stranger.tls, root_ca=honest.tls.root_ca)
-        ),
+        "that, and trust in ours": msgspec.structs.replace(honest, tls=trusting),
         "an expired certificate": of(folder(certs, "worker-late")),
         "a wrong password": msgspec.structs.replace(honest, password="wrong"),
-        "another worker's password": msgspec.structs.replace(
-            honest, password=of(folder(certs, "worker-other")).password
-        ),
+        "another worker's password": msgspec.structs.replace(honest, password=others),
         "the user of this machine's own workers": msgspec.structs.replace(honest, user="worker"),
     }
 
@@ -189,17 +188,12 @@ async def test_a_user_with_another_machines_certificate_is_answered_nothing(
 async def test_a_machines_certificate_cannot_stand_in_for_the_coordinators(certs: OwnCerts) -> None:
     honest, other = of(folder(certs, "worker-honest")), of(folder(certs, "worker-other"))
     assert other.tls is not None
-    config = transport.tls_server_config(
-        CLUSTER,
-        [certs.endpoint],
-        Machines(certs.state).passwords,
-        [("worker", "worker/honest")],
-        other.tls,
-    )
+    passwords, admitted = Machines(certs.state).passwords, [("worker", "worker/honest")]
+    config = transport.tls_server_config(CLUSTER, [certs.endpoint], passwords, admitted, other.tls)
     Machines(certs.state).write_passwords()
     heard: list[IncomingQuery] = []
     async with transport.serve(config, heard.extend) as server:
-        server.declare([keys.worker_expr(CLUSTER)])
+        server.declare([keys.requests(CLUSTER)["worker"]])
         assert not await gets_in(honest)
         assert heard == []
     async with coordinator(certs):
@@ -257,12 +251,9 @@ async def test_a_folder_that_was_issued_again_voids_the_one_before(tmp_path: Pat
     before = of(certs.issue("worker", "w"))
     kept = tmp_path / "kept"
     assert before.tls is not None
-    kept.mkdir()
-    for path in (before.tls.certificate, before.tls.private_key):
-        (kept / Path(path).name).write_bytes(Path(path).read_bytes())
-    old_tls = msgspec.structs.replace(
-        before.tls, certificate=str(kept / "cert.pem"), private_key=str(kept / "key.pem")
-    )
+    shutil.copytree(Path(before.tls.certificate).parent, kept)
+    files = {"certificate": str(kept / "cert.pem"), "private_key": str(kept / "key.pem")}
+    old_tls = msgspec.structs.replace(before.tls, **files)
     after = of(certs.issue("worker", "w", again=True))
     async with coordinator(certs):
         assert not await gets_in(msgspec.structs.replace(before, tls=old_tls))
@@ -290,9 +281,7 @@ async def test_an_open_link_ends_with_its_certificate(tmp_path: Path) -> None:
 
 
 async def test_listening_for_other_machines_needs_certificates(tmp_path: Path) -> None:
-    listener = remote_listener(
-        CLUSTER, ("tls/127.0.0.1:1",), Machines(tmp_path), lambda queries: None, lambda key, alive: None
-    )
+    given = (CLUSTER, ("tls/127.0.0.1:1",), Machines(tmp_path), lambda queries: None, lambda key, alive: None)
     with pytest.raises(ConfigError, match="certs init"):
-        async with listener:
+        async with remote_listener(*given):
             pass

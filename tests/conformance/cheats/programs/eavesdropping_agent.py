@@ -43,7 +43,7 @@ def hear(what):
 held = [listener.declare_subscriber(key, hear("sample")) for key in ("**", "evopolicy/**", "@/**")]
 held += [
     listener.declare_queryable(key, hear("query"), complete=True)
-    for key in ("**", keys.gateway_expr(stolen.cluster), keys.worker_expr(stolen.cluster))
+    for key in ("**", keys.requests(stolen.cluster)["gateway"], keys.requests(stolen.cluster)["worker"])
 ]
 held += [listener.liveliness().declare_subscriber("**", hear("token"), history=True)]
 

@@ -78,18 +78,13 @@ def sample(found: inspect.Type) -> Any:
             return {sample(found.key_type): sample(found.value_type)}
         case inspect.LiteralType():
             return found.values[0]
-        case inspect.StrType():
-            return "a"
-        case inspect.BytesType():
-            return b"a"
-        case inspect.IntType():
-            return 1
-        case inspect.FloatType():
-            return 0.5
-        case inspect.BoolType():
-            return True
         case inspect.EnumType():
             return next(iter(found.cls)).value
+    plain_values = {inspect.StrType: "a", inspect.BytesType: b"a", inspect.IntType: 1, inspect.FloatType: 0.5}
+    if type(found) in plain_values:
+        return plain_values[type(found)]
+    if isinstance(found, inspect.BoolType):
+        return True
     raise AssertionError(f"no sample of {found}")
 
 
@@ -164,12 +159,8 @@ def test_no_part_of_a_message_may_be_beyond_its_bound(kind: type[Message], decod
                 continue
             if len(data) > codec.MAX_MESSAGE_BYTES and isinstance(part, inspect.BytesType):
                 continue
-            refused = False
-            try:
-                codec.decode(decoder, data)
-            except ProtocolError:
-                refused = True
-            assert refused, path
+            with pytest.raises(ProtocolError):
+                pytest.fail(f"{path}: {codec.decode(decoder, data)}")
 
 
 def test_what_a_peer_would_refuse_is_not_sent() -> None:
