@@ -46,6 +46,7 @@ State = Annotated[
         "--state", help="The coordinator's state folder [$EVOPOLICY_STATE or the user's state home]."
     ),
 ]
+Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 
 USAGE_ERROR = 2
 FAILURE = 1

@@ -37,16 +37,13 @@ SEVERAL_LINES = frozenset({"agent"})
 """Parameters whose values may have several lines: an agent may be a shell script."""
 _METAVARS = {"str": "TEXT", "int": "N", "float": "X", "path": "PATH", "file": "PATH", "directory": "DIR"}
 """How help shows values, by the name of their type."""
+_VALUE = re.compile(r"<(?:list\[)?(\w+)(?: range)?\]?>")
 
 
 def _show_version(wanted: bool) -> None:
     if wanted:
-        _say_version()
-        raise typer.Exit
-
-
-def _say_version() -> None:
-    say(f"evopolicy {evopolicy_common.__version__} (Python {platform.python_version()})")
+        say(f"evopolicy {evopolicy_common.__version__} (Python {platform.python_version()})")
+        raise SystemExit(0)
 
 
 Version = Annotated[
@@ -73,7 +70,9 @@ class _Help:
                 continue
             usual = "Options" if param.param_type_name == "option" else "Arguments"
             name = getattr(param, "rich_help_panel", None) or usual
-            groups.setdefault(name, []).append((_value_names(record[0]), record[1]))
+            # `--runs <path>` as `--runs PATH`, `--env <list[str]>` as `--env TEXT`; choices stay unchanged.
+            shown = _VALUE.sub(lambda found: _METAVARS.get(found[1].lower(), found[0]), record[0])
+            groups.setdefault(name, []).append((shown, record[1]))
         if "Options" in groups:  # last: grouped options are more specific
             others = groups.pop("Options")
             groups["Other options" if groups.keys() - {"Arguments"} else "Options"] = others
@@ -87,11 +86,11 @@ class _Help:
         if ctx.resilient_parsing:
             return super().parse_args(ctx, args)  # type: ignore[misc,no-any-return]
         given, _, _ = self.make_parser(ctx).parse_args(args=list(args))  # type: ignore[attr-defined]
-        named = [
-            (param, value)
-            for param in self.get_params(ctx)  # type: ignore[attr-defined]
-            for value in _texts(given.get(param.name))
-        ]
+        named = []
+        for param in self.get_params(ctx):  # type: ignore[attr-defined]
+            values = given.get(param.name)
+            values = values if isinstance(values, list | tuple) else [values]
+            named += [(param, value) for value in values if isinstance(value, str)]
         for param, value in named:
             if why := _unusable(value, several_lines=param.name in SEVERAL_LINES):
                 # A byte that is not UTF-8 is shown as the shell has it.
@@ -102,16 +101,16 @@ class _Help:
             number = ctx.params.get(param.name)
             # Python's numbers may be `inf`, `nan` and `1_000`.
             if isinstance(number, int | float) and (not math.isfinite(number) or "_" in value):
-                raise typer.BadParameter(
-                    f"{shortened(value)!r} is not a finite number in digits", ctx=ctx, param=param
-                )
+                why = f"{shortened(value)!r} is not a finite number in digits"
+                raise typer.BadParameter(why, ctx=ctx, param=param)
         return rest
 
     def invoke(self, ctx: Any) -> Any:
         if not isinstance(self, TyperGroup) or self.invoke_without_command:
             interruptible()
         setup_notices()  # not earlier: help and completion log nothing and do not need structlog
-        return super().invoke(ctx)  # type: ignore[misc]
+        with fail_on_our_errors():
+            return super().invoke(ctx)  # type: ignore[misc]
 
 
 class Command(_Help, TyperCommand):
@@ -145,13 +144,8 @@ class App(typer.Typer):
     """Our `typer.Typer`: `-h`, plain grouped help, and no traceback formatting by typer."""
 
     def __init__(self, **options: Any) -> None:
-        usual = {
-            "cls": Group,
-            "rich_markup_mode": None,
-            "add_completion": False,
-            "context_settings": _SETTINGS,
-        }
-        super().__init__(**(usual | options))
+        usual = {"cls": Group, "rich_markup_mode": None, "add_completion": False}
+        super().__init__(**(usual | {"context_settings": _SETTINGS} | options))
 
     def command(self, name: str | None = None, **options: Any) -> Callable[[Function], Function]:
         """As typer's; the command has grouped help and accepts `-h`."""
@@ -188,19 +182,11 @@ def needed_extras(needed: str | None = None) -> Iterator[None]:
         extra = EXTRAS.get((error.name or "").partition(".")[0])
         if extra is None:
             raise
-        if sys.argv[1:] == ["--version"]:
-            _say_version()
-            raise SystemExit(0) from None
+        _show_version(sys.argv[1:] == ["--version"])
         advice = missing(needed or extra, error.name or "")
         if {"-h", "--help"} & set(sys.argv):
             advice += "; until then, `evopolicy files docs/reference/cli.md` names a page with all commands and options"
         fail(advice)
-
-
-def _texts(given: Any) -> list[str]:
-    """The words of a parameter on the command line."""
-    values = given if isinstance(given, list | tuple) else [given]
-    return [value for value in values if isinstance(value, str)]
 
 
 def _unusable(value: str, *, several_lines: bool) -> str:
@@ -215,13 +201,6 @@ def _unusable(value: str, *, several_lines: bool) -> str:
         return "is not UTF-8, which names and messages are"
     shown = harmless(value) if several_lines else one_line(value)
     return "" if shown == value else "has characters that cannot be printed"
-
-
-def _value_names(text: str) -> str:
-    """Rewrites `--runs <path>` as `--runs PATH` and `--env <list[str]>` as `--env TEXT`; choices stay unchanged."""
-    return re.sub(
-        r"<(?:list\[)?(\w+)(?: range)?\]?>", lambda found: _METAVARS.get(found[1].lower(), found[0]), text
-    )
 
 
 def _usage_text(error: Any) -> str:

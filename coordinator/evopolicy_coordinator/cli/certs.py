@@ -8,14 +8,13 @@ import socket
 from pathlib import Path
 from typing import Annotated
 
-import msgspec
 import typer
 
-from evopolicy_common.cli.conventions import State, fail_on_our_errors
+from evopolicy_common.cli.conventions import Json, State
 from evopolicy_common.cli.frame import App
 from evopolicy_common.console import table, terminal
 from evopolicy_common.errors import ConfigError
-from evopolicy_common.terminal import say, say_json
+from evopolicy_common.terminal import counted, say, say_json
 from evopolicy_common.wire.credentials import MachineRole, default_state_dir
 from evopolicy_coordinator.pki import certs, machines
 from evopolicy_coordinator.pki.machines import Machine, Machines
@@ -28,7 +27,6 @@ PORT = 7447
 _LOOPBACK = ("localhost", "127.0.0.1", "::1")
 
 Days = Annotated[int, typer.Option(min=1, max=3650, help="Validity of the certificate, in days.")]
-Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 
 
 @app.command(epilog="Example: evopolicy-coordinator certs init --host coordinator.lab --host 10.0.0.5")
@@ -60,24 +58,22 @@ def init(
 
     The authority's key never leaves that folder: keep it, and its backups, as private as the hidden cases.
     """
-    with fail_on_our_errors():
-        root = state or default_state_dir()
-        name = cluster_of(root, cluster)
-        old = machines.coordinators_certificate(root)
-        if old is not None and not (renew or force):
-            raise ConfigError(
-                f"{root}/certs holds the coordinator's certificate already (for {', '.join(old.hosts)}, until"
-                f" {old.expires:%Y-%m-%d}); --renew makes that anew, --force a new authority, which voids every"
-                " machine's folder"
-            )
-        hosts = tuple(host or (old.hosts if old is not None else _own_hosts()))
-        machines.init(root, name, _with_loopback(hosts), _now(), days, anew=force)
-        made = machines.coordinators_certificate(root)
-        assert made is not None
-        say(f"authority: {root}/certs/ca.pem{' (new: issue every machine again)' if force else ''}")
-        say(f"coordinator: {', '.join(made.hosts)}, until {made.expires:%Y-%m-%d}")
-        say(f"next: evopolicy-coordinator --listen tls/0.0.0.0:{PORT}{_state_option(state)}")
-        say(f"and for each machine: evopolicy-coordinator certs issue worker NAME{_state_option(state)}")
+    root = state or default_state_dir()
+    name = cluster_of(root, cluster)
+    old = machines.coordinators_certificate(root)
+    if old is not None and not (renew or force):
+        raise ConfigError(
+            f"{root}/certs holds the coordinator's certificate already (for {', '.join(old.hosts)}, until"
+            f" {old.expires:%Y-%m-%d}); --renew makes that anew, --force a new authority, which voids every"
+            " machine's folder"
+        )
+    hosts = host or (old.hosts if old is not None else _own_hosts())
+    machines.init(root, name, tuple(dict.fromkeys((*hosts, *_LOOPBACK))), _now(), days, anew=force)
+    made = _certificate(root)
+    say(f"authority: {root}/certs/ca.pem{' (new: issue every machine again)' if force else ''}")
+    say(f"coordinator: {', '.join(made.hosts)}, until {made.expires:%Y-%m-%d}")
+    say(f"next: evopolicy-coordinator --listen tls/0.0.0.0:{PORT}{_state_option(state)}")
+    say(f"and for each machine: evopolicy-coordinator certs issue worker NAME{_state_option(state)}")
 
 
 @app.command(epilog="Example: evopolicy-coordinator certs issue worker gpu-7 --out ./gpu-7")
@@ -110,42 +106,29 @@ def issue(
     Copy the folder to that machine (scp -rp keeps its modes) and name it with --credentials there. A running
     coordinator admits the machine within seconds. An operator's folder also starts gateways.
     """
-    with fail_on_our_errors():
-        root = state or default_state_dir()
-        usual = first_endpoint(root)  # first: it makes no folder of a wrong --state
-        folder = out or Path(f"{role}-{name}")
-        made = machines.issue(
-            root,
-            cluster_of(root, None),
-            role,
-            name,
-            tuple(connect or ()) or (usual,),
-            folder,
-            _now(),
-            days,
-            hosts=tuple(host or ()),
-            again=renew,
-        )
-        if as_json:
-            say(
-                msgspec.json.encode(
-                    {"folder": str(folder), "machines": [_facts(one) for one in made]}
-                ).decode()
-            )
-            return
-        say(
-            f"{folder}: {' and '.join(one.identity for one in made)}, until {made[0].expires:%Y-%m-%d}"
-            f" (a secret: scp -rp {folder} MACHINE:)"
-        )
-        start = {
-            "worker": "evopolicy-worker --env core16",
-            "gateway": "evopolicy-gateway RUN_DIRECTORY",
-            "operator": "evopolicy run --env gym/acrobot --agent evolve",
-        }.get(role)
-        if start is not None and role != "gateway":
-            say(f"there: {start} --credentials {folder.name}")
-        if role == "router":
-            say(f"next: evopolicy-coordinator router-config {name} --folder {folder}{_state_option(state)}")
+    root = state or default_state_dir()
+    usual = first_endpoint(root)  # first: it makes no folder of a wrong --state
+    cluster, folder, endpoints = (
+        cluster_of(root, None),
+        out or Path(f"{role}-{name}"),
+        tuple(connect or (usual,)),
+    )
+    made = machines.issue(
+        root, cluster, role, name, endpoints, folder, _now(), days, hosts=tuple(host or ()), again=renew
+    )
+    if as_json:
+        say_json({"folder": str(folder), "machines": [_facts(one) for one in made]}, indent=False)
+        return
+    say(
+        f"{folder}: {' and '.join(one.identity for one in made)}, until {made[0].expires:%Y-%m-%d}"
+        f" (a secret: scp -rp {folder} MACHINE:)"
+    )
+    if role == "worker":
+        say(f"there: evopolicy-worker --env core16 --credentials {folder.name}")
+    elif role == "operator":
+        say(f"there: evopolicy run --env gym/acrobot --agent evolve --credentials {folder.name}")
+    elif role == "router":
+        say(f"next: evopolicy-coordinator router-config {name} --folder {folder}{_state_option(state)}")
 
 
 @app.command(epilog="Example: evopolicy-coordinator certs revoke gpu-7")
@@ -158,81 +141,64 @@ def revoke(
 
     Other workers play the jobs that its worker holds. Revoke at your routers as well, where there are any.
     """
-    with fail_on_our_errors():
-        gone = machines.revoke(state or default_state_dir(), name, _now())
-        if as_json:
-            say_json([_facts(one) for one in gone], indent=False)
-        else:
-            say(f"revoked: {', '.join(one.identity for one in gone)}")
+    gone = machines.revoke(state or default_state_dir(), name, _now())
+    if as_json:
+        say_json([_facts(one) for one in gone], indent=False)
+    else:
+        say(f"revoked: {', '.join(one.identity for one in gone)}")
 
 
 @app.command("list", epilog="Example: evopolicy-coordinator certs list --json")
 def list_(state: State = None, as_json: Json = False) -> None:
     """List all issued certificates, with expiry date and revocation."""
-    with fail_on_our_errors():
-        root = state or default_state_dir()
-        own = machines.coordinators_certificate(root)
-        if own is None:
-            raise ConfigError(f"{root} has no certificates yet: evopolicy-coordinator certs init")
-        now = _now()
-        rows = [_facts(machine) for machine in Machines(root).all()]
-        if as_json:
-            coordinator = {"hosts": own.hosts, "expires": own.expires}
-            say_json({"coordinator": coordinator, "machines": rows})
-            return
-        shown = table("name", "role", "expires", "state")
-        shown.add_row(", ".join(own.hosts), "coordinator", *_validity(own.expires, None, now))
-        for machine in Machines(root).all():
-            shown.add_row(machine.name, machine.role, *_validity(machine.expires, machine.revoked, now))
-        terminal().print(shown)
-
-
-def _validity(expires: dt.datetime, revoked: dt.datetime | None, now: dt.datetime) -> tuple[str, str]:
-    if revoked is not None:
-        return f"{expires:%Y-%m-%d}", f"revoked {revoked:%Y-%m-%d}"
-    days = (expires - now).days
-    return f"{expires:%Y-%m-%d}", "expired" if expires <= now else f"{days} days left"
+    root = state or default_state_dir()
+    own, issued, now = _certificate(root), Machines(root).all(), _now()
+    if as_json:
+        coordinator = {"hosts": own.hosts, "expires": own.expires}
+        say_json({"coordinator": coordinator, "machines": [_facts(machine) for machine in issued]})
+        return
+    shown = table("name", "role", "expires", "state")
+    for name, role, expires, revoked in (
+        (", ".join(own.hosts), "coordinator", own.expires, None),
+        *((one.name, one.role, one.expires, one.revoked) for one in issued),
+    ):
+        valid = "expired" if expires <= now else f"{counted((expires - now).days, 'day')} left"
+        state_now = valid if revoked is None else f"revoked {revoked:%Y-%m-%d}"
+        shown.add_row(name, role, f"{expires:%Y-%m-%d}", state_now)
+    terminal().print(shown)
 
 
 def _facts(machine: Machine) -> dict[str, object]:
     """A machine's public fields: neither its password nor its token."""
-    return {
-        "name": machine.name,
-        "role": machine.role,
-        "identity": machine.identity,
-        "serial": machine.serial,
-        "issued": machine.issued,
-        "expires": machine.expires,
-        "revoked": machine.revoked,
-    }
+    names = ("name", "role", "identity", "serial", "issued", "expires", "revoked")
+    return {name: getattr(machine, name) for name in names}
 
 
 def first_endpoint(root: Path) -> str:
     """The coordinator's address. Raises ConfigError before `certs init`."""
-    own = machines.coordinators_certificate(root)
-    if own is None:
-        raise ConfigError(f"{root} has no certificate authority yet: evopolicy-coordinator certs init")
-    host = own.hosts[0]
+    host = _certificate(root).hosts[0]
     return f"tls/[{host}]:{PORT}" if ":" in host else f"tls/{host}:{PORT}"
 
 
-def _with_loopback(hosts: tuple[str, ...]) -> tuple[str, ...]:
-    return tuple(dict.fromkeys((*hosts, *_LOOPBACK)))
+def _certificate(root: Path) -> certs.Described:
+    """The coordinator's."""
+    own = machines.coordinators_certificate(root)
+    if own is None:
+        raise ConfigError(f"{root} has no certificate authority yet: evopolicy-coordinator certs init")
+    return own
 
 
-def _own_hosts() -> tuple[str, ...]:
+def _own_hosts() -> list[str]:
     """This machine's address on the way out, if it has one, and its names."""
     found = []
     with contextlib.suppress(OSError), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.connect(
-            ("192.0.2.1", 9)
-        )  # connect() on a datagram socket sends nothing; it only selects the route
+        probe.connect(("192.0.2.1", 9))  # on a datagram socket it sends nothing, and only selects the route
         found.append(str(probe.getsockname()[0]))
     for name in (socket.getfqdn(), socket.gethostname()):
         with contextlib.suppress(ConfigError):
             certs.check_hosts([name])
             found.append(name)
-    return tuple(dict.fromkeys(found))
+    return found
 
 
 def _state_option(state: Path | None) -> str:

@@ -15,7 +15,7 @@ import typer
 
 from evopolicy_common import catalogue
 from evopolicy_common.catalogue.worlds import unchanged
-from evopolicy_common.cli.conventions import fail, fail_on_our_errors
+from evopolicy_common.cli.conventions import Json, fail
 from evopolicy_common.cli.frame import App
 from evopolicy_common.console import table, terminal
 from evopolicy_common.errors import ConfigError, StorageError
@@ -23,7 +23,7 @@ from evopolicy_common.messages.environment import Split
 from evopolicy_common.messages.run_settings import MAX_HIDDEN
 from evopolicy_common.records import splits as split_files
 from evopolicy_common.records.blobs import write_atomically
-from evopolicy_common.terminal import say, say_json
+from evopolicy_common.terminal import counted, say, say_json
 from evopolicy_coordinator import splits, worlds
 
 MAX_TRAIN = 1_000_000
@@ -37,7 +37,7 @@ app = App(
 
 
 @app.command(
-    epilog="Example: evopolicy data make --env core16 --root data --train 64 --valid 16 --heldout 32",
+    epilog="Example: evopolicy data make --env core16 --root data --train 64 --valid 16 --heldout 32"
 )
 def make(
     env: Annotated[list[str], typer.Option(help="Suite, suite id or glob; may be repeated.")],
@@ -46,11 +46,8 @@ def make(
         int | None,
         typer.Option(
             min=0,
-            help=(
-                "Public seed. Anyone who knows it can derive the cases, so the files say `secret: false`. Default:"
-                " random bits that"
-                " are not stored."
-            ),
+            help="Public seed. Anyone who knows it can derive the cases, so the files say `secret: false`."
+            " Default: random bits that are not stored.",
         ),
     ] = None,
     train: Annotated[
@@ -63,22 +60,28 @@ def make(
         int | None, typer.Option(min=1, max=MAX_HIDDEN, help="Held-out cases [the suite's number].")
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Overwrite files that differ.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print what was written as JSON.")] = False,
+    as_json: Json = False,
 ) -> None:
     """Write train.json, valid.json and heldout.json of each environment."""
-    with fail_on_our_errors():
-        planned = _plan(catalogue.resolve(env), root, seed, train, valid, heldout)
-        if not force:
-            _refuse_different(planned)
-        try:
-            written = _write(planned)
-        except (OSError, StorageError) as error:
-            fail(str(error))
+    planned = _plan(catalogue.resolve(env), root, seed, train, valid, heldout)
+    stored = {path: path.read_bytes() for path in planned if path.exists()}
+    written = [path for path, data in planned.items() if stored.get(path) != data]
+    if not force and (others := [path for path in written if path in stored]):
+        raise ConfigError(
+            f"{others[0]} exists and differs from what would be written; give --force to replace it"
+        )
+    try:
+        for path in written:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_atomically(path, planned[path], mode=0o600)
+    except (OSError, StorageError) as error:
+        fail(str(error))
     if as_json:
         say_json({"root": str(root), "written": [str(path) for path in written]}, indent=False)
         return
     kept = len(planned) - len(written)
-    say(f"{len(written)} files written under {root}" + (f", {kept} were the same already" if kept else ""))
+    same = f", {kept} {'was' if kept == 1 else 'were'} the same already" if kept else ""
+    say(f"{counted(len(written), 'file')} written under {root}{same}")
 
 
 def _plan(
@@ -107,29 +110,10 @@ def _plan(
     return planned
 
 
-def _refuse_different(planned: dict[Path, bytes]) -> None:
-    for path, data in planned.items():
-        if path.exists() and path.read_bytes() != data:
-            raise ConfigError(
-                f"{path} exists and differs from what would be written; give --force to replace it"
-            )
-
-
-def _write(planned: dict[Path, bytes]) -> list[Path]:
-    written = []
-    for path, data in planned.items():
-        if path.exists() and path.read_bytes() == data:
-            continue
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(path, data, mode=0o600)
-        written.append(path)
-    return written
-
-
 @app.command(epilog="Example: evopolicy data check data --json")
 def check(
     folder: Annotated[Path, typer.Argument(help="The root of a data tree, or one environment's folder.")],
-    as_json: Annotated[bool, typer.Option("--json", help="Print the findings and hashes as JSON.")] = False,
+    as_json: Json = False,
 ) -> None:
     """Check that split files are well-formed and disjoint, and print their hashes."""
     if not folder.is_dir():
@@ -138,11 +122,12 @@ def check(
     if not folders:
         fail(f"no train.json, valid.json or heldout.json in {folder} or in its folders")
     reports = [_report(item.resolve()) for item in folders]
+    faulty = any(report["findings"] for report in reports)
     if as_json:
-        say_json({"ok": not any(r["findings"] for r in reports), "environments": reports}, indent=False)
+        say_json({"ok": not faulty, "environments": reports}, indent=False)
     else:
         _print(reports)
-    if any(report["findings"] for report in reports):
+    if faulty:
         raise typer.Exit(1)
 
 
@@ -166,7 +151,7 @@ def _report(folder: Path) -> dict[str, Any]:
 def _print(reports: list[dict[str, Any]]) -> None:
     shown = table("environment", "train", "valid", "heldout", "secret", "sha256 of each", "checks")
     for report in reports:
-        verdict = f"{len(report['findings'])} findings" if report["findings"] else "ok"
+        verdict = counted(len(report["findings"]), "finding") if report["findings"] else "ok"
         if report["env"] is None:
             shown.add_row(Path(report["folder"]).name, "", "", "", "", "", verdict)
             continue

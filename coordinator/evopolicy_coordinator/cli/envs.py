@@ -4,7 +4,7 @@ ship."""
 from __future__ import annotations
 
 import fnmatch
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from typing import Annotated
 
 import msgspec
@@ -12,9 +12,9 @@ import typer
 
 from evopolicy_common import catalogue
 from evopolicy_common.catalogue import installs
-from evopolicy_common.cli.conventions import Connect, CredentialsFile, fail_on_our_errors
+from evopolicy_common.cli.conventions import Connect, CredentialsFile, Json
 from evopolicy_common.cli.frame import App
-from evopolicy_common.console import table, terminal
+from evopolicy_common.console import listing, terminal
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.operator import OfferedEnvironment
 from evopolicy_common.terminal import say, say_json, say_lines
@@ -22,6 +22,17 @@ from evopolicy_common.wire.operator_client import OperatorClient
 from evopolicy_coordinator.cli.status import asking
 
 app = App()
+_COLUMNS: dict[str, Callable[[OfferedEnvironment], str]] = {
+    "environment": lambda one: one.description.env,
+    "family": lambda one: _family(one.description.family),
+    "definition": lambda one: one.digest,
+    "accepted": lambda one: one.accepted,
+    "steps": lambda one: f"{one.description.max_episode_steps:,}",
+    "µs a step": lambda one: f"{one.description.step_us:,.0f}" if one.description.step_us else "",
+    "repeats": lambda one: "yes" if one.description.deterministic else "no",
+    "renders": lambda one: "yes" if one.description.renders else "no",
+    "workers": lambda one: ", ".join(one.workers),
+}
 
 
 @app.callback(invoke_without_command=True, epilog="Example: evopolicy envs --filter 'my/*'")
@@ -36,7 +47,7 @@ def envs(
         str | None,
         typer.Option(help="Show everything about the environment with this id, with its task text."),
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print everything as JSON.")] = False,
+    as_json: Json = False,
 ) -> None:
     """List the environments that the cluster's workers offer, their definitions, and whether runs may use them."""
     if context.invoked_subcommand is not None:
@@ -56,50 +67,13 @@ def envs(
         )
         return
     if show is not None:
-        with fail_on_our_errors():
-            _show(show, found, later, failed)
+        _show(show, found, later, failed)
         return
-    shown = table(
-        *(
-            "environment",
-            "family",
-            "definition",
-            "accepted",
-            "steps",
-            "µs a step",
-            "repeats",
-            "renders",
-            "workers",
-        ),
-        right=("steps", "µs a step"),
-        whole=("environment", "definition"),
-    )
-    for each in found:
-        description = each.description
-        shown.add_row(
-            description.env,
-            _family(description.family),
-            each.digest,
-            each.accepted,
-            f"{description.max_episode_steps:,}",
-            f"{description.step_us:,.0f}" if description.step_us else "",
-            "yes" if description.deterministic else "no",
-            "yes" if description.renders else "no",
-            ", ".join(each.workers),
-        )
+    shown = listing(found, _COLUMNS, right=("steps", "µs a step"), whole=("environment", "definition"))
     for env, workers in later.items():
-        steps = f"{catalogue.entry(env).max_episode_steps:,}"
-        shown.add_row(
-            env,
-            _family(catalogue.entry(env).family),
-            "on first use",
-            "",
-            steps,
-            "",
-            "",
-            "",
-            ", ".join(workers),
-        )
+        entry = catalogue.entry(env)
+        steps, names = f"{entry.max_episode_steps:,}", ", ".join(workers)
+        shown.add_row(env, _family(entry.family), "on first use", "", steps, "", "", "", names)
     if found or later:
         terminal().print(shown)
     elif not failed:
@@ -121,10 +95,9 @@ def approve(
     file: CredentialsFile = None,
 ) -> None:
     """Approve a definition of an environment that does not come with evopolicy, so that runs may use it."""
-    with fail_on_our_errors():
-        env, at, digest = environment.partition("@")
-        if not at:
-            raise ConfigError(f"{environment}: use the form ID@DIGEST; `evopolicy envs` shows both")
+    env, at, digest = environment.partition("@")
+    if not at:
+        raise ConfigError(f"{environment}: use the form ID@DIGEST; `evopolicy envs` shows both")
     asking(connect, file, lambda operator: operator.approve(env, digest))
     say(f"{env} may be used in definition {digest}")
 

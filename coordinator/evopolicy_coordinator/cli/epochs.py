@@ -11,7 +11,7 @@ from typing import Annotated
 
 import typer
 
-from evopolicy_common.cli.conventions import State, fail, fail_on_our_errors
+from evopolicy_common.cli.conventions import Json, State, fail
 from evopolicy_common.cli.frame import App
 from evopolicy_common.console import table, terminal
 from evopolicy_common.errors import ConfigError
@@ -29,23 +29,19 @@ from evopolicy_results.publish.signatures import HEAD
 _PAGE_BYTES = 1 << 20
 
 app = App(
-    help=(
-        "List epochs, and begin a new one. Runs of one epoch have cases derived from one secret; publishing reveals it."
-    ),
+    help="List epochs, and begin a new one. Runs of one epoch have cases derived from one secret; publishing"
+    " reveals it.",
     no_args_is_help=True,
 )
 
-AsJson = Annotated[bool, typer.Option("--json", help="Print as JSON.")]
-
 
 @app.command("list", epilog="Example: evopolicy-coordinator epoch list --state /var/lib/evopolicy")
-def list_(state: State = None, as_json: AsJson = False) -> None:
+def list_(state: State = None, as_json: Json = False) -> None:
     """List the epochs in the journal, with the number of runs and whether their cases are public."""
     root = state or default_state_dir()
-    with fail_on_our_errors():
-        entries = _journal(root)
-        found = journal.epochs(map(journal.read_entry, entries))
-        current = _current(root)
+    entries = _journal(root)
+    found = journal.epochs(map(journal.read_entry, entries))
+    current = _current(root)
     head = ([journal.EMPTY_HEAD, *journal.heads(entries)])[-1]
     if as_json:
         say_json({"current": current, "entries": len(entries), "head": head, "epochs": found})
@@ -58,7 +54,7 @@ def list_(state: State = None, as_json: AsJson = False) -> None:
     if current and all(each.epoch != current for each in found):
         shown.add_row(f"{current} (current)", "0", "0", "none yet", "secret")
     terminal().print(shown)
-    say(f"journal: {len(entries)} entries, head {head}")
+    say(f"journal: {len(entries)} {'entry' if len(entries) == 1 else 'entries'}, head {head}")
 
 
 @app.command(epilog="Example: evopolicy-coordinator epoch new --state /var/lib/evopolicy")
@@ -68,29 +64,22 @@ def new(state: State = None) -> None:
     Unfinished runs keep their cases. Do not compare scores of different epochs: their cases differ.
     """
     root = state or default_state_dir()
-    with fail_on_our_errors():
-        if not (root / "identity.json").is_file():
-            raise no_state(root, "identity.json")
-        opened = StateFolder.open(root)
-        try:
-            before = _current(root)
-            after = splits.renew_secrets(root)
-        finally:
-            opened.close()
+    if not (root / "identity.json").is_file():
+        raise no_state(root, "identity.json")
+    with contextlib.closing(StateFolder.open(root)):
+        before, after = _current(root), splits.renew_secrets(root)
     say(f"epoch {after} begins" + (f", after {before}" if before else ""))
     say("next: start the coordinator; runs on files (--data) are not concerned")
 
 
-def identity(state: State = None, as_json: AsJson = False) -> None:
+def identity(state: State = None, as_json: Json = False) -> None:
     """Print the public key that signs this coordinator's published results; made on first use.
 
     Publish the key in a place that is known to be yours, so that others can pass it to `evopolicy check --identity`.
     """
     root = state or default_state_dir()
-    with fail_on_our_errors():
-        if not root.is_dir():
-            raise ConfigError(f"--state {root}: no such state folder")
-        key = public_key(root)
+    _check_folder(root)
+    key = public_key(root)
     if as_json:
         say_json({"identity": key})
     else:
@@ -116,16 +105,19 @@ def countersign(
     root = state or default_state_dir()
     if not re.fullmatch(r"[0-9a-fA-F]{64}", head):
         fail(f"{head!r} is no head: 64 hexadecimal digits, as `evopolicy-coordinator epoch list` prints them")
-    with fail_on_our_errors():
-        if not root.is_dir():
-            raise ConfigError(f"--state {root}: no such state folder")
-        if out.exists():
-            raise ConfigError(f"--out {out} is there already; name a new file")
-        at = round(time.time(), 3)
-        key, signature = sign(root, head_digest(head.lower(), at), HEAD)
-        signed = Countersignature(head=head.lower(), at=at, key=key, signature=signature)
-        write_atomically(out, document(signed))
+    _check_folder(root)
+    if out.exists():
+        raise ConfigError(f"--out {out} is there already; name a new file")
+    at = round(time.time(), 3)
+    key, signature = sign(root, head_digest(head.lower(), at), HEAD)
+    signed = Countersignature(head=head.lower(), at=at, key=key, signature=signature)
+    write_atomically(out, document(signed))
     say(f"{out}: signed by {key}")
+
+
+def _check_folder(root: Path) -> None:
+    if not root.is_dir():
+        raise ConfigError(f"--state {root}: no such state folder")
 
 
 def _current(root: Path) -> str:

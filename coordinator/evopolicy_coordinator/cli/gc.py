@@ -10,18 +10,15 @@ from typing import Annotated
 import typer
 
 from evopolicy_common import catalogue
-from evopolicy_common.cli.conventions import State, bytes_text, fail_on_our_errors
+from evopolicy_common.cli.conventions import Json, State, bytes_text
 from evopolicy_common.cli.frame import App
 from evopolicy_common.processes.preflight import check_writable
-from evopolicy_common.terminal import say, say_json
+from evopolicy_common.terminal import counted, say, say_json
 from evopolicy_common.wire.credentials import default_state_dir
 from evopolicy_coordinator.storage import disk_use
 
 gc_app = App(name="gc")
 disk_app = App(name="disk")
-
-Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
-DAY_S = 24 * 3600.0
 
 
 @gc_app.command(epilog="Example: evopolicy gc --state /var/lib/evopolicy --older-than 7 --dry-run")
@@ -39,18 +36,18 @@ def collect(
 
     Keeps run directories and the outcomes of runs. The coordinator may be running.
     """
-    with fail_on_our_errors():
-        root = state or default_state_dir()
-        if root.is_dir() and not dry_run:
-            check_writable(root, "--state", may_be_full=True)
-        done = disk_use.collect(root, older_than * DAY_S, dry_run=dry_run)
+    root = state or default_state_dir()
+    if root.is_dir() and not dry_run:
+        check_writable(root, "--state", may_be_full=True)
+    done = disk_use.collect(root, older_than * 24 * 3600.0, dry_run=dry_run)
     if as_json:
         say_json(done, indent=False)
         return
     verb = "would remove" if dry_run else "removed"
     say(
-        f"{verb} {done.episodes:,} episodes of {done.runs} runs and {done.evaluations} evaluations, {done.blobs:,}"
-        f" blobs: {bytes_text(done.bytes)}; {bytes_text(done.free_bytes)} free"
+        f"{verb} {counted(done.episodes, 'episode')} of {counted(done.runs, 'run')} and"
+        f" {counted(done.evaluations, 'evaluation')}, {counted(done.blobs, 'blob')}: {bytes_text(done.bytes)};"
+        f" {bytes_text(done.free_bytes)} free"
     )
     if not dry_run and not done.shrunk:
         say("a coordinator is running: the database keeps its size, and new runs use the freed space")
@@ -72,30 +69,25 @@ def disk(
 
     Run directories need space in addition; their size is printed too. Exit code 1 if the sweep does not fit.
     """
-    with fail_on_our_errors():
-        root = state or default_state_dir()
-        used = disk_use.use(root)
-        planned = {
-            env_id: runs * (budget or catalogue.suite_of(env_id).budget)
-            for env_id in catalogue.resolve(env or [])
-        }
-        needed = disk_use.estimate(root, planned) if planned else None
-        directories = sum(catalogue.entry(env_id).feedback_bytes(n) for env_id, n in planned.items())
+    root = state or default_state_dir()
+    used = disk_use.use(root)
+    planned = {
+        env_id: runs * (budget or catalogue.suite_of(env_id).budget)
+        for env_id in catalogue.resolve(env or [])
+    }
+    needed = disk_use.estimate(root, planned) if planned else None
+    directories = sum(catalogue.entry(env_id).feedback_bytes(n) for env_id, n in planned.items())
     if as_json:
         say_json({"environments": used, "planned": needed, "run_directories": directories}, indent=False)
     else:
         for each in used:
             say(
-                f"{each.env:<32}{each.runs:>5} runs{each.train_episodes:>9,} episodes{bytes_text(each.bytes):>12}"
-                f"{bytes_text(each.bytes_per_episode):>12} an episode"
+                f"{each.env:<32}{counted(each.runs, 'run'):>10}{counted(each.train_episodes, 'episode'):>18}"
+                f"{bytes_text(each.bytes):>12}{bytes_text(each.bytes_per_episode):>12} an episode"
             )
         if needed is not None:
-            guessed = (
-                f"; estimated without earlier runs: {', '.join(needed.guessed)}" if needed.guessed else ""
-            )
-            say(
-                f"planned: about {bytes_text(needed.bytes)}, {bytes_text(needed.free_bytes)} are free{guessed}"
-            )
+            more = f"; estimated without earlier runs: {', '.join(needed.guessed)}" if needed.guessed else ""
+            say(f"planned: about {bytes_text(needed.bytes)}, {bytes_text(needed.free_bytes)} are free{more}")
             say(f"run directories, in addition: at most {bytes_text(directories)}")
     if needed is not None and not needed.fits:
         raise typer.Exit(1)

@@ -11,11 +11,11 @@ from typing import Annotated, Literal
 import msgspec
 import typer
 
-from evopolicy_common.cli.conventions import State, fail_on_our_errors, setup_logging
+from evopolicy_common.cli.conventions import Json, State, setup_logging
 from evopolicy_common.cli.frame import App, Version, run_app
 from evopolicy_common.processes.packages import checked_names
 from evopolicy_common.records.blobs import announcing
-from evopolicy_common.terminal import say, say_json
+from evopolicy_common.terminal import counted, say, say_json
 from evopolicy_common.wire.credentials import default_state_dir
 from evopolicy_common.wire.ready import Ready
 from evopolicy_coordinator.cli import certs as certs_cli
@@ -39,10 +39,8 @@ app.command(
 )(worlds_cli.accept_worlds)
 app.command(
     "router-config",
-    epilog=(
-        "Example: evopolicy-coordinator router-config berlin --folder router-berlin"
-        " --installed-at /etc/evopolicy/router"
-    ),
+    epilog="Example: evopolicy-coordinator router-config berlin --folder router-berlin"
+    " --installed-at /etc/evopolicy/router",
 )(router_config.router_config)
 
 
@@ -55,17 +53,11 @@ def serve(
     listen: Annotated[
         list[str] | None,
         typer.Option(
-            help="Endpoint for other machines, such as tls/0.0.0.0:7447 (port 0: a free one; see `certs`); may be "
-            "repeated. "
-            "A unix socket in the state folder is always listened on."
+            help="Endpoint for other machines, such as tls/0.0.0.0:7447 (port 0: a free one; see `certs`); may be"
+            " repeated. A unix socket in the state folder is always listened on."
         ),
     ] = None,
-    state: Annotated[
-        Path | None,
-        typer.Option(
-            help="State folder: everything that must survive a restart [$EVOPOLICY_STATE or the user's state home]."
-        ),
-    ] = None,
+    state: State = None,
     data: Annotated[
         Path | None,
         typer.Option(
@@ -94,21 +86,15 @@ def serve(
             min=0.0,
             max=1.0,
             metavar="SHARE",
-            help=(
-                "Share of the episodes of new runs whose recorded actions a second worker replays, compared bit for"
-                " bit. If they "
-                "differ, a third worker decides, and the forging worker gets no more work."
-            ),
+            help="Share of the episodes of new runs whose recorded actions a second worker replays, compared bit for"
+            " bit. If they differ, a third worker decides, and the forging worker gets no more work.",
         ),
     ] = 0.0,
     hidden_isolation: Annotated[
         Literal["related", "strict", "off"],
         typer.Option(
-            help=(
-                "Agents and train episodes beside which no hidden episode is played on a kernel. `related`: those of"
-                " runs that share"
-                " a hidden case; `strict`: all; `off`: none, and run.json says `shared`."
-            ),
+            help="Agents and train episodes beside which no hidden episode is played on a kernel. `related`: those"
+            " of runs that share a hidden case; `strict`: all; `off`: none, and run.json says `shared`."
         ),
     ] = "related",
     hidden_wait: Annotated[
@@ -116,11 +102,8 @@ def serve(
         typer.Option(
             min=0.0,
             metavar="SECONDS",
-            help=(
-                "After hidden episodes of closed runs have waited for this time, one machine starts no related agent"
-                " until"
-                " they are played."
-            ),
+            help="After hidden episodes of closed runs have waited for this time, one machine starts no related"
+            " agent until they are played.",
         ),
     ] = CoreSettings().hidden_wait_s,
     agent_wait: Annotated[
@@ -128,21 +111,16 @@ def serve(
         typer.Option(
             min=0.0,
             metavar="SECONDS",
-            help=(
-                "Cancel a run that is still open this long after its agent's start, if hidden episodes of closed runs"
-                " wait for"
-                " the agent. Choose more than the longest wall limit of your agents."
-            ),
+            help="Cancel a run that is still open this long after its agent's start, if hidden episodes of closed"
+            " runs wait for the agent. Choose more than the longest wall limit of your agents.",
         ),
     ] = CoreSettings().agent_wait_s,
     metrics: Annotated[
         str | None,
         typer.Option(
             metavar="HOST:PORT",
-            help=(
-                "Serve /metrics in Prometheus' text format, and /healthz. They need no token and contain nothing about"
-                " single runs."
-            ),
+            help="Serve /metrics in Prometheus' text format, and /healthz. They need no token and contain nothing"
+            " about single runs.",
         ),
     ] = None,
     ready_file: Annotated[
@@ -156,17 +134,14 @@ def serve(
         bool,
         typer.Option(
             "--unjailed-agents",
-            help=(
-                "Agents may be able to read this state folder: give their runs cases of their own, and later runs new"
-                " cases."
-            ),
+            help="Agents may be able to read this state folder: give their runs cases of their own, and later runs"
+            " new cases.",
         ),
     ] = False,
     trust_workers: Annotated[
         bool,
         typer.Option(
-            "--trust-workers",
-            help="Accept all environments that workers announce, also unapproved ones.",
+            "--trust-workers", help="Accept all environments that workers announce, also unapproved ones."
         ),
     ] = False,
     _: Version = False,
@@ -178,34 +153,33 @@ def serve(
     """
     if context.invoked_subcommand is not None:
         return
-    with fail_on_our_errors():
-        setup_logging(log_level)
-        options = Options(
-            state=state or default_state_dir(),
-            data=data,
-            listen=tuple(listen or ()),
-            insecure_tcp=insecure_tcp,
-            cluster=cluster,
-            allowed_packages=checked_names(allow_package),
-            unjailed=unjailed_agents,
-            trust_workers=trust_workers,
-            core=CoreSettings(
-                audit_share=audit,
-                hidden_isolation=hidden_isolation,
-                hidden_wait_s=hidden_wait,
-                agent_wait_s=agent_wait,
-            ),
-            metrics=metrics,
-        )
-        with announcing(ready_file) as announce:
-            asyncio.run(_run(options, announce))
+    setup_logging(log_level)
+    options = Options(
+        state=state or default_state_dir(),
+        data=data,
+        listen=tuple(listen or ()),
+        insecure_tcp=insecure_tcp,
+        cluster=cluster,
+        allowed_packages=checked_names(allow_package),
+        unjailed=unjailed_agents,
+        trust_workers=trust_workers,
+        core=CoreSettings(
+            audit_share=audit,
+            hidden_isolation=hidden_isolation,
+            hidden_wait_s=hidden_wait,
+            agent_wait_s=agent_wait,
+        ),
+        metrics=metrics,
+    )
+    with announcing(ready_file) as announce:
+        asyncio.run(_run(options, announce))
 
 
 @app.command(epilog="Example: evopolicy-coordinator backup /backup/monday --state /var/lib/evopolicy")
 def backup(
     target: Annotated[Path, typer.Argument(help="New folder for the backup.", show_default=False)],
     state: State = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print what was copied as JSON.")] = False,
+    as_json: Json = False,
 ) -> None:
     """Copy the state folder: a consistent database, blobs and keys. The coordinator may be running.
 
@@ -213,12 +187,11 @@ def backup(
     reconnect by themselves; episodes that came in after the backup are played again. Keep backups as private as the
     state: they hold the hidden cases.
     """
-    with fail_on_our_errors():
-        copied = back_up(state or default_state_dir(), target)
+    copied = back_up(state or default_state_dir(), target)
     if as_json:
         say_json(copied, indent=False)
     else:
-        say(f"{copied.path}: database and {copied.blobs:,} blobs, {copied.bytes:,} bytes")
+        say(f"{copied.path}: database and {counted(copied.blobs, 'blob')}, {copied.bytes:,} bytes")
 
 
 async def _run(options: Options, announce: Callable[[bytes], None]) -> None:
@@ -228,18 +201,16 @@ async def _run(options: Options, announce: Callable[[bytes], None]) -> None:
         loop.add_signal_handler(number, stop.set)
 
     def on_ready(ready: Ready) -> None:
-        say(_ready_line(ready))
+        endpoint = ready.endpoints[-1]
+        command = (
+            f"evopolicy-worker --env core16 --connect {endpoint} --credentials {ready.credentials['worker']}"
+        )
+        if endpoint.startswith("tls/"):
+            command = f"evopolicy-coordinator certs issue worker NAME --state {ready.state}"
+        say(f"ready: cluster {ready.cluster}, state {ready.state}; workers join with: {command}")
         announce(msgspec.json.format(msgspec.json.encode(ready)) + b"\n")
 
     await process.run(options, stop, on_ready)
-
-
-def _ready_line(ready: Ready) -> str:
-    line = f"ready: cluster {ready.cluster}, state {ready.state}; workers join with:"
-    endpoint = ready.endpoints[-1]
-    if endpoint.startswith("tls/"):
-        return f"{line} evopolicy-coordinator certs issue worker NAME --state {ready.state}"
-    return f"{line} evopolicy-worker --env core16 --connect {endpoint} --credentials {ready.credentials['worker']}"
 
 
 def main() -> None:

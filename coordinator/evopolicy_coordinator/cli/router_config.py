@@ -19,7 +19,7 @@ from typing import Annotated, Any
 
 import typer
 
-from evopolicy_common.cli.conventions import State, fail_on_our_errors
+from evopolicy_common.cli.conventions import State
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.records.blobs import write_atomically
 from evopolicy_common.terminal import say
@@ -135,18 +135,17 @@ def router_config(
 
     Write it again, and restart zenohd, whenever a machine of the site is issued or revoked.
     """
-    with fail_on_our_errors():
-        root = state or default_state_dir()
-        admitted = write_router_config(
-            root,
-            name,
-            folder,
-            listen=tuple(listen or ()) or (f"tls/0.0.0.0:{PORT}",),
-            connect=tuple(connect or ()) or (first_endpoint(root),),
-            uplink=uplink,
-            admit=tuple(admit or ()),
-            installed_at=installed_at,
-        )
-        there = (installed_at or folder).absolute()
-        say(f"{folder}/zenohd.json lets in: {', '.join(one.identity for one in admitted) or 'nobody'}")
-        say(f"there: zenohd --config {there}/zenohd.json --rest-http-port none --adminspace-permissions none")
+    root = state or default_state_dir()
+    admitted = write_router_config(
+        root,
+        name,
+        folder,
+        listen=tuple(listen or ()) or (f"tls/0.0.0.0:{PORT}",),
+        connect=tuple(connect or ()) or (first_endpoint(root),),
+        uplink=uplink,
+        admit=tuple(admit or ()),
+        installed_at=installed_at,
+    )
+    there = (installed_at or folder).absolute()
+    say(f"{folder}/zenohd.json lets in: {', '.join(one.identity for one in admitted) or 'nobody'}")
+    say(f"there: zenohd --config {there}/zenohd.json --rest-http-port none --adminspace-permissions none")

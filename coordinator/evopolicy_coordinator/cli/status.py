@@ -6,8 +6,9 @@ Exit codes: 0 all well, 1 the coordinator refused or cannot be reached, 2 wrong 
 from __future__ import annotations
 
 import asyncio
+import itertools
 import time
-from collections.abc import Awaitable, Callable, Iterable, Iterator, Sequence
+from collections.abc import Awaitable, Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Literal, TypeVar
 
@@ -18,7 +19,7 @@ from rich.table import Table
 from rich.text import Text
 
 from evopolicy_common import catalogue
-from evopolicy_common.cli.conventions import Connect, CredentialsFile, fail_on_our_errors
+from evopolicy_common.cli.conventions import Connect, CredentialsFile, Json
 from evopolicy_common.cli.frame import App
 from evopolicy_common.console import listing, terminal
 from evopolicy_common.errors import ConfigError
@@ -26,32 +27,23 @@ from evopolicy_common.messages.status import RunStatus, StatusReply, WorkerStatu
 from evopolicy_common.terminal import duration, say, say_json, say_lines
 from evopolicy_common.wire import credentials, transport
 from evopolicy_common.wire.operator_client import OperatorClient
+from evopolicy_coordinator.web.content.remarks import abandoned, audits, lacks, remarks
 
 T = TypeVar("T")
 
 status_app = App(name="status", help="Show workers, runs, and the reasons why runs wait.")
-workers_app = App(
-    name="workers",
-    help="List, drain, pause and resume workers.",
-    no_args_is_help=True,
-)
-runs_app = App(
-    name="runs",
-    help="List, cancel and repin runs.",
-    no_args_is_help=True,
-)
+workers_app = App(name="workers", help="List, drain, pause and resume workers.", no_args_is_help=True)
+runs_app = App(name="runs", help="List, cancel and repin runs.", no_args_is_help=True)
 
 
 def asking(connect: list[str] | None, file: Path | None, work: Callable[[OperatorClient], Awaitable[T]]) -> T:
-    """`work` with a link to the coordinator; our errors as one line."""
+    """`work` with a link to the coordinator."""
 
     async def ask() -> T:
         async with transport.connect(credentials.find("operator", tuple(connect or ()), file)) as link:
             return await work(OperatorClient(link))
 
-    with fail_on_our_errors():
-        return asyncio.run(ask())
-    raise AssertionError("fail_on_our_errors never swallows")
+    return asyncio.run(ask())
 
 
 @status_app.callback(
@@ -60,7 +52,7 @@ def asking(connect: list[str] | None, file: Path | None, work: Callable[[Operato
 def status(
     connect: Connect = None,
     file: CredentialsFile = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the status as JSON.")] = False,
+    as_json: Json = False,
     watch: Annotated[bool, typer.Option("--watch", help="Refresh every second until Ctrl-C.")] = False,
 ) -> None:
     """Show workers, runs, and the reasons why runs wait.
@@ -91,7 +83,6 @@ async def _watch_lines(operator: OperatorClient) -> None:
         await asyncio.sleep(1.0)
 
 
-Json = Annotated[bool, typer.Option("--json", help="Print them as JSON.")]
 WorkerName = Annotated[
     str, typer.Argument(help="The worker's name, as `evopolicy workers list` shows it.", show_default=False)
 ]
@@ -112,18 +103,7 @@ def list_workers(connect: Connect = None, file: CredentialsFile = None, as_json:
         return
     shown = ("worker", "host", "state", "slots", "running", "tiers", "environments")
     terminal().print(_workers(reply, *shown) if reply.workers else "no worker is connected")
-    say_lines(line for worker in reply.workers for line in _lacks(worker))
-
-
-def _tiers(worker: WorkerStatus) -> str:
-    return ", ".join([" ".join(worker.tiers), *(f"no {tier}" for tier in worker.missing_tiers)])
-
-
-def _lacks(worker: WorkerStatus) -> Iterator[str]:
-    for tier, why in worker.missing_tiers.items():
-        yield f"{worker.worker} has no sandbox tier {tier}: {why}"
-    for env, why in worker.failed_environments.items():
-        yield f"{worker.worker} does not offer {env}: {why}"
+    say_lines(line for worker in reply.workers for line in lacks(worker))
 
 
 def _names(env_ids: Sequence[str]) -> str:
@@ -145,7 +125,7 @@ _WORKER_COLUMNS: dict[str, Callable[[WorkerStatus], str]] = {
     "running": lambda one: str(one.running),
     "held": lambda one: str(one.held),
     "envs": lambda one: str(len(one.environments)),
-    "tiers": _tiers,
+    "tiers": lambda one: ", ".join([" ".join(one.tiers), *(f"no {tier}" for tier in one.missing_tiers)]),
     "environments": lambda one: _names(one.environments),
     "class": lambda one: one.fingerprint,
     "seen": lambda one: f"{duration(one.last_seen_s)} ago",
@@ -154,31 +134,8 @@ _WORKER_COLUMNS: dict[str, Callable[[WorkerStatus], str]] = {
 
 def _workers(reply: StatusReply, *columns: str) -> Table:
     shown = {name: _WORKER_COLUMNS[name] for name in columns}
-    return listing(
-        reply.workers, shown, right=("slots", "running", "held", "envs"), whole=("worker", "class")
-    )
-
-
-def _set_worker(
-    worker: str,
-    state: Literal["active", "paused", "draining"],
-    connect: list[str] | None,
-    file: Path | None,
-    absent: bool,
-) -> None:
-    async def work(operator: OperatorClient) -> None:
-        if not absent:
-            reply = await operator.status()
-            known = {*(one.worker for one in reply.workers), *reply.quarantined}
-            if worker not in known:
-                raise ConfigError(
-                    f"no worker {worker!r} is connected; there are: {', '.join(sorted(known)) or 'none'}."
-                    " For a worker that will return, add --absent"
-                )
-        await operator.set_worker(worker, state)
-
-    asking(connect, file, work)
-    say(f"{worker} is {state}")
+    right = ("slots", "running", "held", "envs")
+    return listing(reply.workers, shown, right=right, whole=("worker", "class"))
 
 
 def _command(name: str, state: Literal["active", "paused", "draining"], what: str) -> None:
@@ -186,7 +143,19 @@ def _command(name: str, state: Literal["active", "paused", "draining"], what: st
     def command(
         worker: WorkerName, connect: Connect = None, file: CredentialsFile = None, absent: Absent = False
     ) -> None:
-        _set_worker(worker, state, connect, file, absent)
+        async def work(operator: OperatorClient) -> None:
+            if not absent:
+                reply = await operator.status()
+                known = {*(one.worker for one in reply.workers), *reply.quarantined}
+                if worker not in known:
+                    raise ConfigError(
+                        f"no worker {worker!r} is connected; there are: {', '.join(sorted(known)) or 'none'}."
+                        " For a worker that will return, add --absent"
+                    )
+            await operator.set_worker(worker, state)
+
+        asking(connect, file, work)
+        say(f"{worker} is {state}")
 
 
 _command("drain", "draining", "Give a worker no more work. It finishes its episodes, then ends.")
@@ -207,30 +176,23 @@ def list_runs(connect: Connect = None, file: CredentialsFile = None, as_json: Js
     if as_json:
         say_json(reply.runs)
         return
-    shown = listing(
-        reply.runs, {**_columns("environment"), "waits for": lambda run: run.waits_for}, whole=("run",)
-    )
+    shown = listing(reply.runs, _RUN_COLUMNS | {"waits for": lambda run: run.waits_for}, whole=("run",))
     terminal().print(shown if reply.runs else "no run is open")
     say_lines(abandoned(reply.runs))
 
 
-def _columns(env: str) -> dict[str, Callable[[RunStatus], str]]:
-    """The first columns of tables of runs. `env`: heading of the environment."""
-    return {
-        "run": lambda run: run.run,
-        "entry": lambda run: run.entry,
-        env: lambda run: run.env,
-        "phase": lambda run: f"{run.phase}, abandoned" if run.abandoned else run.phase,
-        "budget left": lambda run: f"{run.remaining_budget}/{run.budget}",
-    }
+_RUN_COLUMNS: dict[str, Callable[[RunStatus], str]] = {
+    "run": lambda run: run.run,
+    "entry": lambda run: run.entry,
+    "environment": lambda run: run.env,
+    "phase": lambda run: f"{run.phase}, abandoned" if run.abandoned else run.phase,
+    "budget left": lambda run: f"{run.remaining_budget}/{run.budget}",
+}
+"""The first columns of tables of runs."""
 
 
 @runs_app.command(epilog="Example: evopolicy runs cancel r-0f2e9a7c11d04b35")
-def cancel(
-    run: RunId,
-    connect: Connect = None,
-    file: CredentialsFile = None,
-) -> None:
+def cancel(run: RunId, connect: Connect = None, file: CredentialsFile = None) -> None:
     """End a run without a score, and stop its episodes."""
 
     async def cancelled(operator: OperatorClient) -> bool:
@@ -243,11 +205,7 @@ def cancel(
 
 
 @runs_app.command("agent-gone", epilog="Example: evopolicy runs agent-gone r-0f2e9a7c11d04b35")
-def agent_gone(
-    run: RunId,
-    connect: Connect = None,
-    file: CredentialsFile = None,
-) -> None:
+def agent_gone(run: RunId, connect: Connect = None, file: CredentialsFile = None) -> None:
     """Vouch that a run's agent has ended, after its machine was lost for good.
 
     The cluster may then play hidden cases on that machine. If the agent is still alive, it could learn them: when in
@@ -284,19 +242,24 @@ def render(reply: StatusReply) -> RenderableType:
     )
     parts: list[RenderableType] = [
         Text(head),
-        _workers(
-            reply, "worker", "host", "state", "slots", "running", "held", "envs", "tiers", "class", "seen"
-        ),
+        _workers(reply, *(name for name in _WORKER_COLUMNS if name != "environments")),
         *_classes(reply),
-        _runs(reply),
+        listing(reply.runs, _RUN_COLUMNS | _RUN_COUNTS, whole=("run",)),
     ]
-    if reply.audit_share or reply.audits:
-        stand = ", ".join(f"{n} {state.replace('_', ' ')}" for state, n in sorted(reply.audits.items()))
-        parts.append(
-            Text(f"audits: {reply.audit_share:g} of the episodes of new runs; now {stand or 'none'}")
-        )
-    parts += [Text(line, style="yellow") for line in _remarks(reply)]
-    return Group(*parts)
+    if shown := audits(reply):
+        parts.append(Text(f"audits: {shown}"))
+    waits = [f"{run.run} waits for {run.waits_for}" for run in reply.runs if run.waits_for]
+    lines = itertools.chain(waits, *remarks(reply).values())
+    return Group(*parts, *(Text(line, style="yellow") for line in lines))
+
+
+_RUN_COUNTS: dict[str, Callable[[RunStatus], str]] = {
+    "submits": lambda run: str(run.n_submits),
+    "queued": lambda run: str(run.queued),
+    "running": lambda run: str(run.running),
+    "done": lambda run: str(run.done),
+    "agent": lambda run: run.agent_host,
+}
 
 
 def _classes(reply: StatusReply) -> Iterator[Text]:
@@ -311,47 +274,3 @@ def _classes(reply: StatusReply) -> Iterator[Text]:
         if len(classes) > 1:
             text = "; ".join(f"class {name} on {', '.join(there)}" for name, there in sorted(classes.items()))
             yield Text(f"{env} has {len(classes)} classes: {text}")
-
-
-def _runs(reply: StatusReply) -> Table:
-    columns = {
-        **_columns("env"),
-        "submits": lambda run: str(run.n_submits),
-        "queued": lambda run: str(run.queued),
-        "running": lambda run: str(run.running),
-        "done": lambda run: str(run.done),
-        "agent": lambda run: run.agent_host,
-    }
-    return listing(reply.runs, columns, whole=("run",))
-
-
-def _remarks(reply: StatusReply) -> Iterator[str]:
-    if reply.trouble:
-        yield f"{reply.trouble}; this is the state of then"
-    for name, why in reply.quarantined.items():
-        yield f"{name} is quarantined: {why} (evopolicy workers resume {name} takes it back)"
-    for one in reply.turned_away:
-        where = f" of {one.host}" if one.host else ""
-        yield f"{one.worker}{where} was turned away {duration(one.ago_s)} ago: {one.why}"
-    yield from reply.disputes
-    for run in reply.runs:
-        if run.waits_for:
-            yield f"{run.run} waits for {run.waits_for}"
-    yield from abandoned(reply.runs)
-    for worker in reply.workers:
-        for run_id, why in worker.refused.items():
-            yield f"{worker.worker} gets no work of {run_id}: {why}"
-        yield from _lacks(worker)
-        if worker.hidden_bar:
-            yield f"{worker.worker} plays no hidden episodes now: {worker.hidden_bar}"
-    yield from reply.stalls
-
-
-def abandoned(runs: Iterable[RunStatus]) -> Iterator[str]:
-    """Says of each abandoned run how to end it."""
-    for run in runs:
-        if run.abandoned:
-            yield (
-                f"{run.run} has had no gateway for {duration(run.silent_s)}: give its command again with --resume, or"
-                f" end it with evopolicy runs cancel {run.run}"
-            )

@@ -20,7 +20,7 @@ import typer
 
 from evopolicy_common import catalogue
 from evopolicy_common.catalogue.worlds import N_WORLDS, ids, unchanged
-from evopolicy_common.cli.conventions import State, end_on_sigterm, fail_on_our_errors, run_to_end
+from evopolicy_common.cli.conventions import State, end_on_sigterm, run_to_end
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.local.cluster import local_cluster, unless_failed
 from evopolicy_common.messages.environment import EnvironmentDescription, Split
@@ -59,13 +59,12 @@ def accept_worlds(
     """
     root = state or credentials.default_state_dir()
     core16 = catalogue.suites()["core16"].environments
-    with fail_on_our_errors():
-        env_ids = catalogue.resolve(env or ["core16"])
-        if others := [each for each in env_ids if each not in core16]:
-            raise ConfigError(f"{others[0]} has no worlds; those of Core16 have some: {', '.join(core16)}")
-        with held(root):
-            secret = splits.load_or_create_secret(root / splits.SECRET)
-            run_to_end(_accept(env_ids, policies, _Journal(root / worlds.JOURNAL, secret), slots))
+    env_ids = catalogue.resolve(env or ["core16"])
+    if others := [each for each in env_ids if each not in core16]:
+        raise ConfigError(f"{others[0]} has no worlds; those of Core16 have some: {', '.join(core16)}")
+    with held(root):
+        secret = splits.load_or_create_secret(root / splits.SECRET)
+        run_to_end(_accept(env_ids, policies, _Journal(root / worlds.JOURNAL, secret), slots))
     say(f"next: evopolicy-coordinator --state {root}")
 
 
@@ -169,7 +168,6 @@ class _Player:
         if bundle is not None:
             await self._evaluations.ask.upload(bundle.digest, bundle.packed)
         message = Evaluate(
-            token="",
             key=uuid.uuid4().hex,
             env=env,
             bundle=None if bundle is None else bundle.digest,
@@ -181,7 +179,7 @@ class _Player:
         return math.fsum(returns) / len(returns)
 
     async def description(self, world: str) -> EnvironmentDescription:
-        await self._evaluations.versions(DescribeEnvironment(token="", env=world), wait=True)
+        await self._evaluations.versions(DescribeEnvironment(env=world), wait=True)
         offered, *_ = await self._evaluations.ask.environments()
         return next(each.description for each in offered if each.description.env == world)
 

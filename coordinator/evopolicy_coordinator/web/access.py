@@ -18,7 +18,7 @@ import ipaddress
 import re
 import secrets
 import socket
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from http.cookies import CookieError, SimpleCookie
 from pathlib import Path
 from typing import Literal
@@ -50,7 +50,6 @@ _HEADERS = {
 }
 _OPEN = ("/login", "/static/", "/healthz")
 """Paths that need no token: they tell nothing."""
-_LOOPBACK_NAMES = ("localhost",)
 _HOST = re.compile(r"(?:\[(?P<six>[0-9A-Fa-f:.]+)\]|(?P<name>[A-Za-z0-9._-]+))(?::[0-9]{1,5})?")
 """The `Host` header; a browser sends names of other alphabets in ASCII."""
 
@@ -92,7 +91,7 @@ class Access:
     def __init__(self, tokens: Tokens, *, acting: bool, names: Iterable[str] = (), cookie: str) -> None:
         """`names`: host names, beside addresses and localhost, under which browsers find this server."""
         self.cookie = cookie
-        own = {socket.gethostname().lower(), *(name.lower() for name in names), *_LOOPBACK_NAMES}
+        own = {socket.gethostname().lower(), *(name.lower() for name in names), "localhost"}
         self._names = frozenset(name.rstrip(".") for name in own if name)
         self._tokens: dict[Role, str] = {"read": tokens.read}
         if acting:
@@ -100,12 +99,7 @@ class Access:
 
     def role_of_token(self, token: str) -> Role | None:
         """A token's rights; None for a wrong token."""
-        given = token.encode()
-        found: Role | None = None
-        for role, right in self._tokens.items():
-            if hmac.compare_digest(given, right.encode()):
-                found = role
-        return found
+        return self._matching(token, self._tokens)
 
     def cookie_of(self, role: Role) -> str:
         """The cookie's value. It is derived from the token, so it outlives a restart if the token does."""
@@ -120,12 +114,13 @@ class Access:
             morsel = SimpleCookie(headers.get("cookie", "")).get(self.cookie)
         except CookieError:
             return None
-        given = "" if morsel is None else morsel.value
-        found: Role | None = None
-        for role in self._tokens:
-            if hmac.compare_digest(given.encode(), self.cookie_of(role).encode()):
-                found = role
-        return found
+        cookies = {role: self.cookie_of(role) for role in self._tokens}
+        return self._matching("" if morsel is None else morsel.value, cookies)
+
+    def _matching(self, given: str, right: Mapping[Role, str]) -> Role | None:
+        # All are compared, so that the time tells nothing.
+        found = [role for role, each in right.items() if hmac.compare_digest(given.encode(), each.encode())]
+        return found[-1] if found else None
 
     def is_own_host(self, host: str) -> bool:
         """Whether `Host` names this server: an address, which cannot be rebound, or one of its names."""
@@ -142,16 +137,12 @@ class Access:
         """Why a request is refused before anything else is looked at; None for a good one."""
         host = headers.get("host", "")
         if not self.is_own_host(host):
-            return (
-                421,
-                f"This server is not called {host[:100]!r}. Use its address, or start it with --name for that name.",
-            )
-        origin = headers.get("origin")
+            advice = "Use its address, or start it with --name for that name."
+            return 421, f"This server is not called {host[:100]!r}. {advice}"
+        origin, site = headers.get("origin"), headers.get("sec-fetch-site", "none")
         same = origin is not None and origin.lower() == f"{scheme}://{host}".lower()
-        if origin is not None and not same:
-            return 403, "The request comes from another site's page."
-        site = headers.get("sec-fetch-site", "none")
-        if site not in ("same-origin", "none") and headers.get("sec-fetch-mode") != "navigate":
+        elsewhere = site not in ("same-origin", "none") and headers.get("sec-fetch-mode") != "navigate"
+        if elsewhere or (origin is not None and not same):
             return 403, "The request comes from another site's page."
         if method not in ("GET", "HEAD") and not same and headers.get("authorization") is None:
             return 403, "The request does not tell its origin."

@@ -10,6 +10,7 @@ import asyncio
 import os
 import time
 from collections.abc import Awaitable, Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -36,8 +37,6 @@ class Act(msgspec.Struct, frozen=True, kw_only=True):
     """The act's effect, shown before it is confirmed."""
     needs: str = ""
     """Name of a text that the operator gives; empty for none."""
-    cluster: bool = True
-    """Whether the coordinator carries it out."""
 
 
 ACTS: Mapping[tuple[str, str], Act] = {
@@ -59,22 +58,16 @@ ACTS: Mapping[tuple[str, str], Act] = {
     ),
     ("run", "repin"): Act(
         title="Repin a run",
-        happens=(
-            "It goes on with workers of another fingerprint class. Its record names both classes and the reason, and"
-            " reports tell that versions changed within it."
-        ),
+        happens="It goes on with workers of another fingerprint class. Its record names both classes and the reason,"
+        " and reports tell that versions changed within it.",
         needs="reason",
     ),
     ("sweep", "pause"): Act(
         title="Pause a sweep",
-        happens=(
-            "No further run of it begins, on any host that shares its folder. Runs that have begun go on to their end."
-        ),
-        cluster=False,
+        happens="No further run of it begins, on any host that shares its folder. Runs that have begun go on to"
+        " their end.",
     ),
-    ("sweep", "resume"): Act(
-        title="Go on with a sweep", happens="Its next runs begin as its limits allow.", cluster=False
-    ),
+    ("sweep", "resume"): Act(title="Go on with a sweep", happens="Its next runs begin as its limits allow."),
 }
 _STATES: Mapping[str, Any] = {"pause": "paused", "drain": "draining", "resume": "active"}
 
@@ -120,11 +113,14 @@ async def carry_out(
     if kind == "sweep":
         if sweep is None or sweep.root is None or not sweep.is_suite:
             raise ConfigError("there is no such sweep")
-        await asyncio.to_thread(_set_paused, sweep.root, verb == "pause")
-        return
-    if operator is None:
+        file = sweep.root / PAUSED
+        if verb == "pause":
+            os.close(os.open(file, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o644))
+        else:
+            file.unlink(missing_ok=True)
+    elif operator is None:
         raise ConfigError("the coordinator does not answer now; try again")
-    if kind == "worker":
+    elif kind == "worker":
         await operator.set_worker(name, _STATES[verb])
     elif verb == "cancel":
         await operator.cancel(name)
@@ -132,24 +128,13 @@ async def carry_out(
         await operator.repin(name, form["class"], form["reason"])
 
 
-async def logged(
-    book: Log, who: str, kind: str, name: str, verb: str, work: Callable[[], Awaitable[None]], **details: str
-) -> None:
+async def logged(book: Log, work: Callable[[], Awaitable[None]], **what: str) -> None:
     """`work`, with its entries in the log."""
-    what = {"act": f"{kind} {verb}", "name": name, "by": who, **details}
-    await asyncio.to_thread(lambda: book.write(**what, outcome="asked"))
+    write = partial(asyncio.to_thread, partial(book.write, **what))
+    await write(outcome="asked")
     try:
         await work()
     except (EvopolicyError, OSError) as error:
-        refused = f"refused: {error}"
-        await asyncio.to_thread(lambda: book.write(**what, outcome=refused))
+        await write(outcome=f"refused: {error}")
         raise
-    await asyncio.to_thread(lambda: book.write(**what, outcome="done"))
-
-
-def _set_paused(root: Path, paused: bool) -> None:
-    file = root / PAUSED
-    if paused:
-        os.close(os.open(file, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o644))
-    else:
-        file.unlink(missing_ok=True)
+    await write(outcome="done")

@@ -11,12 +11,12 @@ import re
 import resource
 import socket
 import time
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qsl, urlencode
 
-import msgspec
 from prometheus_client import CollectorRegistry, Gauge, ProcessCollector, generate_latest
 from starlette.applications import Starlette
 from starlette.middleware.gzip import GZipMiddleware
@@ -27,16 +27,15 @@ from starlette.types import ASGIApp
 
 from evopolicy_common.errors import ConfigError, EvopolicyError
 from evopolicy_common.logs import structlog
-from evopolicy_common.messages.status import StatusReply
 from evopolicy_common.wire.credentials import Credentials
 from evopolicy_common.wire.http import bound, serving
 from evopolicy_coordinator.server.monitoring.metrics import CONTENT_TYPE, StatusCollector
 from evopolicy_coordinator.web import acting
 from evopolicy_coordinator.web.access import Access, Guard
 from evopolicy_coordinator.web.content import rendering
-from evopolicy_coordinator.web.content.cluster import Cluster
+from evopolicy_coordinator.web.content.cluster import Cluster, set_within
 from evopolicy_coordinator.web.content.confined import Confined, NotThereError
-from evopolicy_coordinator.web.content.feeds import Feeds, View
+from evopolicy_coordinator.web.content.feeds import Feeds
 from evopolicy_coordinator.web.content.run_detail import IMAGES, Detail
 from evopolicy_coordinator.web.content.run_folders import Reader, RunFacts, Runs
 from evopolicy_coordinator.web.content.tables import Words, ident
@@ -56,7 +55,20 @@ _SANDBOXED = "default-src 'none'; sandbox"
 pages' rights."""
 _RANGE = re.compile(r"bytes=(\d{0,15})-(\d{0,15})")
 
+_REPORT_TYPES = {
+    ".html": "text/html; charset=utf-8",
+    ".svg": "image/svg+xml",
+    ".csv": "text/csv",
+    ".mp4": "video/mp4",
+    **IMAGES,
+}
+_NOT_THERE = 404, "Not found", "Nothing is at this address, or its run is gone."
+
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
+
+
+class PageError(Exception):
+    """A request that is answered with a status, a title and a text."""
 
 
 class Site:
@@ -90,8 +102,8 @@ class Site:
         browsers = Gauge("evopolicy_web_browsers", "Browsers that follow a page.", registry=self._registry)
         browsers.set_function(lambda: self.feeds.watchers)
         if credentials is not None:
-            self._registry.register(StatusCollector(self._known_status))
-            self.cluster = Cluster(credentials, lambda: self.feeds.watchers > 0, self._moved.set)
+            cluster = self.cluster = Cluster(credentials, lambda: self.feeds.watchers > 0, self._moved.set)
+            self._registry.register(StatusCollector(lambda: cluster.status if cluster.is_known else None))
 
     @contextlib.asynccontextmanager
     async def running(self) -> AsyncIterator[None]:
@@ -116,7 +128,7 @@ class Site:
             began = time.monotonic()
             known = self.cluster is None or self.cluster.is_known
             status = None if self.cluster is None else self.cluster.status
-            open_runs = None if status is None else status.runs
+            open_runs = () if status is None else status.runs
             self.runs = await asyncio.to_thread(self.reader.read, open_runs, cluster_is_known=known)
             self._looked_at = time.monotonic()
             self._took_s = self._looked_at - began
@@ -124,9 +136,7 @@ class Site:
     async def _tell(self) -> None:
         """Updates the open pages."""
         while True:
-            with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(_LOOK_S):
-                    await self._moved.wait()
+            await set_within(self._moved, _LOOK_S)
             self._moved.clear()
             try:
                 if self.feeds.watchers:
@@ -138,91 +148,89 @@ class Site:
                 log.exception("a page could not be updated")
             await asyncio.sleep(0.5)
 
-    def _known_status(self) -> StatusReply | None:
-        return self.cluster.status if self.cluster is not None and self.cluster.is_known else None
-
     # ---- views by page ----
 
-    def view_of(self, page: str, words: Words, *, may_act: bool) -> Callable[[], View] | None:
-        """The function that makes the parts of a page; None for an unknown page."""
+    def view_of(self, page: str, words: Words, *, may_act: bool) -> Callable[[], rendering.View]:
+        """The function that makes the parts of a page. NotThereError for an unknown page."""
+        cluster = self.cluster
         if page == "runs":
-            return lambda: sweeps_view(self.runs, self.cluster, words, self.reader.roots, acting=may_act)
-        if page == "cluster" and self.cluster is not None:
-            cluster = self.cluster
+            return lambda: sweeps_view(self.runs, cluster, words, self.reader.roots, acting=may_act)
+        if page == "cluster" and cluster is not None:
             return lambda: cluster_view(cluster, words, self.runs, self.reader.roots, acting=may_act)
         kind, _, key = page.partition("/")
-        if kind == "run" and key in self.runs.by_key:
-            return lambda: self._run_view(key, words, may_act)
-        return None
+        if kind != "run" or key not in self.runs.by_key:
+            raise NotThereError(page)
 
-    def _run_view(self, key: str, words: Words, may_act: bool) -> View:
-        status = None if self.cluster is None else self.cluster.status
-        run = self.runs.by_key[key]
-        retries = () if self.cluster is None else tuple(self.cluster.retries.get(run.run, ()))
-        return run_view(run, self.runs, self.reader, words, acting=may_act, status=status, retries=retries)
+        def view() -> rendering.View:
+            run = self.runs.by_key[key]
+            status = None if cluster is None else cluster.status
+            retries = () if cluster is None else tuple(cluster.retries.get(run.run, ()))
+            return run_view(
+                run, self.runs, self.reader, words, acting=may_act, status=status, retries=retries
+            )
+
+        return view
 
     # ---- answers ----
 
-    def _shown(self, request: Request, here: str) -> dict[str, Any]:
-        """The data that every page needs."""
-        return {
-            "here": here,
-            "has_cluster": self.cluster is not None,
-            "has_report": self.report is not None,
-            "acting": request.scope.get("role") == "act" and self.book is not None,
-        }
+    def _may_act(self, request: Request) -> bool:
+        return request.scope.get("role") == "act" and self.book is not None
 
-    async def live_page(self, request: Request, name: str, template: str, **values: Any) -> Response:
+    def _page(
+        self, request: Request, template: str, status: int = 200, *, here: str = "", **values: Any
+    ) -> HTMLResponse:
+        html = rendering.page(
+            template,
+            here=here,
+            has_cluster=self.cluster is not None,
+            has_report=self.report is not None,
+            acting=self._may_act(request),
+            **values,
+        )
+        return HTMLResponse(html, status)
+
+    def _run(self, request: Request) -> RunFacts:
+        run = self.runs.by_key.get(request.path_params["key"])
+        if run is None:
+            raise NotThereError(request.path_params["key"])
+        return run
+
+    async def live_page(
+        self, request: Request, name: str, template: str, title: str, **more: Any
+    ) -> Response:
         """A page whose parts are kept up to date."""
-        await self.refresh()
-        words = _words(request)
-        shown = self._shown(request, name)
-        make = self.view_of(name, words, may_act=shown["acting"])
-        if make is None:
-            return self._message(request, "Not found", "There is no such page, or its run is gone.", 404)
-        if name.startswith("run/"):
-            values["run"] = self.runs.by_key[name.partition("/")[2]]
-            values["title"] = f"{values['run'].entry} on {values['run'].env}"
+        words, may_act = _words(request), self._may_act(request)
+        make = self.view_of(name, words, may_act=may_act)
         view = await asyncio.to_thread(make)
-        feed = self.feeds.of(f"{shown['acting']} {name} {words}", make, view)
+        feed = self.feeds.of(f"{may_act} {name} {words}", make, view)
         query = {k: v for k, v in (("q", words.q), ("page", words.page), ("before", words.before)) if v}
         live = f"/events/{name}" + (f"?{urlencode(query)}" if query else "")
-        values.setdefault("title", self.title)
-        html = rendering.page(
-            template, view=view, live=live, cursor=feed.cursor, words=words, **shown, **values
-        )
-        return HTMLResponse(html)
+        shown = {"view": view, "live": live, "cursor": feed.cursor, "words": words, "title": title}
+        return self._page(request, template, here=name, **shown, **more)
 
     async def home(self, request: Request) -> Response:
-        return await self.live_page(request, "runs", "runs.html.j2")
+        await self.refresh()
+        return await self.live_page(request, "runs", "runs.html.j2", self.title)
 
     async def cluster_page(self, request: Request) -> Response:
-        title = (
-            "Cluster"
-            if self.cluster is None or self.cluster.status is None
-            else f"Cluster {self.cluster.status.cluster}"
-        )
-        return await self.live_page(request, "cluster", "cluster.html.j2", title=title)
+        await self.refresh()
+        status = None if self.cluster is None else self.cluster.status
+        title = "Cluster" if status is None else f"Cluster {status.cluster}"
+        return await self.live_page(request, "cluster", "cluster.html.j2", title)
 
     async def run_page(self, request: Request) -> Response:
-        return await self.live_page(
-            request, f"run/{request.path_params['key']}", "run.html.j2", replays=self._replays(request)
-        )
-
-    def _replays(self, request: Request) -> list[tuple[str, str]]:
-        """Recordings of hidden episodes, where they may be shown: their names and addresses."""
-        run = self.runs.by_key.get(request.path_params["key"])
-        if run is None or run.path is None or not self.runs.may_show(run):
-            return []
-        return [(name, _file_link(run, f"replays/{name}/video.mp4")) for name in Detail(run.path).replays()]
+        await self.refresh()
+        run, replays = self._run(request), []
+        if run.path is not None and self.runs.may_show(run):  # recordings of hidden episodes
+            names = Detail(run.path).replays()
+            replays = [(name, _file_link(run, f"replays/{name}/video.mp4")) for name in names]
+        title = f"{run.entry} on {run.env}"
+        return await self.live_page(request, f"run/{run.key}", "run.html.j2", title, run=run, replays=replays)
 
     async def events(self, request: Request) -> Response:
         """The updates of one page, as server-sent events."""
-        name, words = request.path_params["page"], _words(request)
-        may_act = self._shown(request, name)["acting"]
+        name, words, may_act = request.path_params["page"], _words(request), self._may_act(request)
         make = self.view_of(name, words, may_act=may_act)
-        if make is None:
-            return PlainTextResponse("There is no such page.\n", 404)
         cursor = request.headers.get("last-event-id") or request.query_params.get("since", "")
         feed = self.feeds.of(f"{may_act} {name} {words}", make)
         if feed.version == 0 or not feed.watchers:
@@ -232,109 +240,64 @@ class Site:
 
     async def submit_page(self, request: Request) -> Response:
         await self.refresh()
-        run = self.runs.by_key.get(request.path_params["key"])
-        index = request.path_params["index"]
-        values = None
-        if run is not None:
-            values = await asyncio.to_thread(submit_values, run, self.reader, index)
-        if run is None or values is None:
-            return self._message(
-                request, "Not found", "There is no such submit, or it has no verdict yet.", 404
-            )
-        html = rendering.page(
-            "submit.html.j2",
-            title=f"Submit {index} of {run.entry}",
-            run=run,
-            **values,
-            **self._shown(request, "submit"),
-        )
-        return HTMLResponse(html)
+        run, index = self._run(request), request.path_params["index"]
+        values = await asyncio.to_thread(submit_values, run, self.reader, index)
+        title = f"Submit {index} of {run.entry}"
+        return self._page(request, "submit.html.j2", title=title, run=run, **values)
 
     async def episode_page(self, request: Request) -> Response:
         await self.refresh()
-        run = self.runs.by_key.get(request.path_params["key"])
-        index, episode = request.path_params["index"], request.path_params["episode"]
-        try:
-            if run is None or run.path is None:
-                raise NotThereError("run")
-            values = await asyncio.to_thread(_episode, run, run.path, index, episode)
-        except NotThereError:
-            return self._message(request, "Not found", "There is no such episode here.", 404)
-        html = rendering.page(
-            "episode.html.j2", title=f"Episode {episode} of submit {index}", run=run, index=index, episode=episode,
-            **values, **self._shown(request, "episode"),
-        )  # fmt: skip
-        return HTMLResponse(html)
+        run, index, episode = self._run(request), request.path_params["index"], request.path_params["episode"]
+        values = await asyncio.to_thread(_episode, run, index, episode)
+        title = f"Episode {episode} of submit {index}"
+        return self._page(
+            request, "episode.html.j2", title=title, run=run, index=index, episode=episode, **values
+        )
 
     async def file(self, request: Request) -> Response:
         """A file of a run's feedback, or a recording of it once hidden results may be shown."""
-        run = self.runs.by_key.get(request.path_params["key"])
-        path = request.query_params.get("path", "")
+        path, run = request.query_params.get("path", ""), self._run(request)
         allowed = path.startswith("workspace/feedback/")
-        if run is not None and path.startswith("replays/"):
+        if path.startswith("replays/"):
             await self.refresh()
-            run = self.runs.by_key.get(run.key)
-            allowed = run is not None and self.runs.may_show(run)
-        if run is None or run.path is None or not allowed:
-            return PlainTextResponse("There is no such file.\n", 404)
-        suffix = os.path.splitext(path)[1].lower()
-        types = {**IMAGES, ".mp4": "video/mp4"}
-        try:
-            return _file(
-                request, Confined(run.path), path, types.get(suffix, "text/plain; charset=utf-8"), _SANDBOXED
-            )
-        except NotThereError:
-            return PlainTextResponse("There is no such file.\n", 404)
+            run = self._run(request)
+            allowed = self.runs.may_show(run)
+        if run.path is None or not allowed:
+            raise NotThereError(path)
+        return _file(request, Confined(run.path), path, {**IMAGES, ".mp4": "video/mp4"}, _SANDBOXED)
 
     async def report_file(self, request: Request) -> Response:
         """A file of a written report, which holds hidden scores of all its runs."""
         await self.refresh()
         if self.report is None:
-            return self._message(
-                request, "No report", "Start the view with --report DIR to have one here.", 404
-            )
+            raise PageError(404, "No report", "Start the view with --report DIR to have one here.")
         if self.runs.shut is None or self.runs.shut:
             text = "The report holds hidden scores. It is shown once no agent is alive."
-            return self._message(request, "Not yet", text, 403)
-        path = request.path_params["path"]
-        types = {
-            ".html": "text/html; charset=utf-8",
-            ".svg": "image/svg+xml",
-            ".csv": "text/csv",
-            ".mp4": "video/mp4",
-            **IMAGES,
-        }
-        try:
-            kind = types.get(os.path.splitext(path)[1].lower(), "text/plain; charset=utf-8")
-            return _file(request, self.report, path, kind, report_policy())
-        except NotThereError:
-            return self._message(request, "Not found", "The report has no such page.", 404)
+            raise PageError(403, "Not yet", text)
+        return _file(request, self.report, request.path_params["path"], _REPORT_TYPES, report_policy())
 
     # ---- signing in ----
 
     async def login(self, request: Request) -> Response:
         if request.method == "GET":
-            return HTMLResponse(rendering.page("login.html.j2", title="Sign in", wrong=False))
-        body = await _form(request)
-        role = self.access.role_of_token(body.get("token", ""))
+            return self._page(request, "login.html.j2", title="Sign in", wrong=False)
+        role = self.access.role_of_token((await _form(request)).get("token", ""))
         if role is None:
-            return HTMLResponse(rendering.page("login.html.j2", title="Sign in", wrong=True), 401)
+            return self._page(request, "login.html.j2", 401, title="Sign in", wrong=True)
         answer = RedirectResponse("/", 303)
+        secure = request.url.scheme == "https"
+        cookie = self.access.cookie_of(role)
         answer.set_cookie(
-            self.access.cookie,
-            self.access.cookie_of(role),
-            httponly=True,
-            samesite="strict",
-            secure=request.url.scheme == "https",
-            path="/",
+            self.access.cookie, cookie, httponly=True, samesite="strict", secure=secure, path="/"
         )
         return answer
 
     async def static(self, request: Request) -> Response:
-        file = rendering.static_files().get(request.path_params["name"])
-        if file is None:
-            return PlainTextResponse("There is no such file.\n", 404)
-        return Response(file[0], media_type=file[1], headers={"cache-control": "max-age=300"})
+        name = request.path_params["name"]
+        if name not in rendering.static_files():
+            raise NotThereError(name)
+        data, kind = rendering.static_files()[name]
+        return Response(data, media_type=kind, headers={"cache-control": "max-age=300"})
 
     async def health(self, request: Request) -> Response:
         """For service managers: the process serves. It tells nothing else, as it needs no token."""
@@ -348,67 +311,49 @@ class Site:
 
     # ---- acting ----
 
+    def _book_of_actor(self, request: Request) -> acting.Log:
+        if self.book is None or not self._may_act(request):
+            text = "This needs the acting token of a view that was started with --act."
+            raise PageError(403, "Not allowed", text)
+        return self.book
+
     async def act(self, request: Request) -> Response:
         """GET describes the action and shows a button. POST carries it out."""
         kind, name, verb = (request.path_params[each] for each in ("kind", "name", "verb"))
-        act = acting.ACTS.get((kind, verb))
-        shown = self._shown(request, "act")
-        if not shown["acting"] or self.book is None:
-            return self._message(
-                request,
-                "Not allowed",
-                "This needs the acting token of a view that was started with --act.",
-                403,
-            )
+        book, act = self._book_of_actor(request), acting.ACTS.get((kind, verb))
         if act is None:
-            return self._message(request, "Not found", "There is no such action.", 404)
-        back = {"worker": "/cluster", "run": "/", "sweep": "/"}[kind]
+            raise NotThereError(verb)
+        back = "/cluster" if kind == "worker" else "/"
         sweep = next((each for each in self.runs.sweeps if ident("sweep", str(each.root)) == name), None)
         label = sweep.name if kind == "sweep" and sweep is not None else name
         if request.method == "GET":
-            fingerprint_class = request.query_params.get("class", "")[:200]
-            html = rendering.page(
-                "act.html.j2",
-                title=f"{act.title}: {label}",
-                act=act,
-                label=label,
-                fingerprint_class=fingerprint_class,
-                back=back,
-                verb=verb,
-                **shown,
-            )
-            return HTMLResponse(html)
+            shown = {"title": f"{act.title}: {label}", "label": label, "back": back, "verb": verb}
+            of_class = request.query_params.get("class", "")[:200]
+            return self._page(request, "act.html.j2", act=act, fingerprint_class=of_class, **shown)
         body = await _form(request)
         form = {each: body.get(each, "")[:500] for each in ("class", "reason") if body.get(each)}
         if act.needs and not (form.get("reason") and form.get("class")):
-            return self._message(
-                request, "Not done", "A class and a reason are needed; the run's record names both.", 400
-            )
+            text = "A class and a reason are needed; the run's record names both."
+            raise PageError(400, "Not done", text)
         operator = None if self.cluster is None else self.cluster.operator
-        client = request.client
-        who = "browser" if client is None else f"browser at {client.host}"
+        who = "browser" if request.client is None else f"browser at {request.client.host}"
         try:
-            await acting.logged(
-                self.book, who, kind, label, verb,
-                lambda: acting.carry_out(operator, kind, name, verb, sweep, form), **form,
-            )  # fmt: skip
+            work = partial(acting.carry_out, operator, kind, name, verb, sweep, form)
+            await acting.logged(book, work, act=f"{kind} {verb}", name=label, by=who, **form)
         except (EvopolicyError, OSError) as error:
-            return self._message(request, "Not done", str(error), 409)
+            raise PageError(409, "Not done", str(error)) from error
         self._looked_at = float("-inf")
         if self.cluster is not None:
             self.cluster.acted()
         return RedirectResponse(back, 303)
 
     async def action_log(self, request: Request) -> Response:
-        shown = self._shown(request, "log")
-        if not shown["acting"] or self.book is None:
-            return self._message(request, "Not allowed", "This needs the acting token.", 403)
-        entries = await asyncio.to_thread(self.book.last)
-        return HTMLResponse(rendering.page("log.html.j2", title="Actions", entries=entries, **shown))
+        entries = await asyncio.to_thread(self._book_of_actor(request).last)
+        return self._page(request, "log.html.j2", here="log", title="Actions", entries=entries)
 
-    def _message(self, request: Request, title: str, text: str, status: int) -> Response:
-        html = rendering.page("message.html.j2", title=title, text=text, back="/", **self._shown(request, ""))
-        return HTMLResponse(html, status)
+    async def _refused(self, request: Request, error: Exception) -> Response:
+        status, title, text = error.args if isinstance(error, PageError) else _NOT_THERE
+        return self._page(request, "message.html.j2", status, title=title, text=text, back="/")
 
     def app(self) -> ASGIApp:
         """The application with its guards."""
@@ -428,7 +373,8 @@ class Site:
             Route("/act/{kind}/{name}/{verb}", self.act, methods=["GET", "POST"]),
             Route("/log", self.action_log),
         ]
-        site = Starlette(routes=routes, exception_handlers={Exception: _failed})
+        refused = {PageError: self._refused, NotThereError: self._refused}
+        site = Starlette(routes=routes, exception_handlers={Exception: _failed, **refused})
         return Guard(GZipMiddleware(site, minimum_size=1000), self.access)
 
 
@@ -475,34 +421,26 @@ def _file_link(run: RunFacts, path: str) -> str:
     return f"/run/{run.key}/file?{urlencode({'path': path})}"
 
 
-def _episode(run: RunFacts, folder: Path, index: int, episode: int) -> dict[str, Any]:
-    detail = Detail(folder)
+def _episode(run: RunFacts, index: int, episode: int) -> dict[str, Any]:
+    if run.path is None:
+        raise NotThereError(run.key)
+    detail = Detail(run.path)
     place, names = detail.episode_files(index, episode)
     beside = detail.episodes(index)
-    try:
-        played = detail.played(place)
-    except NotThereError:
-        played = None
-    texts = [
-        (name, text)
-        for name in ("error.txt", "stdout.txt", "stderr.txt")
-        if name in names and (text := detail.text(f"{place}/{name}"))
-    ]
-    images = [
-        (name, _file_link(run, f"{place}/{name}"))
-        for name in names
-        if os.path.splitext(name)[1].lower() in IMAGES
-    ]
-    videos = [_file_link(run, f"{place}/{name}") for name in names if name.endswith(".mp4")]
-    near = {
+    texts = [(name, detail.text(f"{place}/{name}")) for name in ("error.txt", "stdout.txt", "stderr.txt")]
+    links = {name: _file_link(run, f"{place}/{name}") for name in names}
+    return {
+        **episode_values(detail, place),
         "previous": episode - 1 if episode - 1 in beside else None,
         "next": episode + 1 if episode + 1 in beside else None,
+        "texts": [(name, text) for name, text in texts if text],
+        "images": [(name, link) for name, link in links.items() if Path(name).suffix.lower() in IMAGES],
+        "videos": [link for name, link in links.items() if name.endswith(".mp4")],
     }
-    return {**episode_values(played), **near, "texts": texts, "images": images, "videos": videos}
 
 
-def _file(request: Request, files: Confined, path: str, kind: str, policy: str) -> Response:
-    """A file, or the requested range of it. Raises NotThereError if it does not exist."""
+def _file(request: Request, files: Confined, path: str, types: Mapping[str, str], policy: str) -> Response:
+    """A file, or the requested range of it; plain text unless its suffix has another type. Raises NotThereError."""
     fd = files.open(path)
     size = os.fstat(fd).st_size
     first, last, status = 0, size - 1, 200
@@ -519,6 +457,7 @@ def _file(request: Request, files: Confined, path: str, kind: str, policy: str) 
         status = 206
         headers["content-range"] = f"bytes {first}-{last}/{size}"
     headers["content-length"] = str(last - first + 1)
+    kind = types.get(Path(path).suffix.lower(), "text/plain; charset=utf-8")
     return StreamingResponse(_chunks(fd, first, last), status, headers, media_type=kind)
 
 
@@ -534,32 +473,22 @@ async def _chunks(fd: int, first: int, last: int) -> AsyncIterator[bytes]:
             yield data
 
 
-class Address(msgspec.Struct, frozen=True, kw_only=True):
-    """The address of the listener."""
-
-    host: str
-    port: int
-    certificate: Path | None = None
-    private_key: Path | None = None
-
-
-def listen(address: Address) -> socket.socket:
+def listen(host: str, port: int) -> socket.socket:
     """A bound socket. ConfigError where the machine refuses."""
     try:
-        return bound(address.host, address.port)
+        return bound(host, port)
     except OSError as error:
+        why = error.strerror or error
         raise ConfigError(
-            f"cannot listen on {address.host}:{address.port}: {error.strerror or error}; choose another with --http"
-            " HOST:PORT"
+            f"cannot listen on {host}:{port}: {why}; choose another with --http HOST:PORT"
         ) from error
 
 
-async def serve(site: Site, sock: socket.socket, address: Address, ready: Callable[[], None]) -> None:
-    """Serves until the task is cancelled."""
+async def serve(site: Site, sock: socket.socket, ready: Callable[[], None], **tls: Path | None) -> None:
+    """Serves until the task is cancelled. `tls`: as for `serving`."""
     # A connection that never ends its TLS handshake holds a descriptor for a minute.
     _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
-    tls = {"certificate": address.certificate, "private_key": address.private_key}
     async with site.running(), serving(site.app(), sock, **tls) as task:
         ready()
         await asyncio.shield(task)

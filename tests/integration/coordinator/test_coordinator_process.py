@@ -151,12 +151,6 @@ def test_wrong_option_is_reported_in_a_line_and_exits_2(
     assert message in ended.stderr.splitlines()[-1]
 
 
-def test_help_has_an_example() -> None:
-    ended = command("--help")
-    assert ended.returncode == 0
-    assert "Example: evopolicy-coordinator --listen" in ended.stdout
-
-
 def test_damaged_database_is_reported_and_not_overwritten(tmp_path: Path) -> None:
     state = tmp_path / "state"
     state.mkdir(mode=0o700)
@@ -237,23 +231,6 @@ def test_a_full_disk_refuses_new_work_and_loses_nothing(coordinator: Coordinator
     run(scenario)
     assert "the store cannot write" in coordinator.log.read_text()
     assert coordinator.stop() == 0
-
-
-async def test_status_names_workers_runs_and_what_waits(coordinator: Coordinator) -> None:
-    async with operator_of(coordinator) as operator:
-        created = await operator.create()
-        async with gateway_of(coordinator, created) as gateway:
-            await gateway.submit(bundle_of("# policy"), (0, 1), "key")
-            (waiting,) = (await operator.status()).runs
-            assert (waiting.run, waiting.n_submits, waiting.queued) == (created.run, 1, 2)
-            assert "toy/line" in waiting.waits_for
-            async with working(coordinator):
-                await gateway.results(0)
-                status = await operator.status()
-                assert [worker.worker for worker in status.workers] == ["w-1"]
-                assert status.workers[0].state == "active"
-                assert status.episodes_done >= 2
-                assert status.cluster == "local"
 
 
 def test_coordinator_hears_at_once_of_a_worker_that_is_gone(tmp_path: Path) -> None:

@@ -142,10 +142,8 @@ def test_runs_workers_and_sweeps_are_acted_on_from_the_page(tmp_path: Path) -> N
                     run_page = page.run(opened)
                     act(run_page, "a.href.includes('/repin?class=')", reason="the first machine has died")
                     page.visit(f"{base}{run_page}")
-                    page.until(
-                        "document.getElementById('events')?.innerText.includes('Worker w-first was lost with 1 job of"
-                        " this run')"
-                    )
+                    lost = "Worker w-first was lost with 1 job of this run"
+                    page.until(f"document.getElementById('events')?.innerText.includes({lost!r})")
                     (folder / "go-3").touch()
                     wait_until(lambda: done(folder) == 4, lambda: sweep.text)
 
@@ -153,15 +151,12 @@ def test_runs_workers_and_sweeps_are_acted_on_from_the_page(tmp_path: Path) -> N
                     assert not (runs / "acted" / "paused").exists()
                     act(run_page, "a.href.endsWith('/cancel')")
                     wait_until(lambda: len(workspaces()) == 2, lambda: sweep.text)
-                    record = json.loads(
-                        wait_until(lambda: list(folder.parent.glob("run.json")))[0].read_text()
-                    )
+                    (written,) = wait_until(lambda: list(folder.parent.glob("run.json")))
+                    record = json.loads(written.read_text())
                     assert record["outcome"]["status"] == "cancelled"
                     assert "the first machine has died" in json.dumps(record)
-                    reader.until(
-                        "[...document.querySelectorAll('#run-rows td')].some((cell) => cell.textContent ==="
-                        " 'cancelled')"
-                    )
+                    cells = "[...document.querySelectorAll('#run-rows td')]"
+                    reader.until(f"{cells}.some((cell) => cell.textContent === 'cancelled')")
 
                     # A drained worker ends by itself.
                     act("/cluster", "a.href.endsWith('/worker/w-other/drain')")
@@ -183,9 +178,8 @@ def test_runs_workers_and_sweeps_are_acted_on_from_the_page(tmp_path: Path) -> N
         "run cancel",
         "worker drain",
     ]
-    assert [(one["act"], one["outcome"]) for one in entries] == [
-        (name, outcome) for name in names for outcome in ("asked", "done")
-    ]
+    told = [(name, outcome) for name in names for outcome in ("asked", "done")]
+    assert [(one["act"], one["outcome"]) for one in entries] == told
     assert [one["name"] for one in entries[::2]][:3] == ["acted", "w-first", "w-first"]
     assert entries[6]["reason"] == entries[7]["reason"] == "the first machine has died"
     assert {one["by"] for one in entries} == {"browser at 127.0.0.1"}

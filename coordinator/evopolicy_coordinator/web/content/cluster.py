@@ -111,10 +111,10 @@ class Cluster:
             cost_s = status.cost_s or time.monotonic() - began
             self.take(status)
             self._pause_s = min(_IDLE_S, max(_LEAST_PAUSE_S, _SHARE * cost_s))
-            await _set_within(self._acted, self._pause_s)
+            await set_within(self._acted, self._pause_s)
             if not self._watched() and not self._acted.is_set():
                 self._wake.clear()
-                await _set_within(self._wake, _IDLE_S - self._pause_s)
+                await set_within(self._wake, _IDLE_S - self._pause_s)
 
     def take(self, status: StatusReply) -> None:
         """A new status."""
@@ -150,7 +150,7 @@ class Cluster:
         self._changed()
 
 
-async def _set_within(event: asyncio.Event, seconds: float) -> None:
+async def set_within(event: asyncio.Event, seconds: float) -> None:
     """Waits until the event is set, or for this time."""
     with contextlib.suppress(TimeoutError):
         async with asyncio.timeout(seconds):

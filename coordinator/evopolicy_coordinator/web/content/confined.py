@@ -6,6 +6,8 @@ devices are not opened; every read has a limit.
 
 from __future__ import annotations
 
+import contextlib
+import itertools
 import os
 import stat
 from pathlib import Path
@@ -50,42 +52,35 @@ class Confined:
         finally:
             os.close(folder)
 
-    def read(self, path: str, limit: int, offset: int = 0) -> bytes:
+    def read(self, path: str, limit: int) -> bytes:
         """At most `limit` bytes of a regular file."""
-        fd = self.open(path)
-        with os.fdopen(fd, "rb") as file:
-            file.seek(offset)
+        with os.fdopen(self.open(path), "rb") as file:
             return file.read(limit)
 
-    def size(self, path: str) -> int:
-        """Bytes of a regular file."""
-        fd = self.open(path)
+    def found(self, path: str, limit: int) -> bytes:
+        """As `read`; empty for a refused path."""
         try:
-            return os.fstat(fd).st_size
-        finally:
-            os.close(fd)
+            return self.read(path, limit)
+        except NotThereError:
+            return b""
 
     def names(self, path: str) -> list[Name]:
-        """Regular files and folders of a folder, by name, the first few thousand; links and all else are left out."""
-        folder = self._folder(_parts(path) if path else [])
+        """Regular files and folders of a folder, by name, the first few thousand; links and all else are left out.
+        Empty for a refused path."""
         found: list[Name] = []
-        try:
-            with os.scandir(folder) as entries:
-                for entry in entries:
-                    if len(found) == _MAX_NAMES:
-                        break
-                    try:
-                        info = entry.stat(follow_symlinks=False)
-                    except OSError:
-                        continue
-                    if stat.S_ISDIR(info.st_mode):
-                        found.append(Name(entry.name, True, 0))
-                    elif stat.S_ISREG(info.st_mode):
-                        found.append(Name(entry.name, False, info.st_size))
-        except OSError as error:
-            raise NotThereError(path) from error
-        finally:
-            os.close(folder)
+        with contextlib.suppress(NotThereError, OSError):
+            folder = self._folder(_parts(path))
+            try:
+                with os.scandir(folder) as entries:
+                    for entry in itertools.islice(entries, _MAX_NAMES):
+                        with contextlib.suppress(OSError):
+                            info = entry.stat(follow_symlinks=False)
+                            if stat.S_ISDIR(info.st_mode):
+                                found.append(Name(entry.name, True, 0))
+                            elif stat.S_ISREG(info.st_mode):
+                                found.append(Name(entry.name, False, info.st_size))
+            finally:
+                os.close(folder)
         return sorted(found)
 
     def _folder(self, parts: list[str]) -> int:

@@ -9,10 +9,14 @@ from __future__ import annotations
 
 import asyncio
 import secrets
-from collections.abc import AsyncIterator, Callable, Mapping, Sequence
-from typing import Any
+from collections.abc import AsyncIterator, Callable
+from typing import Any, TypeVar
 
 import msgspec
+
+from evopolicy_coordinator.web.content.rendering import View
+
+T = TypeVar("T")
 
 LEAST_PAUSE_S = 0.5
 """Between two updates of one browser."""
@@ -20,14 +24,6 @@ KEEP_ALIVE_S = 15.0
 """A comment is sent after this time without an update, so that dead connections are noticed."""
 MAX_FEEDS = 512
 """Number of pages kept for browsers; pages without a browser are dropped first."""
-
-
-class View(msgspec.Struct, frozen=True, kw_only=True):
-    """A page's content at one moment. Every part's HTML is one element whose id is the part's name."""
-
-    parts: Mapping[str, str]
-    lists: Mapping[str, Sequence[str]] = {}
-    """By id of the element that holds them: names of parts, in order."""
 
 
 class Feed:
@@ -50,19 +46,11 @@ class Feed:
     def update(self, view: View) -> None:
         """Takes what has changed."""
         version = self.version + 1
-        changed = False
-        parts: dict[str, tuple[int, str]] = {}
-        for name, html in view.parts.items():
-            known = self._parts.get(name)
-            parts[name] = known if known is not None and known[1] == html else (version, html)
-            changed = changed or parts[name] is not known
-        lists: dict[str, tuple[int, tuple[str, ...]]] = {}
-        for name, order in view.lists.items():
-            listed = self._lists.get(name)
-            lists[name] = (
-                listed if listed is not None and listed[1] == tuple(order) else (version, tuple(order))
-            )
-            changed = changed or lists[name] is not listed
+        parts = {name: _newer(self._parts.get(name), html, version) for name, html in view.parts.items()}
+        lists = {
+            name: _newer(self._lists.get(name), tuple(order), version) for name, order in view.lists.items()
+        }
+        changed = any(each[0] == version for each in (*parts.values(), *lists.values()))
         self._parts, self._lists = parts, lists
         if changed:
             self.version = version
@@ -100,6 +88,10 @@ class Feed:
                 await asyncio.sleep(LEAST_PAUSE_S)
         finally:
             self.watchers -= 1
+
+
+def _newer(known: tuple[int, T] | None, content: T, version: int) -> tuple[int, T]:
+    return known if known is not None and known[1] == content else (version, content)
 
 
 class Feeds:

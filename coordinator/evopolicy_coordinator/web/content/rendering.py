@@ -12,8 +12,7 @@ from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from evopolicy_common.records.words import in_words
-from evopolicy_common.terminal import duration, number
-from evopolicy_coordinator.web.content.feeds import View
+from evopolicy_common.terminal import counted, duration, number
 from evopolicy_results.html import visible
 from evopolicy_results.reading.environments import title_of
 
@@ -56,8 +55,9 @@ def _environment() -> Environment:
         "short": short,
         "state": state_words,
         "words": in_words,
+        "counted": counted,
+        "priority": lambda name: _PRIORITIES.get(name, name),
     }
-    environment.filters["priority"] = lambda name: _PRIORITIES.get(name, name)
     environment.globals["title_of"] = title_of
     return environment
 
@@ -66,15 +66,10 @@ def _environment() -> Environment:
 def static_files() -> dict[str, tuple[bytes, str]]:
     """Static files of the pages, by name: bytes and content type."""
     types = {".css": "text/css; charset=utf-8", ".js": "text/javascript; charset=utf-8"}
-    found: dict[str, tuple[bytes, str]] = {}
-    report = files("evopolicy_results.html").joinpath("templates")
-    for folder, names in (
-        (files(__package__ or "").joinpath("static"), ("web.css", "web.js", "idiomorph.min.js")),
-        (report, ("report.css", "report.js")),
-    ):
-        for name in names:
-            found[name] = folder.joinpath(name).read_bytes(), types[Path(name).suffix]
-    return found
+    own, report = files(__package__ or "") / "static", files("evopolicy_results.html") / "templates"
+    paths = [own / name for name in ("web.css", "web.js", "idiomorph.min.js")]
+    paths += [report / name for name in ("report.css", "report.js")]
+    return {path.name: (path.read_bytes(), types[Path(path.name).suffix]) for path in paths}
 
 
 def part(name: str, /, **values: Any) -> str:
@@ -83,10 +78,26 @@ def part(name: str, /, **values: Any) -> str:
     return str(macro(**values))
 
 
+class View:
+    """A page's content at one moment. Every part's HTML is one element whose id is the part's name."""
+
+    def __init__(self, *lists: str) -> None:
+        """`lists`: ids of the elements that hold lists of parts."""
+        self.parts: dict[str, str] = {}
+        self.lists: dict[str, list[str]] = {name: [] for name in lists}
+        """By id of the element that holds them: names of parts, in order."""
+
+    def row(self, of: str, macro: str, ident: str, **values: Any) -> None:
+        """Adds a part, once, to a list."""
+        if ident not in self.parts:
+            self.lists[of].append(ident)
+            self.parts[ident] = part(macro, ident=ident, **values)
+
+
 def page(template: str, *, view: View | None = None, live: str = "", cursor: str = "", **values: Any) -> str:
     """A whole page. In it `part(name)` and `listed(name)` put the view's parts; `live` is where its updates come
     from."""
-    shown = View(parts={}) if view is None else view
+    shown = view or View()
 
     def one(name: str) -> Markup:
         return Markup(shown.parts[name])

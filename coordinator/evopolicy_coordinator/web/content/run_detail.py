@@ -7,6 +7,7 @@ an open run is in its gateway's folder, found by the gateway's journal; that of 
 from __future__ import annotations
 
 import contextlib
+import itertools
 import os
 from collections import OrderedDict
 from collections.abc import Iterable, Iterator, Mapping
@@ -28,6 +29,7 @@ from evopolicy_common.records.policies import bundles
 from evopolicy_common.records.policies.checkpoints import METADATA
 from evopolicy_common.records.words import in_words
 from evopolicy_common.terminal import event_text
+from evopolicy_coordinator.web.content.charts import Line
 from evopolicy_coordinator.web.content.confined import Confined, NotThereError
 
 MAX_TEXT = 256 << 10
@@ -84,23 +86,6 @@ class Happened(msgspec.Struct, frozen=True, kw_only=True):
     text: str
 
 
-class Series(msgspec.Struct, frozen=True, kw_only=True):
-    """One line of a plot."""
-
-    name: str
-    values: tuple[float, ...]
-
-
-class EpisodePlot(msgspec.Struct, frozen=True, kw_only=True):
-    """One episode's trajectory, as far as it can be drawn."""
-
-    steps: int
-    rewards: tuple[Series, ...]
-    observations: tuple[Series, ...]
-    actions: tuple[Series, ...]
-    note: str = ""
-
-
 class Detail:
     """Reads one run's folder. Cheap to create; the caller keeps costly results."""
 
@@ -112,20 +97,20 @@ class Detail:
     def code(self, index: int, *, checkpoints: bool) -> tuple[CodeFile, ...]:
         """`system/` as it was at a submit; empty where it is not told. `checkpoints`: the run's own may be read."""
         digest = self._bundle_of(index)
-        if digest is not None:
-            found = _unpacked(self.files, digest)
-            if found is not None:
-                return found
-        return self._checkpoint(index) if checkpoints else ()
+        found = None if digest is None else _unpacked(self.files, digest)
+        if found is not None or not checkpoints:
+            return found or ()
+        folder = self._numbered("checkpoints/submit_", index)
+        return _ordered(
+            CodeFile(path=path, size=size, text=_as_text(self.files.found(f"{folder}/{path}", MAX_TEXT + 1)))
+            for path, size in self._below(folder)
+            if path not in METADATA
+        )
 
     def _bundle_of(self, index: int) -> str | None:
         """The digest of a submit's snapshot, by the gateway's journal."""
-        try:
-            data = self.files.read(open_run.JOURNAL, _MAX_JOURNAL)
-        except NotThereError:
-            return None
         bundles_by_key: dict[str, str | None] = {}
-        for line in data.splitlines():
+        for line in self.files.found(open_run.JOURNAL, _MAX_JOURNAL).splitlines():
             try:
                 entry = open_run.entry_decoder.decode(line)
             except DECODE_ERRORS:
@@ -137,23 +122,10 @@ class Detail:
                 return digest if digest is not None and is_digest(digest) else None
         return None
 
-    def _checkpoint(self, index: int) -> tuple[CodeFile, ...]:
-        folder = self._numbered("checkpoints/submit_", index)
-        if folder is None:
-            return ()
-        return _ordered(
-            CodeFile(path=path, size=size, text=self._text(f"{folder}/{path}"))
-            for path, size in self._below(folder)
-            if path not in METADATA
-        )
-
-    def _numbered(self, prefix: str, number: int) -> str | None:
-        """The folder with that prefix and number, which has 3 digits or more; None where there is none."""
-        for width in range(3, 8):
-            with contextlib.suppress(NotThereError):
-                self.files.names(name := f"{prefix}{number:0{width}d}")
-                return name
-        return None
+    def _numbered(self, prefix: str, number: int) -> str:
+        """The folder with that prefix and number, which has 3 digits or more; empty where there is none."""
+        names = (f"{prefix}{number:0{width}d}" for width in range(3, 8))
+        return next(filter(self.files.names, names), "")
 
     def _below(self, folder: str) -> Iterator[tuple[str, int]]:
         waiting, n = [""], 0
@@ -167,103 +139,61 @@ class Detail:
                     n += 1
                     yield path, name.size
 
-    def _text(self, path: str) -> str | None:
-        try:
-            return _as_text(self.files.read(path, MAX_TEXT + 1))
-        except NotThereError:
-            return None
-
     # ---- feedback ----
 
-    def folder_of(self, index: int) -> str | None:
-        """The feedback folder of a submit."""
+    def folder_of(self, index: int) -> str:
+        """The feedback folder of a submit; empty where there is none."""
         return self._numbered("workspace/feedback/submit_", index)
 
     def summary(self, index: int) -> Mapping[str, Any]:
         """A submit's summary, as its agent has it; empty where there is none."""
-        folder = self.folder_of(index)
-        if folder is None:
-            return {}
-        try:
-            found = msgspec.json.decode(self.files.read(f"{folder}/summary.json", _MAX_TRAJECTORY))
-        except (NotThereError, *DECODE_ERRORS):
-            return {}
-        return found if isinstance(found, dict) else {}
+        data = self.files.found(f"{self.folder_of(index)}/summary.json", _MAX_TRAJECTORY)
+        return next(objects([data]), {})
 
     def episodes(self, index: int) -> list[int]:
         """The numbers of a submit's episodes that have a folder, counted through the run."""
-        folder = self.folder_of(index)
-        try:
-            names = [] if folder is None else self.files.names(f"{folder}/episodes")
-        except NotThereError:
-            return []
+        names = self.files.names(f"{self.folder_of(index)}/episodes")
         numbers = [name.name.removeprefix("ep_") for name in names if name.is_folder]
         return sorted(int(number) for number in numbers if number.isdecimal() and len(number) < 10)
 
     def episode_files(self, index: int, episode: int) -> tuple[str, list[str]]:
         """The folder of an episode, and the names of its files. NotThereError for none."""
         inner = self._numbered(f"{self.folder_of(index)}/episodes/ep_", episode)
-        if inner is None:
+        if not inner:
             raise NotThereError(f"submit {index}, episode {episode}")
         return inner, [name.name for name in self.files.names(inner) if not name.is_folder]
 
     def text(self, path: str) -> str:
         """The beginning of a file as text; empty where there is none."""
-        try:
-            data = self.files.read(path, MAX_TEXT)
-        except NotThereError:
-            return ""
-        return data.decode("utf-8", "replace")
+        return self.files.found(path, MAX_TEXT).decode("utf-8", "replace")
 
-    def played(self, folder: str) -> EpisodePlot:
-        """An episode's columns, for plots."""
-        rewards: list[float] = []
-        actions: list[Any] = []
-        inline: list[Any] = []
-        data = self.files.read(f"{folder}/trajectory.jsonl", _MAX_TRAJECTORY)
-        for row in objects(data.splitlines()):
-            if len(rewards) == MAX_STEPS:
-                break
-            reward = row.get("reward")
-            # Others wrote it: an integer may be too large for a float.
-            is_number = isinstance(reward, int | float) and abs(reward) <= LARGEST
-            rewards.append(float(reward or 0.0) if is_number else float("nan"))
-            actions.append(row.get("action"))
-            inline.append(row.get("obs"))
-        observed: Any = inline if any(each is not None for each in inline) else self._arrays(folder)
-        observations, note = _series(observed, len(rewards), "obs")
-        acted, _ = _series(actions, len(rewards), "action")
-        return EpisodePlot(
-            steps=len(rewards),
-            rewards=(Series(name="reward", values=tuple(rewards)),),
-            observations=observations,
-            actions=acted,
-            note=note,
+    def played(self, folder: str) -> tuple[int, dict[str, list[Line]], str]:
+        """An episode's number of steps, its columns by title of a plot, and a note; as far as it can be drawn."""
+        rows = list(
+            itertools.islice(
+                objects(self.files.found(f"{folder}/trajectory.jsonl", _MAX_TRAJECTORY).splitlines()),
+                MAX_STEPS,
+            )
         )
+        inline = [row.get("obs") for row in rows]
+        observed: Any = inline if any(each is not None for each in inline) else self._arrays(folder)
+        observations, note = _series(observed, len(rows), "obs")
+        actions, _ = _series([row.get("action") for row in rows], len(rows), "action")
+        rewards = [Line("reward", list(enumerate(map(_reward, rows))))]
+        return len(rows), {"Reward": rewards, "Observation": observations, "Action": actions}, note
 
     def _arrays(self, folder: str) -> Any:
         for name in ("observations.npy", "observations.npz"):
-            try:
-                data = self.files.read(f"{folder}/{name}", _MAX_TRAJECTORY)
+            with contextlib.suppress(OSError, ValueError):
+                data = self.files.found(f"{folder}/{name}", _MAX_TRAJECTORY)
                 found = read_arrays(data, _MAX_UNPACKED)
                 return found.get("", found)
-            except (NotThereError, OSError, ValueError):
-                continue
         return None
 
     def replays(self) -> list[str]:
         """Names of the recorded hidden episodes. They are hidden results: only for whom those may be shown."""
-        try:
-            names = [name.name for name in self.files.names("replays") if name.is_folder]
-        except NotThereError:
-            return []
-        return [name for name in names if self._is_file(f"replays/{name}/video.mp4")]
-
-    def _is_file(self, path: str) -> bool:
-        try:
-            return self.files.size(path) > 0
-        except NotThereError:
-            return False
+        names = [name.name for name in self.files.names("replays") if name.is_folder]
+        return [name for name in names if self.files.found(f"replays/{name}/video.mp4", 1)]
 
     # ---- words and events ----
 
@@ -276,10 +206,8 @@ class Detail:
 
     def happened(self) -> list[Happened]:
         """The last events of the run; newest first."""
-        found = []
-        for _, line in self._last_lines("logs/harness.log", None):
-            for entry in objects([line]):
-                found.append(_event(entry))
+        lines = [line for _, line in self._last_lines("logs/harness.log", None)]
+        found = list(map(_event, objects(lines)))
         return found[-MAX_WORDS:][::-1]
 
     def _last_lines(self, path: str, before: int | None) -> list[tuple[int, bytes]]:
@@ -332,40 +260,44 @@ def _ordered(files: Iterable[CodeFile]) -> tuple[CodeFile, ...]:
 def _as_text(data: bytes) -> str | None:
     if len(data) > MAX_TEXT or b"\0" in data:
         return None
-    try:
+    with contextlib.suppress(UnicodeDecodeError):
         return data.decode()
-    except UnicodeDecodeError:
-        return None
+    return None
 
 
-def _series(columns: Any, n: int, name: str) -> tuple[tuple[Series, ...], str]:
+def _reward(row: dict[str, Any]) -> float:
+    # Others wrote it: an integer may be too large for a float.
+    reward = row.get("reward")
+    return float(reward) if isinstance(reward, int | float) and abs(reward) <= LARGEST else float("nan")
+
+
+def _series(columns: Any, n: int, name: str) -> tuple[list[Line], str]:
     """Lines of those values that are numeric with one length; and a note if some are left out."""
     if columns is None:
-        return (), ""
+        return [], ""
+    if isinstance(columns, list) and columns and isinstance(columns[0], dict):
+        rows = [row if isinstance(row, dict) else {} for row in columns]
+        columns = {key: [row.get(key) for row in rows] for key in columns[0]}
     if isinstance(columns, dict):
         parts = [_series(value, n, key) for key, value in sorted(columns.items())]
-        found = tuple(each for one, _ in parts for each in one)
+        found = [each for one, _ in parts for each in one]
         return found[:_MAX_SERIES], next((note for _, note in parts if note), "")
-    if isinstance(columns, list) and columns and isinstance(columns[0], dict):
-        names = sorted(columns[0])
-        rows = [row if isinstance(row, dict) else {} for row in columns]
-        return _series({key: [row.get(key) for row in rows] for key in names}, n, name)
     try:
         array = np.asarray(columns, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
-        return (), f"{name} is not made of numbers of one shape, so it is not drawn."
+        return [], f"{name} is not made of numbers of one shape, so it is not drawn."
     if array.ndim == 0 or not len(array):
-        return (), ""
+        return [], ""
     array = array[:n].reshape(len(array[:n]), -1)
     width = array.shape[1]
     if width > 64:
-        return (), f"{name} has {width:,} numbers a step, so it is not drawn."
-    kept = range(min(width, _MAX_SERIES))
-    found = tuple(
-        Series(name=name if width == 1 else f"{name}[{i}]", values=tuple(map(float, array[:, i])))
-        for i in kept
-    )
-    return found, f"The first {_MAX_SERIES} of {width} components are drawn." if width > _MAX_SERIES else ""
+        return [], f"{name} has {width:,} numbers a step, so it is not drawn."
+    columns = array[:, :_MAX_SERIES].T.tolist()
+    lines = [
+        Line(name if width == 1 else f"{name}[{i}]", list(enumerate(values)))
+        for i, values in enumerate(columns)
+    ]
+    return lines, f"The first {_MAX_SERIES} of {width} components are drawn." if width > _MAX_SERIES else ""
 
 
 # ---- the agent's log ----
@@ -439,11 +371,8 @@ def _plain(value: Any) -> str:
 
 
 def _cut(text: str) -> str:
-    return (
-        text
-        if len(text) <= _MAX_LINE
-        else f"{text[:_MAX_LINE]} … ({len(text) - _MAX_LINE:,} more characters)"
-    )
+    more = len(text) - _MAX_LINE
+    return text if more <= 0 else f"{text[:_MAX_LINE]} … ({more:,} more characters)"
 
 
 _NOT_SHOWN = frozenset({"event", "level", "timestamp", "exception", "exc_info", "run", "stimulus"})

@@ -8,10 +8,8 @@ holds its lock here. A cluster that does not answer might have such agents: then
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import hashlib
 import itertools
-import os
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from datetime import datetime
@@ -26,15 +24,15 @@ from evopolicy_common.messages.status import RunStatus
 from evopolicy_common.records import open_run
 from evopolicy_common.records.open_run import IntendedRun, OpenedRun
 from evopolicy_common.records.run_files import RUN_JSON, read_record
-from evopolicy_common.records.run_record import RunRecord
 from evopolicy_common.records.suite_folder import INDEX, PAUSED, Entry, Index
 from evopolicy_common.records.summary import Summary, decode_summary
 from evopolicy_common.regular_files import read_regular
-from evopolicy_coordinator.web.content.confined import Confined, NotThereError
+from evopolicy_coordinator.web.content.confined import Confined
 from evopolicy_results.reading.environments import learn_names
 from evopolicy_results.reading.reader import find_run_dirs
 
 _MAX_SUMMARY_BYTES = 8 << 20
+_FROM_SETTINGS = ("entry", "env", "exp_id", "repeat", "budget", "hidden_cases", "start", "replay_of")
 _BY_EPISODE = ("env_instances", "returns", "episode_lengths", "reward_components_per_episode", "successes")
 
 
@@ -142,9 +140,7 @@ class Runs(msgspec.Struct, frozen=True, kw_only=True):
 
     def may_show(self, run: RunFacts) -> bool:
         """Whether hidden results of a finished run may be shown now."""
-        if not run.finished:
-            return False
-        if self.shut is None:
+        if not run.finished or self.shut is None:
             return False
         if run.hidden_cases == "per_run":
             return run.run not in self.origins
@@ -171,9 +167,6 @@ class Reader:
         by_run = {status.run: status for status in cluster or ()}
         by_name = {(status.entry, status.env, status.exp_id): status for status in by_run.values()}
         sweeps: list[Sweep] = []
-        alive: set[str] = set()
-        origins = {status.origin for status in by_run.values() if _may_be_alive(status)}
-        seen: set[str] = set()
         sweep_folders = _sweep_folders(self.roots)
         for root, index in sweep_folders:
             inner = [other for other, _ in sweep_folders if root in other.parents]
@@ -181,36 +174,27 @@ class Reader:
             folders = [folder for folder in folders if not any(each in folder.parents for each in inner)]
             if index is None and not folders and inner:
                 continue
-            entries = {} if index is None else index.runs
-            by_folder = {(root / each.directory): each for each in entries.values() if each.directory}
-            found: list[RunFacts] = []
-            for folder in folders:
-                facts = self.run(folder, by_folder.pop(folder, None), by_run)
-                found.append(facts)
-                seen.add(facts.run)
-                if facts.agent_alive and not facts.finished:
-                    alive.add(facts.env)
-                    origins.add(facts.origin_run)
-            listed = {each.name for each in by_folder.values()} | {
-                each.name for each in entries.values() if not each.directory
-            }
-            for entry in entries.values():
-                if entry.name in listed:
+            entries = [] if index is None else list(index.runs.values())
+            by_folder = {root / each.directory: each for each in entries if each.directory}
+            here = set(folders)
+            found = [self.run(folder, by_folder.get(folder), by_run) for folder in folders]
+            for entry in entries:
+                if not entry.directory or root / entry.directory not in here:
                     # Another host of the sweep may have started it and reported its id only to the coordinator.
                     name = "" if index is None else f"{index.suite}-{entry.repeat}"
                     status = by_run.get(entry.run) or by_name.get((entry.agent, entry.env, name))
                     found.append(_without_folder(root, entry, status))
-                    seen.add(entry.run if status is None else status.run)
             name = root.name if index is None else index.suite
-            paused = (root / PAUSED).exists()
-            sweeps.append(
-                Sweep(name=name, root=root, runs=tuple(found), is_suite=index is not None, paused=paused)
-            )
-        elsewhere = tuple(_of_cluster(status) for status in by_run.values() if status.run not in seen)
-        if elsewhere:
+            paused, is_suite = (root / PAUSED).exists(), index is not None
+            sweeps.append(Sweep(name=name, root=root, runs=tuple(found), is_suite=is_suite, paused=paused))
+        seen = {run.run for sweep in sweeps for run in sweep.runs}
+        if elsewhere := tuple(_of_cluster(status) for name, status in by_run.items() if name not in seen):
             sweeps.append(Sweep(name="elsewhere on the cluster", root=None, runs=elsewhere, is_suite=False))
-        alive |= {status.env for status in by_run.values() if _may_be_alive(status)}
         by_key = {run.key: run for sweep in sweeps for run in sweep.runs}
+        open_here = [run for run in by_key.values() if run.path and run.agent_alive and not run.finished]
+        on_cluster = [status for status in by_run.values() if _may_be_alive(status)]
+        alive = {*(run.env for run in open_here), *(status.env for status in on_cluster)}
+        origins = {*(run.origin_run for run in open_here), *(status.origin for status in on_cluster)}
         self._forget(by_key.values())
         before = {run.run: run.origin_run for run in by_key.values()}
         while further := {before.get(name, "") for name in origins} - origins:
@@ -233,71 +217,40 @@ class Reader:
     def submits(self, folder: Path) -> list[Submit]:
         """The submits of a run, in order; each summary is read once."""
         confined = Confined(folder)
-        try:
-            names = confined.names("workspace/feedback")
-        except NotThereError:
-            return []
         known = self._submits.setdefault(folder, {})
-        for name in names:
+        for name in confined.names("workspace/feedback"):
             index = name.name.removeprefix("submit_")
             if name.name in known or index == name.name or not index.isdecimal():
                 continue
-            try:
-                summary = decode_summary(
-                    confined.read(f"workspace/feedback/{name.name}/summary.json", _MAX_SUMMARY_BYTES)
-                )
-            except (NotThereError, ProtocolError):
-                continue
-            known[name.name] = msgspec.structs.replace(summary, **dict.fromkeys(_BY_EPISODE))
+            data = confined.found(f"workspace/feedback/{name.name}/summary.json", _MAX_SUMMARY_BYTES)
+            with contextlib.suppress(ProtocolError):
+                known[name.name] = msgspec.structs.replace(decode_summary(data), **dict.fromkeys(_BY_EPISODE))
         summaries = sorted(known.values(), key=lambda each: each.submit_index)
         consumed = itertools.accumulate(each.n_episodes for each in summaries)
         return list(map(Submit, summaries, consumed))
 
     def _open(self, folder: Path, entry: Entry | None, by_run: Mapping[str, RunStatus]) -> RunFacts:
         settings, run = _settings(folder), _opened(folder)
-        status = by_run.get(run)
-        submits = self.submits(folder)
-        entry_name, env, exp_id = folder.parts[-3], folder.parts[-2].replace("_", "/", 1), folder.name
-        budget, repeat, hidden_cases, start, replay_of = None, 0, "shared", None, ""
-        if settings is not None:
-            entry_name, env, exp_id = settings.entry, settings.env, settings.exp_id
-            budget, repeat, hidden_cases = settings.budget, settings.repeat, settings.hidden_cases
-            start, replay_of = settings.start, settings.replay_of
-        elif entry is not None:
-            entry_name, env, repeat = entry.agent, entry.env, entry.repeat
-        if submits and budget is None:
-            budget = submits[-1].consumed + submits[-1].summary.remaining_budget
+        status, submits = by_run.get(run), self.submits(folder)
         alive = _agent_alive(folder) if status is None else _may_be_alive(status)
-        state = "open" if alive else "interrupted"
+        facts: dict[str, Any] = {**_placed(folder), "run": run, "agent_alive": alive, "budget": None}
+        facts["state"] = "open" if alive else "interrupted"
+        if entry is not None:
+            facts |= {"entry": entry.agent, "env": entry.env, "repeat": entry.repeat, **_of_entry(entry)}
+            if entry.state != "pending":
+                facts["state"] = "open" if entry.state == "running" else entry.state
+        if settings is not None:
+            facts |= {name: getattr(settings, name) for name in _FROM_SETTINGS}
+        if submits:
+            last = submits[-1]
+            facts |= {"used": last.consumed, "n_submits": len(submits), "best": _best(submits)}
+            facts["budget"] = facts["budget"] or last.consumed + last.summary.remaining_budget
         if status is not None:
-            state, budget = status.phase, status.budget
-        elif entry is not None and entry.state not in ("running", "pending"):
-            state = entry.state
-        elif entry is not None and entry.state == "running" and not alive:
-            state = "open"
-        return RunFacts(
-            key=key_of(str(folder)),
-            path=folder,
-            run=run,
-            entry=entry_name,
-            env=env,
-            exp_id=exp_id,
-            repeat=repeat,
-            state=state,
-            budget=budget,
-            used=submits[-1].consumed if submits else 0,
-            n_submits=len(submits),
-            best=_best(submits),
-            waits_for="" if status is None else status.waits_for,
-            running=0 if status is None else status.running,
-            queued=0 if status is None else status.queued,
-            agent_alive=alive,
-            started_at=_began(folder),
-            hidden_cases=hidden_cases,
-            start=start,
-            replay_of=replay_of,
-            **({} if entry is None else _of_entry(entry)),
-        )
+            told = _of_status(status)
+            facts |= {name: told[name] for name in ("state", "budget", "waits_for", "running", "queued")}
+        with contextlib.suppress(OSError):
+            facts["started_at"] = (folder / open_run.INTENDED).stat().st_mtime
+        return RunFacts(**facts)
 
     def _forget(self, runs: Iterable[RunFacts]) -> None:
         kept = {run.path for run in runs}
@@ -310,28 +263,21 @@ def _best(submits: Iterable[Submit]) -> float | None:
     return max((one.mean for one in submits if one.mean is not None), default=None)
 
 
+def _placed(folder: Path) -> dict[str, Any]:
+    """What the place of a run's folder tells."""
+    entry, env, exp_id = folder.parts[-3:]
+    env = env.replace("_", "/", 1)
+    return {"key": key_of(str(folder)), "path": folder, "entry": entry, "env": env, "exp_id": exp_id}
+
+
 def _finished(folder: Path) -> RunFacts:
     """From `run.json`; a record that cannot be read is a run with that error."""
     try:
         record = read_record(folder)
     except (OSError, ProtocolError) as error:
-        return RunFacts(
-            key=key_of(str(folder)),
-            path=folder,
-            entry=folder.parts[-3],
-            env=folder.parts[-2].replace("_", "/", 1),
-            exp_id=folder.name,
-            state="unreadable",
-            error=str(error),
-            finished=True,
-        )
-    return _of_record(folder, record)
-
-
-def _of_record(folder: Path, record: RunRecord) -> RunFacts:
+        return RunFacts(**_placed(folder), state="unreadable", error=str(error), finished=True)
     learn_names([record])
-    outcome, dimensions = record.outcome, record.experiment_dimensions
-    tokens = None if record.agent.tokens is None else msgspec.to_builtins(record.agent.tokens)
+    outcome, dimensions, tokens = record.outcome, record.experiment_dimensions, record.agent.tokens
     retries = outcome.auxiliary.get("infrastructure_retries")
     submits = Reader([]).submits(folder)
     return RunFacts(
@@ -348,15 +294,15 @@ def _of_record(folder: Path, record: RunRecord) -> RunFacts:
         used=outcome.budget_used,
         n_submits=len(submits),
         best=_best(submits),
-        tokens=_n_tokens(tokens),
-        cost=_cost(tokens),
+        tokens=0 if tokens is None else tokens.total,
+        cost=0.0 if tokens is None else tokens.cost or 0.0,
         error=outcome.error or "",
         started_at=_unix(record.timing.start_time),
         wall_s=record.timing.wall_time_seconds,
         retries=retries if isinstance(retries, int) else 0,
         hidden_cases=dimensions.hidden_cases,
         score=outcome.score,
-        random=None if outcome.random_reference is None else outcome.random_reference.mean_return,
+        random=outcome.random_score,
         finished=True,
         start=record.start,
         replay_of=record.replay_of,
@@ -458,52 +404,26 @@ def _index(root: Path) -> Index | None:
 
 
 def _settings(folder: Path) -> RunSettings | None:
-    try:
-        data = Confined(folder).read(open_run.INTENDED, _MAX_SUMMARY_BYTES)
+    data = Confined(folder).found(open_run.INTENDED, _MAX_SUMMARY_BYTES)
+    with contextlib.suppress(*DECODE_ERRORS):
         return msgspec.json.decode(data, type=IntendedRun).settings
-    except (NotThereError, *DECODE_ERRORS):
-        return None
+    return None
 
 
 def _opened(folder: Path) -> str:
-    try:
-        data = Confined(folder).read(open_run.OPENED, _MAX_SUMMARY_BYTES)
+    data = Confined(folder).found(open_run.OPENED, _MAX_SUMMARY_BYTES)
+    with contextlib.suppress(*DECODE_ERRORS):
         return msgspec.json.decode(data, type=OpenedRun).run
-    except (NotThereError, *DECODE_ERRORS):
-        return ""
-
-
-def _began(folder: Path) -> float | None:
-    try:
-        return (folder / open_run.INTENDED).stat().st_mtime
-    except OSError:
-        return None
+    return ""
 
 
 def _agent_alive(folder: Path) -> bool:
     """Whether an agent of an open run may be alive: a lock of its folder is held, or no process here watches it."""
     if any((folder / path).exists() for path in (open_run.LISTENER, open_run.UNWATCHED)):
         return True
-    try:
-        locks = [path for path in (folder / open_run.STATE).iterdir() if path.suffix == ".lock"]
-    except OSError:
-        return False
-    return any(_is_held(lock) for lock in locks)
-
-
-def _is_held(lock: Path) -> bool:
-    try:
-        fd = os.open(lock, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW)
-    except FileNotFoundError:
-        return False
-    except OSError:
-        return True
-    try:
-        fcntl.flock(fd, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except OSError:
-        return True
-    finally:
-        os.close(fd)
+    with contextlib.suppress(OSError):
+        state = (folder / open_run.STATE).iterdir()
+        return any(open_run.is_held(path) for path in state if path.suffix == ".lock")
     return False
 
 
@@ -517,7 +437,6 @@ def _cost(tokens: dict[str, Any] | None) -> float:
 
 
 def _unix(text: str) -> float | None:
-    try:
+    with contextlib.suppress(ValueError):
         return datetime.fromisoformat(text).timestamp()
-    except ValueError:
-        return None
+    return None

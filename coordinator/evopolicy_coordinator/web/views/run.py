@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -11,18 +12,11 @@ from evopolicy_common.messages.status import RetriedJobs, StatusReply
 from evopolicy_common.records.model_calls import before
 from evopolicy_common.records.policies.trees import changes
 from evopolicy_common.records.summary import utc_text
-from evopolicy_common.terminal import duration, number
+from evopolicy_common.terminal import counted, duration, number
 from evopolicy_coordinator.web.content.charts import Line, chart
-from evopolicy_coordinator.web.content.feeds import View
-from evopolicy_coordinator.web.content.rendering import part, short, state_words
-from evopolicy_coordinator.web.content.run_detail import (
-    MAX_WORDS,
-    CodeFile,
-    Detail,
-    EpisodePlot,
-    Happened,
-    Series,
-)
+from evopolicy_coordinator.web.content.confined import NotThereError
+from evopolicy_coordinator.web.content.rendering import View, part, short, state_words
+from evopolicy_coordinator.web.content.run_detail import MAX_WORDS, CodeFile, Detail, Happened
 from evopolicy_coordinator.web.content.run_folders import Reader, RunFacts, Runs, Submit
 from evopolicy_coordinator.web.content.tables import Words, ident
 from evopolicy_results.behaviour.trace import diff
@@ -51,14 +45,14 @@ def run_view(
     submits = [] if run.path is None else reader.submits(run.path)
     detail = None if run.path is None else Detail(run.path)
     reference = ("random, held-out", run.random) if may_show and run.random is not None else None
-    parts = {
+    parent = runs.of(run.start.run) if run.start else None
+    view = View("submit-rows", "messages", "events")
+    messages = [] if detail is None else detail.messages(words.before)
+    earlier = words.link(before=messages[0].at) if messages and messages[0].at > 0 else ""
+    latest = words.before is not None
+    view.parts |= {
         "facts": part("facts", facts=_run_facts(run, may_show)),
-        "lineage": part(
-            "lineage",
-            run=run,
-            parent=runs.of(run.start.run) if run.start else None,
-            original=runs.of(run.replay_of),
-        ),
+        "lineage": part("lineage", run=run, parent=parent, original=runs.of(run.replay_of)),
         "notices": part("notices", notices=_one_run_notices(run, may_show)),
         "curve": part(
             "figure",
@@ -69,39 +63,28 @@ def run_view(
             caption="Mean visible train return of every ok submit, and the best so far.",
         ),
         "actions": part("run_actions", run=run, acting=acting, classes=_classes(run, status)),
+        "messages-more": part("messages_more", earlier=earlier, latest=latest, n=len(messages)),
+        "look": part("identity", run=run, look=look, env_title=title_of(run.env)),
     }
-    lists: dict[str, list[str]] = {"submit-rows": [], "messages": [], "events": []}
-    best = float("-inf")
-    rises = []
+    best, rises = float("-inf"), []
     for submit in submits:
-        rises.append(submit.mean is not None and submit.mean > best)
-        best = max(best, submit.mean) if rises[-1] and submit.mean is not None else best
+        mean = float("-inf") if submit.mean is None else submit.mean
+        rises.append(mean > best)
+        best = max(best, mean)
     for submit, rise in list(zip(submits, rises, strict=True))[::-1][:MAX_SUBMITS]:
+        shown = {"submit": submit.summary, "consumed": submit.consumed, "best": rise}
         name = f"submit-{submit.summary.submit_index}"
-        lists["submit-rows"].append(name)
-        shown = {"submit": submit.summary, "consumed": submit.consumed}
-        parts[name] = part("submit_row", ident=name, key=run.key, best=rise, **shown)
-    messages = [] if detail is None else detail.messages(words.before)
+        view.row("submit-rows", "submit_row", name, key=run.key, **shown)
     for one in messages:
-        name = f"message-{one.at}"
-        lists["messages"].append(name)
-        parts[name] = part("message", ident=name, one=one)
-    earlier = words.link(before=messages[0].at) if messages and messages[0].at > 0 else ""
-    parts["messages-more"] = part(
-        "messages_more", earlier=earlier, latest=words.before is not None, n=len(messages)
-    )
+        view.row("messages", "message", f"message-{one.at}", one=one)
     events = [*([] if detail is None else detail.happened()), *map(_retried, retries)]
-    for one_event in sorted(events, key=lambda each: each.at, reverse=True)[:MAX_WORDS]:
-        name = ident("event", one_event.at, one_event.text)
-        if name not in parts:
-            lists["events"].append(name)
-            parts[name] = part("event", ident=name, one=one_event)
-    parts["look"] = part("identity", run=run, look=look, env_title=title_of(run.env))
-    return View(parts=parts, lists=lists)
+    for event in sorted(events, key=lambda each: each.at, reverse=True)[:MAX_WORDS]:
+        view.row("events", "event", ident("event", event.at, event.text), one=event)
+    return view
 
 
 def _retried(one: RetriedJobs) -> Happened:
-    jobs = "1 job" if one.jobs == 1 else f"{one.jobs} jobs"
+    jobs = counted(one.jobs, "job")
     what = {
         "worker_lost": f"Worker {one.worker} was lost with {jobs} of this run",
         "failed": f"{jobs} failed on worker {one.worker}, through no fault of the policy",
@@ -148,32 +131,18 @@ def _one_run_notices(run: RunFacts, may_show: bool) -> list[dict[str, Any]]:
         notices.append(notice("Its hidden scores are shown once no agent of a related run is alive."))
     if run.path is None:
         where = f" on {run.host}" if run.host else ""
-        notices.append(
-            notice(f"Its folder is not on this host{where}: only what the cluster tells is shown.")
-        )
+        text = f"Its folder is not on this host{where}: only what the cluster tells is shown."
+        notices.append(notice(text))
     return notices
 
 
 def _curve(submits: Sequence[Submit], run: RunFacts, reference: tuple[str, float] | None) -> str:
-    points, best, rising = [], float("-inf"), []
-    for submit in submits:
-        if submit.mean is not None:
-            points.append((float(submit.consumed), submit.mean))
-            best = max(best, submit.mean)
-            rising.append((float(submit.consumed), best))
+    points = [(float(each.consumed), mean) for each in submits if (mean := each.mean) is not None]
+    best = itertools.accumulate((mean for _, mean in points), max)
+    rising = [(at, mean) for (at, _), mean in zip(points, best, strict=True)]
     lines = [Line("mean train return", points, dots=True), Line("best so far", rising, steps=True)]
-    return (
-        chart(
-            "Train returns over budget",
-            "train episodes consumed",
-            lines,
-            height=240.0,
-            x_max=float(run.budget or 0),
-            reference=reference,
-        )
-        if points
-        else ""
-    )
+    title, x_title, x_max = "Train returns over budget", "train episodes consumed", float(run.budget or 0)
+    return chart(title, x_title, lines, height=240.0, x_max=x_max, reference=reference)
 
 
 def _classes(run: RunFacts, status: StatusReply | None) -> list[str]:
@@ -188,34 +157,34 @@ def _classes(run: RunFacts, status: StatusReply | None) -> list[str]:
     )
 
 
-def submit_values(run: RunFacts, reader: Reader, index: int) -> dict[str, Any] | None:
-    """The parts of one submit's page; None for an unknown submit."""
-    if run.path is None:
-        return None
-    submits = {one.summary.submit_index: one for one in reader.submits(run.path)}
+def submit_values(run: RunFacts, reader: Reader, index: int) -> dict[str, Any]:
+    """The parts of one submit's page. NotThereError for a submit that is unknown or has no verdict yet."""
+    submits = {one.summary.submit_index: one for one in (reader.submits(run.path) if run.path else ())}
     submit = submits.get(index)
-    if submit is None:
-        return None
+    if run.path is None or submit is None:
+        raise NotThereError(f"submit {index}")
     detail, may_read = Detail(run.path), run.finished
     code = detail.code(index, checkpoints=may_read)
     previous = detail.code(index - 1, checkpoints=may_read) if index - 1 in submits else ()
-    summary = detail.summary(index)
-    returns, lengths = _numbers(summary.get("returns")), _numbers(summary.get("episode_lengths"))
-    cases = _numbers(summary.get("env_instances"))
+    summary, n = detail.summary(index), submit.summary.n_episodes
+    names = ("env_instances", "returns", "episode_lengths")
+    columns = [_numbers(summary.get(name))[:n] for name in names]
     failed = {int(each) for each in _numbers(summary.get("errors")) if each is not None}
     first, known = summary.get("first_global_episode"), detail.episodes(index)
     begin = first if isinstance(first, int) else known[0] if known else 0
+    rows = itertools.islice(itertools.zip_longest(range(n), *columns), MAX_EPISODES)
     episodes = [
         {
             "number": begin + at,
             "kept": begin + at in known,
-            "case": _at(cases, at),
-            "value": _at(returns, at),
-            "length": _at(lengths, at),
+            "case": case,
+            "value": value,
+            "length": length,
             "failed": at in failed,
         }
-        for at in range(min(MAX_EPISODES, submit.summary.n_episodes))
+        for at, case, value, length in rows
     ]
+    starts = [each.summary.submit_started_at for at in (index - 1, index) if (each := submits.get(at))]
     return {
         "submit": submit.summary,
         "consumed": submit.consumed,
@@ -223,24 +192,16 @@ def submit_values(run: RunFacts, reader: Reader, index: int) -> dict[str, Any] |
         "next": index + 1 if index + 1 in submits else None,
         "diffs": _diffs(previous, code) if previous else [],
         "files": code,
-        "calls": before(
-            run.path,
-            [each.summary.submit_started_at for at in (index - 1, index) if (each := submits.get(at))],
-        )[-1],
+        "calls": before(run.path, starts)[-1],
         "workspace": changes(run.path, index),
         "episodes": episodes,
-        "left_out": max(0, submit.summary.n_episodes - MAX_EPISODES),
+        "left_out": max(0, n - MAX_EPISODES),
     }
 
 
 def _numbers(value: Any) -> list[float | None]:
-    return (
-        [each if isinstance(each, int | float) else None for each in value] if isinstance(value, list) else []
-    )
-
-
-def _at(values: Sequence[float | None], index: int) -> float | None:
-    return values[index] if index < len(values) else None
+    values = value if isinstance(value, list) else []
+    return [each if isinstance(each, int | float) else None for each in values]
 
 
 def _diffs(before: Iterable[CodeFile], after: Iterable[CodeFile]) -> list[dict[str, Any]]:
@@ -253,21 +214,8 @@ def _diffs(before: Iterable[CodeFile], after: Iterable[CodeFile]) -> list[dict[s
     ]
 
 
-def episode_values(played: EpisodePlot | None) -> dict[str, Any]:
-    """Charts of one episode."""
-    if played is None:
-        return {"charts": [], "note": "", "steps": 0}
-    charts = [
-        (title, Markup(svg))
-        for title, series in (
-            ("Reward", played.rewards),
-            ("Observation", played.observations),
-            ("Action", played.actions),
-        )
-        if (svg := chart(f"{title} over steps", "step", list(map(_line, series))))
-    ]
-    return {"charts": charts, "note": played.note, "steps": played.steps}
-
-
-def _line(series: Series) -> Line:
-    return Line(series.name, [(float(step), value) for step, value in enumerate(series.values)])
+def episode_values(detail: Detail, place: str) -> dict[str, Any]:
+    """Charts of the episode in a folder."""
+    steps, lines, note = detail.played(place)
+    charts = [(title, chart(f"{title} over steps", "step", series)) for title, series in lines.items()]
+    return {"charts": [(title, Markup(svg)) for title, svg in charts if svg], "note": note, "steps": steps}

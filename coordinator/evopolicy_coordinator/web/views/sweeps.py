@@ -9,10 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from evopolicy_common.cli.conventions import bytes_text
-from evopolicy_common.terminal import duration, number
+from evopolicy_common.terminal import counted, duration, number
 from evopolicy_coordinator.web.content.cluster import Cluster
-from evopolicy_coordinator.web.content.feeds import View
-from evopolicy_coordinator.web.content.rendering import STATES, part, short, state_words
+from evopolicy_coordinator.web.content.rendering import STATES, View, part, short, state_words
 from evopolicy_coordinator.web.content.run_folders import RunFacts, Runs, Sweep
 from evopolicy_coordinator.web.content.tables import Words, ident, matches, paged
 from evopolicy_results.html import notice
@@ -30,35 +29,38 @@ def sweeps_view(
     """All runs: a matrix for each sweep, and one table."""
     every = [run for sweep in runs.sweeps for run in sweep.runs]
     agents = looks(sorted({run.entry for run in every}), None)
-    parts = {
-        "facts": part("facts", facts=_sweep_facts(every)),
-        "notices": part("notices", notices=_run_notices(runs, every, cluster, roots)),
-    }
-    lists: dict[str, list[str]] = {"matrices": []}
+    view = View("matrices", "run-rows")
     cells = MAX_CELLS
     for sweep in runs.sweeps:
         name = ident("sweep", str(sweep.root))
-        lists["matrices"].append(name)
         matrix, cells = _matrix(sweep, runs, agents, cells)
-        parts[name] = part("matrix", ident=name, key=name, acting=acting, **matrix)
+        view.row("matrices", "matrix", name, key=name, acting=acting, **matrix)
     kept = [
         run
-        for run in every
+        for run in sorted(every, key=_order)
         if matches(
             words.q, run.entry, run.env, run.exp_id, run.host, state_words(run.state), run.run, run.origin
         )
     ]
-    kept.sort(key=_order)
     shown, pages = paged(kept, words)
-    parts["run-pages"] = part("pages", ident="run-pages", what="runs", pages=pages)
-    lists["run-rows"] = []
+    view.parts |= {
+        "facts": part("facts", facts=_sweep_facts(every)),
+        "notices": part("notices", notices=_run_notices(runs, every, cluster, roots)),
+        "run-pages": part("pages", ident="run-pages", what="runs", pages=pages),
+    }
     for run in shown:
-        name = ident("row", run.key)
-        lists["run-rows"].append(name)
-        parts[name] = part(
-            "run_row", ident=name, run=run, look=agents[run.entry], **_shown(run, runs.may_show(run))
+        may_show = runs.may_show(run)
+        view.row(
+            "run-rows",
+            "run_row",
+            ident("row", run.key),
+            run=run,
+            look=agents[run.entry],
+            score=run.score if may_show else None,
+            random=run.random if may_show else None,
+            hidden=run.finished and not may_show and run.state == "completed",
         )
-    return View(parts=parts, lists=lists)
+    return view
 
 
 def _order(run: RunFacts) -> tuple[int, str, str, int]:
@@ -68,33 +70,19 @@ def _order(run: RunFacts) -> tuple[int, str, str, int]:
     return (place + (run.state == "pending"), run.env, run.entry.casefold(), run.repeat)
 
 
-def _shown(run: RunFacts, may_show: bool) -> dict[str, Any]:
-    """The visible part of a run's hidden results."""
-    return {
-        "score": run.score if may_show else None,
-        "random": run.random if may_show else None,
-        "hidden": run.finished and not may_show and run.state == "completed",
-    }
-
-
 def _sweep_facts(every: Sequence[RunFacts]) -> list[tuple[str, str]]:
-    done = [run for run in every if run.finished]
+    states = Counter(run.state for run in every)
     open_runs = [run for run in every if not run.finished and run.state not in ("pending", "interrupted")]
-    walls = [run.wall_s for run in done if run.wall_s]
-    waiting = sum(run.state in ("pending", "interrupted") for run in every)
-    remaining_s = [run.left_s for run in open_runs if run.left_s is not None]
-    rest = max(remaining_s, default=0.0)
+    walls = [run.wall_s for run in every if run.finished and run.wall_s]
+    waiting = states["pending"] + states["interrupted"]
+    rest = max((run.left_s for run in open_runs if run.left_s is not None), default=0.0)
     if walls and waiting:
         rest += sum(walls) / len(walls) * waiting / max(1, len(open_runs))
     facts = [
-        ("completed", f"{sum(run.state == 'completed' for run in every)} of {len(every)}"),
-        *(
-            (state_words(state), str(n))
-            for state in _TROUBLED
-            if (n := sum(run.state == state for run in every))
-        ),
+        ("completed", f"{states['completed']} of {len(every)}"),
+        *((state_words(state), str(states[state])) for state in _TROUBLED if states[state]),
         ("open", str(len(open_runs))),
-        ("waiting", str(sum(run.state == "pending" for run in every))),
+        ("waiting", str(states["pending"])),
         ("episodes used", short(sum(run.used for run in every))),
         ("tokens", short(sum(run.tokens for run in every))),
     ]
@@ -113,17 +101,13 @@ def _run_notices(
         title = "The coordinator does not answer; this is the last that is known."
         notices.append(notice(title, [cluster.trouble]))
     if runs.shut is None and any(run.finished for run in every):
-        notices.append(
-            notice(
-                "Hidden scores are not shown: without the coordinator nobody knows which agents are alive."
-            )
-        )
-    elif hidden := sum(run.finished and run.state == "completed" and not runs.may_show(run) for run in every):
-        title = f"{hidden} finished runs keep their hidden scores until no agent of a related run is alive."
+        title = "Hidden scores are not shown: without the coordinator nobody knows which agents are alive."
         notices.append(notice(title))
-    waits = Counter(run.waits_for for run in every if run.waits_for)
-    if waits:
-        lines = [f"{n} run{'s' * (n != 1)}: {what}" for what, n in waits.most_common(12)]
+    elif hidden := sum(run.finished and run.state == "completed" and not runs.may_show(run) for run in every):
+        shown = "1 finished run keeps its" if hidden == 1 else f"{hidden} finished runs keep their"
+        notices.append(notice(f"{shown} hidden scores until no agent of a related run is alive."))
+    if waits := Counter(run.waits_for for run in every if run.waits_for):
+        lines = [f"{counted(n, 'run')}: {what}" for what, n in waits.most_common(12)]
         notices.append(notice("Runs wait", lines))
     for root in roots:
         try:

@@ -106,10 +106,3 @@ def test_wrong_usage_is_reported_and_exits_2(
     assert result.exit_code == 2
     assert message in result.stderr
     assert list(tmp_path.iterdir()) == []
-
-
-def test_every_command_has_help_with_an_example() -> None:
-    for command in ("make", "check"):
-        result = call(command, "--help")
-        assert result.exit_code == 0
-        assert f"Example: evopolicy data {command}" in result.stdout

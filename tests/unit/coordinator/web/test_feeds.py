@@ -6,11 +6,14 @@ import asyncio
 import json
 from typing import Any
 
-from evopolicy_coordinator.web.content.feeds import LEAST_PAUSE_S, Feed, Feeds, View
+from evopolicy_coordinator.web.content.feeds import LEAST_PAUSE_S, Feed, Feeds
+from evopolicy_coordinator.web.content.rendering import View
 
 
 def view(rows: dict[str, str], **parts: str) -> View:
-    return View(parts={**parts, **rows}, lists={"rows": tuple(rows)})
+    made = View("rows")
+    made.parts, made.lists["rows"] = {**parts, **rows}, list(rows)
+    return made
 
 
 def test_only_what_changed_is_sent() -> None:
@@ -88,10 +91,10 @@ def test_many_changes_within_a_pause_are_one_event() -> None:
 
 def test_pages_that_nobody_watches_are_let_go_of_first() -> None:
     feeds = Feeds()
-    kept = feeds.of("kept", lambda: View(parts={}))
+    kept = feeds.of("kept", lambda: View())
     kept.watchers = 1
     for number in range(2000):
-        feeds.of(f"page {number}", lambda: View(parts={}))
-    assert feeds.of("kept", lambda: View(parts={})) is kept
+        feeds.of(f"page {number}", lambda: View())
+    assert feeds.of("kept", lambda: View()) is kept
     assert [feed for feed, _ in feeds.watched()] == [kept]
     assert len(feeds._feeds) <= 512

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from functools import partial
 from pathlib import Path
 
 import msgspec
@@ -12,12 +13,7 @@ from invented.run_dirs import write_run
 from invented.web_site import client, finished_run, open_run, open_status, site_of, status
 
 from evopolicy_common.messages.run_settings import Start
-from evopolicy_common.messages.status import (
-    DiskUse,
-    QueuedJobs,
-    RetriedJobs,
-    WorkerStatus,
-)
+from evopolicy_common.messages.status import DiskUse, QueuedJobs, RetriedJobs, WorkerStatus
 from evopolicy_coordinator.web.content.charts import Line, chart
 from evopolicy_coordinator.web.content.cluster import _RETRIES_OF_A_RUN
 from evopolicy_coordinator.web.content.run_folders import key_of
@@ -40,22 +36,12 @@ def worker(name: str, **more: object) -> WorkerStatus:
 
 def test_lost_workers_and_retries_stand_among_a_runs_events(tmp_path: Path) -> None:
     folder = open_run(tmp_path)
+    why = {"reason": "agent_failed", "detail": "Error code: 401", "turns": 0}
+    verdict = {"submit": "submit_0003", "status": "import_error", "detail": ""}
     lines = [
-        {
-            "event": "agent ended",
-            "reason": "agent_failed",
-            "detail": "Error code: 401",
-            "turns": 0,
-            "timestamp": "2026-01-02T00:00:40Z",
-        },
+        {"event": "agent ended", "timestamp": "2026-01-02T00:00:40Z", **why},
         {"event": "agent paused for the provider", "timestamp": "2026-01-02T00:00:30Z", "level": "info"},
-        {
-            "event": "submit committed",
-            "submit": "submit_0003",
-            "status": "import_error",
-            "detail": "",
-            "timestamp": "2026-01-01T23:30:00Z",
-        },
+        {"event": "submit committed", "timestamp": "2026-01-01T23:30:00Z", **verdict},
         {"event": "run opened", "timestamp": "2026-01-01T23:00:00Z", "level": "info"},
     ]
     (folder / "logs" / "harness.log").write_text("".join(json.dumps(line) + "\n" for line in lines))
@@ -96,12 +82,9 @@ def test_a_finished_run_tells_how_many_jobs_were_played_again(tmp_path: Path) ->
 
 
 def test_the_cluster_page_has_the_queue_by_priority_and_the_disks(tmp_path: Path) -> None:
-    queue = (
-        QueuedJobs(
-            priority="train", env="gym/acrobot", runs=2, waiting=5, leased=1, waits_for={"a free slot": 1}
-        ),
-        QueuedJobs(priority="heldout", env="gym/acrobot", runs=1, waiting=9, leased=0),
-    )
+    waits, queued = {"a free slot": 1}, partial(QueuedJobs, env="gym/acrobot")
+    train = queued(priority="train", runs=2, waiting=5, leased=1, waits_for=waits)
+    queue = (train, queued(priority="heldout", runs=1, waiting=9, leased=0))
     disk = DiskUse(database=3 << 30, free=20 << 30, total=80 << 30)
     reply = status(open_status("r-1"), workers=(worker("w"),), queue=queue, disk=disk)
     with client(site_of(tmp_path, cluster=reply)) as browser:
@@ -128,15 +111,8 @@ def test_a_run_can_be_repinned_to_barred_classes_only(tmp_path: Path) -> None:
 
 
 def test_every_end_has_a_counter_and_a_place_in_the_legend(tmp_path: Path) -> None:
-    for number, (end, error) in enumerate(
-        [
-            ("completed", None),
-            ("cancelled", "stopped by its operator"),
-            ("error", "no such model"),
-            ("error", "401"),
-            ("no_ok_submit", None),
-        ]
-    ):
+    ends = [("completed", None), ("cancelled", "stopped by its operator"), ("error", "no such model")]
+    for number, (end, error) in enumerate([*ends, ("error", "401"), ("no_ok_submit", None)]):
         folder = finished_run(tmp_path, exp_id=f"e{number}")
         record = json.loads((folder / "run.json").read_text())
         record["outcome"] |= {"status": end, "error": error}
@@ -151,12 +127,8 @@ def test_every_end_has_a_counter_and_a_place_in_the_legend(tmp_path: Path) -> No
         ("cancelled", "1"),
     ]
     legend = page.partition('<ul class="legend"')[2].partition("</ul>")[0]
-    assert re.findall(r"</span>([a-z ]+)</li>", legend) == [
-        "completed",
-        "no working submit",
-        "failed",
-        "cancelled",
-    ]
+    words = re.findall(r"</span>([a-z ]+)</li>", legend)
+    assert words == ["completed", "no working submit", "failed", "cancelled"]
     (row,) = [row for row in page.split("<tr") if "stopped by its operator</td>" in row]
     assert row.index("cancelled") < row.index("stopped by its operator") < row.index("episodes used")
 

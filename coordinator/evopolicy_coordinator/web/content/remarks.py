@@ -1,0 +1,67 @@
+"""What an operator should know of a cluster, in words for terminals and pages. It imports nothing of the web."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+
+from evopolicy_common.messages.status import RunStatus, StatusReply, WorkerStatus
+from evopolicy_common.terminal import duration
+
+
+def remarks(reply: StatusReply) -> Mapping[str, Iterable[str]]:
+    """Whole sentences by heading; some have none."""
+    workers = reply.workers
+    turned_away = (
+        f"{one.worker}{f' of {one.host}' * bool(one.host)} was turned away {duration(one.ago_s)} ago: {one.why}"
+        for one in reply.turned_away
+    )
+    quarantined = (
+        f"{name} is quarantined: {why} (evopolicy workers resume {name} takes it back)"
+        for name, why in reply.quarantined.items()
+    )
+    refused = (
+        f"{one.worker} gets no work of {run}: {why}" for one in workers for run, why in one.refused.items()
+    )
+    barred = (
+        f"{one.worker} plays no hidden episodes now: {one.hidden_bar}" for one in workers if one.hidden_bar
+    )
+    trouble = [f"{reply.trouble}; what follows is the last state"] if reply.trouble else []
+    return {
+        "The coordinator accepts no changes": trouble,
+        "Quarantined workers": quarantined,
+        "Turned away": turned_away,
+        "Disputes of audits": reply.disputes,
+        "Abandoned runs, without a gateway for an hour": abandoned(reply.runs),
+        "Workers that get no work of some runs": refused,
+        "Workers that lack a sandbox tier or an environment": (
+            text for one in workers for text in lacks(one)
+        ),
+        "Workers that play no hidden episodes now": barred,
+        "Waits longer than it should": reply.stalls,
+    }
+
+
+def abandoned(runs: Iterable[RunStatus]) -> Iterator[str]:
+    """How to end each abandoned run."""
+    for run in runs:
+        if run.abandoned:
+            yield (
+                f"{run.run} has had no gateway for {duration(run.silent_s)}: give its command again with --resume, or"
+                f" end it with evopolicy runs cancel {run.run}"
+            )
+
+
+def lacks(worker: WorkerStatus) -> Iterator[str]:
+    """Sandbox tiers and environments that it should have, with the reasons."""
+    for tier, why in worker.missing_tiers.items():
+        yield f"{worker.worker} has no sandbox tier {tier}: {why}"
+    for env, why in worker.failed_environments.items():
+        yield f"{worker.worker} does not offer {env}: {why}"
+
+
+def audits(reply: StatusReply) -> str:
+    """The share of audited episodes and their states; empty without audits."""
+    if not (reply.audit_share or reply.audits):
+        return ""
+    states = ", ".join(f"{n} {state.replace('_', ' ')}" for state, n in sorted(reply.audits.items()))
+    return f"{reply.audit_share:g} of the episodes of new runs; now {states or 'none'}"
