@@ -53,7 +53,7 @@ def test_a_run_continues_from_a_backup_of_a_running_coordinator(
 ) -> None:
     target = tmp_path / "backup"
 
-    async def begin() -> tuple[str, str]:
+    async def begin() -> None:
         async with operator_of(coordinator) as operator, working(coordinator):
             created = await operator.create(n_validation=2, n_heldout=2)
             async with gateway_of(coordinator, created) as gateway:
@@ -67,9 +67,10 @@ def test_a_run_continues_from_a_backup_of_a_running_coordinator(
                 # What comes after the backup is lost with the disk.
                 await gateway.submit(bundle_of("lost"), (0,), "k1")
                 await gateway.results(1)
-            return created.run, created.capability
+            ids.extend((created.run, created.capability))
 
-    async def go_on(restored: Coordinator, run_id: str, capability: str) -> None:
+    async def go_on() -> None:
+        run_id, capability = ids
         assert restored.credentials("gateway") == before
         async with operator_of(restored) as operator, working(restored), connect(before) as link:
             gateway = GatewayClient(link, run_id, capability)
@@ -83,20 +84,15 @@ def test_a_run_continues_from_a_backup_of_a_running_coordinator(
             assert finished["budget_used"] == 16
             assert sorted(finished["val_scores"]) == [0, 1]
 
-    before = coordinator.credentials("gateway")
-    ids: list[tuple[str, str]] = []
-
-    async def first() -> None:
-        ids.append(await begin())
-
-    run(first)
+    before, ids = coordinator.credentials("gateway"), list[str]()
+    run(begin)
     coordinator.kill()
     shutil.rmtree(coordinator.state)
     shutil.copytree(target, coordinator.state)
     coordinator.state.chmod(0o700)
     restored = Coordinator(coordinator.state)
     try:
-        run(lambda: go_on(restored, *ids[0]))
+        run(go_on)
     finally:
         assert restored.stop() == 0
 
@@ -170,8 +166,7 @@ def test_gc_takes_old_finished_runs_and_leaves_the_others(coordinator: Coordinat
     run(scenario)
     assert coordinator.stop() == 0
     assert disk_use.collect(coordinator.state, 0.0).shrunk
-    restarted = Coordinator(coordinator.state)
-    assert restarted.stop() == 0
+    assert Coordinator(coordinator.state).stop() == 0
 
 
 def test_a_blob_that_nothing_names_goes_once_it_is_old(coordinator: Coordinator) -> None:

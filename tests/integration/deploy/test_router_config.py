@@ -13,6 +13,7 @@ import msgspec
 import pytest
 import zenoh
 from attacks.eavesdropper import eavesdropping
+from machines.answering import KEYS, Asked, answered
 from machines.own_certs import CLUSTER, OwnCerts, free_port
 from typer.testing import CliRunner
 from waiting import eventually
@@ -20,16 +21,10 @@ from waiting import eventually
 from evopolicy_common.errors import ConfigError, TransportError
 from evopolicy_common.wire import credentials, keys, transport
 from evopolicy_common.wire.credentials import Role
-from evopolicy_common.wire.transport import IncomingQuery, Link
+from evopolicy_common.wire.transport import Link
 from evopolicy_coordinator.cli.main import app
 from evopolicy_coordinator.cli.router_config import write_router_config
 from evopolicy_coordinator.pki.machines import Machines
-
-OWN_KEY = {
-    "worker": keys.worker_key(CLUSTER, "lease"),
-    "gateway": keys.gateway_key(CLUSTER, "run1", "state"),
-    "operator": keys.operator_key(CLUSTER, "status"),
-}
 
 
 class Site:
@@ -55,13 +50,7 @@ class Site:
     @contextlib.asynccontextmanager
     async def up(self, alive: list[tuple[str, bool]] | None = None) -> AsyncIterator[list[str]]:
         """Coordinator and router; yields the keys that the coordinator is asked."""
-        asked: list[str] = []
-
-        def answer(queries: list[IncomingQuery]) -> None:
-            for query in queries:
-                asked.append(query.key)
-                query.reply(b"coordinator")
-
+        asked = Asked()
         machines = Machines(self.certs.state)
         machines.write_passwords()
         assert machines.tls is not None
@@ -69,7 +58,7 @@ class Site:
         config = transport.tls_server_config(
             CLUSTER, [self.certs.endpoint], machines.passwords, listed, machines.tls
         )
-        async with transport.serve(config, answer) as server, open_router(self.folder):
+        async with transport.serve(config, asked) as server, open_router(self.folder):
             server.declare(keys.requests(CLUSTER).values())
             if alive is not None:
                 server.watch_liveliness(
@@ -93,16 +82,6 @@ async def open_router(folder: Path) -> AsyncIterator[None]:
         await asyncio.to_thread(session.close)
 
 
-async def answered(link: Link, key: str, attempts: int = 1) -> bool:
-    """Whether the coordinator answers; more attempts where the router may not have reached it yet."""
-    for attempt in range(attempts):
-        if attempt:
-            await asyncio.sleep(0.1)
-        with contextlib.suppress(TransportError):
-            return await link.ask(key, b"?", 5.0) == b"coordinator"
-    return False
-
-
 @pytest.fixture
 def site(tmp_path: Path) -> Site:
     return Site(tmp_path)
@@ -111,10 +90,10 @@ def site(tmp_path: Path) -> Site:
 @pytest.mark.parametrize("role", ["worker", "gateway", "operator"])
 async def test_a_sites_router_answers_a_role_on_its_keys_only(site: Site, role: Role) -> None:
     async with site.up() as asked, site.link(role) as link:
-        assert await answered(link, OWN_KEY[role], attempts=300)
-        for owner, key in OWN_KEY.items():
+        assert await answered(link, KEYS[role], attempts=300)
+        for owner, key in KEYS.items():
             assert await answered(link, key) == (owner == role), key
-        assert set(asked) == {OWN_KEY[role]}
+        assert set(asked) == {KEYS[role]}
 
 
 async def test_a_machine_of_another_site_is_not_let_in(site: Site) -> None:
@@ -133,9 +112,9 @@ async def test_no_machine_answers_or_overhears_another_behind_the_same_router(si
         site.link("gateway") as honest,
         eavesdropping(found, keys.requests(CLUSTER)["gateway"]) as overheard,
     ):
-        assert await answered(honest, OWN_KEY["gateway"], attempts=300)
+        assert await answered(honest, KEYS["gateway"], attempts=300)
         for _ in range(20):
-            assert await answered(honest, OWN_KEY["gateway"])
+            assert await answered(honest, KEYS["gateway"])
         assert overheard == []
 
 
@@ -144,7 +123,7 @@ async def test_a_workers_liveliness_is_seen_through_the_router_and_no_one_elses(
     true, false = (keys.liveliness_key(CLUSTER, name) for name in ("here", "desk"))
     async with site.up(alive):
         async with site.link("gateway") as pretender, site.link("worker") as worker:
-            assert await answered(pretender, OWN_KEY["gateway"], attempts=300)
+            assert await answered(pretender, KEYS["gateway"], attempts=300)
             pretender.declare_alive(false)
             worker.declare_alive(true)
             await eventually(lambda: alive == [(true, True)])
@@ -160,23 +139,23 @@ async def test_a_router_behind_another_one_passes_on_as_far_as_roles_allow(site:
     alive: list[tuple[str, bool]] = []
     found = credentials.find("worker", (endpoint,), site.elsewhere)
     async with site.up(alive), open_router(far), transport.connect(found, timeout_s=30.0) as link:
-        assert await answered(link, OWN_KEY["worker"], attempts=300)
-        assert not await answered(link, OWN_KEY["gateway"])
+        assert await answered(link, KEYS["worker"], attempts=300)
+        assert not await answered(link, KEYS["gateway"])
         key = keys.liveliness_key(CLUSTER, "elsewhere")
         link.declare_alive(key)
         await eventually(lambda: alive == [(key, True)])
         async with site.link("worker") as other:
-            assert await answered(other, OWN_KEY["worker"], attempts=300)
+            assert await answered(other, KEYS["worker"], attempts=300)
 
 
 async def test_a_restarted_router_carries_on(site: Site) -> None:
     async with contextlib.AsyncExitStack() as stack:
         async with site.up():
             link = await stack.enter_async_context(site.link("worker"))
-            assert await answered(link, OWN_KEY["worker"], attempts=300)
-        assert not await answered(link, OWN_KEY["worker"])
+            assert await answered(link, KEYS["worker"], attempts=300)
+        assert not await answered(link, KEYS["worker"])
         async with site.up():
-            assert await answered(link, OWN_KEY["worker"], attempts=300)
+            assert await answered(link, KEYS["worker"], attempts=300)
 
 
 def test_the_file_holds_the_coordinators_own_rules(site: Site) -> None:

@@ -10,20 +10,15 @@ from pathlib import Path
 import pytest
 import zenoh
 from attacks.eavesdropper import eavesdropping
+from machines.answering import KEYS, Asked, answered
+from machines.own_certs import CLUSTER
 from waiting import eventually
 
 from evopolicy_common.errors import TransportError
 from evopolicy_common.wire import keys, transport
 from evopolicy_common.wire.credentials import Credentials, Role
-from evopolicy_common.wire.transport import IncomingQuery, Link
 
-CLUSTER = "test"
 PASSWORDS: dict[Role, str] = {"worker": "w-secret", "gateway": "g-secret", "operator": "o-secret"}
-OWN_KEY = {
-    "worker": keys.worker_key(CLUSTER, "lease"),
-    "gateway": keys.gateway_key(CLUSTER, "run1", "state"),
-    "operator": keys.operator_key(CLUSTER, "status"),
-}
 
 
 def credentials(folder: Path, role: Role, password: str | None = None) -> Credentials:
@@ -40,31 +35,18 @@ def config_of(folder: Path) -> zenoh.Config:
 @contextlib.asynccontextmanager
 async def coordinator(folder: Path) -> AsyncIterator[list[str]]:
     """A listening session that answers every key of the cluster with its own name; yields the keys it was asked."""
-    asked: list[str] = []
-
-    def answer(queries: list[IncomingQuery]) -> None:
-        for query in queries:
-            asked.append(query.key)
-            query.reply(b"coordinator")
-
-    async with transport.serve(config_of(folder), answer) as server:
+    asked = Asked()
+    async with transport.serve(config_of(folder), asked) as server:
         server.declare(keys.requests(CLUSTER).values())
         yield asked
-
-
-async def answered(link: Link, key: str) -> bool:
-    try:
-        return await link.ask(key, b"?", 2.0) == b"coordinator"
-    except TransportError:
-        return False
 
 
 @pytest.mark.parametrize("role", ["worker", "gateway", "operator"])
 async def test_a_role_is_answered_on_its_own_keys_only(tmp_path: Path, role: Role) -> None:
     async with coordinator(tmp_path) as asked, transport.connect(credentials(tmp_path, role)) as link:
-        for owner, key in OWN_KEY.items():
+        for owner, key in KEYS.items():
             assert await answered(link, key) == (owner == role), key
-        assert asked == [OWN_KEY[role]]
+        assert asked == [KEYS[role]]
 
 
 @pytest.mark.parametrize(("role", "password"), [("worker", "wrong"), ("gateway", PASSWORDS["worker"])])
@@ -97,7 +79,7 @@ async def test_one_gateway_cannot_answer_or_overhear_another(tmp_path: Path) -> 
     ):
         await asyncio.sleep(0.3)
         for _ in range(20):
-            assert await answered(honest, OWN_KEY["gateway"])
+            assert await answered(honest, KEYS["gateway"])
         assert overheard == []
 
 
@@ -121,12 +103,12 @@ async def test_a_client_finds_its_way_back_to_a_restarted_coordinator(tmp_path: 
     async with contextlib.AsyncExitStack() as stack:
         async with coordinator(tmp_path):
             link = await stack.enter_async_context(transport.connect(credentials(tmp_path, "worker")))
-            assert await answered(link, OWN_KEY["worker"])
-        assert not await answered(link, OWN_KEY["worker"])
+            assert await answered(link, KEYS["worker"])
+        assert not await answered(link, KEYS["worker"])
         async with coordinator(tmp_path):
             await eventually(lambda: link.connected)
             for _ in range(100):
-                if await answered(link, OWN_KEY["worker"]):
+                if await answered(link, KEYS["worker"]):
                     return
                 await asyncio.sleep(0.05)
             raise AssertionError("not answered after the restart")

@@ -14,6 +14,7 @@ from pathlib import Path
 import msgspec
 import pytest
 import zenoh
+from machines.answering import KEYS, Asked, answered
 from machines.own_certs import CLUSTER, DAYS, OwnCerts, now, of
 from waiting import eventually
 
@@ -24,35 +25,14 @@ from evopolicy_common.wire.transport import IncomingQuery, Link
 from evopolicy_coordinator.pki.machines import Machines
 from evopolicy_coordinator.server.remote_listener import remote_listener
 
-KEYS: dict[Role, str] = {
-    "worker": keys.worker_key(CLUSTER, "lease"),
-    "gateway": keys.gateway_key(CLUSTER, "run1", "state"),
-    "operator": keys.operator_key(CLUSTER, "status"),
-}
-
 
 @contextlib.asynccontextmanager
 async def coordinator(certs: OwnCerts) -> AsyncIterator[list[str]]:
     """The coordinator's listener for other machines, which answers every key; yields the keys it was asked."""
-    asked: list[str] = []
-
-    def answer(queries: list[IncomingQuery]) -> None:
-        for query in queries:
-            asked.append(query.key)
-            query.reply(b"coordinator")
-
-    listener = remote_listener(
-        CLUSTER, (certs.endpoint,), Machines(certs.state), answer, lambda key, alive: None
-    )
-    async with listener:
+    asked = Asked()
+    machines = Machines(certs.state)
+    async with remote_listener(CLUSTER, (certs.endpoint,), machines, asked, lambda key, alive: None):
         yield asked
-
-
-async def answered(link: Link, key: str) -> bool:
-    try:
-        return await link.ask(key, b"?", 20.0) == b"coordinator"
-    except TransportError:
-        return False
 
 
 async def gets_in(credentials: Credentials, timeout_s: float = 0.5) -> bool:

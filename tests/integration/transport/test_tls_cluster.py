@@ -97,20 +97,6 @@ async def refusal(answer: Awaitable[object]) -> str:
     return refused.value.status
 
 
-def test_a_run_is_played_by_machines_that_have_certificates(
-    certs: OwnCerts, coordinator: Coordinator
-) -> None:
-    async def scenario() -> None:
-        boss, machine = certs.issue("operator", "boss"), certs.issue("worker", "w")
-        async with operators(boss) as operator, joined(machine, "w") as worker, at_work(worker):
-            finished = await play_run(operator, boss)
-            assert finished.status == "completed"
-            assert worker.jobs
-
-    run(scenario, 120)
-    assert coordinator.stop() == 0
-
-
 @pytest.mark.slow  # until the leases have run out
 async def test_a_revoked_worker_loses_its_leases_to_an_honest_one(
     certs: OwnCerts, coordinator: Coordinator
@@ -146,9 +132,8 @@ async def test_a_revoked_operator_asks_for_nothing_more(certs: OwnCerts, coordin
     boss = certs.issue("operator", "boss")
     async with operators(boss) as operator:
         await operator.status()
-    async with connect(
-        msgspec.structs.replace(coordinator.credentials("operator"), token=of(boss, "operator").token)
-    ) as link:
+    token = of(boss, "operator").token
+    async with connect(msgspec.structs.replace(coordinator.credentials("operator"), token=token)) as link:
         await OperatorClient(link).status()
         certs.revoke("operator/boss")
         with pytest.raises(RefusedError, match="bad_token"):
@@ -163,6 +148,7 @@ async def test_machines_reconnect_after_an_issue_or_a_restart(certs: OwnCerts) -
     try:
         async with operators(boss) as operator, joined(machine, "w") as worker, at_work(worker):
             one = await play_run(operator, boss)
+            assert (one.status, bool(worker.jobs)) == ("completed", True)
             certs.issue("worker", "late")
             first.kill()
             second = Coordinator(certs.state, "--listen", certs.endpoint, "--hidden-isolation", "off")

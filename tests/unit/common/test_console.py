@@ -16,7 +16,7 @@ HEADINGS = ("worker", "host", "state", "slots", "environments")
 
 
 def shown(width: int, headings: tuple[str, ...] = HEADINGS, rows: tuple[tuple[str, ...], ...] = ROWS) -> str:
-    made = table(*headings, right=("slots",))
+    made = table(*headings, right=("slots",), whole=("run",))
     for row in rows:
         made.add_row(*row)
     out = io.StringIO()
@@ -66,11 +66,8 @@ def test_a_narrow_table_of_few_columns_stays_a_table() -> None:
 
 
 def test_words_of_headings_and_whole_columns_never_fold() -> None:
-    made = table("run", "environment", "running", whole=("run",))
-    made.add_row("r-93859e511889fb5e", "gym/some-environment-of-a-long-name", "12")
-    out = io.StringIO()
-    Terminal(file=out, width=44).print(made)
-    lines = out.getvalue().splitlines()
+    row = ("r-93859e511889fb5e", "gym/some-environment-of-a-long-name", "12")
+    lines = shown(44, ("run", "environment", "running"), (row,)).splitlines()
     assert lines[0].split() == ["run", "environment", "running"]
     assert lines[1].split()[0] == "r-93859e511889fb5e"
     assert len(lines) == 4

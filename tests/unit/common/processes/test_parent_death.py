@@ -36,17 +36,13 @@ time.sleep(1000)
 
 
 def test_a_program_whose_parent_is_gone_does_not_start() -> None:
-    done = subprocess.run(
-        [sys.executable, parent_death.__file__, "1", "9", "", "/bin/echo", "started"],
-        capture_output=True,
-        check=False,
-    )
+    words = [sys.executable, parent_death.__file__, "1", "9", "", "/bin/echo", "started"]
+    done = subprocess.run(words, capture_output=True, check=False)
     assert (done.returncode, done.stdout) == (1, b"")
 
 
 def test_a_program_that_is_not_there_is_reported_in_one_line() -> None:
-    done = subprocess.run(
-        parent_death.ending_with_parent(["/no/such/program"]), capture_output=True, text=True, check=False
-    )
+    words = parent_death.ending_with_parent(["/no/such/program"])
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
     assert done.returncode == 127
     assert done.stderr == "cannot start /no/such/program: No such file or directory\n"

@@ -16,13 +16,19 @@ from evopolicy_common.errors import ConfigError, DamagedStoreError
 from evopolicy_common.processes.preflight import check_text, check_writable, explained
 
 
+def refuse(monkeypatch: pytest.MonkeyPatch, fault: int) -> None:
+    """Makes the disk refuse temporary files."""
+
+    def refuses(**_: Any) -> None:
+        raise OSError(fault, os.strerror(fault))
+
+    monkeypatch.setattr(tempfile, "TemporaryFile", refuses)
+
+
 def test_a_full_disk_is_reported_unless_who_asks_waits_for_room(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def full(**_: Any) -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr(tempfile, "TemporaryFile", full)
+    refuse(monkeypatch, errno.ENOSPC)
     with pytest.raises(ConfigError, match=f"{tmp_path / 'new'}.*make room.*--state"):
         check_writable(tmp_path / "new", "--state")
     check_writable(tmp_path / "new", "--state", may_be_full=True)
@@ -35,10 +41,7 @@ def test_a_full_disk_is_reported_unless_who_asks_waits_for_room(
 def test_only_passing_causes_restart_a_program(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fault: int, code: int
 ) -> None:
-    def refuses(**_: Any) -> None:
-        raise OSError(fault, os.strerror(fault))
-
-    monkeypatch.setattr(tempfile, "TemporaryFile", refuses)
+    refuse(monkeypatch, fault)
     with pytest.raises(SystemExit) as ended, fail_on_our_errors():
         check_writable(tmp_path, "--state")
     assert ended.value.code == code
