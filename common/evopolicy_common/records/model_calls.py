@@ -12,6 +12,7 @@ from evopolicy_common.errors import DECODE_ERRORS
 from evopolicy_common.records.run_record import Tokens
 from evopolicy_common.records.summary import utc_text
 from evopolicy_common.regular_files import read_regular
+from evopolicy_common.terminal import counted
 
 LEDGER = "logs/model_requests.jsonl"
 _MAX_BYTES = 64 << 20
@@ -52,6 +53,6 @@ def _words(calls: Sequence[_Call]) -> str:
         return ""
     failed = sum(not 200 <= call.status < 300 or call.broken for call in calls)
     return (
-        f"{len(calls):,} model call{'s' * (len(calls) > 1)}{f' ({failed:,} failed)' if failed else ''},"
+        f"{counted(len(calls), 'model call')}{f' ({failed:,} failed)' if failed else ''},"
         f" {sum(call.usage.total for call in calls):,} tokens, {sum(call.whole_s for call in calls):,.0f} s"
     )

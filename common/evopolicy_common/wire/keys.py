@@ -22,7 +22,7 @@ def worker_key(cluster: str, verb: str) -> str:
 
 
 def liveliness_key(cluster: str, worker: str) -> str:
-    """Key of a worker's liveliness token, a hint to check its leases now and never a fact; with `*`, of all of them."""
+    """Key of a worker's liveliness token: a hint to check its leases now, never a fact. `*`: of all workers."""
     return f"{_ROOT}/{cluster}/worker/{worker}/live"
 
 

@@ -373,7 +373,7 @@ def tls_server_config(
 def machine_access_control(
     cluster: str, machines: Iterable[tuple[MachineRole, str]], uplink: str | None = None
 ) -> dict[str, Any]:
-    """The access rules of a session over TLS: each machine has one name, in its certificate and as its user name.
+    """The access rules over TLS: each machine has one name, in its certificate and as its user name.
 
     A `router` is a site's own `zenohd`, which speaks for all roles behind it and has to apply these rules to them.
     `uplink`: the common name of the peer that such a router connects to; requests go there and replies come from it.
@@ -430,10 +430,10 @@ def site_router_settings(
 def _access_control(
     cluster: str, subjects: list[dict[str, Any]], roles: list[tuple[str, MachineRole]]
 ) -> dict[str, Any]:
-    """Zenoh's access rules: each role sends requests on its own keys and receives the replies, and nothing else.
+    """Zenoh's access rules: each role sends requests on its own keys and receives the replies, nothing else.
 
-    `declare_queryable` goes out to clients only: if it were accepted from them, one gateway could answer another's
-    queries.
+    `declare_queryable` goes out to clients only: if it were accepted from them, one gateway could answer
+    another's queries.
     """
     rules: list[dict[str, Any]] = []
     granted: dict[MachineRole, list[str]] = {}

@@ -46,8 +46,8 @@ def collect(
     verb = "would remove" if dry_run else "removed"
     say(
         f"{verb} {counted(done.episodes, 'episode')} of {counted(done.runs, 'run')} and"
-        f" {counted(done.evaluations, 'evaluation')}, {counted(done.blobs, 'blob')}: {bytes_text(done.bytes)};"
-        f" {bytes_text(done.free_bytes)} free"
+        f" {counted(done.evaluations, 'evaluation')}, {counted(done.blobs, 'blob')}:"
+        f" {bytes_text(done.bytes)}; {bytes_text(done.free_bytes)} free"
     )
     if not dry_run and not done.shrunk:
         say("a coordinator is running: the database keeps its size, and new runs use the freed space")

@@ -53,8 +53,8 @@ def serve(
     listen: Annotated[
         list[str] | None,
         typer.Option(
-            help="Endpoint for other machines, such as tls/0.0.0.0:7447 (port 0: a free one; see `certs`); may be"
-            " repeated. A unix socket in the state folder is always listened on."
+            help="Endpoint for other machines, such as tls/0.0.0.0:7447 (port 0: a free one; see `certs`); may"
+            " be repeated. A unix socket in the state folder is always listened on."
         ),
     ] = None,
     state: State = None,
@@ -86,15 +86,15 @@ def serve(
             min=0.0,
             max=1.0,
             metavar="SHARE",
-            help="Share of the episodes of new runs whose recorded actions a second worker replays, compared bit for"
-            " bit. If they differ, a third worker decides, and the forging worker gets no more work.",
+            help="Share of the episodes of new runs whose recorded actions a second worker replays, compared bit"
+            " for bit. If they differ, a third worker decides, and the forging worker gets no more work.",
         ),
     ] = 0.0,
     hidden_isolation: Annotated[
         Literal["related", "strict", "off"],
         typer.Option(
-            help="Agents and train episodes beside which no hidden episode is played on a kernel. `related`: those"
-            " of runs that share a hidden case; `strict`: all; `off`: none, and run.json says `shared`."
+            help="Agents and train episodes beside which no hidden episode is played on a kernel. `related`:"
+            " those of runs that share a hidden case; `strict`: all; `off`: none, and run.json says `shared`."
         ),
     ] = "related",
     hidden_wait: Annotated[
@@ -102,8 +102,8 @@ def serve(
         typer.Option(
             min=0.0,
             metavar="SECONDS",
-            help="After hidden episodes of closed runs have waited for this time, one machine starts no related"
-            " agent until they are played.",
+            help="After hidden episodes of closed runs have waited for this time, one machine starts no"
+            " related agent until they are played.",
         ),
     ] = CoreSettings().hidden_wait_s,
     agent_wait: Annotated[
@@ -111,16 +111,16 @@ def serve(
         typer.Option(
             min=0.0,
             metavar="SECONDS",
-            help="Cancel a run that is still open this long after its agent's start, if hidden episodes of closed"
-            " runs wait for the agent. Choose more than the longest wall limit of your agents.",
+            help="Cancel a run that is still open this long after its agent's start, if hidden episodes of"
+            " closed runs wait for the agent. Choose more than the longest wall limit of your agents.",
         ),
     ] = CoreSettings().agent_wait_s,
     metrics: Annotated[
         str | None,
         typer.Option(
             metavar="HOST:PORT",
-            help="Serve /metrics in Prometheus' text format, and /healthz. They need no token and contain nothing"
-            " about single runs.",
+            help="Serve /metrics in Prometheus' text format, and /healthz. They need no token and contain"
+            " nothing about single runs.",
         ),
     ] = None,
     ready_file: Annotated[
@@ -134,8 +134,8 @@ def serve(
         bool,
         typer.Option(
             "--unjailed-agents",
-            help="Agents may be able to read this state folder: give their runs cases of their own, and later runs"
-            " new cases.",
+            help="Agents may be able to read this state folder: give their runs cases of their own, and later"
+            " runs new cases.",
         ),
     ] = False,
     trust_workers: Annotated[

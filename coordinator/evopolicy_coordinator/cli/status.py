@@ -24,7 +24,7 @@ from evopolicy_common.cli.frame import App
 from evopolicy_common.console import listing, terminal
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.status import RunStatus, StatusReply, WorkerStatus
-from evopolicy_common.terminal import duration, say, say_json, say_lines
+from evopolicy_common.terminal import counted, duration, say, say_json, say_lines
 from evopolicy_common.wire import credentials, transport
 from evopolicy_common.wire.operator_client import OperatorClient
 from evopolicy_coordinator.web.content.remarks import abandoned, audits, lacks, remarks
@@ -236,9 +236,10 @@ def render(reply: StatusReply) -> RenderableType:
     """The status as tables."""
     slots = sum(worker.slots for worker in reply.workers if worker.state == "active")
     head = (
-        f"cluster {reply.cluster} · evopolicy {reply.version} · up {duration(reply.uptime_s)} · {slots} slots ·"
-        f" {sum(run.queued for run in reply.runs)} queued, {sum(run.running for run in reply.runs)} running,"
-        f" {reply.episodes_done} episodes done, {reply.episodes_per_s:.1f}/s over the last minute"
+        f"cluster {reply.cluster} · evopolicy {reply.version} · up {duration(reply.uptime_s)} ·"
+        f" {counted(slots, 'slot')} · {sum(run.queued for run in reply.runs)} queued,"
+        f" {sum(run.running for run in reply.runs)} running,"
+        f" {counted(reply.episodes_done, 'episode')} done, {reply.episodes_per_s:.1f}/s over the last minute"
     )
     parts: list[RenderableType] = [
         Text(head),

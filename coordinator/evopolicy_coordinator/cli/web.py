@@ -57,8 +57,8 @@ def web(
     token_file: Annotated[
         Path | None,
         typer.Option(
-            help="File that keeps the tokens, mode 0600, so that browsers stay signed in after a restart; default:"
-            " new tokens.",
+            help="File that keeps the tokens, mode 0600, so that browsers stay signed in after a restart;"
+            " default: new tokens.",
             show_default=False,
         ),
     ] = None,

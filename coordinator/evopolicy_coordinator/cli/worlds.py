@@ -30,7 +30,7 @@ from evopolicy_common.records import splits as split_files
 from evopolicy_common.records.blobs import write_atomically
 from evopolicy_common.records.journal import epoch_of
 from evopolicy_common.records.policies.bundles import Bundle, snapshot
-from evopolicy_common.terminal import number, say
+from evopolicy_common.terminal import counted, number, say
 from evopolicy_common.wire import credentials, transport
 from evopolicy_common.worlds.rules import PARAMETERS, Rules
 from evopolicy_common.worlds.transformed import transformed, varied
@@ -104,7 +104,7 @@ async def _accept(env_ids: list[str], policies: Path, journal: _Journal, slots: 
                         await _environment(env, policies / catalogue.folder_name(env), journal, player)
 
                 await unless_failed(asyncio.create_task(work()), cluster.failed)
-    say(f"{len(env_ids)} environments in {time.monotonic() - began:.0f} s")
+    say(f"{counted(len(env_ids), 'environment')} in {time.monotonic() - began:.0f} s")
 
 
 async def _environment(env: str, folder: Path, journal: _Journal, player: _Player) -> None:

@@ -58,14 +58,14 @@ ACTS: Mapping[tuple[str, str], Act] = {
     ),
     ("run", "repin"): Act(
         title="Repin a run",
-        happens="It goes on with workers of another fingerprint class. Its record names both classes and the reason,"
-        " and reports tell that versions changed within it.",
+        happens="It goes on with workers of another fingerprint class. Its record names both classes and the"
+        " reason, and reports tell that versions changed within it.",
         needs="reason",
     ),
     ("sweep", "pause"): Act(
         title="Pause a sweep",
-        happens="No further run of it begins, on any host that shares its folder. Runs that have begun go on to"
-        " their end.",
+        happens="No further run of it begins, on any host that shares its folder. Runs that have begun go"
+        " on to their end.",
     ),
     ("sweep", "resume"): Act(title="Go on with a sweep", happens="Its next runs begin as its limits allow."),
 }

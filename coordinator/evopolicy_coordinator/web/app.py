@@ -440,7 +440,7 @@ def _episode(run: RunFacts, index: int, episode: int) -> dict[str, Any]:
 
 
 def _file(request: Request, files: Confined, path: str, types: Mapping[str, str], policy: str) -> Response:
-    """A file, or the requested range of it; plain text unless its suffix has another type. Raises NotThereError."""
+    """A file, or the requested range of it; plain text unless its suffix tells. Raises NotThereError."""
     fd = files.open(path)
     size = os.fstat(fd).st_size
     first, last, status = 0, size - 1, 200

@@ -29,7 +29,7 @@ from evopolicy_common.console import listing, terminal
 from evopolicy_common.errors import DECODE_ERRORS, ConfigError, ProtocolError
 from evopolicy_common.processes.packages import checked_names
 from evopolicy_common.regular_files import read_given
-from evopolicy_common.terminal import one_line, say, say_json
+from evopolicy_common.terminal import counted, one_line, say, say_json
 from evopolicy_results.cli.cluster import Local, State, where_of
 from evopolicy_results.publish import replay as replays
 from evopolicy_results.publish import rules
@@ -124,7 +124,7 @@ def publish(
     if as_json:
         say_json(done)
         return
-    say(f"{done.path}: {done.runs} runs, {done.bytes:,} bytes, signed by {done.signer}")
+    say(f"{done.path}: {counted(done.runs, 'run')}, {done.bytes:,} bytes, signed by {done.signer}")
     say(f"journal head: {done.journal_head}")
     for each in done.folders_left_out[:_SHOWN]:
         say(one_line(f"left out: {each.what}: {each.why}"))
@@ -307,7 +307,11 @@ def _print(checked: Checked) -> None:
                 say(f"{marks[state]} {kind}: … and {len(lines) - _SHOWN} more (--json tells all)")
         if all(each.state == "ok" for each in of_kind):
             n = len({each.run for each in of_kind if each.run})
-            say(one_line(f"{marks['ok']} {kind}: " + (f"{meaning} ({n} runs)" if n else of_kind[0].text)))
+            say(
+                one_line(
+                    f"{marks['ok']} {kind}: " + (f"{meaning} ({counted(n, 'run')})" if n else of_kind[0].text)
+                )
+            )
     if checked.covered:
         say(f"the replay covered {checked.coverage()} episodes")
     _say_left_out([each for each in checked.listing if each.state != "published"])

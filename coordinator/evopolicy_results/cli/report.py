@@ -23,7 +23,7 @@ from evopolicy_common.errors import ConfigError
 from evopolicy_common.processes.preflight import check_writable
 from evopolicy_common.records.rescores import is_name
 from evopolicy_common.regular_files import read_given
-from evopolicy_common.terminal import say, say_json, say_lines
+from evopolicy_common.terminal import counted, say, say_json, say_lines
 from evopolicy_results.reading.comparability import REMEDIES, UNKNOWN_ISOLATION, MixedRunsError
 from evopolicy_results.reading.parallel import Processes
 from evopolicy_results.reading.reader import load_runs
@@ -149,9 +149,7 @@ def report(
     else:
         say_lines((f"left out: {item.path}: {item.reason}" for item in study.left_out), err=True)
         if index is not None:
-            say(
-                f"{len(study.runs)} run{'s' * (len(study.runs) != 1)}, {len(study.left_out)} left out: {index}"
-            )
+            say(f"{counted(len(study.runs), 'run')}, {len(study.left_out)} left out: {index}")
     if index is None:
         fail(
             f"no finished run in {', '.join(map(str, runs))}; nothing written. Name run directories, such as"

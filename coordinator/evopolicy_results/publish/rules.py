@@ -17,6 +17,7 @@ from evopolicy_common.records import journal
 from evopolicy_common.records.canary import CANARY
 from evopolicy_common.records.journal import Ended, Opened
 from evopolicy_common.records.summary import utc_text
+from evopolicy_common.terminal import counted
 from evopolicy_results.publish import card as cards
 from evopolicy_results.publish import contents, descriptions, fields
 from evopolicy_results.publish.contents import Countersignature, Manifest, Removed, Signature
@@ -149,7 +150,7 @@ def _digests(files: Files, manifest: Manifest, checked: Checked) -> tuple[set[st
     for text in bad:
         checked.add("digests", "failed", text)
     if not bad:
-        checked.add("digests", "ok", f"{len(wanted):,} files")
+        checked.add("digests", "ok", counted(len(wanted), "file"))
     return damaged, wanted
 
 
@@ -204,7 +205,7 @@ def _order(history: History, noted: Sequence[str | Countersignature], checked: C
         checked.add(
             "order",
             "ok",
-            f"the journal had entry {number} with the head {by}; {later} runs were opened after it",
+            f"the journal had entry {number} with the head {by}; {counted(later, 'run')} opened after it",
         )
 
 

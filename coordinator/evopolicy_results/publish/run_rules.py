@@ -22,6 +22,7 @@ from evopolicy_common.records.policies.bundles import Bundle
 from evopolicy_common.records.run_record import PROTOCOL_VERSION, decode_run_record, inputs_digest
 from evopolicy_common.records.splits import FILE_STEMS, SPLITS, cases_hash, overlaps
 from evopolicy_common.records.summary import utc_text
+from evopolicy_common.terminal import counted
 from evopolicy_results.publish import contents, fields
 from evopolicy_results.publish.contents import Group
 from evopolicy_results.publish.findings import KINDS, Checked, Fault, Files, History, PublishedRun, decoded
@@ -376,7 +377,7 @@ def _recordings(files: Files, run: PublishedRun, damaged: set[str], checked: Che
         text = f"only {', '.join(missing)} episodes have a recording: the other returns rest on the publisher's word"
         checked.add("recordings", "open", text, name)
     elif fine:
-        checked.add("recordings", "ok", f"{sum(n for n, _ in recorded.values())} episodes", name)
+        checked.add("recordings", "ok", counted(sum(n for n, _ in recorded.values()), "episode"), name)
 
 
 def recording_fault(episode: contents.Episode, data: bytes) -> str | None:

@@ -23,6 +23,7 @@ from evopolicy_common.errors import EvopolicyError
 from evopolicy_common.messages.environment import Split
 from evopolicy_common.records.fingerprints import comparable
 from evopolicy_common.records.run_record import inputs_digest
+from evopolicy_common.terminal import counted
 from evopolicy_results.reading.environments import ordered_environments, suites_of
 from evopolicy_results.reading.records import Run, path_text
 
@@ -40,7 +41,7 @@ class Mixture(msgspec.Struct, frozen=True, kw_only=True):
     """Each value to the folders of the runs with it; empty if the runs have none, or the value names its run."""
 
     def __str__(self) -> str:
-        found = ", ".join(f"{value} ({n} run{'s' * (n != 1)})" for value, n in self.values.items())
+        found = ", ".join(f"{value} ({counted(n, 'run')})" for value, n in self.values.items())
         return f"{self.what} on {self.where}" + (f": {found}" if found else "")
 
 

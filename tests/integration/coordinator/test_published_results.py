@@ -263,7 +263,7 @@ def test_heads_that_were_noted_show_whether_the_journal_was_begun_anew(results: 
 
     for head in (heads[1], seen):
         state, text = order(results.files, head)
-        assert (state, "1 runs were opened after it" in text) == ("ok", True)
+        assert (state, "1 run opened after it" in text) == ("ok", True)
     state, text = order(results.files, "00" * 32)
     assert (state, "never had the head" in text) == ("failed", True)
     anew = Forger(results.files)

@@ -106,8 +106,8 @@ _KINDS = {
 def walk(root: int, leave_out: Collection[str], most: int) -> Iterator[tuple[str, BinaryIO | str]]:
     """The regular files below an open folder, open, by path; the reason in place of one that is left out.
 
-    Neither follows a link nor opens anything but regular files and folders. `leave_out`: entries of the folder itself
-    to pass over, as files and folders that tools make are. `most`: files and folders to look at.
+    Neither follows a link nor opens anything but regular files and folders. `leave_out`: entries of the folder
+    itself to pass over, as files and folders that tools make are. `most`: files and folders to look at.
     """
     left = most
 

@@ -65,8 +65,8 @@ class Confined:
             return b""
 
     def names(self, path: str) -> list[Name]:
-        """Regular files and folders of a folder, by name, the first few thousand; links and all else are left out.
-        Empty for a refused path."""
+        """Regular files and folders of a folder, by name, the first few thousand; links and all else are left
+        out. Empty for a refused path."""
         found: list[Name] = []
         with contextlib.suppress(NotThereError, OSError):
             folder = self._folder(_parts(path))

@@ -1,4 +1,4 @@
-"""What an operator should know of a cluster, in words for terminals and pages. It imports nothing of the web."""
+"""Remarks on a cluster for its operator, in words for terminals and pages. Imports nothing of the web."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ def remarks(reply: StatusReply) -> Mapping[str, Iterable[str]]:
     """Whole sentences by heading; some have none."""
     workers = reply.workers
     turned_away = (
-        f"{one.worker}{f' of {one.host}' * bool(one.host)} was turned away {duration(one.ago_s)} ago: {one.why}"
+        f"{one.worker}{one.host and f' of {one.host}'} was turned away {duration(one.ago_s)} ago: {one.why}"
         for one in reply.turned_away
     )
     quarantined = (
@@ -46,8 +46,8 @@ def abandoned(runs: Iterable[RunStatus]) -> Iterator[str]:
     for run in runs:
         if run.abandoned:
             yield (
-                f"{run.run} has had no gateway for {duration(run.silent_s)}: give its command again with --resume, or"
-                f" end it with evopolicy runs cancel {run.run}"
+                f"{run.run} has had no gateway for {duration(run.silent_s)}: give its command again with"
+                f" --resume, or end it with evopolicy runs cancel {run.run}"
             )
 
 

@@ -168,7 +168,7 @@ class Detail:
         return self.files.found(path, MAX_TEXT).decode("utf-8", "replace")
 
     def played(self, folder: str) -> tuple[int, dict[str, list[Line]], str]:
-        """An episode's number of steps, its columns by title of a plot, and a note; as far as it can be drawn."""
+        """Number of steps of an episode, its columns by title of a plot, and a note; what can be drawn."""
         rows = list(
             itertools.islice(
                 objects(self.files.found(f"{folder}/trajectory.jsonl", _MAX_TRAJECTORY).splitlines()),
