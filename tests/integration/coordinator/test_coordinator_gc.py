@@ -125,45 +125,42 @@ def by_digest(job: Job, spec: EpisodeSpec) -> EpisodeOutcome:
     return msgspec.structs.replace(play(job, spec), trajectory=blob if job.record == "full" else None)
 
 
-def test_gc_takes_old_finished_runs_and_leaves_the_others(coordinator: Coordinator) -> None:
+async def test_gc_takes_old_finished_runs_and_leaves_the_others(coordinator: Coordinator) -> None:
     blobs = BlobStore(coordinator.state / "blobs")
 
-    async def scenario() -> None:
-        kept, gone = bundle_of("open policy").digest, bundle_of("old policy").digest
-        async with working(coordinator, play=by_digest) as worker:
-            while not worker.session:
-                await asyncio.sleep(0.01)
-            for data in (trajectory_of(kept), trajectory_of(gone)):
-                await worker.ask.upload(worker.name, worker.session, digest_of(data), data)
-            old = await whole_run(coordinator, "old", "old policy")
-            async with operator_of(coordinator) as operator:
-                created = await operator.create(key="open", n_validation=2, n_heldout=2)
-                async with gateway_of(coordinator, created) as gateway:
-                    await gateway.submit(bundle_of("open policy"), tuple(range(8)), "k")
-                    await gateway.results(0)
-                    fresh = disk_use.collect(coordinator.state, WEEK_S)
-                    assert (fresh.runs, fresh.episodes, fresh.blobs) == (0, 0, 0)
-                    later = time.time() + WEEK_S + 3600.0
-                    planned = disk_use.collect(coordinator.state, WEEK_S, now=later, dry_run=True)
-                    assert blobs.has(gone)
-                    done = await asyncio.to_thread(disk_use.collect, coordinator.state, WEEK_S, now=later)
-                    assert (done.runs, done.blobs, done.bytes) == (planned.runs, planned.blobs, planned.bytes)
-                    # 8 train, 2 validation, 2 held-out, 2 random.
-                    assert (done.runs, done.episodes, done.blobs, done.shrunk) == (1, 14, 2, False)
-                    assert blobs.has(kept)
-                    assert blobs.has(digest_of(trajectory_of(kept)))
-                    assert not blobs.has(gone)
-                    assert not blobs.has(digest_of(trajectory_of(gone)))
-                    # The outcome stays known, and the open run goes on.
-                    assert (await operator.finished(old)).status == "completed"
-                    episodes, _ = await gateway.results(0)
-                    assert len(episodes) == 8
-                    await gateway.submit(bundle_of("open policy"), (0,), "k1")
-                    await gateway.results(1)
-                    await gateway.close()
-                assert (await operator.finished(created.run)).status == "completed"
-
-    run(scenario)
+    kept, gone = bundle_of("open policy").digest, bundle_of("old policy").digest
+    async with working(coordinator, play=by_digest) as worker:
+        while not worker.session:
+            await asyncio.sleep(0.01)
+        for data in (trajectory_of(kept), trajectory_of(gone)):
+            await worker.ask.upload(worker.name, worker.session, digest_of(data), data)
+        old = await whole_run(coordinator, "old", "old policy")
+        async with operator_of(coordinator) as operator:
+            created = await operator.create(key="open", n_validation=2, n_heldout=2)
+            async with gateway_of(coordinator, created) as gateway:
+                await gateway.submit(bundle_of("open policy"), tuple(range(8)), "k")
+                await gateway.results(0)
+                fresh = disk_use.collect(coordinator.state, WEEK_S)
+                assert (fresh.runs, fresh.episodes, fresh.blobs) == (0, 0, 0)
+                later = time.time() + WEEK_S + 3600.0
+                planned = disk_use.collect(coordinator.state, WEEK_S, now=later, dry_run=True)
+                assert blobs.has(gone)
+                done = await asyncio.to_thread(disk_use.collect, coordinator.state, WEEK_S, now=later)
+                assert (done.runs, done.blobs, done.bytes) == (planned.runs, planned.blobs, planned.bytes)
+                # 8 train, 2 validation, 2 held-out, 2 random.
+                assert (done.runs, done.episodes, done.blobs, done.shrunk) == (1, 14, 2, False)
+                assert blobs.has(kept)
+                assert blobs.has(digest_of(trajectory_of(kept)))
+                assert not blobs.has(gone)
+                assert not blobs.has(digest_of(trajectory_of(gone)))
+                # The outcome stays known, and the open run goes on.
+                assert (await operator.finished(old)).status == "completed"
+                episodes, _ = await gateway.results(0)
+                assert len(episodes) == 8
+                await gateway.submit(bundle_of("open policy"), (0,), "k1")
+                await gateway.results(1)
+                await gateway.close()
+            assert (await operator.finished(created.run)).status == "completed"
     assert coordinator.stop() == 0
     assert disk_use.collect(coordinator.state, 0.0).shrunk
     assert Coordinator(coordinator.state).stop() == 0
@@ -182,12 +179,9 @@ def test_a_blob_that_nothing_names_goes_once_it_is_old(coordinator: Coordinator)
     assert not blobs.has(digest)
 
 
-def test_disk_tells_what_runs_take_and_whether_a_sweep_fits(coordinator: Coordinator) -> None:
-    async def scenario() -> None:
-        async with working(coordinator):
-            await whole_run(coordinator, "one", "a policy")
-
-    run(scenario)
+async def test_disk_tells_what_runs_take_and_whether_a_sweep_fits(coordinator: Coordinator) -> None:
+    async with working(coordinator):
+        await whole_run(coordinator, "one", "a policy")
     (found,) = disk_use.use(coordinator.state)
     assert (found.env, found.runs, found.train_episodes) == ("toy/line", 1, 8)
     assert found.bytes > 8 * 100

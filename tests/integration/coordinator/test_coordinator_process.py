@@ -18,7 +18,7 @@ from pathlib import Path
 
 import msgspec
 import pytest
-from coordinator_harness import TIMEOUT_S, Coordinator, bundle_of, gateway_of, operator_of, run, working
+from coordinator_harness import TIMEOUT_S, Coordinator, bundle_of, gateway_of, operator_of, working
 
 from evopolicy_common.errors import RefusedError
 from evopolicy_common.wire import credentials
@@ -52,14 +52,11 @@ def test_ready_file_tells_where_to_connect_and_goes_with_the_process(coordinator
     assert not coordinator.ready_file.exists()
 
 
-def test_a_state_that_no_core_loads_ends_the_process(coordinator: Coordinator) -> None:
-    async def scenario() -> None:
-        async with operator_of(coordinator) as operator:
-            created = await operator.create()
-            async with gateway_of(coordinator, created) as gateway:
-                await gateway.submit(bundle_of("policy"), (0, 1), "k")
-
-    run(scenario)
+async def test_a_state_that_no_core_loads_ends_the_process(coordinator: Coordinator) -> None:
+    async with operator_of(coordinator) as operator:
+        created = await operator.create()
+        async with gateway_of(coordinator, created) as gateway:
+            await gateway.submit(bundle_of("policy"), (0, 1), "k")
     assert coordinator.stop() == 0
     with contextlib.closing(sqlite3.connect(coordinator.state / "coordinator.sqlite")) as database:
         ((data,),) = database.execute("SELECT data FROM runs")
@@ -93,10 +90,12 @@ def test_commands_of_the_same_user_find_the_cluster_by_its_endpoint(
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_signal_ends_it_in_good_order_also_while_others_wait_for_it(tmp_path: Path, number: int) -> None:
+async def test_signal_ends_it_in_good_order_also_while_others_wait_for_it(
+    tmp_path: Path, number: int
+) -> None:
     coordinator = Coordinator(tmp_path / "state")
 
-    async def scenario() -> None:
+    try:
         async with operator_of(coordinator) as operator, working(coordinator):
             created = await operator.create()
             waiting = asyncio.create_task(operator.progress(created.run, 30))
@@ -106,9 +105,6 @@ def test_signal_ends_it_in_good_order_also_while_others_wait_for_it(tmp_path: Pa
             waiting.cancel()
             with contextlib.suppress(asyncio.CancelledError):
                 await waiting
-
-    try:
-        run(scenario)
     finally:
         coordinator.kill()
     assert "everything is on disk" in coordinator.log.read_text()
@@ -162,7 +158,7 @@ def test_damaged_database_is_reported_and_not_overwritten(tmp_path: Path) -> Non
     assert (state / "coordinator.sqlite").read_bytes() == damaged
 
 
-def test_splits_come_from_the_data_folder_where_one_is_named(tmp_path: Path) -> None:
+async def test_splits_come_from_the_data_folder_where_one_is_named(tmp_path: Path) -> None:
     folder = tmp_path / "data" / "toy_line"
     folder.mkdir(parents=True)
     for stem, seeds in (("train", [1, 2]), ("valid", [3]), ("heldout", [4, 5])):
@@ -170,7 +166,7 @@ def test_splits_come_from_the_data_folder_where_one_is_named(tmp_path: Path) -> 
         (folder / f"{stem}.json").write_text(json.dumps({"env": "toy/line", "split": stem, "cases": cases}))
     coordinator = Coordinator(tmp_path / "state", "--data", str(tmp_path / "data"))
 
-    async def scenario() -> None:
+    try:
         async with operator_of(coordinator) as operator, working(coordinator) as worker:
             created = await operator.create()
             async with gateway_of(coordinator, created) as gateway:
@@ -186,67 +182,58 @@ def test_splits_come_from_the_data_folder_where_one_is_named(tmp_path: Path) -> 
                 with pytest.raises(RefusedError) as refused:
                     await operator.create(f"wrong {settings}", **settings)
                 assert refused.value.status == "invalid_settings"
-
-    try:
-        run(scenario)
     finally:
         coordinator.kill()
 
 
-def test_a_full_disk_refuses_new_work_and_loses_nothing(coordinator: Coordinator) -> None:
+async def test_a_full_disk_refuses_new_work_and_loses_nothing(coordinator: Coordinator) -> None:
     """The disk is made full for the running process by a limit on the size of its files."""
 
-    async def scenario() -> None:
-        pid = coordinator.process.pid
-        unlimited = resource.prlimit(pid, resource.RLIMIT_FSIZE)
-        async with operator_of(coordinator) as operator, working(coordinator) as worker:
-            created = await operator.create(budget=64)
-            async with gateway_of(coordinator, created) as gateway:
-                await gateway.submit(bundle_of("# one"), tuple(range(8)), "before")
-                await gateway.results(0)
-                worker.hold.clear()
-                second = bundle_of("# two")
-                await gateway.submit(second, tuple(range(8)), "held")
-                wal = coordinator.state / "coordinator.sqlite-wal"
-                resource.prlimit(pid, resource.RLIMIT_FSIZE, (wal.stat().st_size, unlimited[1]))
-                worker.hold.set()
-                # "busy" until the results that are reported meet the full disk.
-                while (
-                    refused := await refusal(gateway.submit_digest(second.digest, (0,), "during"))
-                ).status == "busy":
-                    await asyncio.sleep(0.02)
-                assert refused.status == "unavailable"
-                assert "cannot write its store" in refused.message
-                status = await operator.status()
-                assert "accepts no changes until it can: " in status.trouble
-                assert [run.run for run in status.runs] == [created.run]
-                resource.prlimit(pid, resource.RLIMIT_FSIZE, unlimited)
-                episodes, done = await gateway.results(1)
-                assert (len(episodes), done.status) == (8, "ok")
-                while (await gateway.state()).n_submits < 3:
-                    with contextlib.suppress(RefusedError):
-                        await gateway.submit_digest(second.digest, (0,), "during")
-                assert (await gateway.state()).remaining_budget == 64 - 17
-
-    run(scenario)
+    pid = coordinator.process.pid
+    unlimited = resource.prlimit(pid, resource.RLIMIT_FSIZE)
+    async with operator_of(coordinator) as operator, working(coordinator) as worker:
+        created = await operator.create(budget=64)
+        async with gateway_of(coordinator, created) as gateway:
+            await gateway.submit(bundle_of("# one"), tuple(range(8)), "before")
+            await gateway.results(0)
+            worker.hold.clear()
+            second = bundle_of("# two")
+            await gateway.submit(second, tuple(range(8)), "held")
+            wal = coordinator.state / "coordinator.sqlite-wal"
+            resource.prlimit(pid, resource.RLIMIT_FSIZE, (wal.stat().st_size, unlimited[1]))
+            worker.hold.set()
+            # "busy" until the results that are reported meet the full disk.
+            while (
+                refused := await refusal(gateway.submit_digest(second.digest, (0,), "during"))
+            ).status == "busy":
+                await asyncio.sleep(0.02)
+            assert refused.status == "unavailable"
+            assert "cannot write its store" in refused.message
+            status = await operator.status()
+            assert "accepts no changes until it can: " in status.trouble
+            assert [run.run for run in status.runs] == [created.run]
+            resource.prlimit(pid, resource.RLIMIT_FSIZE, unlimited)
+            episodes, done = await gateway.results(1)
+            assert (len(episodes), done.status) == (8, "ok")
+            while (await gateway.state()).n_submits < 3:
+                with contextlib.suppress(RefusedError):
+                    await gateway.submit_digest(second.digest, (0,), "during")
+            assert (await gateway.state()).remaining_budget == 64 - 17
     assert "the store cannot write" in coordinator.log.read_text()
     assert coordinator.stop() == 0
 
 
-def test_coordinator_hears_at_once_of_a_worker_that_is_gone(tmp_path: Path) -> None:
+async def test_coordinator_hears_at_once_of_a_worker_that_is_gone(tmp_path: Path) -> None:
     coordinator = Coordinator(tmp_path / "state", "--log-level", "debug")
-
-    async def scenario() -> None:
-        async with working(coordinator, "w-1") as worker:
-            worker.declare_alive()
-            await seen('"worker": "w-1", "alive": true')
-        await seen('"worker": "w-1", "alive": false')
 
     async def seen(text: str) -> None:
         while text not in coordinator.log.read_text():
             await asyncio.sleep(0.02)
 
     try:
-        run(scenario)
+        async with working(coordinator, "w-1") as worker:
+            worker.declare_alive()
+            await seen('"worker": "w-1", "alive": true')
+        await seen('"worker": "w-1", "alive": false')
     finally:
         coordinator.kill()

@@ -23,7 +23,6 @@ from coordinator_harness import (
     bundle_of,
     comparable,
     operator_of,
-    run,
 )
 from machines.own_certs import DAYS, OwnCerts, now, of
 
@@ -169,7 +168,7 @@ async def test_machines_reconnect_after_an_issue_or_a_restart(certs: OwnCerts) -
 
 
 @pytest.mark.slow  # until the certificate is over, and the leases
-def test_a_worker_goes_on_with_a_renewed_certificate_in_a_run(
+async def test_a_worker_goes_on_with_a_renewed_certificate_in_a_run(
     certs: OwnCerts, coordinator: Coordinator
 ) -> None:
     boss = certs.issue("operator", "boss")
@@ -177,7 +176,7 @@ def test_a_worker_goes_on_with_a_renewed_certificate_in_a_run(
     log = certs.root / "worker.log"
     arguments = ("--env", "toy/line", "--slots", "1", "--unsandboxed", "--credentials", str(machine))
 
-    async def scenario() -> None:
+    with process(log, "evopolicy_worker.cli", *arguments) as worker:
         async with operators(boss) as operator:
             created = await operator.create(sandbox_tier="none")
             async with connect(of(boss, "gateway"), timeout_s=TIMEOUT_S) as link:
@@ -195,9 +194,6 @@ def test_a_worker_goes_on_with_a_renewed_certificate_in_a_run(
                 assert len(episodes) == len(IDS)
                 await gateway.close()
             assert (await operator.finished(created.run)).status == "completed"
-
-    with process(log, "evopolicy_worker.cli", *arguments) as worker:
-        run(scenario, 150)
         assert worker.poll() is None
     assert "renewed credentials are in use" in log.read_text()
 
