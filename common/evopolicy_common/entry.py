@@ -8,27 +8,8 @@ from __future__ import annotations
 import importlib
 import os
 import signal
+from functools import partial
 from types import FrameType
-
-
-def evopolicy() -> None:
-    """`evopolicy`."""
-    _start("evopolicy_gateway.cli.main", "main")
-
-
-def coordinator() -> None:
-    """`evopolicy-coordinator`."""
-    _start("evopolicy_coordinator.cli", "program")
-
-
-def gateway() -> None:
-    """`evopolicy-gateway`."""
-    _start("evopolicy_gateway.cli", "gateway_program")
-
-
-def worker() -> None:
-    """`evopolicy-worker`."""
-    _start("evopolicy_worker.cli", "main")
 
 
 def interruptible() -> None:
@@ -47,3 +28,10 @@ def _interrupted(_: int, __: FrameType | None) -> None:
     # No exception: an import may swallow it, and there is nothing yet to clean up.
     os.write(2, b"error: interrupted\n")
     os._exit(130)
+
+
+evopolicy = partial(_start, "evopolicy_gateway.cli.main", "main")
+coordinator = partial(_start, "evopolicy_coordinator.cli", "program")
+gateway = partial(_start, "evopolicy_gateway.cli", "gateway_program")
+worker = partial(_start, "evopolicy_worker.cli", "main")
+"""The programs: `evopolicy` and, with a hyphen after it, the others."""

@@ -24,39 +24,14 @@ from typing import Any
 import msgspec
 
 from evopolicy_common.catalogue import worlds
-from evopolicy_common.catalogue.definition import (
-    USUAL_STEPS,
-    Entry,
-    Wrapper,
-    earlier_folder_name,
-    folder_name,
-    read_file,
-    valid_id,
-)
+from evopolicy_common.catalogue.definition import USUAL_STEPS as USUAL_STEPS
+from evopolicy_common.catalogue.definition import Entry as Entry
+from evopolicy_common.catalogue.definition import Wrapper as Wrapper
+from evopolicy_common.catalogue.definition import earlier_folder_name as earlier_folder_name
+from evopolicy_common.catalogue.definition import folder_name as folder_name
+from evopolicy_common.catalogue.definition import read_file
+from evopolicy_common.catalogue.definition import valid_id as valid_id
 from evopolicy_common.errors import ConfigError
-
-__all__ = [
-    "USUAL_STEPS",
-    "Entry",
-    "Suite",
-    "Wrapper",
-    "add",
-    "digests",
-    "earlier_folder_name",
-    "entries",
-    "entry",
-    "families",
-    "folder_name",
-    "is_shipped",
-    "known",
-    "near",
-    "pinned",
-    "resolve",
-    "source_of",
-    "suite_of",
-    "suites",
-    "valid_id",
-]
 
 ENTRY_POINTS = "evopolicy.environments"
 """Entry point group of packages that offer environments: `name = "package:FILE.toml"`, an environment file in it."""
