@@ -22,21 +22,7 @@ from evopolicy_results.code.sources import MAX_FILE_BYTES, parsed
 from evopolicy_results.scan.constants import dynamics_constants
 from evopolicy_results.scan.signals import Kind, Signal, signal
 
-_NETWORK = frozenset(
-    {
-        "socket",
-        "urllib",
-        "http",
-        "requests",
-        "httpx",
-        "aiohttp",
-        "ftplib",
-        "smtplib",
-        "websocket",
-        "websockets",
-        "paramiko",
-    }
-)
+_NETWORK = re.compile("socket|urllib|http|requests|httpx|aiohttp|ftplib|smtplib|websockets?|paramiko")
 _SIMULATORS = frozenset(SIMULATORS) | {
     *("brax", "gymnax", "pymunk", "jumanji", "mujoco_mjx", "envpool", "safety_gymnasium")
 }
@@ -52,13 +38,12 @@ def code_signals(index: int, files: Mapping[str, bytes], env: str = "") -> Itera
     """Signals of one checkpoint (files by path). Numbers of the dynamics are searched if `env` is given."""
     for path, source in files.items():
         if path.endswith(".py"):
-            for one in file_signals(f"system/{path}", source, env):
-                yield msgspec.structs.replace(one, submits=(index,))
+            yield from file_signals(f"system/{path}", source, env, (index,))
 
 
-def file_signals(path: str, source: bytes, env: str) -> tuple[Signal, ...]:
+def file_signals(path: str, source: bytes, env: str, submits: tuple[int, ...] = ()) -> list[Signal]:
     """Signals of one file."""
-    return tuple(msgspec.structs.replace(one, path=path) for one in _signals_in(source, env))
+    return [msgspec.structs.replace(one, path=path, submits=submits) for one in _signals_in(source, env)]
 
 
 @lru_cache(maxsize=128)
@@ -88,7 +73,7 @@ def _module(nodes: Sequence[ast.AST], lines: list[str], env: str) -> Iterator[Si
     hashed, numbers = _tainted(assigned)
     for node in nodes:
         for name in _imports(node):
-            if name in _NETWORK:
+            if _NETWORK.fullmatch(name):
                 yield at("network", node, f"imports {name}")
             elif name in _SIMULATORS:
                 yield at("simulator", node, f"imports {name}")
@@ -127,15 +112,11 @@ def _is_digest(value: object) -> bool:
 
 def _lookup(node: ast.AST) -> tuple[ast.expr, ast.expr] | None:
     """The table and the key of a lookup that reads: `table[key]`, `table.get(key)`, `key in table` is none."""
-    if isinstance(node, ast.Subscript) and isinstance(node.ctx, ast.Load):
-        return node.value, node.slice
-    if (
-        isinstance(node, ast.Call)
-        and isinstance(node.func, ast.Attribute)
-        and node.func.attr == "get"
-        and node.args
-    ):
-        return node.func.value, node.args[0]
+    match node:
+        case ast.Subscript(value=table, slice=key, ctx=ast.Load()):
+            return table, key
+        case ast.Call(func=ast.Attribute(value=table, attr="get"), args=[key, *_]):
+            return table, key
     return None
 
 
@@ -176,12 +157,8 @@ def _tainted(assigned: Sequence[tuple[str, ast.expr]]) -> tuple[frozenset[str], 
 
 def _is_episodes(value: ast.expr) -> bool:
     """Whether a literal holds several sequences, each long enough to be an episode's actions."""
-    members = (
-        value.values
-        if isinstance(value, ast.Dict)
-        else value.elts
-        if isinstance(value, ast.List | ast.Tuple)
-        else []
-    )
+    members: Sequence[ast.expr] = ()
+    if isinstance(value, ast.Dict | ast.List | ast.Tuple):
+        members = value.values if isinstance(value, ast.Dict) else value.elts
     long = (isinstance(each, ast.List | ast.Tuple) and len(each.elts) >= _FEWEST_STEPS for each in members)
     return sum(long) >= 2

@@ -134,9 +134,7 @@ def _sequences(path: str, data: bytes) -> Iterator[list[float]]:
     if path.endswith(".py"):
         for node in parsed(data):
             if isinstance(node, ast.List | ast.Tuple) and len(node.elts) * 8 >= _WINDOW:
-                numbers = _numbers(node)
-                if len(numbers) >= _WINDOW:
-                    yield numbers
+                yield from (numbers for numbers in _arrays(_literal(node)) if len(numbers) >= _WINDOW)
     elif path.endswith(".json"):
         try:
             yield from _arrays(json.loads(data))
@@ -161,22 +159,14 @@ def _sequences(path: str, data: bytes) -> Iterator[list[float]]:
             yield numbers
 
 
-def _numbers(node: ast.expr) -> list[float]:
-    found: list[float] = []
-    queue: list[ast.expr] = [node]
-    while queue:
-        one = queue.pop()
-        if isinstance(one, ast.List | ast.Tuple):
-            queue += reversed(one.elts)
-        elif isinstance(one, ast.UnaryOp) and isinstance(one.op, ast.USub):
-            inner = one.operand
-            if isinstance(inner, ast.Constant) and isinstance(inner.value, int | float):
-                found.append(_rounded(-inner.value))
-        elif isinstance(one, ast.Constant) and isinstance(one.value, int | float):
-            found.append(_rounded(one.value))
-        if len(found) > _MAX_NUMBERS:
-            break
-    return found
+def _literal(node: ast.expr) -> Any:
+    """A literal's lists of numbers, with None in place of everything else."""
+    if isinstance(node, ast.List | ast.Tuple):
+        return [_literal(each) for each in node.elts]
+    is_negative = isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub)
+    number = node.operand if isinstance(node, ast.UnaryOp) and is_negative else node
+    value = number.value if isinstance(number, ast.Constant) else None
+    return (-1 if is_negative else 1) * value if isinstance(value, int | float) else None
 
 
 def _arrays(value: Any) -> Iterator[list[float]]:

@@ -66,28 +66,20 @@ def log_signals(lines: Iterable[bytes]) -> Iterator[Signal]:
 
 def _calls(value: dict[str, Any]) -> Iterator[str]:
     """The commands and code that an event had a tool run."""
-    kind = value.get("type")
-    item = value.get("item")
-    if kind == "assistant":
-        message = value.get("message")
-        content = message.get("content") if isinstance(message, dict) else None
-        for block in content if isinstance(content, list) else ():
-            if isinstance(block, dict) and block.get("type") == "tool_use":
-                arguments = block.get("input")
-                if isinstance(arguments, dict):
-                    yield from (
-                        text
-                        for name in ("command", "url", "file_path", "path")
-                        if isinstance(text := arguments.get(name), str)
-                    )
-    elif kind in ("item.completed", "item.started") and isinstance(item, dict):
-        command = item.get("command")
-        if isinstance(command, str):
+    match value:
+        case {"type": "assistant", "message": {"content": [*blocks]}}:
+            for block in blocks:
+                match block:
+                    case {"type": "tool_use", "input": {**arguments}}:
+                        found = map(arguments.get, ("command", "url", "file_path", "path"))
+                        yield from (text for text in found if isinstance(text, str))
+        case {"type": "item.completed" | "item.started", "item": {"command": [*words]}}:
+            yield " ".join(text for text in words if isinstance(text, str))
+        case {"type": "item.completed" | "item.started", "item": {"command": str(command)}} | {
+            "type": "command",
+            "command": str(command),
+        }:
             yield command
-        elif isinstance(command, list):
-            yield " ".join(text for text in command if isinstance(text, str))
-    elif kind == "command" and isinstance(value.get("command"), str):
-        yield value["command"]
 
 
 def _command(text: str, line: int) -> Iterator[Signal]:
@@ -130,7 +122,5 @@ def _line_of(text: str, at: int) -> str:
     """The line of the command that holds position `at`."""
     # A match may begin with the line's end before it.
     start = text.rfind("\n", 0, at + 1) + 1
-    if start > at:
-        at = start
-    end = text.find("\n", at + 1)
+    end = text.find("\n", max(at, start) + 1)
     return text[start : len(text) if end < 0 else end].strip()

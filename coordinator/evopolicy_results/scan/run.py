@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -66,11 +67,10 @@ def _kept(checkpoints: Iterable[tuple[int, Files]]) -> list[tuple[int, Files]]:
     for index, files in checkpoints:
         searched: dict[str, bytes] = {}
         for path, data in files.items():
-            if not path.endswith(_SEARCHED) or (data not in contents and len(data) > left):
-                continue
-            if data not in contents:
-                left -= len(data)
-            searched[path] = contents.setdefault(data, data)
+            new = 0 if data in contents else len(data)
+            if path.endswith(_SEARCHED) and new <= left:
+                left -= new
+                searched[path] = contents.setdefault(data, data)
         kept.append((index, searched))
     return kept
 
@@ -128,11 +128,9 @@ def feedback_actions(submit: Path) -> Iterator[list[Any]]:
             if path.stat().st_size > _MAX_LOG_BYTES:
                 continue
             with open_regular(path) as lines:
-                for line in lines:
-                    actions.append(_rows.decode(line).action)
+                for line in itertools.islice(lines, left):
                     left -= 1
-                    if left <= 0:
-                        break
+                    actions.append(_rows.decode(line).action)
         except (OSError, *DECODE_ERRORS):
             continue
         yield actions

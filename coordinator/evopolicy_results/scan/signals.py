@@ -43,13 +43,8 @@ class Signal(msgspec.Struct, frozen=True, kw_only=True):
     @property
     def place(self) -> str:
         """File and line. The path of a log has its line already."""
-        return (
-            self.path
-            if self.path.startswith("logs/")
-            else f"{self.path}:{self.line}"
-            if self.line
-            else self.path
-        )
+        has_line = self.line and not self.path.startswith("logs/")
+        return f"{self.path}:{self.line}" if has_line else self.path
 
 
 def signal(kind: Kind, path: str, line: int, reason: str, quote: str, submits: Sequence[int] = ()) -> Signal:

@@ -47,27 +47,28 @@ class Evolution(msgspec.Struct, frozen=True, kw_only=True):
     to_80: int | None
 
 
-def curve(run: Run) -> tuple[CurvePoint, ...]:
-    """The run's steps, one per score-bearing submit."""
-    return tuple(
-        CurvePoint(index=t.index, consumed=t.consumed, val_mean=t.val_mean, best=t.best, improved=t.hit)
-        for t in classify(run.submits)
-    )
-
-
 def evolutions(runs: Iterable[Run], references: Mapping[str, float]) -> list[Evolution]:
     """Every run's curve, environments in catalogue order, then by entry and run.
 
     `references`: by environment, the mean return of the random reference, if known.
     """
-    by_env: dict[str, list[tuple[Run, tuple[CurvePoint, ...]]]] = {}
+    by_env: dict[str, list[Run]] = {}
     for run in runs:
-        by_env.setdefault(run.env, []).append((run, curve(run)))
+        by_env.setdefault(run.env, []).append(run)
     out: list[Evolution] = []
     for env in ordered_environments(by_env):
-        group = sorted(by_env[env], key=lambda pair: (pair[0].entry.casefold(), pair[0].name))
-        base, top = scale([steps for _, steps in group], references.get(env))
-        for run, steps in group:
+        group = sorted(by_env[env], key=lambda run: (run.entry.casefold(), run.name))
+        curves = [
+            tuple(
+                CurvePoint(
+                    index=t.index, consumed=t.consumed, val_mean=t.val_mean, best=t.best, improved=t.hit
+                )
+                for t in classify(run.submits)
+            )
+            for run in group
+        ]
+        base, top = scale(curves, references.get(env))
+        for run, steps in zip(group, curves, strict=True):
             out.append(
                 Evolution(
                     run=run.name,

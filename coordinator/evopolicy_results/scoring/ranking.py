@@ -88,15 +88,8 @@ class Leaderboard(msgspec.Struct, frozen=True, kw_only=True):
 
 def competition_ranks(values: Mapping[str, float | None]) -> dict[str, int]:
     """Descending ranks from 1; equal values share the better rank, None ranks below every number."""
-    return {
-        name: 1 + sum(_above(other, value) for other in values.values()) for name, value in values.items()
-    }
-
-
-def _above(other: float | None, value: float | None) -> bool:
-    if other is None:
-        return False
-    return value is None or other > value
+    known = {name: (value is not None, value or 0.0) for name, value in values.items()}
+    return {name: 1 + sum(other > own for other in known.values()) for name, own in known.items()}
 
 
 def rank_score(rank: int, n: int) -> float | None:
@@ -106,12 +99,31 @@ def rank_score(rank: int, n: int) -> float | None:
 
 def leaderboard(table: ScoreTable) -> Leaderboard:
     """Ranks `table` as one suite."""
-    played = {entry: {env for e, env in table.cells if e == entry} for entry in table.entries}
+    played = {entry: [env for e, env in table.cells if e == entry] for entry in table.entries}
     ranked = [entry for entry in table.entries if len(played[entry]) == len(table.environments)]
     cells = _rank_cells(table, ranked)
-    suite_scores = {entry: _mean(_scores(cells, table, entry)) for entry in ranked}
-    ranks = competition_ranks(suite_scores)
-    standings = [_standing(table, cells, entry, suite_scores[entry], ranks[entry]) for entry in ranked]
+    own = {entry: [cells[entry, env] for env in table.environments] for entry in ranked}
+    scores = {entry: _mean([cell.score for cell in found]) for entry, found in own.items()}
+    standings = []
+    for entry, rank in competition_ranks(scores).items():
+        families: dict[str, list[float | None]] = {}
+        for cell in own[entry]:
+            families.setdefault(family_of(cell.env), []).append(cell.score)
+        places = [cell.rank for cell in own[entry] if cell.score is not None and cell.mean is not None]
+        standings.append(
+            Standing(
+                entry=entry,
+                harness=table.harness[entry],
+                is_reference=entry == table.reference,
+                families={family: _mean(values) for family, values in families.items()},
+                score=scores[entry],
+                wins=places.count(1),
+                top2=places.count(1) + places.count(2),
+                n_environments=len(own[entry]),
+                n_runs=sum(cell.n_runs for cell in own[entry]),
+                rank=rank,
+            )
+        )
     standings.sort(key=lambda row: (row.rank, row.is_reference, row.entry.casefold(), row.entry))
     incomplete = tuple(
         Incomplete(
@@ -148,37 +160,7 @@ def _rank_cells(table: ScoreTable, ranked: Sequence[str]) -> dict[tuple[str, str
     return out
 
 
-def _scores(cells: Mapping[tuple[str, str], CellResult], table: ScoreTable, entry: str) -> list[float | None]:
-    return [cells[entry, env].score for env in table.environments]
-
-
 def _mean(values: Sequence[float | None]) -> float | None:
     """The mean, rounded to remove float differences of equal rank sums, so that equal standings stay ties."""
     known = [value for value in values if value is not None]
     return round(fmean(known), 12) if known else None
-
-
-def _standing(
-    table: ScoreTable,
-    cells: Mapping[tuple[str, str], CellResult],
-    entry: str,
-    score: float | None,
-    rank: int,
-) -> Standing:
-    own = [cells[entry, env] for env in table.environments]
-    families: dict[str, list[float | None]] = {}
-    for cell in own:
-        families.setdefault(family_of(cell.env), []).append(cell.score)
-    scored = [cell for cell in own if cell.score is not None and cell.mean is not None]
-    return Standing(
-        entry=entry,
-        harness=table.harness[entry],
-        is_reference=entry == table.reference,
-        families={family: _mean(values) for family, values in families.items()},
-        score=score,
-        wins=sum(cell.rank == 1 for cell in scored),
-        top2=sum(cell.rank in (1, 2) for cell in scored),
-        n_environments=len(own),
-        n_runs=sum(cell.n_runs for cell in own),
-        rank=rank,
-    )

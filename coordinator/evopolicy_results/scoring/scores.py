@@ -92,7 +92,9 @@ def score_table(runs: Iterable[Run]) -> ScoreTable:
     while name in harness:  # an operator may have given an agent this name
         name += " (reference)"
     cells = {
-        key: Cell(entry=key[0], env=key[1], scores=tuple(sorted(found, key=_none_first)))
+        key: Cell(
+            entry=key[0], env=key[1], scores=tuple(sorted(found, key=lambda one: (one is not None, one)))
+        )
         for key, found in scores.items()
     }
     for env, mean in reference.items():
@@ -130,10 +132,6 @@ def _one_mean(values: Iterable[float]) -> float:
     """The mean; exactly the common value if all are equal."""
     found = list(values)
     return found[0] if len(set(found)) == 1 else fmean(found)
-
-
-def _none_first(score: float | None) -> float:
-    return -math.inf if score is None else score
 
 
 def read_score_csv(text: str, *, source: str = "the CSV") -> ScoreTable:
