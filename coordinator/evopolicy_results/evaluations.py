@@ -1,25 +1,53 @@
-"""Evaluations on a cluster for the commands on finished runs: requests, outcomes with progress, and the workers'
-versions."""
+"""The replay client of the commands on finished runs: requests, outcomes with progress, and the workers' versions."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import random
 import time
-from collections.abc import AsyncIterator, Callable
+import uuid
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+
+import msgspec
 
 from evopolicy_common.errors import BrokenEnvironmentError
-from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome
-from evopolicy_common.messages.operator import DescribeEnvironment, EnvironmentState, Evaluate, Rescore
+from evopolicy_common.messages.environment import Split
+from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome, Record, ResourceLimits, Tier
+from evopolicy_common.messages.operator import (
+    DescribeEnvironment,
+    EnvironmentState,
+    Evaluate,
+    PlayedAs,
+    Rescore,
+)
+from evopolicy_common.messages.run_settings import RunSettings
 from evopolicy_common.records.blobs import digest_of
 from evopolicy_common.records.episodes.rendered import decode
 from evopolicy_common.records.episodes.trajectory import Trajectory
+from evopolicy_common.records.policies.bundles import Bundle
+from evopolicy_common.records.run_record import ExperimentDimensions
 from evopolicy_common.wire.operator_client import DESCRIPTION_S, OperatorClient
 from evopolicy_common.wire.transport import Link
 
 Tell = Callable[[int, str], None]
 """Called with the number of finished episodes and what the cluster waits for (empty: nothing)."""
+RANDOM = -1
+"""Submit index of the random reference."""
 _WORKER_PAUSE_S = 0.3
+
+
+class Cases(msgspec.Struct, frozen=True, kw_only=True):
+    """A list of cases that one policy played: a submit's, or a checkpoint's hidden ones."""
+
+    split: Split
+    submit_index: int
+    """`RANDOM` for the random reference."""
+    env_instances: tuple[int, ...]
+    """Ids in the split, in order."""
+    modulo: int
+    """Number of episodes of the policy's own submit."""
+    remaining_budget_after: int
 
 
 class Evaluations:
@@ -42,14 +70,63 @@ class Evaluations:
                 if outcome is not None:
                     yield outcome
 
+    async def replayed(
+        self,
+        cases: Cases,
+        indexes: Sequence[int],
+        *,
+        env: str,
+        conditions: ExperimentDimensions | RunSettings,
+        actions: Sequence[bytes] = (),
+        bundle: Bundle | None = None,
+        record: Record = "actions",
+        run: str = "",
+        tier: Tier = "bwrap",
+        limits: ResourceLimits | None = None,
+    ) -> AsyncIterator[tuple[int, EpisodeOutcome | None]]:
+        """Plays some of a list's episodes again, by recorded `actions` (trajectories, one for each index) or with the
+        policy of `bundle`. Yields each index with its outcome as it arrives, then those that have none. `run`: the
+        coordinator's id, for the policies' random seeds."""
+        for data in actions:
+            await self.ask.upload(digest_of(data), data)
+        if bundle is not None:
+            await self.ask.upload(bundle.digest, bundle.packed)
+        is_random = cases.submit_index == RANDOM
+        message = Evaluate(
+            token="",
+            key=uuid.uuid4().hex,
+            env=env,
+            bundle=None if bundle is None else bundle.digest,
+            split=cases.split,
+            cases=tuple(cases.env_instances[index] for index in indexes),
+            record=record,
+            sandbox_tier=tier,
+            limits=limits or ResourceLimits(),
+            replays=tuple(BlobRef(digest=digest_of(data), size=len(data)) for data in actions),
+            step_limit=conditions.step_limit,
+            as_in=PlayedAs(
+                run=run,
+                submit_index=cases.submit_index,
+                env_instances=cases.env_instances,
+                indexes=tuple(indexes),
+                modulo=cases.modulo,
+                remaining_budget_after=cases.remaining_budget_after,
+                policy_scope=conditions.policy_scope,
+                # Random actions had no policy that could receive lists, and are recorded as arrays.
+                observations="arrays" if is_random else conditions.observations,
+                failed_episodes=conditions.failed_episodes,
+                hidden_evaluation=conditions.hidden_evaluation,
+            ),
+        )
+        left = dict(enumerate(indexes))
+        async for outcome in self.outcomes(message):
+            yield left.pop(outcome.index), outcome
+        for index in left.values():
+            yield index, None
+
     async def recording(self, outcome: EpisodeOutcome) -> Trajectory:
         assert outcome.trajectory is not None
         return decode(await self.ask.fetch(outcome.trajectory))
-
-    async def uploaded(self, actions: bytes) -> BlobRef:
-        """The reference of uploaded actions, for `Evaluate.replays`."""
-        await self.ask.upload(digest_of(actions), actions)
-        return BlobRef(digest=digest_of(actions), size=len(actions))
 
     async def versions(self, message: DescribeEnvironment, *, wait: bool) -> EnvironmentState:
         """The environment's state, with the versions of the workers that offer it.
@@ -68,3 +145,22 @@ class Evaluations:
                 if message.env in failed:
                     raise BrokenEnvironmentError("; ".join(failed[message.env].values()))
             await asyncio.sleep(_WORKER_PAUSE_S)
+
+
+def unlike(then: Mapping[str, str], here: Mapping[str, str]) -> list[str]:
+    """The versions of two fingerprints that differ, as `numpy 1.0 in the run, 2.0 here`."""
+    return [
+        f"{name} {then.get(name, 'none')} in the run, {here.get(name, 'none')} here"
+        for name in sorted(then.keys() | here.keys())
+        if then.get(name) != here.get(name)
+    ]
+
+
+def sample(sizes: Sequence[int], n: int, seed: int) -> list[tuple[int, tuple[int, ...]]]:
+    """Draws `n` episodes from lists of these sizes without replacement (all if there are fewer): the number of each
+    list that has some, and their indexes in it."""
+    everything = [(k, index) for k, size in enumerate(sizes) for index in range(size)]
+    chosen: dict[int, list[int]] = {}
+    for k, index in sorted(random.Random(seed).sample(everything, min(n, len(everything)))):
+        chosen.setdefault(k, []).append(index)
+    return [(k, tuple(indexes)) for k, indexes in chosen.items()]

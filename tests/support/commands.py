@@ -33,6 +33,11 @@ def submit(body, **headers):
     except urllib.error.HTTPError as error:
         return json.load(error)
 
+def submit_policy(text, body):
+    with open("system/policy.py", "w") as file:
+        file.write(text)
+    return submit(body)
+
 def patient_submit(body, key):
     while True:
         try:
@@ -49,9 +54,9 @@ def agent(folder: Path, code: str) -> str:
     return f"command:{sys.executable} {path}"
 
 
-def evopolicy(cwd: Path, *args: str) -> subprocess.CompletedProcess[str]:
-    """`evopolicy` with these arguments in `cwd`, to its end."""
-    return subprocess.run(
+def evopolicy(cwd: Path, *args: str, code: int | None = None) -> subprocess.CompletedProcess[str]:
+    """`evopolicy` with these arguments in `cwd`, to its end. `code`: the exit code that it has to have."""
+    done = subprocess.run(
         [sys.executable, "-m", "evopolicy_gateway.cli", *args],
         cwd=cwd,
         capture_output=True,
@@ -59,6 +64,13 @@ def evopolicy(cwd: Path, *args: str) -> subprocess.CompletedProcess[str]:
         timeout=300,
         check=False,
     )
+    assert code in (None, done.returncode), done.stdout + done.stderr
+    return done
+
+
+def words(text: str) -> list[str]:
+    """The words of a command line without quotes."""
+    return text.split()
 
 
 @contextlib.contextmanager

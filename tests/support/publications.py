@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import msgspec
-from commands import evopolicy
+from commands import agent, evopolicy
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
 
@@ -23,25 +22,18 @@ from evopolicy_results.publish import contents, descriptions
 from evopolicy_results.publish.archive import Archive, Writer
 
 ENV = "toy/line"
-AGENT = """
-import json, os, urllib.request
-def submit(scale, ids):
-    with open("system/policy.py", "w") as file:
-        file.write(f'''
+CONSTANT = """
 class Policy:
     def __init__(self, obs_space, action_space, env_meta):
         pass
     def reset(self, episode_index):
         pass
     def act(self, obs):
-        return {scale}
-''')
-    request = urllib.request.Request(
-        os.environ["EVOPOLICYGYM_SUBMIT_URL"], data=json.dumps({"env_instances": ids}).encode()
-    )
-    urllib.request.urlopen(request).read()
-submit(1, [0, 1])
-submit(0, [2, 0, 1])
+        return {}
+"""
+AGENT = f"""
+submit_policy({CONSTANT.format(1)!r}, [0, 1])
+submit_policy({CONSTANT.format(0)!r}, [2, 0, 1])
 """
 
 
@@ -50,45 +42,21 @@ class Results:
 
     def __init__(self, root: Path) -> None:
         self.root = root
-        (root / "agent.py").write_text(AGENT)
+        own = ("--agent", agent(root, AGENT), "--entry", "mine")
+        numbers = ("--budget", "5", "--validation", "2", "--heldout", "3", "--state", "st")
         for exp_id in ("first", "second"):
-            done = evopolicy(
-                root,
-                *(
-                    "local",
-                    "--env",
-                    ENV,
-                    "--budget",
-                    "5",
-                    "--validation",
-                    "2",
-                    "--heldout",
-                    "3",
-                    "--state",
-                    "st",
-                ),
-                *(
-                    "--agent",
-                    f"command:{sys.executable} {root / 'agent.py'}",
-                    "--entry",
-                    "mine",
-                    "--exp-id",
-                    exp_id,
-                ),
-            )
-            assert done.returncode == 0, done.stdout + done.stderr
+            evopolicy(root, "local", "--env", ENV, *numbers, *own, "--exp-id", exp_id, code=0)
         self.summary = self.publish("all.evp", "runs")
         self.files = self.read("all.evp")
 
     def publish(self, out: str, *runs: str) -> dict[str, Any]:
-        done = evopolicy(self.root, "publish", *runs, "--out", out, "--local", "--state", "st", "--json")
-        assert done.returncode == 0, done.stdout + done.stderr
+        state = ("--local", "--state", "st", "--json")
+        done = evopolicy(self.root, "publish", *runs, "--out", out, *state, code=0)
         document: dict[str, Any] = json.loads(done.stdout)
         return document
 
     def read(self, name: str) -> dict[str, bytes]:
-        with Archive(self.root / name) as archive:
-            return {each: archive.read(each, 1 << 30) for each in archive.names}
+        return read(self.root / name)
 
     def run_folder(self, exp_id: str) -> str:
         return str(next(self.root.glob(f"runs/*/*/{exp_id}")).relative_to(self.root))
@@ -195,9 +163,7 @@ class Forger:
             self.files[f"{folder}/{contents.DIGESTS}"] = contents.document(own)
             manifest["files"][f"{folder}/{contents.DIGESTS}"] = contents.digest(contents.document(own))
         self.describe(state)
-        for name in (contents.JOURNAL, contents.REMOVED, *contents.DESCRIPTIONS):
-            if name not in self.files:
-                continue
+        for name in {contents.JOURNAL, contents.REMOVED, *contents.DESCRIPTIONS} & self.files.keys():
             manifest["files"][name] = contents.digest(self.files[name])
         lines = contents.journal_entries(self.files[contents.JOURNAL])
         manifest["journal_entries"], manifest["journal_head"] = len(lines), journal.heads(lines)[-1]
@@ -234,21 +200,29 @@ class Forger:
     def sign_manifest(self, state: Path | None = None) -> None:
         """Makes the signature anew, of the manifest as it is."""
         digest = contents.digest(self.files[contents.MANIFEST])
-        if state is None:
-            key, signature = (
-                key_of(state),
-                FORGER.sign(b"evopolicy manifest 1\0" + bytes.fromhex(digest)).hex(),
-            )
-        else:
-            key, signature = identity.sign(state, digest)
-        self.put(contents.SIGNATURE, {"key": key, "signature": signature})
+        signature = FORGER.sign(b"evopolicy manifest 1\0" + bytes.fromhex(digest)).hex()
+        if state is not None:
+            _, signature = identity.sign(state, digest)
+        self.put(contents.SIGNATURE, {"key": key_of(state), "signature": signature})
 
     def write(self, path: Path) -> None:
         """The files as an archive."""
-        writer = Writer(path)
-        for name, data in self.files.items():
-            writer.add(name, data)
-        writer.close()
+        written(path, self.files)
+
+
+def written(path: Path, files: dict[str, bytes]) -> Path:
+    """These files as an archive."""
+    writer = Writer(path)
+    for name, data in files.items():
+        writer.add(name, data)
+    writer.close()
+    return path
+
+
+def read(path: Path) -> dict[str, bytes]:
+    """The files of an archive."""
+    with Archive(path) as archive:
+        return {each: archive.read(each, 1 << 30) for each in archive.names}
 
 
 FORGER = Ed25519PrivateKey.from_private_bytes(b"f" * 32)

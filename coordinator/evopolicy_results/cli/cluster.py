@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import os
-from collections.abc import AsyncIterator, Callable, Coroutine, Iterator, Sequence
+from collections.abc import AsyncIterator, Callable, Coroutine, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -19,20 +19,18 @@ from evopolicy_common.errors import ConfigError
 from evopolicy_common.local.cluster import LocalCluster, local_cluster, unless_failed
 from evopolicy_common.messages.episode import Tier
 from evopolicy_common.wire import credentials, transport
+from evopolicy_results.evaluations import Evaluations
 
 Local = Annotated[
     bool,
     typer.Option(
-        "--local",
-        help="Start a cluster on this machine for this command.",
-        rich_help_panel=CLUSTER,
+        "--local", help="Start a cluster on this machine for this command.", rich_help_panel=CLUSTER
     ),
 ]
 State = Annotated[
     Path | None,
     typer.Option(
         help="With --local: the state folder of the runs; default: the one that `evopolicy local` uses.",
-        show_default=False,
         rich_help_panel=CLUSTER,
     ),
 ]
@@ -42,6 +40,20 @@ Slots = Annotated[
         min=1, max=1024, help="With --local: episodes played at the same time.", rich_help_panel=CLUSTER
     ),
 ]
+
+
+Runs = Annotated[
+    list[Path], typer.Argument(metavar="RUNS...", help="Finished runs' directories, or folders of them.")
+]
+
+
+_SHOWN = 20
+
+
+def first(lines: Sequence[str]) -> list[str]:
+    """The first lines of a list, and how many more there are."""
+    more = [f"… and {len(lines) - _SHOWN} more (--json tells all)"] if len(lines) > _SHOWN else []
+    return [*lines[:_SHOWN], *more]
 
 
 class Where(msgspec.Struct, frozen=True, kw_only=True):
@@ -78,19 +90,50 @@ class Where(msgspec.Struct, frozen=True, kw_only=True):
             found = credentials.find("operator", self.connect, file)
             yield await stack.enter_async_context(transport.connect(found)), cluster
 
+    @contextlib.asynccontextmanager
+    async def playing(
+        self, kind: str, console: Terminal, *, needs_state: bool = True, packages: Sequence[str] = ()
+    ) -> AsyncIterator[Playing]:
+        """Evaluations on the cluster of `link`, with a progress bar while the body runs."""
+        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+        async with self.link(kind, needs_state=needs_state, packages=packages) as (link, cluster):
+            with Progress(
+                *columns, console=console, transient=True, disable=not console.is_terminal
+            ) as progress:
+                yield Playing(link, cluster, progress, kind)
 
-async def play(
-    cluster: LocalCluster | None,
-    env_ids: list[str],
-    tiers: set[Tier],
-    slots: int,
-    work: Callable[[], Coroutine[Any, Any, None]],
-) -> None:
-    """Does the work; with a cluster of the command's own it starts workers first, and ends with an error when one
-    fails."""
-    if cluster is not None:
-        await cluster.start_workers(env_ids, slots=slots, tiers=tiers)
-    await unless_failed(asyncio.create_task(work()), None if cluster is None else cluster.failed)
+
+class Playing:
+    """Evaluations of a command, with a bar of episodes on a terminal. Elsewhere it prints only why episodes wait."""
+
+    def __init__(
+        self, link: transport.Link, cluster: LocalCluster | None, progress: Progress, title: str
+    ) -> None:
+        """`cluster`: the command's own, which has no workers yet."""
+        self.evaluations = Evaluations(link, self._played, own=cluster is not None)
+        self._cluster, self._progress = cluster, progress
+        self._task = progress.add_task(title, total=None)
+        self._shown_reasons: set[str] = set()
+
+    def update(self, *, total: int | None = None, title: str | None = None) -> None:
+        """Sets the number of episodes to come, or the bar's title."""
+        self._progress.update(self._task, total=total, description=title)
+
+    def _played(self, count: int, waits_for: str) -> None:
+        self._progress.update(self._task, completed=count)
+        if waits_for and waits_for not in self._shown_reasons:
+            self._shown_reasons.add(waits_for)
+            self._progress.console.print(f"waits for {waits_for}")
+
+    async def play(
+        self, envs: list[str], tiers: set[Tier], slots: int, work: Callable[[], Coroutine[Any, Any, None]]
+    ) -> None:
+        """Does the work. A cluster of the command's own gets workers first, and its failure ends the work."""
+        failed = None
+        if self._cluster is not None:
+            await self._cluster.start_workers(envs, slots=slots, tiers=tiers)
+            failed = self._cluster.failed
+        await unless_failed(asyncio.create_task(work()), failed)
 
 
 def where_of(
@@ -124,38 +167,3 @@ def _sweeps_states(runs: Sequence[Path]) -> list[Path]:
     states = [folder / credentials.SWEEP_STATE for folder in folders]
     # Not `Path.is_file`, which raises for folders that this user may not look into.
     return list(dict.fromkeys(state for state in states if os.path.isfile(state / "coordinator.sqlite")))
-
-
-class Playing:
-    """A progress bar of episodes on a terminal. Elsewhere it prints only the reasons why episodes wait."""
-
-    def __init__(self, progress: Progress, title: str) -> None:
-        self._progress = progress
-        self._task = progress.add_task(title, total=None)
-        self._shown_reasons: set[str] = set()
-
-    def update(self, *, total: int | None = None, title: str | None = None) -> None:
-        """Sets the number of episodes to come, or the bar's title."""
-        self._progress.update(self._task, total=total, description=title)
-
-    def played(self, count: int, waits_for: str) -> None:
-        """Shows the number of episodes played, and each reason for waiting once."""
-        self._progress.update(self._task, completed=count)
-        if waits_for and waits_for not in self._shown_reasons:
-            self._shown_reasons.add(waits_for)
-            self._progress.console.print(f"waits for {waits_for}")
-
-
-@contextlib.contextmanager
-def playing(console: Terminal, title: str) -> Iterator[Playing]:
-    """A progress bar while the body runs."""
-    with Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        console=console,
-        transient=True,
-        disable=not console.is_terminal,
-    ) as progress:
-        yield Playing(progress, title)

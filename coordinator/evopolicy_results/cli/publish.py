@@ -30,7 +30,7 @@ from evopolicy_common.errors import DECODE_ERRORS, ConfigError, ProtocolError
 from evopolicy_common.processes.packages import checked_names
 from evopolicy_common.regular_files import read_given
 from evopolicy_common.terminal import counted, one_line, say, say_json
-from evopolicy_results.cli.cluster import Local, State, where_of
+from evopolicy_results.cli.cluster import Local, Runs, State, first, where_of
 from evopolicy_results.publish import replay as replays
 from evopolicy_results.publish import rules
 from evopolicy_results.publish.archive import Archive
@@ -42,6 +42,7 @@ from evopolicy_results.publish.scan import scan_published
 
 FAILED, NOT_REPLAYED = 1, 3
 _SHOWN = 20
+_LISTED = "run;entry;environment;experiment;repeat;attempt;state;replaced by"
 
 app = App(name="publish")
 check_app = App(name="check")
@@ -49,20 +50,14 @@ check_app = App(name="check")
 
 @app.command(name="publish", epilog="Example: evopolicy publish runs/evolve --out evolve.evp --local")
 def publish(
-    runs: Annotated[
-        list[Path],
-        typer.Argument(
-            metavar="RUNS...", help="Finished runs' directories, or folders of them.", show_default=False
-        ),
-    ],
+    runs: Runs,
     out: Annotated[Path, typer.Option(help="File to write, such as results.evp.")],
     connect: Connect = None,
     file: CredentialsFile = None,
     local: Local = False,
     state: State = None,
     with_logs: Annotated[
-        bool,
-        typer.Option("--with-logs", help="Publish the agents' logs too, with the same removals."),
+        bool, typer.Option("--with-logs", help="Publish the agents' logs too, with the same removals.")
     ] = False,
     remove_findings: Annotated[
         bool,
@@ -73,19 +68,14 @@ def publish(
         typer.Option(
             metavar="FILE:LINE",
             help="Publish this line as it is, though it looks like a secret; may be repeated.",
-            show_default=False,
         ),
     ] = None,
-    licence: Annotated[
-        str,
-        typer.Option(help="Licence of the file, such as CC-BY-4.0, for its card.", show_default=False),
-    ] = "",
+    licence: Annotated[str, typer.Option(help="Licence of the file, such as CC-BY-4.0, for its card.")] = "",
     card: Annotated[
         Path | None,
         typer.Option(
             metavar="FOLDER",
             help="Also write the evaluation card and a Croissant description of the file into this folder.",
-            show_default=False,
         ),
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print what was published as JSON.")] = False,
@@ -126,10 +116,8 @@ def publish(
         return
     say(f"{done.path}: {counted(done.runs, 'run')}, {done.bytes:,} bytes, signed by {done.signer}")
     say(f"journal head: {done.journal_head}")
-    for each in done.folders_left_out[:_SHOWN]:
-        say(one_line(f"left out: {each.what}: {each.why}"))
-    if len(done.folders_left_out) > _SHOWN:
-        say(f"… and {len(done.folders_left_out) - _SHOWN} more (--json tells all)")
+    for line in first([f"left out: {each.what}: {each.why}" for each in done.folders_left_out]):
+        say(one_line(line))
     say(f"completeness: {done.completeness}; {len(done.folders_left_out)} folders were left out")
     _say_left_out(done.left_out)
     say(f"{len(done.removed)} things were removed; removed.json in the file lists them")
@@ -138,13 +126,11 @@ def publish(
 
 @check_app.command(name="check", epilog="Example: evopolicy check results.evp --replay 5% --identity KEY")
 def check(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="Published results.", show_default=False)],
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="Published results.")],
     replay: Annotated[
         str | None,
         typer.Option(
-            metavar="SHARE",
-            help="Replay recorded actions: `5%` of the episodes, drawn at random, or `all`.",
-            show_default=False,
+            metavar="SHARE", help="Replay recorded actions: `5%` of the episodes, drawn at random, or `all`."
         ),
     ] = None,
     policies: Annotated[
@@ -156,7 +142,6 @@ def check(
                 " `5%` of the"
                 " episodes, or `all`."
             ),
-            show_default=False,
         ),
     ] = None,
     policy_package: Annotated[
@@ -168,15 +153,10 @@ def check(
                 "With --policies: package that policies may import besides numpy, where their run names it; may be"
                 " repeated."
             ),
-            show_default=False,
         ),
     ] = None,
     identity: Annotated[
-        str | None,
-        typer.Option(
-            help="Public key of the expected signer, from another source than the file.",
-            show_default=False,
-        ),
+        str | None, typer.Option(help="Public key of the expected signer, from another source than the file.")
     ] = None,
     head: Annotated[
         list[str] | None,
@@ -184,12 +164,9 @@ def check(
             metavar="HEAD",
             help="Head of the journal that you noted earlier: 64 hexadecimal digits, or a file written by"
             " `evopolicy-coordinator countersign`; may be repeated.",
-            show_default=False,
         ),
     ] = None,
-    seed: Annotated[
-        int | None, typer.Option(help="Seed of the draw; default: random.", show_default=False)
-    ] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of the draw; default: random.")] = None,
     slots: Annotated[int, typer.Option(min=1, max=1024, help="Episodes at the same time.")] = 2,
     as_json: Annotated[bool, typer.Option("--json", help="Print all findings as JSON.")] = False,
 ) -> None:
@@ -203,12 +180,12 @@ def check(
         fail(
             f"--identity {identity!r}: 64 hexadecimal digits, as `evopolicy-coordinator identity` prints them"
         )
-    share, policy_share = _share("--replay", replay), _share("--policies", policies)
-    if policy_package and policy_share is None:
-        fail("--policy-package goes with --policies")
-    noted = [_noted(each) for each in head or ()]
-    drawn = random.SystemRandom().randrange(2**32) if seed is None else seed
     with fail_on_our_errors():
+        share, policy_share = replays.share_of("--replay", replay), replays.share_of("--policies", policies)
+        if policy_package and policy_share is None:
+            fail("--policy-package goes with --policies")
+        noted = [_noted(each) for each in head or ()]
+        drawn = random.SystemRandom().randrange(2**32) if seed is None else seed
         play_them = functools.partial(play_policies, packages=frozenset(checked_names(policy_package)))
         try:
             with Archive(file) as archive:
@@ -258,15 +235,6 @@ def _noted(text: str) -> str | Countersignature:
         fail(f"--head {text!r} is neither 64 hexadecimal digits nor a countersignature's file: {error}")
 
 
-def _share(option: str, text: str | None) -> float | None:
-    if text is None:
-        return None
-    try:
-        return replays.share_of(text)
-    except ValueError:
-        fail(f"{option} {text!r}: say a share such as 5%, or all")
-
-
 async def _play(
     what: str,
     play: Callable[..., Awaitable[None]],
@@ -298,13 +266,12 @@ def _print(checked: Checked) -> None:
             for each in of_kind:
                 if each.state == state:
                     lines.setdefault(each.text, []).append(each.run)
-            for text, named in list(lines.items())[:_SHOWN]:
-                where = (
-                    "" if not named[0] else f" [{named[0]}]" if len(named) == 1 else f" [{len(named)} runs]"
-                )
-                say(one_line(f"{marks[state]} {kind}: {text}{where}"))
-            if len(lines) > _SHOWN:
-                say(f"{marks[state]} {kind}: … and {len(lines) - _SHOWN} more (--json tells all)")
+            texts = []
+            for text, named in lines.items():
+                where = f" [{named[0] if len(named) == 1 else f'{len(named)} runs'}]" if named[0] else ""
+                texts.append(f"{text}{where}")
+            for text in first(texts):
+                say(one_line(f"{marks[state]} {kind}: {text}"))
         if all(each.state == "ok" for each in of_kind):
             n = len({each.run for each in of_kind if each.run})
             say(
@@ -315,18 +282,15 @@ def _print(checked: Checked) -> None:
     if checked.covered:
         say(f"the replay covered {checked.coverage()} episodes")
     _say_left_out([each for each in checked.listing if each.state != "published"])
-    shown = (
-        "something in this file contradicts itself or what you expect"
-        if checked.failed
-        else "nothing in this file contradicts itself"
-    )
-    without = sum(bool(checked.unrecorded(run)) for run in checked.recorded)
-    if without:
+    shown = "nothing in this file contradicts itself"
+    if checked.failed:
+        shown = "something in this file contradicts itself or what you expect"
+    if without := sum(bool(checked.unrecorded(run)) for run in checked.recorded):
         shown += (
             f"; {without} of {len(checked.recorded)} runs have episodes without a recording, which no replay can"
             " confirm"
         )
-    known = any(each.kind == "identity" and each.state == "ok" for each in checked.findings)
+    known = checked.state_of("identity") == "ok"
     say(f"verdict: {shown}; " + ("the signer is the one that you named" if known else "self-signed"))
 
 
@@ -334,16 +298,7 @@ def _say_left_out(listed: Sequence[Listed]) -> None:
     if not listed:
         return
     say("left out, of the same entries:")
-    columns = {
-        "run": lambda one: one.run,
-        "entry": lambda one: one.entry,
-        "environment": lambda one: one.env,
-        "experiment": lambda one: one.exp_id,
-        "repeat": lambda one: str(one.repeat),
-        "attempt": lambda one: str(one.attempt),
-        "state": lambda one: one.state,
-        "replaced by": lambda one: one.replaced_by,
-    }
-    terminal().print(listing(listed[:_SHOWN], columns))
+    columns = {title: lambda row, n=n: str(row[n]) for n, title in enumerate(_LISTED.split(";"))}
+    terminal().print(listing([msgspec.structs.astuple(each) for each in listed[:_SHOWN]], columns))
     if len(listed) > _SHOWN:
         say(f"… and {len(listed) - _SHOWN} more")

@@ -28,7 +28,7 @@ from evopolicy_results.reading.comparability import REMEDIES, UNKNOWN_ISOLATION,
 from evopolicy_results.reading.parallel import Processes
 from evopolicy_results.reading.reader import load_runs
 from evopolicy_results.reading.rescored import rescored
-from evopolicy_results.scoring.scores import ScoreTable, read_score_csv
+from evopolicy_results.scoring.scores import read_score_csv
 from evopolicy_results.studies.study import Study, study_of
 
 if TYPE_CHECKING:
@@ -52,21 +52,17 @@ def report(
                 " (entry,harness,<environment>,…) adds "
                 "entries without runs."
             ),
-            show_default=False,
         ),
     ],
-    out: Annotated[
-        Path, typer.Option(help="Folder to write; a new one, or an earlier report's.", show_default=False)
-    ],
+    out: Annotated[Path, typer.Option(help="Folder to write; a new one, or an earlier report's.")],
     scores: Annotated[
         str | None,
         typer.Option(
             metavar="NAME",
             help="Use the held-out scores of this re-score of `evopolicy rescore`; the report labels them post hoc.",
-            show_default=False,
         ),
     ] = None,
-    title: Annotated[str | None, typer.Option(help="Heading of the report.", show_default=False)] = None,
+    title: Annotated[str | None, typer.Option(help="Heading of the report.")] = None,
     allow_mixed: Annotated[
         bool,
         typer.Option(
@@ -91,9 +87,7 @@ def report(
             "--pages/--no-pages", help="Write a page for each run: feedback use, checkpoints, differences."
         ),
     ] = True,
-    jobs: Annotated[
-        int, typer.Option(min=0, help="Number of processes; 0: one for each core.", show_default=True)
-    ] = 0,
+    jobs: Annotated[int, typer.Option(min=0, help="Number of processes; 0: one for each core.")] = 0,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print the written files and the excluded runs as JSON.")
     ] = False,
@@ -178,7 +172,12 @@ def _study(
         raise ConfigError(
             f"--scores {rescore!r} cannot be the name of a re-score: use letters, digits, '.', '_' and '-'"
         )
-    scores = _read_table(tables[0]) if tables else None
+    scores = None
+    if tables:
+        try:
+            scores = read_score_csv(read_given(tables[0], str(tables[0])).decode(), source=str(tables[0]))
+        except UnicodeDecodeError as error:
+            raise ConfigError(f"{tables[0]} cannot be read: {error}") from error
     tell("statistics", 0, 1)
     study = study_of(
         rescored(loaded.runs, rescore) if rescore else loaded.runs,
@@ -189,13 +188,6 @@ def _study(
     )
     tell("statistics", 1, 1)
     return study
-
-
-def _read_table(path: Path) -> ScoreTable:
-    try:
-        return read_score_csv(read_given(path, str(path)).decode(), source=str(path))
-    except UnicodeDecodeError as error:
-        raise ConfigError(f"{path} cannot be read: {error}") from error
 
 
 @contextmanager

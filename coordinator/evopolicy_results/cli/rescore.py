@@ -21,14 +21,15 @@ from evopolicy_common.cli.conventions import (
     run_to_end,
 )
 from evopolicy_common.cli.frame import App
-from evopolicy_common.console import Terminal, listing, terminal
+from evopolicy_common.console import listing, terminal
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.processes.packages import packages_in
 from evopolicy_common.records.rescores import is_name
 from evopolicy_common.records.run_files import no_run_below, run_folders
 from evopolicy_common.terminal import number, one_line, say, say_json
-from evopolicy_results.cli.cluster import Local, Slots, State, Where, play, playing, where_of
-from evopolicy_results.rescore.play import Finished, Rescorer, Wanted, Written, read_finished
+from evopolicy_results.cli.cluster import Local, Runs, Slots, State, where_of
+from evopolicy_results.rescore.play import Finished, Wanted, Written, read_finished
+from evopolicy_results.rescore.play import rescore as rescore_run
 
 PARTIAL = 3
 
@@ -42,26 +43,19 @@ app = App(name="rescore")
     ),
 )
 def rescore(
-    runs: Annotated[
-        list[Path],
-        typer.Argument(
-            metavar="RUNS...", help="Finished runs' directories, or folders of them.", show_default=False
-        ),
-    ],
+    runs: Runs,
     cases: Annotated[
         int | None,
         typer.Option(
             min=1,
             max=10_000,
             help="Number of new hidden cases. The coordinator derives them from its secret.",
-            show_default=False,
         ),
     ] = None,
     data: Annotated[
         Path | None,
         typer.Option(
-            help="Take the held-out cases of this folder of split files instead; with --cases, the first ones.",
-            show_default=False,
+            help="Take the held-out cases of this folder of split files instead; with --cases, the first ones."
         ),
     ] = None,
     all_checkpoints: Annotated[
@@ -72,8 +66,7 @@ def rescore(
         str | None,
         typer.Option(
             help="Name of the re-score; runs have the same new cases under the same name. Default: cases-N, or the"
-            " data folder's name.",
-            show_default=False,
+            " data folder's name."
         ),
     ] = None,
     connect: Connect = None,
@@ -110,62 +103,46 @@ def rescore(
         if not finished:
             raise ConfigError(failed[0] if failed else "none of these runs has a checkpoint to re-score")
         written: list[Written] = []
+
+        async def work() -> None:
+            end_on_sigterm()
+            packages = _packages(finished) if local else ()
+            async with where.playing("rescore", console, packages=packages) as playing:
+
+                async def play() -> None:
+                    for run in finished:
+                        playing.update(title=f"{run.record.agent.entry} on {run.record.env}")
+                        try:
+                            written.append(await rescore_run(run, wanted, playing.evaluations))
+                        except ConfigError as error:
+                            failed.append(f"{run.folder}: {error}")
+
+                envs = sorted({run.record.env for run in finished})
+                await playing.play(envs, {run.record.sandbox_tier for run in finished}, slots, play)
+
         try:
-            run_to_end(_rescore(finished, wanted, where, slots, console, written, failed))
+            run_to_end(work())
             if not written:
                 raise ConfigError(failed[0])
         finally:
             for text in failed if written else failed[1:]:
                 say(f"not re-scored: {one_line(text)}", err=True)
-            if written:
-                _print(written, as_json, console)
+            if written and as_json:
+                say_json(written)
+            elif written:
+                columns = {
+                    "environment": lambda one: one.env,
+                    "entry": lambda one: one.entry,
+                    "held-out mean": lambda one: number(one.score),
+                    "re-scored mean": lambda one: number(one.rescored),
+                    "episodes": lambda one: str(one.episodes),
+                }
+                console.print(listing(written, columns, right=("held-out mean",)))
     if failed:
         say(f"{len(written)} of {len(written) + len(failed)} runs are re-scored", err=True)
         raise typer.Exit(PARTIAL)
     if not as_json:
         say(f"next: evopolicy report {' '.join(map(str, runs))} --scores {chosen} --out report")
-
-
-def _print(written: list[Written], as_json: bool, console: Terminal) -> None:
-    if as_json:
-        say_json(written)
-        return
-    columns = {
-        "environment": lambda one: one.env,
-        "entry": lambda one: one.entry,
-        "held-out mean": lambda one: number(one.score),
-        "re-scored mean": lambda one: number(one.rescored),
-        "episodes": lambda one: str(one.episodes),
-    }
-    console.print(listing(written, columns, right=("held-out mean",)))
-
-
-async def _rescore(
-    runs: list[Finished],
-    wanted: Wanted,
-    where: Where,
-    slots: int,
-    console: Terminal,
-    written: list[Written],
-    failed: list[str],
-) -> None:
-    """Adds to `written` what is re-scored, and to `failed` why other runs cannot be."""
-    end_on_sigterm()
-    packages = _packages(runs) if where.local else ()
-    async with where.link("rescore", packages=packages) as (link, cluster):
-        with playing(console, "rescore") as shown:
-            rescorer = Rescorer(link, wanted, shown.played, own_workers=cluster is not None)
-
-            async def work() -> None:
-                for run in runs:
-                    shown.update(title=f"{run.record.agent.entry} on {run.record.env}")
-                    try:
-                        written.append(await rescorer.rescore(run))
-                    except ConfigError as error:
-                        failed.append(f"{run.folder}: {error}")
-
-            envs = sorted({run.record.env for run in runs})
-            await play(cluster, envs, {run.record.sandbox_tier for run in runs}, slots, work)
 
 
 def _packages(runs: list[Finished]) -> tuple[str, ...]:

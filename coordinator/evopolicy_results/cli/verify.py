@@ -10,7 +10,6 @@ import random
 from pathlib import Path
 from typing import Annotated
 
-import msgspec
 import typer
 
 from evopolicy_common.cli.conventions import (
@@ -28,25 +27,14 @@ from evopolicy_common.errors import ConfigError, EvopolicyError
 from evopolicy_common.messages.episode import Tier
 from evopolicy_common.processes.packages import packages_in
 from evopolicy_common.terminal import one_line, say_json
-from evopolicy_results.cli.cluster import Local, Slots, State, Where, play, playing, where_of
-from evopolicy_results.verify.run import Report, Verifier
-from evopolicy_results.verify.source import read_run, sample
+from evopolicy_results.cli.cluster import Local, Slots, State, first, where_of
+from evopolicy_results.evaluations import sample as draw
+from evopolicy_results.verify.run import Finding, Report, Verifier
+from evopolicy_results.verify.source import read_run
 
 DIFFERS, USAGE, UNCHECKED = 1, 2, 3
-_SHOWN = 20
 
 app = App(name="verify")
-
-
-class _Order(msgspec.Struct, frozen=True, kw_only=True):
-    """The options that say what to play."""
-
-    run: Path
-    sample: int | None
-    seed: int
-    slots: int
-    tier: Tier | None
-    policy: bool
 
 
 @app.command(
@@ -54,18 +42,11 @@ class _Order(msgspec.Struct, frozen=True, kw_only=True):
     epilog="Example: evopolicy verify runs/evolve/gym_acrobot/20260131-120000 --sample 16 --local",
 )
 def verify(
-    run: Annotated[
-        Path, typer.Argument(metavar="RUN_DIR", help="A finished run's directory.", show_default=False)
-    ],
-    sample_: Annotated[
-        int | None,
-        typer.Option(
-            "--sample", min=1, help="Number of episodes, drawn at random; default: all.", show_default=False
-        ),
+    run: Annotated[Path, typer.Argument(metavar="RUN_DIR", help="A finished run's directory.")],
+    sample: Annotated[
+        int | None, typer.Option("--sample", min=1, help="Number of episodes, drawn at random; default: all.")
     ] = None,
-    seed: Annotated[
-        int | None, typer.Option(help="Seed of the draw; default: random.", show_default=False)
-    ] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of the draw; default: random.")] = None,
     connect: Connect = None,
     file: CredentialsFile = None,
     local: Local = False,
@@ -79,8 +60,7 @@ def verify(
     ] = None,
     slots: Slots = 2,
     tier: Annotated[
-        Tier | None,
-        typer.Option(help="Sandbox tier of the workers' slots; default: the run's.", show_default=False),
+        Tier | None, typer.Option(help="Sandbox tier of the workers' slots; default: the run's.")
     ] = None,
     policy: Annotated[
         bool,
@@ -98,19 +78,47 @@ def verify(
     shows them. Returns of re-scores (rescore/NAME.json) are not played again. Exit codes: 0 identical, 1 something
     differs, 2 wrong usage or other cases than the run's, 3 could not be checked, or not all of it.
     """
-    order = _Order(
-        run=run,
-        sample=sample_,
-        seed=random.SystemRandom().randrange(2**32) if seed is None else seed,
-        slots=slots,
-        tier=tier,
-        policy=policy,
-    )
+    seed = random.SystemRandom().randrange(2**32) if seed is None else seed
     where = where_of(connect, file, local, state, data, runs=[run])
     console = terminal(stderr=as_json)
+
+    async def work() -> Report:
+        end_on_sigterm()
+        found = read_run(run)
+        packages = packages_in(found.record.versions.fingerprint)
+        async with where.playing("verify", console, needs_state=False, packages=packages) as playing:
+            verifier = Verifier(playing.evaluations, found, tier)
+            knows_run = await verifier.check_cases()
+            lists = [*found.train, *(found.hidden if knows_run else ())]
+            sizes = [len(played.env_instances) for played in lists]
+            chosen = [(lists[k], indexes) for k, indexes in draw(sizes, sample or sum(sizes), seed)]
+            if not chosen:
+                raise ConfigError(f"{run} has no episode to play again, as no submit was ok")
+            notes = verifier.report.notes
+            if sample is not None:
+                notes.append(f"the sample was drawn with --seed {seed}")
+            if not knows_run:
+                notes.append(
+                    "this coordinator has no record of the run: actions are those of the feedback files, hidden"
+                    " episodes are not checked, policies get other seeds than they had, and edits that agree with"
+                    " each other are found only where a train episode that is played again shows them"
+                )
+            total = sum(len(indexes) * (1 + (policy and one.split == "train")) for one, indexes in chosen)
+            playing.update(total=total)
+
+            async def play() -> None:
+                for played, indexes in chosen:
+                    await verifier.replay(played, indexes)
+                    if policy and played.split == "train":
+                        await verifier.play_policy(played, indexes)
+                await verifier.check_fingerprint()
+
+            await playing.play([found.record.env], {tier or found.record.sandbox_tier}, slots, play)
+        return verifier.report
+
     with fail_on_our_errors():
         try:
-            report = run_to_end(_verify(order, where, console))
+            report = run_to_end(work())
         except ConfigError:
             raise
         except EvopolicyError as error:
@@ -122,61 +130,22 @@ def verify(
     raise typer.Exit(DIFFERS if not report.identical else UNCHECKED if report.unchecked_episodes else 0)
 
 
-async def _verify(order: _Order, where: Where, console: Terminal) -> Report:
-    end_on_sigterm()
-    run = read_run(order.run)
-    packages = packages_in(run.record.versions.fingerprint)
-    async with where.link("verify", needs_state=False, packages=packages) as (link, cluster):
-        with playing(console, "verify") as shown:
-            verifier = Verifier(link, run, shown.played, order.tier, own=cluster is not None)
-            knows_run = await verifier.check_cases()
-            chosen = sample([*run.train, *(run.hidden if knows_run else ())], order.sample, order.seed)
-            if not chosen:
-                raise ConfigError(f"{order.run} has no episode to play again, as no submit was ok")
-            notes = verifier.report.notes
-            if order.sample is not None:
-                notes.append(f"the sample was drawn with --seed {order.seed}")
-            if not knows_run:
-                notes.append(
-                    "this coordinator has no record of the run: actions are those of the feedback files, hidden"
-                    " episodes are not checked, policies get other seeds than they had, and edits that agree with each"
-                    " other are found only where a train episode that is played again shows them"
-                )
-            shown.update(
-                total=sum(
-                    len(indexes) * (1 + (order.policy and one.split == "train")) for one, indexes in chosen
-                )
-            )
-
-            async def work() -> None:
-                for played, indexes in chosen:
-                    await verifier.replay(played, indexes)
-                    if order.policy and played.split == "train":
-                        await verifier.play_policy(played, indexes)
-                await verifier.check_fingerprint()
-
-            tiers = {order.tier or run.record.sandbox_tier}
-            await play(cluster, [run.record.env], tiers, order.slots, work)
-    return verifier.report
-
-
 def _print(report: Report, console: Terminal) -> None:
     def say(text: str) -> None:
         console.print(one_line(text), soft_wrap=True)
 
     def listed(heading: str, lines: list[str]) -> None:
-        if lines:
-            say(heading)
-            for line in lines[:_SHOWN]:
-                say(f"  {line}")
-            if len(lines) > _SHOWN:
-                say(f"  … and {len(lines) - _SHOWN} more (--json tells all)")
+        for line in [heading, *(f"  {each}" for each in first(lines))] if lines else ():
+            say(line)
+
+    def texts(findings: list[Finding]) -> list[str]:
+        return [f"{one.episode}: {one.difference}" for one in findings]
 
     for note in report.notes:
         say(f"note: {note}")
     listed("library versions differ:", report.fingerprint_differences)
-    listed("not checked:", [f"{one.episode}: {one.difference}" for one in report.not_checked])
-    listed("differs:", [f"{one.episode}: {one.difference}" for one in report.differences])
+    listed("not checked:", texts(report.not_checked))
+    listed("differs:", texts(report.differences))
     source = f", {report.from_files} of them from feedback files" if report.from_files else ""
     verdict = "identical" if report.identical else "NOT identical"
     unchecked = report.unchecked_episodes
@@ -184,10 +153,7 @@ def _print(report: Report, console: Terminal) -> None:
     say(f"{report.env}: recorded actions of {report.episodes} episodes{source}: {verdict}{rest}")
     if report.policy_episodes:
         others = len(report.policy_differences)
-        listed(
-            "policy again, advisory:",
-            [f"{one.episode}: {one.difference}" for one in report.policy_differences],
-        )
+        listed("policy again, advisory:", texts(report.policy_differences))
         say(
             f"policy again (advisory): {report.policy_episodes - others} of {report.policy_episodes} episodes the same"
         )

@@ -13,16 +13,19 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import msgspec
+import numpy as np
 
-from evopolicy_common.errors import BundleError, ProtocolError
+from evopolicy_common.errors import ProtocolError
 from evopolicy_common.records import journal
-from evopolicy_common.records.policies import bundles, checkpoints
+from evopolicy_common.records.policies import checkpoints
 from evopolicy_common.records.policies.checkpoints import CheckpointMeta
 from evopolicy_common.records.run_record import Artifacts, encode_run_record
 from evopolicy_results.publish import contents, rules, run_rules
 from evopolicy_results.publish.archive import Archive
+from evopolicy_results.publish.contents import Episode
 from evopolicy_results.publish.findings import Checked, PublishedRun
 from evopolicy_results.publish.scan import scan_published
 from evopolicy_results.reading.reader import load_runs
@@ -35,25 +38,15 @@ Replay = Callable[[Archive, Checked], None]
 """Replays recorded actions and adds the findings."""
 
 
-class Curve(msgspec.Struct, frozen=True, kw_only=True):
-    """A recorded held-out episode."""
-
-    index: int
-    episode_return: float
-    length: int
-    failure: str
-    sums: tuple[float, ...]
-    """Sum of the rewards so far at up to `_POINTS` steps; empty where the recording was withheld."""
-
-
 class LabRun(msgspec.Struct, frozen=True, kw_only=True):
     """A published run and its run directory."""
 
     run: Run
     published: str
     """The coordinator's id."""
-    episodes: tuple[Curve, ...]
-    """Held-out episodes of the selected checkpoint."""
+    episodes: tuple[tuple[Episode, tuple[float, ...]], ...]
+    """Held-out episodes of the selected checkpoint, each with the sum of its rewards so far at up to `_POINTS` steps;
+    without sums where the recording was withheld."""
     unrecorded: bool = False
     """Some of its episodes have no recording, so that no replay can contradict their returns."""
 
@@ -88,28 +81,18 @@ class LabBundle(msgspec.Struct, kw_only=True):
         return self.checked.signer
 
     @property
-    def known(self) -> bool:
-        """Whether the site's owner named the signer's key."""
-        return any(each.kind == "identity" and each.state == "ok" for each in self.checked.findings)
-
-    @property
     def label(self) -> str:
         """The signer as text: its name, or the first digits of its key."""
         return self.lab or (f"key {self.signer[:8]}" if self.signer else "no signer")
 
-    def state_of(self, kind: str) -> str:
-        """`failed`, `open` or `ok`, the gravest of the kind's findings; empty when there are none."""
-        states = {each.state for each in self.checked.findings if each.kind == kind}
-        return next((state for state in ("failed", "open", "ok") if state in states), "")
-
 
 def read_bundles(
-    files: Sequence[Path], labs: dict[str, str], folder: Path, replay: Replay | None = None
+    files: Sequence[Path], labs: dict[str, str], folder: Path, replay: Replay = lambda archive, checked: None
 ) -> list[LabBundle]:
     """Checks all files and unpacks their runs below `folder`. `labs`: public key (hex) to the signer's name, empty for
     none."""
     found: list[LabBundle] = []
-    seen: dict[str, str] = {}
+    seen: dict[tuple[str, str], str] = {}
     for number, path in enumerate(files):
         bundle = LabBundle(file=path.name, sha256=_sha256(path), number=number)
         found.append(bundle)
@@ -128,8 +111,8 @@ def _read(
     bundle: LabBundle,
     labs: dict[str, str],
     folder: Path,
-    seen: dict[str, str],
-    replay: Replay | None,
+    seen: dict[tuple[str, str], str],
+    replay: Replay,
 ) -> None:
     checked = rules.check(archive)
     if checked.signer in labs:
@@ -139,47 +122,43 @@ def _read(
         bundle.lab = labs[checked.signer]
     scan_published(archive, checked)
     bundle.checked = checked
-    if replay is not None and not checked.failed:
+    if not checked.failed:
         replay(archive, checked)
     if checked.failed:
         bundle.refused = "; ".join(
             dict.fromkeys(f"{each.kind}: {each.text}" for each in checked.findings if each.state == "failed")
         )[:500]
         return
-    again = [run.opening.run for run in checked.runs if f"{checked.signer} {run.opening.run}" in seen]
-    if again:
-        bundle.refused = f"run {again[0]} is also in {seen[f'{checked.signer} {again[0]}']}"
-        return
+    for run in checked.runs:
+        if before := seen.get((checked.signer, run.opening.run)):
+            bundle.refused = f"run {run.opening.run} is also in {before}"
+            return
     lines = contents.journal_entries(archive.read(contents.JOURNAL, contents.MAX_RECORDING_BYTES))
     bundle.heads = journal.heads(lines)
-    processors: dict[str, None] = {}
-    by_folder: dict[Path, PublishedRun] = {}
-    for run in checked.runs:
-        seen[f"{checked.signer} {run.opening.run}"] = bundle.file
-        processors[run.record.versions.fingerprint.get("cpu", "")] = None
-        place = folder / run.folder
+    folder = folder.resolve()
+    by_folder = {folder / run.folder: run for run in checked.runs}
+    for place, run in by_folder.items():
+        seen[checked.signer, run.opening.run] = bundle.file
         _unpack(archive, run, place)
-        by_folder[place.resolve()] = run
-    bundle.processors = [each for each in processors if each]
+    cpus = (run.record.versions.fingerprint.get("cpu", "") for run in checked.runs)
+    bundle.processors = [each for each in dict.fromkeys(cpus) if each]
     loaded = load_runs([folder])
     bundle.left_out = [
-        (
-            msgspec.structs.replace(each, path=each.path.relative_to(folder.resolve()))
-            if each.path.is_relative_to(folder.resolve())
-            else each
-        )
+        msgspec.structs.replace(each, path=each.path.relative_to(folder))
+        if each.path.is_relative_to(folder)
+        else each
         for each in loaded.left_out
     ]
-    for loaded_run in loaded.runs:
-        source = by_folder[loaded_run.path]
-        bundle.runs.append(
-            LabRun(
-                run=loaded_run,
-                published=source.opening.run,
-                episodes=_curves(archive, source),
-                unrecorded=bool(checked.unrecorded(source.opening.run)),
-            )
+    bundle.runs = [
+        LabRun(
+            run=each,
+            published=run.opening.run,
+            episodes=_curves(archive, run),
+            unrecorded=bool(checked.unrecorded(run.opening.run)),
         )
+        for each in loaded.runs
+        for run in (by_folder[each.path],)
+    ]
     if not bundle.runs:
         bundle.refused = "none of its runs has a score"
 
@@ -187,33 +166,24 @@ def _read(
 def _unpack(archive: Archive, run: PublishedRun, place: Path) -> None:
     """Writes `run.json` and the checkpoints as a run directory."""
     place.mkdir(parents=True)
-    record, result = run.record, run.result
-    versions = msgspec.structs.replace(
-        record.versions,
-        fingerprint={name: each for name, each in record.versions.fingerprint.items() if name != "cpu"},
-    )
-    kept = msgspec.structs.replace(
+    replace, record = msgspec.structs.replace, run.record
+    fingerprint = {name: each for name, each in record.versions.fingerprint.items() if name != "cpu"}
+    agent = record.agent
+    kept = replace(
         record,
         exp_id=_short(record.exp_id),
-        agent=msgspec.structs.replace(
-            record.agent, entry=_short(record.agent.entry), harness=_short(record.agent.harness)
-        ),
-        versions=versions,
+        agent=replace(agent, entry=_short(agent.entry), harness=_short(agent.harness)),
+        versions=replace(record.versions, fingerprint=fingerprint),
         # They name files of a run directory; this folder contains only the files written here.
         artifacts=Artifacts(),
         replays=(),
     )
     (place / "run.json").write_bytes(encode_run_record(kept))
     left = run.opening.budget
-    for submit in result.submits:
+    policies = dict(run.bundles(archive))
+    for submit in run.result.submits:
         before, left = left, left - len(submit.env_instances)
-        name = f"{run.folder}/{contents.checkpoint_path(submit.submit_index)}"
-        bundle = None
-        if submit.bundle is not None and name in archive.names:
-            try:
-                bundle = bundles.load(archive.read(name, contents.MAX_DOCUMENT_BYTES * 2), submit.bundle)
-            except BundleError:
-                bundle = None
+        bundle = policies.get(submit.submit_index)
         meta = CheckpointMeta(
             submit_index=submit.submit_index,
             submit_time="",
@@ -228,34 +198,20 @@ def _unpack(archive: Archive, run: PublishedRun, place: Path) -> None:
         checkpoints.write(folder, meta, bundle, checkpoints.measured(bundle))
 
 
-def _curves(archive: Archive, run: PublishedRun) -> tuple[Curve, ...]:
+def _curves(archive: Archive, run: PublishedRun) -> tuple[tuple[Episode, tuple[float, ...]], ...]:
     best = run.result.best_submit_index
     group = next((each for each in run.groups if each.split == "heldout" and each.submit_index == best), None)
     if group is None:
         return ()
-    recordings = run.recordings(archive, group.name)
+    recordings = dict(enumerate(run.recordings(archive, group.name)))
     found = []
     for episode in group.episodes:
-        data = recordings[episode.index] if episode.index < len(recordings) else None
-        found.append(
-            Curve(
-                index=episode.index,
-                episode_return=episode.episode_return,
-                length=episode.length,
-                failure=episode.failure,
-                sums=() if data is None else _sums(run_rules.recording_of(data).rewards.tolist()),
-            )
-        )
+        sums = np.zeros(0)
+        if (data := recordings.get(episode.index)) is not None:
+            sums = np.cumsum([0.0, *run_rules.recording_of(data).rewards.tolist()])
+        step = max(1, -(-len(sums) // _POINTS))
+        found.append((episode, (*sums[:-1:step].tolist(), *sums[-1:].tolist())))
     return tuple(found)
-
-
-def _sums(rewards: Sequence[float]) -> tuple[float, ...]:
-    total, sums = 0.0, [0.0]
-    for reward in rewards:
-        total += reward
-        sums.append(total)
-    step = max(1, -(-len(sums) // _POINTS))
-    return (*sums[:-1:step], sums[-1])
 
 
 def _compare_journals(found: Sequence[LabBundle]) -> None:
@@ -282,12 +238,10 @@ def _tell_apart(found: Sequence[LabBundle]) -> None:
     while shared := _shared(found):
         for bundle, name in zip(found, names, strict=True):
             for number, each in enumerate(bundle.runs):
-                if each.run.entry in shared:
-                    agent = msgspec.structs.replace(each.run.record.agent, entry=f"{each.run.entry} ({name})")
-                    record = msgspec.structs.replace(each.run.record, agent=agent)
-                    bundle.runs[number] = msgspec.structs.replace(
-                        each, run=msgspec.structs.replace(each.run, record=record)
-                    )
+                agent = each.run.record.agent
+                if agent.entry in shared:
+                    new = msgspec.structs.replace(agent, entry=f"{agent.entry} ({name})")
+                    bundle.runs[number] = _with(each, agent=new)
         # Names and first digits may be equal; whole keys are not.
         names = [bundle.signer for bundle in found]
     # A report knows a run by its name, so two files of one signer may not have the same one.
@@ -295,13 +249,15 @@ def _tell_apart(found: Sequence[LabBundle]) -> None:
     for bundle in found:
         for number, each in enumerate(bundle.runs):
             while each.run.name in seen:
-                record = msgspec.structs.replace(
-                    each.run.record, exp_id=f"{each.run.record.exp_id} ({each.published})"
-                )
-                each = bundle.runs[number] = msgspec.structs.replace(
-                    each, run=msgspec.structs.replace(each.run, record=record)
-                )
+                each = _with(each, exp_id=f"{each.run.record.exp_id} ({each.published})")
+            bundle.runs[number] = each
             seen.add(each.run.name)
+
+
+def _with(each: LabRun, **changes: Any) -> LabRun:
+    """The run with other fields of its `run.json`."""
+    record = msgspec.structs.replace(each.run.record, **changes)
+    return msgspec.structs.replace(each, run=msgspec.structs.replace(each.run, record=record))
 
 
 def _shared(found: Sequence[LabBundle]) -> set[str]:

@@ -37,18 +37,13 @@ app = App(name="leaderboard")
     ),
 )
 def leaderboard(
-    files: Annotated[
-        list[Path], typer.Argument(metavar="FILES...", help="Published results.", show_default=False)
-    ],
-    out: Annotated[
-        Path, typer.Option(help="Folder to write; a new one, or an earlier site's.", show_default=False)
-    ],
+    files: Annotated[list[Path], typer.Argument(metavar="FILES...", help="Published results.")],
+    out: Annotated[Path, typer.Option(help="Folder to write; a new one, or an earlier site's.")],
     identity: Annotated[
         list[str] | None,
         typer.Option(
             metavar="KEY[=NAME]",
             help="Public key of a signer, from another source than the file, and the name of the lab; may be repeated.",
-            show_default=False,
         ),
     ] = None,
     replay: Annotated[
@@ -56,7 +51,6 @@ def leaderboard(
         typer.Option(
             metavar="SHARE",
             help="Replay recorded actions of each file: `5%` of the episodes, drawn at random, or `all`.",
-            show_default=False,
         ),
     ] = None,
     slots: Annotated[
@@ -81,12 +75,6 @@ def leaderboard(
                 " =NAME"
             )
         labs[key.lower()] = name
-    share = None
-    if replay is not None:
-        try:
-            share = share_of(replay)
-        except ValueError:
-            fail(f"--replay {replay!r}: say a share such as 5%, or all")
     for path in files:
         if text := described(path):
             fail(f"{path} is {text}")
@@ -96,15 +84,17 @@ def leaderboard(
     from evopolicy_results.leaderboard.bundles import read_bundles
     from evopolicy_results.leaderboard.write import write_site
 
-    def play(archive: Archive, checked: Checked) -> None:
-        assert share is not None
-        drawn = random.SystemRandom().randrange(2**32)
-        asyncio.run(replayed(archive, checked, share, drawn, slots, lambda played, total: None))
-
     with fail_on_our_errors(), scratch_folder("leaderboard") as folder:
+        share = share_of("--replay", replay)
         check_writable(out, "--out")
+
+        def play(archive: Archive, checked: Checked) -> None:
+            if share is not None:
+                drawn = random.SystemRandom().randrange(2**32)
+                asyncio.run(replayed(archive, checked, share, drawn, slots, lambda played, total: None))
+
         try:
-            bundles = read_bundles(files, labs, Path(folder), None if share is None else play)
+            bundles = read_bundles(files, labs, Path(folder), play)
         except OSError as error:
             raise ConfigError(f"{error.filename}: {error.strerror}") from error
         shown = [bundle for bundle in bundles if not bundle.refused]

@@ -14,14 +14,16 @@ import shlex
 import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
+
+import msgspec
+from markupsafe import Markup
 
 from evopolicy_common.errors import ConfigError
 from evopolicy_results.html import notice, section
 from evopolicy_results.html.pages import page, table_view
 from evopolicy_results.leaderboard.bundles import LabBundle, LabRun
 from evopolicy_results.leaderboard.compare import Board, boards
-from evopolicy_results.leaderboard.pages import Cell, Link, curve_svg, plain_view
 from evopolicy_results.publish.findings import KINDS
 from evopolicy_results.reading.environments import title_of
 from evopolicy_results.report import slug, write_report
@@ -33,9 +35,21 @@ _MADE_BY = "Made by evopolicy leaderboard"
 _SHOWN = ("leaderboard", "incomplete", "heldout", "cells", "pairs", "resolution")
 """Tables on the front page, by the first part of their names."""
 _FOLDED = ("cells", "pairs")
+_WIDTH, _HEIGHT = 240.0, 72.0
+_LONG = 60
 _WORDS = {"ok": "ok", "open": "open", "failed": "FAILED", "": "–"}
 
 Tell = Callable[[str], None]
+
+
+class Link(NamedTuple):
+    """A cell with a link."""
+
+    text: str
+    href: str
+
+
+Cell = str | int | float | Link
 
 
 def write_site(
@@ -64,7 +78,7 @@ def _write_pages(bundles: Sequence[LabBundle], out: Path, title: str, tell: Tell
     sections: list[dict[str, Any]] = []
     entries: set[str] = set()
     reference: str | None = None
-    run_rows: list[list[Cell]] = []
+    runs: list[tuple[Cell, ...]] = []
     for number, board in enumerate(all_boards, start=1):
         tell(f"board {number} of {len(all_boards)}: {len(board.runs)} runs")
         study = study_of(board.runs, allow_mixed=True, allow_unknown=True)
@@ -75,27 +89,35 @@ def _write_pages(bundles: Sequence[LabBundle], out: Path, title: str, tell: Tell
         sections.append(_board(board, study, number, folder))
         for bundle in board.bundles:
             for each in bundle.runs:
-                episodes = f"episodes/{slug(each.run)}-{number}.html"
-                _write(out / episodes, _episodes(each, bundle, f"../{folder}/traces/{slug(each.run)}.html"))
-                run_rows.append(_run_row(each, bundle, folder, episodes))
-    sections.append(_files(bundles))
-    if run_rows:
-        columns = ("Entry", "Environment", "Repeat", "Held-out mean", "Run", "Episodes", "File", "Signed by")
-        caption = (
-            "Each run's page shows its submits, sources and their differences. Its recorded episodes are the held-out"
-            " episodes of the selected checkpoint."
-        )
-        table = plain_view("runs", "Runs", caption, columns, run_rows)
-        sections.append(section("runs", "Runs", tables=[table]))
-    refused = [bundle for bundle in bundles if bundle.refused]
-    if refused:
-        rows: list[list[Cell]] = [[Link(each.file, each.page), each.label, each.refused] for each in refused]
-        table = plain_view(
-            "refused", "Not shown", "No run of these files is in a board.", ("File", "Signed by", "Why"), rows
-        )
-        sections.append(section("refused", "Not shown", tables=[table]))
+                run, name = each.run, slug(each.run)
+                own, episodes = f"{folder}/traces/{name}.html", f"episodes/{name}-{number}.html"
+                _write(out / episodes, _episodes(each, bundle, f"../{own}"))
+                n = len(each.episodes)
+                runs.append(
+                    (
+                        *(run.entry, title_of(run.env), run.record.repeat),
+                        "–" if run.score is None else run.score,
+                        Link(run.record.exp_id, own),
+                        Link(f"{n} episodes", episodes) if n else "–",
+                        *_named(bundle),
+                    )
+                )
+    kinds = [kind for kind in KINDS if any(bundle.checked.state_of(kind) for bundle in bundles)]
+    files: list[tuple[Cell, ...]] = []
+    for bundle in bundles:
+        left = sum(each.state != "published" for each in bundle.checked.listing)
+        states = (_WORDS[bundle.checked.state_of(kind)] for kind in kinds)
+        files.append((*_named(bundle), len(bundle.checked.runs), left, *states))
+    refused = [(*_named(bundle), bundle.refused) for bundle in bundles if bundle.refused]
+    columns = ";".join(("File;Signed by;Runs;Left out", *kinds))
+    for ident, name, table in (
+        ("files", "Files and checks", _table("files", "Published results", _FILES, columns, files)),
+        ("runs", "Runs", _table("runs", "Runs", _RUNS, _RUN_COLUMNS, runs)),
+        ("refused", "Not shown", _table("refused", "Not shown", _REFUSED, "File;Signed by;Why", refused)),
+    ):
+        if table["rows"] or ident == "files":
+            sections.append(section(ident, name, tables=[table]))
     sections.append(_checking(bundles))
-    n_runs = sum(len(bundle.runs) for bundle in bundles)
     front = page(
         "index",
         title=title,
@@ -107,7 +129,7 @@ def _write_pages(bundles: Sequence[LabBundle], out: Path, title: str, tell: Tell
             ("signers", len({bundle.signer for bundle in bundles if bundle.signer})),
             ("files", len(bundles)),
             ("entries", len(entries)),
-            ("runs", n_runs),
+            ("runs", len(runs)),
             ("not shown", len(refused)),
         ],
         notices=_notices(bundles),
@@ -190,43 +212,24 @@ def _board(board: Board, study: Study, number: int, folder: str) -> dict[str, An
     )
 
 
-def _run_row(each: LabRun, bundle: LabBundle, folder: str, episodes: str) -> list[Cell]:
-    run = each.run
-    return [
-        run.entry,
-        title_of(run.env),
-        run.record.repeat,
-        "–" if run.score is None else run.score,
-        Link(run.record.exp_id, f"{folder}/traces/{slug(run)}.html"),
-        Link(f"{len(each.episodes)} episodes", episodes) if each.episodes else "–",
-        Link(bundle.file, bundle.page),
-        bundle.label,
-    ]
+_FILES = (
+    "Each column after Left out is a check. ok: shown. open: this check cannot decide, or was not made. FAILED:"
+    " the file contradicts itself, or another file of its signer. Left out: runs that the same coordinator opened"
+    " for the same entries and that are not in the file."
+)
+_RUNS = (
+    "Each run's page shows its submits, sources and their differences. Its recorded episodes are the held-out episodes"
+    " of the selected checkpoint."
+)
+_REFUSED = "No run of these files is in a board."
+_RUN_COLUMNS = "Entry;Environment;Repeat;Held-out mean;Run;Episodes;File;Signed by"
+_LISTED = "Every run that the journal has of the published entries, in the order in which they were opened."
+_LISTED_COLUMNS = "Run;Entry;Environment;Experiment;Repeat;Attempt;State;Replaced by"
+_REMOVED = "What the publisher's command removed, in its words."
 
 
-def _files(bundles: Sequence[LabBundle]) -> dict[str, Any]:
-    kinds = [kind for kind in KINDS if any(bundle.state_of(kind) for bundle in bundles)]
-    rows: list[list[Cell]] = []
-    for bundle in bundles:
-        left = [each for each in bundle.checked.listing if each.state != "published"]
-        rows.append(
-            [
-                Link(bundle.file, bundle.page),
-                bundle.label,
-                len(bundle.checked.runs),
-                len(left),
-                *(_WORDS[bundle.state_of(kind)] for kind in kinds),
-            ]
-        )
-    caption = (
-        "Each column after Left out is a check. ok: shown. open: this check cannot decide, or was not made. FAILED: the"
-        " file contradicts itself, or another file of its signer. Left out: runs that the same coordinator opened for"
-        " the same entries and that are not in the file."
-    )
-    table = plain_view(
-        "files", "Published results", caption, ("File", "Signed by", "Runs", "Left out", *kinds), rows
-    )
-    return section("files", "Files and checks", tables=[table])
+def _named(bundle: LabBundle) -> tuple[Cell, Cell]:
+    return Link(bundle.file, bundle.page), bundle.label
 
 
 def _bundle_page(bundle: LabBundle) -> str:
@@ -235,46 +238,24 @@ def _bundle_page(bundle: LabBundle) -> str:
     grouped: dict[tuple[str, str, str], list[str]] = {}
     for each in sorted(checked.findings, key=lambda each: order.get(each.kind, len(order))):
         grouped.setdefault((each.kind, each.state, each.text), []).append(each.run)
-    findings: list[list[Cell]] = [
-        [
-            _WORDS[state],
-            kind,
-            text,
-            KINDS.get(kind, ""),
+    findings = [
+        (
+            *(_WORDS[state], kind, text, KINDS.get(kind, "")),
             named[0] if len(named) == 1 else f"{len(named)} runs",
-        ]
+        )
         for (kind, state, text), named in grouped.items()
     ]
+    listed, removed = (
+        list(map(msgspec.structs.astuple, each)) for each in (checked.listing, checked.removed)
+    )
+    left = [(str(each.path), each.reason) for each in bundle.left_out]
     tables = [
-        plain_view("findings", "Checks", "", ("Verdict", "Check", "Finding", "Question", "Run"), findings)
+        _table("findings", "Checks", "", "Verdict;Check;Finding;Question;Run", findings),
+        _table("listing", "Runs that were opened", _LISTED, _LISTED_COLUMNS, listed),
+        _table("left-out", "Runs without a score", "", "Run;Why", left),
+        _table("removed", "Removed before publication", _REMOVED, "What;Why", removed),
     ]
-    rows: list[list[Cell]]
-    if checked.listing:
-        rows = [
-            [
-                each.run,
-                each.entry,
-                each.env,
-                each.exp_id,
-                each.repeat,
-                each.attempt,
-                each.state,
-                each.replaced_by,
-            ]
-            for each in checked.listing
-        ]
-        columns = ("Run", "Entry", "Environment", "Experiment", "Repeat", "Attempt", "State", "Replaced by")
-        text = (
-            "Every run that the journal has of the published entries, in the order in which they were opened."
-        )
-        tables.append(plain_view("listing", "Runs that were opened", text, columns, rows))
-    if bundle.left_out:
-        rows = [[str(each.path), each.reason] for each in bundle.left_out]
-        tables.append(plain_view("left-out", "Runs without a score", "", ("Run", "Why"), rows))
-    if checked.removed:
-        rows = [[each.what, each.why] for each in checked.removed]
-        text = "What the publisher's command removed, in its words."
-        tables.append(plain_view("removed", "Removed before publication", text, ("What", "Why"), rows))
+    states = [checked.state_of(kind) for kind in KINDS]
     return page(
         "site_bundle",
         title=bundle.file,
@@ -284,21 +265,21 @@ def _bundle_page(bundle: LabBundle) -> str:
         facts=[
             ("signer", bundle.label),
             ("runs", len(checked.runs)),
-            ("checks passed", sum(bundle.state_of(kind) == "ok" for kind in KINDS)),
-            ("open", sum(bundle.state_of(kind) == "open" for kind in KINDS)),
-            ("failed", sum(bundle.state_of(kind) == "failed" for kind in KINDS)),
+            ("checks passed", states.count("ok")),
+            ("open", states.count("open")),
+            ("failed", states.count("failed")),
         ],
-        tables=tables,
+        tables=[tables[0], *(each for each in tables[1:] if each["rows"])],
     )
 
 
 def _episodes(each: LabRun, bundle: LabBundle, run_page: str) -> str:
     cards = []
-    for one in each.episodes:
+    for one, sums in each.episodes:
         text = f"return {one.episode_return:.4g}, {one.length} steps"
         if one.failure:
             text += f", the policy failed: {one.failure}"
-        svg = curve_svg(one.sums, f"Sum of rewards in case {one.index}") if one.sums else ""
+        svg = _curve(sums, f"Sum of rewards in case {one.index}") if sums else ""
         cards.append({"index": one.index, "svg": svg, "text": text})
     return page(
         "site_episodes",
@@ -314,41 +295,88 @@ def _episodes(each: LabRun, bundle: LabBundle, run_page: str) -> str:
 
 
 def _checking(bundles: Sequence[LabBundle]) -> dict[str, Any]:
-    lines = []
-    for bundle in bundles:
-        key = f" --identity {bundle.signer}" if bundle.signer else ""
-        lines.append(f"evopolicy check {shlex.quote(bundle.file)}{key} --replay 5%")
-    return section(
-        "check",
-        "Check it yourself",
-        texts=[
-            "Take each signer's key from a place that you know to be theirs, not from this page.",
-            (
-                "No check shows that recorded actions came from the policy, that a publisher did not start over with a"
-                " new journal (unless you have an earlier head of it), or what a publisher states about jails and"
-                " machines."
-            ),
-        ],
-        code="\n".join(lines),
-    )
+    identities = [f" --identity {each.signer}" if each.signer else "" for each in bundles]
+    lines = [
+        f"evopolicy check {shlex.quote(each.file)}{identity} --replay 5%"
+        for each, identity in zip(bundles, identities, strict=True)
+    ]
+    texts = [
+        "Take each signer's key from a place that you know to be theirs, not from this page.",
+        (
+            "No check shows that recorded actions came from the policy, that a publisher did not start over with a new"
+            " journal (unless you have an earlier head of it), or what a publisher states about jails and machines."
+        ),
+    ]
+    return section("check", "Check it yourself", texts=texts, code="\n".join(lines))
 
 
 def _notices(bundles: Sequence[LabBundle]) -> list[dict[str, Any]]:
-    out: list[dict[str, Any]] = []
     shown = [bundle for bundle in bundles if not bundle.refused]
-    unknown = [bundle.file for bundle in shown if not bundle.known]
-    if unknown:
-        title = f"{len(unknown)} of {len(shown)} files are self-signed: nobody named their signer's key to this site."
-        out.append(notice(title, unknown))
-    not_replayed = [bundle.file for bundle in shown if bundle.state_of("replay") != "ok"]
-    if not_replayed:
-        title = (
+    unknown = [bundle.file for bundle in shown if bundle.checked.state_of("identity") != "ok"]
+    not_replayed = [bundle.file for bundle in shown if bundle.checked.state_of("replay") != "ok"]
+    processors = sorted({each[:200] for bundle in shown for each in bundle.processors})
+    differ = len({each for bundle in shown for each in bundle.processors}) > 1
+    found = (
+        (
+            f"{len(unknown)} of {len(shown)} files are self-signed: nobody named their signer's key to this site.",
+            unknown,
+        ),
+        (
             f"{len(not_replayed)} of {len(shown)} files were not replayed for this site: their rewards rest on the"
-            " publisher's word."
-        )
-        out.append(notice(title, not_replayed))
-    processors = {each for bundle in shown for each in bundle.processors}
-    if len(processors) > 1:
-        title = "The runs were played on processors with different features, which can change numbers in their last digits."  # noqa: E501
-        out.append(notice(title, sorted(each[:200] for each in processors)))
-    return out
+            " publisher's word.",
+            not_replayed,
+        ),
+        (
+            "The runs were played on processors with different features, which can change numbers in their last"
+            " digits.",
+            processors * differ,
+        ),
+    )
+    return [notice(title, lines) for title, lines in found if lines]
+
+
+def _table(
+    ident: str, title: str, caption: str, columns: str, rows: Sequence[tuple[Cell, ...]]
+) -> dict[str, Any]:
+    """A table for the page; cells that are numbers sort as numbers. `columns`: their titles."""
+    cells = [list(map(_cell, row)) for row in rows]
+    return {
+        "id": f"{ident}-table",
+        "title": title,
+        "caption": caption,
+        "files": [],
+        "filter": len(cells) > 8,
+        "folded": False,
+        "columns": [
+            {"title": name, "numeric": bool(cells) and cells[0][place]["value"] is not None, "note": ""}
+            for place, name in enumerate(columns.split(";"))
+        ],
+        "rows": cells,
+    }
+
+
+def _cell(cell: Cell) -> dict[str, Any]:
+    text = cell.text if isinstance(cell, Link) else f"{cell:.4g}" if isinstance(cell, float) else str(cell)
+    value = cell if isinstance(cell, int | float) else None
+    return {
+        "text": text,
+        "value": value,
+        "cls": "n" if value is not None else "long" if len(text) > _LONG else "",
+        "href": cell.href if isinstance(cell, Link) else None,
+        "entry": text if isinstance(cell, str) else None,
+    }
+
+
+def _curve(sums: Sequence[float], label: str) -> Markup:
+    """The sum of rewards over an episode as a small line."""
+    low, high = min(sums), max(sums)
+    span = high - low or 1.0
+    step = _WIDTH / max(1, len(sums) - 1)
+    points = " ".join(
+        f"{place * step:.1f},{4.0 + (_HEIGHT - 8.0) * (1.0 - (value - low) / span):.1f}"
+        for place, value in enumerate(sums)
+    )
+    return Markup(
+        '<svg role="img" aria-label="{}" viewBox="0 0 {:g} {:g}" style="width:100%;height:auto">'
+        '<polyline points="{}" fill="none" stroke="currentColor" stroke-width="1.5"/></svg>'
+    ).format(label, _WIDTH, _HEIGHT, points)

@@ -13,8 +13,8 @@ import re
 import struct
 import zipfile
 import zlib
+from collections import namedtuple
 from pathlib import Path
-from types import TracebackType
 from typing import BinaryIO
 
 from evopolicy_common.errors import ProtocolError
@@ -26,6 +26,10 @@ _MAX_NAME = 120
 _NAME = re.compile(r"[a-z0-9_][a-z0-9._-]*(/[a-z0-9_][a-z0-9._-]*){0,4}")
 _END = struct.Struct("<4sHHHHIIH")
 _ENTRY = struct.Struct("<4sHHHHHHIIIHHHHHII")
+_Entry = namedtuple(
+    "_Entry",
+    "mark made needs flags method time date crc packed length n_name n_extra n_comment part internal mode offset",
+)
 _LOCAL = struct.Struct("<4sHHHHHIIIHH")
 _FILE_MODE = 0o100644
 
@@ -82,9 +86,7 @@ class Archive:
     def __enter__(self) -> Archive:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._file.close()
 
 
@@ -110,48 +112,29 @@ def _places(file: BinaryIO) -> dict[str, tuple[int, int, int]]:
     for _ in range(n):
         if at + _ENTRY.size > len(listed):
             raise ProtocolError("its list of files is cut off")
-        (
-            mark,
-            made,
-            _,
-            flags,
-            method,
-            _,
-            _,
-            crc,
-            packed,
-            length,
-            n_name,
-            n_extra,
-            n_comment,
-            part,
-            _,
-            mode,
-            offset,
-        ) = _ENTRY.unpack_from(listed, at)
-        raw = listed[at + _ENTRY.size : at + _ENTRY.size + n_name]
-        at += _ENTRY.size + n_name
+        each = _Entry._make(_ENTRY.unpack_from(listed, at))
+        raw = listed[at + _ENTRY.size : at + _ENTRY.size + each.n_name]
+        at += _ENTRY.size + each.n_name
         name = raw.decode("ascii", "backslashreplace")
         _check_name(name)
-        if mark != b"PK\1\2" or n_extra or n_comment or part or flags:
+        if each.mark != b"PK\1\2" or each.n_extra or each.n_comment or each.part or each.flags:
             raise ProtocolError(f"{name}: an entry with extras, which published results do not have")
-        if made >> 8 != 3 or mode != _FILE_MODE << 16:
+        if each.made >> 8 != 3 or each.mode != _FILE_MODE << 16:
             raise ProtocolError(f"{name} is a link, a folder or another special file")
-        if method or packed != length:
+        if each.method or each.packed != each.length:
             raise ProtocolError(f"{name} is compressed, which published results never are")
         if name in places:
             raise ProtocolError(f"{name} occurs twice")
-        if offset != expected or offset + _LOCAL.size + n_name + length > start:
+        begin = expected + _LOCAL.size + each.n_name
+        if each.offset != expected or begin + each.length > start:
             raise ProtocolError(f"{name} overlaps another file, or leaves a gap")
-        file.seek(offset)
-        head = _LOCAL.unpack(file.read(_LOCAL.size))
-        if (head[0], head[2], head[3], head[6:]) != (b"PK\3\4", 0, 0, (crc, length, length, n_name, 0)) or (
-            file.read(n_name) != raw
-        ):
+        file.seek(expected)
+        mark, _, flags, method, _, _, *sizes = _LOCAL.unpack(file.read(_LOCAL.size))
+        same = (each.crc, each.length, each.length, each.n_name, 0) == tuple(sizes)
+        if (mark, flags, method) != (b"PK\3\4", 0, 0) or not same or file.read(each.n_name) != raw:
             raise ProtocolError(f"{name}: its two headers differ")
-        begin = offset + _LOCAL.size + n_name
-        places[name] = (begin, length, crc)
-        expected = begin + length
+        places[name] = (begin, each.length, each.crc)
+        expected = begin + each.length
     if at != len(listed) or expected != start:
         raise ProtocolError("some bytes belong to no file")
     return places

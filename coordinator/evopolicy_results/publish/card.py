@@ -157,8 +157,9 @@ def make(
     cells: dict[tuple[str, str], list[Source]] = {}
     by_entry: dict[str, list[Source]] = {}
     for each in sources:
-        cells.setdefault((each.record.env, each.record.agent.entry), []).append(each)
-        by_entry.setdefault(each.record.agent.entry, []).append(each)
+        entry = each.record.agent.entry
+        cells.setdefault((each.record.env, entry), []).append(each)
+        by_entry.setdefault(entry, []).append(each)
     conditions = _conditions(records)
     scores = [[each.record.outcome.score for each in cell] for cell in cells.values()]
     return Card(
@@ -248,6 +249,7 @@ def _conditions(records: Sequence[RunRecord]) -> dict[str, dict[str, dict[str, i
         resources = record.agent.resources
         own = {} if resources is None else msgspec.to_builtins(resources.limits)
         entry = catalogue.known(record.env)
+        unmetered = "unknown" if record.agent.model_string else "nothing"
         topics: dict[str, dict[str, Any]] = {
             "isolation": {
                 "policies' sandbox": record.sandbox_tier,
@@ -257,11 +259,7 @@ def _conditions(records: Sequence[RunRecord]) -> dict[str, dict[str, dict[str, i
                 "rules": "renewed" if entry is not None and entry.world else "fixed",
             },
             "metering": {
-                "tokens counted by": use.metering
-                if use
-                else "unknown"
-                if record.agent.model_string
-                else "nothing",
+                "tokens counted by": use.metering if use else unmetered,
                 "audits": f"{audit.agreed} of {audit.sampled} confirmed" if audit else "none",
             },
             "hardware": {"processor": versions.fingerprint.get("cpu")},

@@ -14,7 +14,7 @@ import getpass
 import hashlib
 import os
 import socket
-from collections.abc import AsyncIterator, Callable, Sequence
+from collections.abc import Callable, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import NamedTuple
@@ -24,7 +24,6 @@ import numpy as np
 
 from evopolicy_common.errors import ConfigError, EvopolicyError, ProtocolError, RefusedError
 from evopolicy_common.messages.environment import Split
-from evopolicy_common.messages.episode import EpisodeOutcome
 from evopolicy_common.records import journal
 from evopolicy_common.records.canary import CANARY
 from evopolicy_common.records.episodes.rendered import decode
@@ -46,22 +45,13 @@ from evopolicy_results.publish.contents import Episode, Group, Listed, Manifest,
 Tell = Callable[[str], None]
 _SHOWN = 20
 
-_LOGS = Removed(what="logs/", why="agents' and programs' logs name paths, hosts and variables")
-_OTHER_LOGS = Removed(what="logs/, but agent.jsonl", why="programs' logs name paths, hosts and variables")
-_NEVER = (
-    Removed(
-        what="trees/",
-        why="the agent's notes are its operator's; the policies are checkpoints, and digests stay",
-    ),
-    Removed(
-        what="workspace/", why="feedback follows from the recorded actions; the final policy is a checkpoint"
-    ),
-    Removed(what="replays/", why="videos are not published"),
-    Removed(what="notes, agent_host", why="the operator's own labels and machines"),
-    Removed(
-        what="observations, stdout, stderr", why="they follow from the recorded actions, or are free text"
-    ),
-)
+_NEVER = {
+    "trees/": "the agent's notes are its operator's; the policies are checkpoints, and digests stay",
+    "workspace/": "feedback follows from the recorded actions; the final policy is a checkpoint",
+    "replays/": "videos are not published",
+    "notes, agent_host": "the operator's own labels and machines",
+    "observations, stdout, stderr": "they follow from the recorded actions, or are free text",
+}
 
 
 class Published(msgspec.Struct, frozen=True, kw_only=True):
@@ -94,22 +84,22 @@ def find_runs(paths: Sequence[Path]) -> tuple[list[tuple[Path, RunRecord]], list
         try:
             record = read_record(folder)
         except FileNotFoundError:
-            left.append((folder, "the run did not finish: it has no run.json"))
+            why = "the run did not finish: it has no run.json"
         except OSError as error:
-            left.append((folder, f"run.json cannot be read: {error.strerror}"))
+            why = f"run.json cannot be read: {error.strerror}"
         except ProtocolError as error:
-            left.append((folder, str(error)))
+            why = str(error)
         else:
             if record.committed is None:
-                left.append(
-                    (folder, "it has no commitment: its coordinator kept no journal when it opened the run")
-                )
+                why = "it has no commitment: its coordinator kept no journal when it opened the run"
             elif record.replay_of:
-                left.append((folder, f"it is a replay of run {record.replay_of}, and no run of its own"))
+                why = f"it is a replay of run {record.replay_of}, and no run of its own"
             elif record.run in found:
-                left.append((folder, f"it repeats the run in {found[record.run][0]}"))
+                why = f"it repeats the run in {found[record.run][0]}"
             else:
                 found[record.run] = folder, record
+                continue
+        left.append((folder, why))
     attempts = [each for path in paths for each in path.rglob(".attempts") if each.is_dir()]
     left += [(each, "another attempt replaced it") for each in run_folders(attempts)[0]]
     removed = [Removed(what=str(folder), why=why) for folder, why in left]
@@ -117,6 +107,20 @@ def find_runs(paths: Sequence[Path]) -> tuple[list[tuple[Path, RunRecord]], list
         listed = "; ".join(f"{each.what}: {each.why}" for each in removed[:8])
         raise ConfigError(f"no finished run to publish: {listed}")
     return [found[run] for run in sorted(found)], removed
+
+
+class _Secret(NamedTuple):
+    place: str
+    """`FILE:LINE`; empty for a term of this machine."""
+    what: str
+
+
+class _Source(NamedTuple):
+    """A run that is published."""
+
+    folder: Path
+    record: RunRecord
+    passed: Passed | None
 
 
 class Publisher:
@@ -141,7 +145,11 @@ class Publisher:
         self._ask = OperatorClient(link)
         self._tell = tell
         self._needles = needles
-        self._removed: list[Removed] = [_OTHER_LOGS if with_logs else _LOGS, *_NEVER]
+        logs, whose = ("logs/, but agent.jsonl", "") if with_logs else ("logs/", "agents' and ")
+        never = {logs: f"{whose}programs' logs name paths, hosts and variables", **_NEVER}
+        self._removed = [Removed(what=what, why=why) for what, why in never.items()]
+        self._written: dict[str, str] = {}
+        """Digests of the files in the archive, by name."""
 
     async def publish(
         self,
@@ -155,13 +163,14 @@ class Publisher:
         """Writes `out` atomically. Raises ConfigError when the coordinator refuses. `left`: folders that are
         left out. `licence`: of the file, for its card. `card`: a folder for copies of card and descriptions."""
         left = list(left)
-        ids: list[str] = []
-        passed = [read_passed(folder) for folder, _ in runs]
+        sources = [_Source(folder, record, read_passed(folder)) for folder, record in runs]
         self._stop_at(
             [
                 secret
-                for (folder, _), each in zip(runs, passed, strict=True)
-                for secret in self._in_folder(folder, each)
+                for each in sources
+                for path in sorted((each.folder / "checkpoints").glob("submit_*"))
+                if (bundle := _bundle(path)) is not None
+                for secret in self._in_policy(path, bundle, each.passed)
             ]
         )
         try:
@@ -172,206 +181,186 @@ class Publisher:
             where = f" ({', '.join(named[:8])})" if named else ""
             raise ConfigError(f"{error}{where}") from error
         entries = await self._ask.journal()
-        files: dict[str, str] = {}
-        described: dict[str, str] = {}
-        sources: list[cards.Source] = []
+        described: list[cards.Source] = []
         partial = out.with_name(f".{out.name}.partial")
-        writer = Writer(partial)
+        writer = self._writer = Writer(partial)
         try:
-            for number, (folder, record) in enumerate(runs):
+            for number, source in enumerate(sources):
+                record = source.record
                 self._tell(f"{number + 1} of {len(runs)}: {record.agent.entry} on {record.env}")
-                place = contents.run_folder(len(ids))
-                inner: dict[str, str] = {}
-                documents: dict[str, bytes] = {}
                 before = len(self._removed)
                 try:
-                    async for name, data in self._run_files(folder, record, place, passed[number]):
-                        writer.add(f"{place}/{name}", data)
-                        inner[name] = contents.digest(data)
-                        if name in (contents.RUN, contents.RESULT):
-                            documents[name] = data
+                    described.append(await self._add_run(source, f"runs/{len(described):04d}"))
                 except _GoneError as error:  # before the first file
                     del self._removed[before:]
-                    left.append(Removed(what=str(folder), why=str(error)))
-                    continue
-                digests = contents.document(inner)
-                writer.add(f"{place}/{contents.DIGESTS}", digests)
-                files[f"{place}/{contents.DIGESTS}"] = contents.digest(digests)
-                described |= {f"{place}/{name}": each for name, each in inner.items()}
-                result = msgspec.json.decode(documents[contents.RESULT], type=Result)
-                sources.append(cards.Source(place, decode_run_record(documents[contents.RUN]), result))
-                ids.append(record.run)
-            if not ids:
+                    left.append(Removed(what=str(source.folder), why=str(error)))
+            if not described:
                 raise ConfigError(f"no run to publish: {left[-1].what}: {left[-1].why}")
-            lines = contents.journal_lines(entries)
-            for name, data in (
-                (contents.JOURNAL, lines),
-                (contents.REMOVED, contents.document(tuple(self._removed))),
-            ):
-                self._must_be_clean(name, data)
-                writer.add(name, data)
-                files[name] = contents.digest(data)
-            heads = journal.heads(entries)
-            made = cards.make(
-                sources,
-                entries,
-                # The card names the key, so it is asked for before the manifest can be signed.
-                signer=(await self._ask.sign(heads[-1])).key,
-                software=version("evopolicy"),
-                licence=licence,
-            )
-            described |= files
-            for name, data in descriptions.files(made, described).items():
-                self._must_be_clean(name, data)
-                writer.add(name, data)
-                files[name] = contents.digest(data)
+            self._add_clean(contents.JOURNAL, contents.journal_lines(entries))
+            self._add_clean(contents.REMOVED, contents.document(tuple(self._removed)))
+            head, software = journal.heads(entries)[-1], version("evopolicy")
+            # The card names the key, so it is asked for before the manifest can be signed.
+            signer = (await self._ask.sign(head)).key
+            made = cards.make(described, entries, signer=signer, software=software, licence=licence)
+            digests = dict(self._written)
+            for name, data in descriptions.files(made, digests).items():
+                self._add_clean(name, data)
             manifest = contents.document(
                 Manifest(
                     format=contents.FORMAT,
                     version=contents.VERSION,
                     canary=CANARY,
-                    software=version("evopolicy"),
+                    software=software,
                     journal_entries=len(entries),
-                    journal_head=heads[-1],
-                    files=files,
+                    journal_head=head,
+                    files={
+                        name: digest
+                        for name, digest in self._written.items()
+                        if "/" not in name or name.endswith(f"/{contents.DIGESTS}")
+                    },
                 )
             )
             signed = await self._ask.sign(contents.digest(manifest))
-            writer.add(contents.MANIFEST, manifest)
+            self._add(contents.MANIFEST, manifest)
             signature = contents.Signature(key=signed.key, signature=signed.signature)
-            writer.add(contents.SIGNATURE, contents.document(signature))
+            self._add(contents.SIGNATURE, contents.document(signature))
             writer.close()
             partial.replace(out)
             if card is not None:
                 with out.open("rb") as stream:
                     sha256 = hashlib.file_digest(stream, "sha256").hexdigest()
                 file = descriptions.File(out.name, sha256, out.stat().st_size)
-                for name, data in descriptions.files(made, described, file).items():
+                for name, data in descriptions.files(made, digests, file).items():
                     (card / name).write_bytes(data)
         finally:
             partial.unlink(missing_ok=True)
+        ids = [each.result.run for each in described]
         listed = contents.listing(map(journal.read_entry, entries), ids)
         return Published(
             path=str(out),
             bytes=out.stat().st_size,
             runs=len(ids),
             signer=signed.key,
-            journal_head=heads[-1],
+            journal_head=head,
             removed=tuple(self._removed),
             left_out=tuple(each for each in listed if each.state != "published"),
             folders_left_out=tuple(left),
             completeness=contents.completeness(listed),
         )
 
-    async def _run_files(
-        self, folder: Path, record: RunRecord, place: str, passed: Passed | None
-    ) -> AsyncIterator[tuple[str, bytes]]:
+    def _add(self, name: str, data: bytes) -> None:
+        self._writer.add(name, data)
+        self._written[name] = contents.digest(data)
+
+    def _add_clean(self, name: str, data: bytes, passed: Passed | None = None) -> None:
+        self._must_be_clean(name, data, passed)
+        self._add(name, data)
+
+    def _leave_out(self, what: str, why: str) -> None:
+        self._removed.append(Removed(what=what, why=why))
+
+    async def _add_run(self, source: _Source, place: str) -> cards.Source:
+        record = source.record
         opened = await self._ask.opening(record.run)
         result = msgspec.json.decode(opened.result, type=Result)
         kept, removed = scrub.record(record)
-        self._removed += [Removed(what=f"{place}/run.json: {each.what}", why=each.why) for each in removed]
+        for each in removed:
+            self._leave_out(f"{place}/run.json: {each.what}", each.why)
         groups: list[Group] = []
-        recorded: list[tuple[str, bytes]] = []
+        recorded: dict[str, bytes] = {}
         for split, index, n in contents.wanted_groups(result):
-            group, recordings = await self._group(record.run, split, index, n, place, passed)
+            group, recordings = await self._group(source, split, index, n, place)
             groups.append(group)
             if recordings is not None:
-                recorded.append((f"actions/{group.name}", recordings))
+                recorded[f"{place}/actions/{group.name}"] = recordings
+        run_json = encode_run_record(kept)
         for name, data in (
-            (contents.RUN, encode_run_record(kept)),
+            (contents.RUN, run_json),
             (contents.OPENING, opened.opening),
             (contents.SALT, opened.salt.hex().encode()),
             (contents.RESULT, opened.result),
             (contents.EPISODES, contents.document(tuple(groups))),
         ):
-            self._must_be_clean(f"{place}/{name}", data, passed)
-            yield name, data
-        for name, data in recorded:
-            yield name, data
+            self._add_clean(f"{place}/{name}", data, source.passed)
+        for name, data in recorded.items():
+            self._add(name, data)
         for submit in result.submits:
-            packed = self._checkpoint(folder, submit, place, passed)
-            if packed is not None:
-                yield contents.checkpoint_path(submit.submit_index), packed
-        if self._with_logs and (log := self._log(folder, record, place, passed)) is not None:
-            yield contents.LOG, log
+            path = f"{place}/{contents.checkpoint_path(submit.submit_index)}"
+            if submit.bundle is not None and (packed := self._checkpoint(source, submit, path)) is not None:
+                self._add(path, packed)
+        if self._with_logs and (log := self._log(source, f"{place}/{contents.LOG}")) is not None:
+            self._add(f"{place}/{contents.LOG}", log)
+        own = {
+            name.removeprefix(f"{place}/"): digest
+            for name, digest in self._written.items()
+            if name.startswith(f"{place}/")
+        }
+        self._add(f"{place}/{contents.DIGESTS}", contents.document(own))
+        return cards.Source(place, decode_run_record(run_json), result)
 
     async def _group(
-        self, run: str, split: Split, index: int, n: int, place: str, passed: Passed | None
+        self, source: _Source, split: Split, index: int, n: int, place: str
     ) -> tuple[Group, bytes | None]:
         """A group's returns, and its recordings packed; None where something in them must not be published."""
-        outcomes: dict[int, EpisodeOutcome] = {}
-        async for outcome in self._ask.recorded(run, split, index, timeout_s=TIMEOUT_S):
-            outcomes[outcome.index] = outcome
-        name = contents.group_name(split, index)
+        run, name = source.record.run, contents.group_name(split, index)
+        recorded = self._ask.recorded(run, split, index, timeout_s=TIMEOUT_S)
+        outcomes = {outcome.index: outcome async for outcome in recorded}
         if not outcomes or (n >= 0 and len(outcomes) < n):
             raise _GoneError(
                 f"the coordinator no longer has the episodes of {name}: `evopolicy gc` removed them"
             )
         episodes = []
         recordings: list[bytes | None] = []
-        found: list[str | _Secret] = []
-        for number in sorted(outcomes):
-            outcome = outcomes[number]
+        found: list[_Secret] = []
+        for number, outcome in sorted(outcomes.items()):
+            failure = "" if outcome.failure is None else outcome.failure.category
             episodes.append(
                 Episode(
                     index=number,
                     episode_return=outcome.episode_return,
                     length=outcome.length,
-                    failure="" if outcome.failure is None else outcome.failure.category,
+                    failure=failure,
                 )
             )
             data = None
             if outcome.trajectory is not None:
                 trajectory = decode(await self._ask.fetch(outcome.trajectory))
                 texts = _texts(trajectory)
-                found += scrub.search(texts, self._needles)
-                found += self._secrets(f"{place}/actions/{name}/{number}", texts, passed)
+                found += self._terms(texts)
+                found += self._secrets(f"{place}/actions/{name}/{number}", texts, source.passed)
                 data = actions_only(trajectory)
             recordings.append(data)
         group = Group(split=split, submit_index=index, episodes=tuple(episodes))
         if found:
-            self._stop_at([each for each in found if isinstance(each, _Secret)])
-            self._removed.append(
-                Removed(what=f"run {run}: actions of {name}", why=f"they held {_kind(found[0])}")
-            )
+            self._stop_at(found)
+            self._leave_out(f"run {run}: actions of {name}", f"they held {found[0].what}")
             return group, None
         return group, contents.pack_recordings(recordings)
 
-    def _checkpoint(
-        self, folder: Path, submit: SubmitResult, place: str, passed: Passed | None
-    ) -> bytes | None:
-        if submit.bundle is None:
-            return None
-        what = f"{place}/{contents.checkpoint_path(submit.submit_index)}"
-        matches = sorted((folder / "checkpoints").glob(f"submit_*{submit.submit_index:03d}"))
+    def _checkpoint(self, source: _Source, submit: SubmitResult, what: str) -> bytes | None:
+        matches = sorted((source.folder / "checkpoints").glob(f"submit_*{submit.submit_index:03d}"))
         bundle = _bundle(matches[0]) if matches else None
         if bundle is None or bundle.digest != submit.bundle:
-            why = "the run directory does not hold the policy that was submitted"
-            self._removed.append(Removed(what=what, why=why))
+            self._leave_out(what, "the run directory does not hold the policy that was submitted")
             return None
-        kept_back = self._in_policy(matches[0], bundle, passed)
         # Of files that have changed since the first look.
-        self._stop_at(kept_back)
-        found: list[str | _Secret] = [*scrub.search(bundle.packed, self._needles), *kept_back]
+        found = [*self._terms(bundle.packed), *self._in_policy(matches[0], bundle, source.passed)]
+        self._stop_at(found)
         if found:
-            self._removed.append(Removed(what=what, why=f"it holds {_kind(found[0])}"))
+            self._leave_out(what, f"it holds {found[0].what}")
             return None
         return bundle.packed
 
-    def _in_folder(self, folder: Path, passed: Passed | None) -> list[_Secret]:
-        """Secrets in a run directory's files, apart from the log, in which they are replaced."""
-        found: list[_Secret] = []
-        for path in sorted((folder / "checkpoints").glob("submit_*")):
-            if (bundle := _bundle(path)) is not None:
-                found += self._in_policy(path, bundle, passed)
-        return found
-
     def _in_policy(self, folder: Path, bundle: Bundle, passed: Passed | None) -> list[_Secret]:
+        """Secrets in a run directory's policy. In its log they are replaced."""
         names = "\n".join(file.path for file in bundle.files).encode()
         found = self._secrets(f"{folder} (names of files)", names, passed)
         for file in bundle.files:
             found += self._secrets(str(folder / file.path), file.data, passed)
         return found
+
+    def _terms(self, data: bytes) -> list[_Secret]:
+        return [_Secret("", what) for what in scrub.search(data, self._needles)]
 
     def _secrets(self, name: str, data: bytes, passed: Passed | None) -> list[_Secret]:
         """Secrets whose lines are not accepted."""
@@ -381,6 +370,7 @@ class Publisher:
 
     def _stop_at(self, found: Sequence[_Secret], *, always: bool = False) -> None:
         """Raises ConfigError for secrets, unless what holds them is left out."""
+        found = [each for each in found if each.place]
         if not found or (self._remove_findings and not always):
             return
         here = f"{os.getcwd()}/"
@@ -388,25 +378,24 @@ class Publisher:
         more = f"; and {len(found) - _SHOWN} more" if len(found) > _SHOWN else ""
         left_out = "" if always else "leave out these policies and recordings with --remove-findings, or "
         raise ConfigError(
-            f"nothing is published, as this looks like secrets: {shown}{more}. Revoke real keys; then {left_out}publish"
-            " a line as it is with --accept-finding FILE:LINE"
+            f"nothing is published, as this looks like secrets: {shown}{more}. Revoke real keys; then"
+            f" {left_out}publish a line as it is with --accept-finding FILE:LINE"
         )
 
-    def _log(self, folder: Path, record: RunRecord, place: str, passed: Passed | None) -> bytes | None:
+    def _log(self, source: _Source, what: str) -> bytes | None:
         """The agent's log without what the search finds; None where there is none to publish."""
-        path = folder / (record.artifacts.logs_agent or "logs/agent.jsonl")
-        what = f"{place}/{contents.LOG}"
+        path = source.folder / (source.record.artifacts.logs_agent or "logs/agent.jsonl")
         try:
             log = read_regular(path, contents.MAX_DOCUMENT_BYTES)
-            data, counts = scrub.redact(log, self._needles, passed)
         except FileNotFoundError:
             return None
         except OSError as error:
-            self._removed.append(Removed(what=what, why=error.strerror or "it cannot be read"))
+            self._leave_out(what, error.strerror or "it cannot be read")
             return None
+        data, counts = scrub.redact(log, self._needles, source.passed)
         for found, n in sorted(counts.items()):
-            self._removed.append(Removed(what=f"{what}: {n} places", why=f"they held {found}"))
-        self._must_be_clean(what, data, passed)
+            self._leave_out(f"{what}: {n} places", f"they held {found}")
+        self._must_be_clean(what, data, source.passed)
         return data
 
     def _must_be_clean(self, name: str, data: bytes, passed: Passed | None = None) -> None:
@@ -416,16 +405,6 @@ class Publisher:
                 f"{name} would reveal {found[0]}; nothing is published. Names of entries, models and experiments are"
                 " published as they are: use other names for the runs, or unset a variable whose value is such a name"
             )
-
-
-class _Secret(NamedTuple):
-    place: str
-    """`FILE:LINE`."""
-    what: str
-
-
-def _kind(found: str | _Secret) -> str:
-    return found.what if isinstance(found, _Secret) else found
 
 
 def _bundle(checkpoint: Path) -> Bundle | None:

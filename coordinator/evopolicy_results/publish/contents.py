@@ -20,6 +20,7 @@ Digests are SHA-256 (hex). JSON is as `document` makes it: the same content give
 from __future__ import annotations
 
 import hashlib
+import operator
 from collections.abc import Iterable, Sequence
 
 import msgspec
@@ -36,14 +37,10 @@ MANIFEST, SIGNATURE, JOURNAL, REMOVED = "manifest.json", "signature.json", "jour
 CARD, CARD_TEXT, CROISSANT = "card.json", "card.md", "croissant.json"
 DESCRIPTIONS = (CARD, CARD_TEXT, CROISSANT)
 """Files that follow from the others."""
-DIGESTS, RUN, OPENING, SALT, RESULT, EPISODES = (
-    "digests.json",
-    "run.json",
-    "opening.json",
-    "salt",
-    "result.json",
-    "episodes.json",
+DIGESTS, RUN, OPENING, RESULT, EPISODES = (
+    f"{name}.json" for name in ("digests", "run", "opening", "result", "episodes")
 )
+SALT = "salt"
 LOG = "logs/agent.jsonl"
 """Of a run, where its publisher chose to: the agent's log. The journal does not fix it."""
 MAX_RUNS = 4096
@@ -150,11 +147,6 @@ def wanted_groups(result: Result) -> list[tuple[Split, int, int]]:
     return found
 
 
-def run_folder(number: int) -> str:
-    """A run's folder in the archive."""
-    return f"runs/{number:04d}"
-
-
 def checkpoint_path(submit_index: int) -> str:
     """Below a run's folder."""
     return f"checkpoints/{submit_index:03d}"
@@ -216,36 +208,29 @@ class Listed(msgspec.Struct, frozen=True, kw_only=True):
 def listing(entries: Iterable[journal.Entry], published: Iterable[str]) -> tuple[Listed, ...]:
     """Every run that the journal has of the entries that `published` runs are of, in the order in which they were
     opened."""
-    chosen = set(published)
-    opened: list[journal.Opened] = []
-    status: dict[str, str] = {}
-    for entry in entries:
-        if isinstance(entry, journal.Opened):
-            opened.append(entry)
-        elif isinstance(entry, journal.Ended):
-            status[entry.run] = entry.status
+    chosen, entries = set(published), list(entries)
+    opened = [each for each in entries if isinstance(each, journal.Opened)]
+    status = {each.run: each.status for each in entries if isinstance(each, journal.Ended)}
     names = {each.entry for each in opened if each.run in chosen}
-    last = {
-        (each.exp_id, each.entry, each.env, each.repeat): each.run for each in opened if not each.replay_of
-    }
+    place = operator.attrgetter("exp_id", "entry", "env", "repeat")
+    last = {place(each): each.run for each in opened if not each.replay_of}
     found = []
     for each in opened:
-        if each.entry not in names:
-            continue
-        later = last.get((each.exp_id, each.entry, each.env, each.repeat), each.run)
-        left = "replayed" if each.replay_of else status.get(each.run, "not finished")
-        found.append(
-            Listed(
-                run=each.run,
-                entry=each.entry,
-                env=each.env,
-                exp_id=each.exp_id,
-                repeat=each.repeat,
-                attempt=each.attempt,
-                state="published" if each.run in chosen else left,
-                replaced_by="" if later == each.run or each.replay_of else later,
+        if each.entry in names:
+            left = "replayed" if each.replay_of else status.get(each.run, "not finished")
+            later = each.run if each.replay_of else last[place(each)]
+            found.append(
+                Listed(
+                    run=each.run,
+                    entry=each.entry,
+                    env=each.env,
+                    exp_id=each.exp_id,
+                    repeat=each.repeat,
+                    attempt=each.attempt,
+                    state="published" if each.run in chosen else left,
+                    replaced_by="" if later == each.run else later,
+                )
             )
-        )
     return tuple(found)
 
 

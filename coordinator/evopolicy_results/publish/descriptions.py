@@ -62,7 +62,7 @@ checkpoint. The score is the checkpoint's mean return on other hidden cases.
 random actions on the same cases.
 """,
         *_table(
-            ("environment", "entry", "runs", "mean", "95 % interval", "over", "random"),
+            "environment entry runs mean 95_%_interval over random",
             (
                 (
                     *(each.env, each.entry, each.runs, _number(each.mean)),
@@ -74,18 +74,7 @@ random actions on the same cases.
         ),
         "\n## Agents and costs\n\n*Hours*: the runs' wall times. *CPU s*: the agents' own.\n",
         *_table(
-            (
-                "entry",
-                "agent",
-                "runs",
-                "submits",
-                "episodes",
-                "hours",
-                "CPU s",
-                "turns",
-                "tokens",
-                "US dollars",
-            ),
+            "entry agent runs submits episodes hours CPU_s turns tokens US_dollars",
             (
                 (
                     *(each.entry, "; ".join(each.agents), each.runs, each.submits, each.episodes),
@@ -108,7 +97,7 @@ Of the published file: {_plain(card.licence) or "not stated"}. Of the packages a
 families, as the packages state them (none for toys):
 """)
     found = ((each.what, each.version, each.licence, ", ".join(each.used_by)) for each in card.licences)
-    lines += _table(("package or asset", "version", "licence", "families"), found)
+    lines += _table("package_or_asset version licence families", found)
     lines.append(f"""
 ## Who signs, and how to check
 
@@ -124,7 +113,8 @@ families, as the packages state them (none for toys):
     return "\n".join(lines)
 
 
-def _table(head: tuple[str, ...], rows: Iterable[tuple[object, ...]]) -> list[str]:
+def _table(titles: str, rows: Iterable[tuple[object, ...]]) -> list[str]:
+    head = tuple(title.replace("_", " ") for title in titles.split())
     listed = [tuple(_plain(str(each)) for each in row) for row in rows]
     return [f"| {' | '.join(row)} |" for row in (head, ("---",) * len(head), *listed)]
 

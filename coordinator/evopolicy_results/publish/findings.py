@@ -47,11 +47,14 @@ KINDS = {
 """The checks, in the order of the output."""
 
 
+State = Literal["ok", "failed", "open"]
+
+
 class Finding(msgspec.Struct, frozen=True, kw_only=True):
     """One verdict."""
 
     kind: str
-    state: Literal["ok", "failed", "open"]
+    state: State
     text: str
     run: str = ""
     """The run it is of; empty for the whole."""
@@ -83,11 +86,8 @@ class PublishedRun(msgspec.Struct, frozen=True, kw_only=True):
 
     def cases(self, split: Split) -> tuple[Any, ...]:
         """The cases of a split."""
-        return {
-            "train": self.opening.train,
-            "validation": self.opening.validation,
-            "heldout": self.opening.heldout,
-        }[split]
+        found: tuple[Any, ...] = getattr(self.opening, split)
+        return found
 
     def recordings(self, files: Files, group: str) -> list[bytes | None]:
         """The packed recordings of a group's episodes, by its name; empty without any. ProtocolError for damaged
@@ -132,6 +132,11 @@ class Checked(msgspec.Struct, kw_only=True):
     covered: dict[str, int] = {}
     """By part, the episodes that a replay played."""
 
+    def state_of(self, kind: str) -> str:
+        """`failed`, `open` or `ok`, the gravest of the kind's findings; empty when there are none."""
+        states = {each.state for each in self.findings if each.kind == kind}
+        return next((state for state in ("failed", "open", "ok") if state in states), "")
+
     def coverage(self) -> str:
         """The episodes that a replay played of all, by part, such as `2 of 5 train, 0 of 3 held-out`."""
         total: dict[str, int] = {}
@@ -148,7 +153,7 @@ class Checked(msgspec.Struct, kw_only=True):
         if found := list(fields):
             self.claims.setdefault(file, []).extend(found)
 
-    def add(self, kind: str, state: Literal["ok", "failed", "open"], text: str, run: str = "") -> None:
+    def add(self, kind: str, state: State, text: str, run: str = "") -> None:
         self.findings.append(Finding(kind=kind, state=state, text=text, run=run))
 
 

@@ -6,30 +6,31 @@ Rules that this module owns:
 - The splits are those of the opening, which the commitment fixes. A run whose environment is not installed, or in other
   versions than the run tells, is not played: other versions give other numbers. Nor is one whose environment does not
   repeat episodes according to this machine; the file's own statement does not count.
+- The packages that a run's policies import are those that its `run.json` names, and only if the operator names them
+  too: names in the file alone make nothing of this machine visible or imported.
 """
 
 from __future__ import annotations
 
 import contextlib
-import random
-import uuid
-from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
+import shlex
+from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Sequence
 from pathlib import Path
-from typing import Any
 
 import msgspec
 import numpy as np
 
 from evopolicy_common import catalogue
-from evopolicy_common.errors import BrokenEnvironmentError, EvopolicyError, ProtocolError
+from evopolicy_common.errors import BrokenEnvironmentError, ConfigError, EvopolicyError, ProtocolError
 from evopolicy_common.local.cluster import local_cluster
-from evopolicy_common.messages.operator import DescribeEnvironment, Evaluate
+from evopolicy_common.messages.operator import DescribeEnvironment
+from evopolicy_common.processes.packages import packages_in
 from evopolicy_common.processes.scratch import scratch_folder
 from evopolicy_common.records.episodes import compare
 from evopolicy_common.records.episodes.trajectory import Trajectory
 from evopolicy_common.records.splits import FILE_STEMS, SPLITS, SplitFile, cases_hash
 from evopolicy_common.wire import credentials, transport
-from evopolicy_results.evaluations import Evaluations
+from evopolicy_results.evaluations import Cases, Evaluations, sample, unlike
 from evopolicy_results.publish.contents import Group
 from evopolicy_results.publish.findings import Checked, Files, PublishedRun
 from evopolicy_results.publish.run_rules import recording_of
@@ -46,8 +47,8 @@ class Chosen(msgspec.Struct, frozen=True):
 
     run: PublishedRun
     group: Group
+    cases: Cases
     indexes: tuple[int, ...]
-    case_ids: tuple[int, ...]
 
 
 PlayRun = Callable[[Evaluations, PublishedRun, Sequence[Chosen], bool], Awaitable[None]]
@@ -64,149 +65,153 @@ async def replay(files: Files, checked: Checked, share: float, seed: int, slots:
     async def play_run(
         evaluations: Evaluations, run: PublishedRun, parts: Sequence[Chosen], other_cpu: bool
     ) -> None:
-        await _play_run(evaluations, files, run, parts, other_cpu, checked, seed)
+        name, played, alike = run.opening.run, 0, True
+        for part in parts:
+            n, faults = await _play(evaluations, files, part)
+            checked.covered[part.group.part] = checked.covered.get(part.group.part, 0) + n
+            played += n
+            for fault, rounding in faults:
+                alike = False
+                if other_cpu and rounding:
+                    fault += (
+                        f", {LAST_PLACES} units in the last place at most: this machine's processor has other features"
+                        " than the run's"
+                    )
+                elif other_cpu:
+                    fault += "; other features of the processor do not explain this"
+                checked.add("replay", "open" if other_cpu and rounding else "failed", fault, name)
+        # A replay shows nothing of episodes without a recording, however many it drew.
+        missing = checked.unrecorded(name)
+        if alike:
+            text = f"{played} episodes, bit for bit (drawn by seed {seed})"
+            if missing:
+                text += f"; only {', '.join(missing)} episodes have a recording"
+            checked.add("replay", "open" if missing else "ok", text, name)
 
-    await play_runs("replay", installed(chosen, checked, "replay"), checked, slots, tell, play_run)
+    await play_runs("replay", chosen, checked, slots, tell, play_run)
+
+
+async def _play(evaluations: Evaluations, files: Files, part: Chosen) -> tuple[int, list[tuple[str, bool]]]:
+    """How many of these episodes were played, and what differed, each with whether it may be a matter of rounding."""
+    settings, group = part.run.opening.settings, part.group
+    recorded: dict[int, bytes] = {}
+    actions: list[bytes] = []
+    with contextlib.suppress(ProtocolError):  # reported by the check of recordings
+        for index, data in enumerate(part.run.recordings(files, group.name)):
+            if data is not None and index in part.indexes:
+                actions.append(compare.action_log(recording_of(data).actions))
+                recorded[index] = data
+    faults: list[tuple[str, bool]] = []
+    if not recorded:
+        return 0, faults
+    async for index, outcome in evaluations.replayed(
+        part.cases, list(recorded), env=settings.env, conditions=settings, actions=actions
+    ):
+        place, told = f"{group.name}, episode {index}", group.episodes[index].episode_return
+        if outcome is None or outcome.trajectory is None:
+            faults.append((f"{place}: not played to its end", False))
+            continue
+        before, again = recording_of(recorded[index]), await evaluations.recording(outcome)
+        fault = compare.first_difference(before, again)
+        if fault is None and not compare.same(told, outcome.episode_return):
+            fault = f"return {told!r} is told, {outcome.episode_return!r} came"
+        if fault is not None:
+            faults.append((f"{place}: {fault}", rounded(before, again)))
+    return len(recorded), faults
 
 
 async def play_runs(
     kind: str,
-    by_run: dict[str, list[Chosen]],
+    chosen: Sequence[Chosen],
     checked: Checked,
     slots: int,
     tell: Tell,
     play_run: PlayRun,
-    packages_of: Callable[[PublishedRun], tuple[str, ...]] = lambda run: (),
+    packages: Collection[str] | None = None,
 ) -> None:
     """Plays runs on as many clusters, one after another, as their cases and packages ask for. Adds to `checked` those
-    that cannot be."""
+    that cannot be played. `packages`: those that the runs' policies may import; None where no policy is played."""
+    by_run: dict[str, list[Chosen]] = {}
+    layers: list[tuple[tuple[str, ...], dict[str, str], list[PublishedRun]]] = []
+    for each in chosen:
+        by_run.setdefault(each.run.folder, []).append(each)
+    for folder, (part, *_) in list(by_run.items()):
+        run = part.run
+        env, imported = run.opening.settings.env, packages_in(run.record.versions.fingerprint)
+        lacking = [name for name in imported if packages is not None and name not in packages]
+        # A name that is not of an installed environment could be that of a module to import.
+        if not (catalogue.is_shipped(env) or env in catalogue.plugins()):
+            checked.add(kind, "open", f"{env} is not installed here", run.opening.run)
+        elif lacking:
+            checked.add(kind, "open", f"not played: {not_allowed(lacking)}", run.opening.run)
+        else:
+            # A cluster has one set of cases of each environment.
+            cases = cases_hash(case for split in SPLITS for case in run.cases(split))
+            offered = () if packages is None else imported
+            for has, known, members in layers:
+                if has == offered and known.setdefault(env, cases) == cases:
+                    members.append(run)
+                    break
+            else:
+                layers.append((offered, {env: cases}, [run]))
+            continue
+        del by_run[folder]
     total = sum(len(each.indexes) for parts in by_run.values() for each in parts)
-    by_packages: dict[tuple[str, ...], list[PublishedRun]] = {}
-    for part, *_ in by_run.values():
-        by_packages.setdefault(packages_of(part.run), []).append(part.run)
     played = 0
 
     def told(count: int, waits_for: str) -> None:
         tell(played + count, total)
 
-    for packages, runs in by_packages.items():
-        for layer in layers(runs):
-            try:
-                async with cluster_of(layer, slots, told, packages) as evaluations:
-                    for run in layer:
-                        why_not, other_cpu = await unplayable(evaluations, run)
-                        if why_not:
-                            checked.add(kind, "open", f"not played: {why_not}", run.opening.run)
-                        else:
-                            await play_run(evaluations, run, by_run[run.folder], other_cpu)
-                    played += evaluations.played
-            except EvopolicyError as error:
-                checked.add(kind, "open", f"could not be played: {error}")
+    for offered, _, runs in layers:
+        try:
+            async with _cluster_of(runs, slots, told, offered) as evaluations:
+                for run in runs:
+                    why_not, other_cpu = await unplayable(evaluations, run)
+                    if why_not:
+                        checked.add(kind, "open", f"not played: {why_not}", run.opening.run)
+                    else:
+                        await play_run(evaluations, run, by_run[run.folder], other_cpu)
+                played += evaluations.played
+        except EvopolicyError as error:
+            checked.add(kind, "open", f"could not be played: {error}")
 
 
-def installed(chosen: Sequence[Chosen], checked: Checked, kind: str) -> dict[str, list[Chosen]]:
-    """The runs that can be replayed here, by the run's folder; the others are added to `checked` as open."""
-    by_run: dict[str, list[Chosen]] = {}
-    missing: dict[str, str] = {}
-    for each in chosen:
-        env = each.run.opening.settings.env
-        # A name that is not of an installed environment could be that of a module to import.
-        if catalogue.is_shipped(env) or env in catalogue.plugins():
-            by_run.setdefault(each.run.folder, []).append(each)
-        else:
-            missing[each.run.opening.run] = env
-    for name, env in missing.items():
-        checked.add(kind, "open", f"{env} is not installed here", name)
-    return by_run
-
-
-def layers(runs: Sequence[PublishedRun]) -> list[list[PublishedRun]]:
-    """The runs in groups in which no two have other cases of one environment: a cluster has one set of cases of
-    each."""
-    layers: list[tuple[dict[str, str], list[PublishedRun]]] = []
-    for run in runs:
-        env, cases = (
-            run.opening.settings.env,
-            cases_hash(case for split in SPLITS for case in run.cases(split)),
-        )
-        for known, members in layers:
-            if known.setdefault(env, cases) == cases:
-                members.append(run)
-                break
-        else:
-            layers.append(({env: cases}, [run]))
-    return [members for _, members in layers]
-
-
-async def _play_run(
-    evaluations: Evaluations,
-    files: Files,
-    run: PublishedRun,
-    parts: Sequence[Chosen],
-    other_cpu: bool,
-    checked: Checked,
-    seed: int,
-) -> None:
-    name = run.opening.run
-    played, alike = 0, True
-    for part in parts:
-        n, faults = await _play(evaluations, files, part)
-        checked.covered[part.group.part] = checked.covered.get(part.group.part, 0) + n
-        played += n
-        for fault, rounding in faults:
-            alike = False
-            if other_cpu and rounding:
-                text = (
-                    f"{fault}, {LAST_PLACES} units in the last place at most: this machine's processor has other"
-                    " features than the run's"
-                )
-                checked.add("replay", "open", text, name)
-            elif other_cpu:
-                text = f"{fault}; other features of the processor do not explain this"
-                checked.add("replay", "failed", text, name)
-            else:
-                checked.add("replay", "failed", fault, name)
-    # A replay shows nothing of episodes without a recording, however many it drew.
-    missing = checked.unrecorded(name)
-    if alike:
-        text = f"{played} episodes, bit for bit (drawn by seed {seed})"
-        if missing:
-            text += f"; only {', '.join(missing)} episodes have a recording"
-        checked.add("replay", "open" if missing else "ok", text, name)
+def not_allowed(packages: Sequence[str]) -> str:
+    """Says which packages policies import without being allowed to, with the options that allow them."""
+    # The names are the publisher's, and the options are made to be copied into a shell.
+    options = " ".join(f"--policy-package {shlex.quote(name)}" for name in packages)
+    return f"its policies import packages that this command does not allow; allow them with {options}"
 
 
 def draw(runs: Sequence[PublishedRun], share: float, seed: int) -> list[Chosen]:
-    everything: list[tuple[int, int, int]] = []
-    for k, run in enumerate(runs):
-        for g, group in enumerate(run.groups):
-            everything += [(k, g, i) for i in range(len(group.episodes))]
-    n = len(everything) if share >= 1.0 else min(len(everything), max(1, round(share * len(everything))))
-    by_group: dict[tuple[int, int], list[int]] = {}
-    for k, g, i in random.Random(seed).sample(everything, n):
-        by_group.setdefault((k, g), []).append(i)
+    """A share of all episodes of the runs, by group. Leaves out those whose cases cannot be."""
+    groups = [(run, group) for run in runs for group in run.groups]
+    sizes = [len(group.episodes) for _, group in groups]
     found = []
-    for (k, g), indexes in sorted(by_group.items()):
-        run, group = runs[k], runs[k].groups[g]
-        ids = _case_ids(run, group)
-        kept = tuple(index for index in sorted(indexes) if index < len(ids))
-        if kept:
-            found.append(Chosen(run, group, kept, tuple(ids[index] for index in kept)))
+    for k, drawn in sample(sizes, max(1, round(share * sum(sizes))), seed):
+        run, group = groups[k]
+        submit = next((one for one in run.result.submits if one.submit_index == group.submit_index), None)
+        train = () if submit is None else submit.env_instances
+        ids = train if group.split == "train" else tuple(range(len(group.episodes)))
+        indexes = tuple(index for index in drawn if index < len(ids))
+        if not indexes or not all(0 <= each < len(run.cases(group.split)) for each in ids):
+            continue
+        used = sum(
+            len(one.env_instances) for one in run.result.submits if one.submit_index <= group.submit_index
+        )
+        cases = Cases(
+            split=group.split,
+            submit_index=group.submit_index,
+            env_instances=ids,
+            modulo=len(train) or len(ids),
+            remaining_budget_after=run.opening.budget - used,
+        )
+        found.append(Chosen(run, group, cases, indexes))
     return found
 
 
-def _case_ids(run: PublishedRun, group: Group) -> tuple[int, ...]:
-    """The ids, in its split, of the cases that a group's episodes play; none for what cannot be."""
-    if group.split == "train":
-        submit = next((each for each in run.result.submits if each.submit_index == group.submit_index), None)
-        ids = () if submit is None else submit.env_instances
-    else:
-        ids = tuple(range(len(group.episodes)))
-    n = len(run.cases(group.split))
-    return ids if all(0 <= each < n for each in ids) else ()
-
-
 @contextlib.asynccontextmanager
-async def cluster_of(
+async def _cluster_of(
     runs: Sequence[PublishedRun], slots: int, tell: Callable[[int, str], None], packages: Sequence[str]
 ) -> AsyncIterator[Evaluations]:
     """A cluster whose splits are those of the runs. `packages`: those that policies may import besides numpy."""
@@ -240,63 +245,9 @@ async def unplayable(evaluations: Evaluations, run: PublishedRun) -> tuple[str, 
     here: dict[str, str] = {}
     for fingerprint in state.fingerprints:
         here |= fingerprint.flat()
-    names = sorted(known.keys() & here.keys() - {"cpu", "evopolicy-worker"})
-    differ = [
-        f"{name} {here[name]} here, {known[name]} in the run" for name in names if here[name] != known[name]
-    ]
+    names = known.keys() & here.keys() - {"cpu", "evopolicy-worker"}
+    differ = unlike({name: known[name] for name in names}, {name: here[name] for name in names})
     return "; ".join(differ[:4]), here.get("cpu") != known.get("cpu")
-
-
-async def _play(evaluations: Evaluations, files: Files, part: Chosen) -> tuple[int, list[tuple[str, bool]]]:
-    """How many of these episodes were played, and what differed, each with whether it may be a matter of rounding."""
-    run, group = part.run, part.group
-    try:
-        recordings = run.recordings(files, group.name)
-    except ProtocolError:
-        return 0, []  # reported by the check of recordings
-    stored: list[tuple[int, bytes]] = []
-    case_ids, refs = [], []
-    for index, case_id in zip(part.indexes, part.case_ids, strict=True):
-        data = recordings[index] if index < len(recordings) else None
-        if data is None:
-            continue
-        try:
-            actions = compare.action_log(recording_of(data).actions)
-        except ProtocolError:
-            continue
-        refs.append(await evaluations.uploaded(actions))
-        stored.append((index, data))
-        case_ids.append(case_id)
-    if not refs:
-        return 0, []
-    message = Evaluate(
-        token="",
-        key=uuid.uuid4().hex,
-        env=run.opening.settings.env,
-        bundle=None,
-        split=group.split,
-        cases=tuple(case_ids),
-        record="actions",
-        replays=tuple(refs),
-        step_limit=run.opening.settings.step_limit,
-    )
-    faults: list[tuple[str, bool]] = []
-    seen: set[int] = set()
-    async for outcome in evaluations.outcomes(message):
-        if outcome.trajectory is None:
-            continue
-        index, data = stored[outcome.index]
-        seen.add(index)
-        episode = group.episodes[index]
-        recorded, again = recording_of(data), await evaluations.recording(outcome)
-        fault = compare.first_difference(recorded, again)
-        if fault is None and not compare.same(episode.episode_return, outcome.episode_return):
-            fault = f"return {episode.episode_return!r} is told, {outcome.episode_return!r} came"
-        if fault is not None:
-            faults.append((f"{group.name}, episode {index}: {fault}", rounded(recorded, again)))
-    missing = [index for index, _ in stored if index not in seen]
-    faults += [(f"{group.name}, episode {index}: not played to its end", False) for index in missing]
-    return len(stored), faults
 
 
 def rounded(recorded: Trajectory, again: Trajectory) -> bool:
@@ -317,11 +268,12 @@ def rounded(recorded: Trajectory, again: Trajectory) -> bool:
     return False
 
 
-def share_of(text: str) -> float:
-    """`5%` or `all` as a share, 0 to 1. ValueError for anything else."""
-    value: Any = (
-        1.0 if text == "all" else float(text.removesuffix("%")) / 100.0 if text.endswith("%") else None
-    )
-    if value is None or not 0.0 < value <= 1.0:
-        raise ValueError(text)
-    return float(value)
+def share_of(option: str, text: str | None) -> float | None:
+    """`5%` or `all` as a share, 0 to 1; None for none. ConfigError, which names the option, for anything else."""
+    if text is None:
+        return None
+    with contextlib.suppress(ValueError):
+        value = 100.0 if text == "all" else float(text.removesuffix("%")) if text.endswith("%") else 0.0
+        if 0.0 < value <= 100.0:
+            return value / 100.0
+    raise ConfigError(f"{option} {text!r}: say a share such as 5%, or all")

@@ -21,7 +21,7 @@ from evopolicy_common.terminal import counted
 from evopolicy_results.publish import card as cards
 from evopolicy_results.publish import contents, descriptions, fields
 from evopolicy_results.publish.contents import Countersignature, Manifest, Removed, Signature
-from evopolicy_results.publish.findings import KINDS, Checked, Files, History, decoded
+from evopolicy_results.publish.findings import KINDS, Checked, Files, History, State, decoded
 from evopolicy_results.publish.run_rules import UPDATE, check_run, read_run, refuse_unknown
 from evopolicy_results.publish.signatures import HEAD, signed_by
 
@@ -61,7 +61,8 @@ def check(files: Files, identity: str = "", heads: Sequence[str | Countersignatu
         text = "only --replay compares the recorded actions, single rewards and ends with the environment"
         checked.add("claims", "open", text)
     checked.listing = contents.listing(entries.entries, seen)
-    _completeness(checked)
+    is_whole = all(each.state == "published" for each in checked.listing)
+    checked.add("completeness", "ok" if is_whole else "open", contents.completeness(checked.listing))
     _descriptions(files, manifest, digests, checked)
     _claims(checked)
     return checked
@@ -78,18 +79,16 @@ def _manifest(files: Files, identity: str, checked: Checked) -> Manifest | None:
     except ProtocolError as error:
         checked.add("format", "failed", str(error))
         return None
+    fault = ""
     if (manifest.format, manifest.version) != (contents.FORMAT, contents.VERSION):
-        found = f"{manifest.format[:40]!r} version {manifest.version}"
-        checked.add(
-            "format", "failed", f"{found}; this program reads {contents.FORMAT!r} version {contents.VERSION}"
+        fault = (
+            f"{manifest.format[:40]!r} version {manifest.version}; this program reads {contents.FORMAT!r} version"
+            f" {contents.VERSION}"
         )
-        return None
-    if data != contents.document(manifest) or manifest.canary != CANARY:
-        checked.add(
-            "format",
-            "failed",
-            "the manifest is not written as the software writes it: a field is added or doubled, or another canary",
-        )
+    elif data != contents.document(manifest) or manifest.canary != CANARY:
+        fault = "the manifest is not written as the software writes it: a field is added or doubled, or another canary"
+    if fault:
+        checked.add("format", "failed", fault)
         return None
     checked.claim(contents.MANIFEST, ["software"])
     checked.add("format", "ok", f"version {manifest.version}, made by evopolicy {manifest.software}")
@@ -98,15 +97,16 @@ def _manifest(files: Files, identity: str, checked: Checked) -> Manifest | None:
         return manifest
     checked.signer = signature.key
     checked.add("signature", "ok", f"signed by {signature.key}")
+    state: State = "failed"
+    text = f"another signer: {signature.key}, not {identity}"
     if not identity:
+        state = "open"
         text = (
             "self-signed: whoever made the file chose the key. Name the key that you expect with --identity"
         )
-        checked.add("identity", "open", text)
     elif signature.key == identity.lower():
-        checked.add("identity", "ok", "signed by the key that you named")
-    else:
-        checked.add("identity", "failed", f"another signer: {signature.key}, not {identity}")
+        state, text = "ok", "signed by the key that you named"
+    checked.add("identity", state, text)
     return manifest
 
 
@@ -168,10 +168,8 @@ def _journal(files: Files, manifest: Manifest, checked: Checked) -> History:
     fault = _history_fault(entries)
     if (len(lines), head) != (manifest.journal_entries, manifest.journal_head):
         fault = f"its {len(lines)} entries come to the head {head}, which is not the signed one"
-    if fault:
-        checked.add("journal", "failed", fault)
-    else:
-        checked.add("journal", "ok", f"{len(lines)} entries, head {head}")
+    text = fault or f"{len(lines)} entries, head {head}"
+    checked.add("journal", "failed" if fault else "ok", text)
     return History(entries, heads)
 
 
@@ -211,29 +209,25 @@ def _order(history: History, noted: Sequence[str | Countersignature], checked: C
 
 def _history_fault(entries: Sequence[journal.Entry]) -> str | None:
     """A contradiction in the order of the entries; None if there is none."""
-    opened: dict[str, str] = {}
-    ended: set[str] = set()
-    revealed: set[str] = set()
+    still_open: dict[str, str] = {}
+    seen: set[str] = set()
     at = 0.0
     for number, entry in enumerate(entries):
         if entry.at < at:
             return f"entry {number} is older than the one before it"
         at = entry.at
         if isinstance(entry, Opened):
-            if entry.run in opened:
+            if entry.run in seen:
                 return f"run {entry.run} is opened twice"
-            opened[entry.run] = entry.epoch
+            seen.add(entry.run)
+            still_open[entry.run] = entry.epoch
         elif isinstance(entry, Ended):
-            if entry.run not in opened or entry.run in ended:
+            if still_open.pop(entry.run, None) is None:
                 return f"run {entry.run} ends without being open"
-            ended.add(entry.run)
         else:
-            revealed.add(entry.epoch)
-            open_run = next(
-                (run for run, of in opened.items() if of == entry.epoch and run not in ended), None
-            )
-            if open_run is not None:
-                return f"epoch {entry.epoch} is revealed while run {open_run} is open"
+            run = next((run for run, epoch in still_open.items() if epoch == entry.epoch), None)
+            if run is not None:
+                return f"epoch {entry.epoch} is revealed while run {run} is open"
     return None
 
 
@@ -288,8 +282,3 @@ def _claims(checked: Checked) -> None:
         run = next((run.opening.run for run in checked.runs if file.startswith(f"{run.folder}/")), "")
         text = f"nobody can check, in {kind.removeprefix('runs/*/')}: {', '.join(found)}"
         checked.add("claims", "open", text, run)
-
-
-def _completeness(checked: Checked) -> None:
-    is_whole = all(each.state == "published" for each in checked.listing)
-    checked.add("completeness", "ok" if is_whole else "open", contents.completeness(checked.listing))

@@ -3,7 +3,7 @@ recordings."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from itertools import zip_longest
 from typing import Any, TypeVar
 
@@ -33,15 +33,7 @@ T = TypeVar("T")
 _SHOWN = 8
 """Unknown fields of a file that become findings."""
 _BY_SUBMIT = "code_metrics_by_submit"
-_PARSED = (
-    "classes",
-    "functions",
-    "imports",
-    "import_count",
-    "cyclomatic_total",
-    "cyclomatic_max",
-    "parse_errors",
-)
+_PARSED = "classes functions imports import_count cyclomatic_total cyclomatic_max parse_errors"
 """Metrics of code that rest on Python's parser."""
 UPDATE = "it was added, or a later version of evopolicy wrote it (then update)"
 
@@ -50,9 +42,8 @@ def refuse_unknown(name: str, value: Any, committed: dict[str, Any], checked: Ch
     """Refuses fields that the table of `fields` does not name, and notes those that are claims."""
     unknown, claims = fields.unknown_and_claims(name, value, committed)
     for field in unknown[:_SHOWN]:
-        checked.add(
-            "format", "failed", f"{name}: {field[:120]} is no field of published results: {UPDATE}", run
-        )
+        text = f"{name}: {field[:120]} is no field of published results: {UPDATE}"
+        checked.add("format", "failed", text, run)
     checked.claim(name, claims)
 
 
@@ -87,17 +78,8 @@ def read_run(files: Files, folder: str, checked: Checked) -> PublishedRun | None
 
 def check_run(files: Files, run: PublishedRun, history: History, damaged: set[str], checked: Checked) -> None:
     name = run.opening.run
-    rules: tuple[tuple[str, Iterator[Fault]], ...] = (
-        ("commitment", _commitment(run, history)),
-        ("disclosure", _disclosure(run, history)),
-        ("result", _result(run, history)),
-        ("record", _record(run, history)),
-        ("budget", _budget(run)),
-        ("selection", _selection(run)),
-        ("scores", _scores(run)),
-    )
-    for kind, faults in rules:
-        found = list(faults)
+    for kind, rule in _RULES.items():
+        found = [each if isinstance(each, Fault) else Fault(kind, each) for each in rule(run, history)]
         for fault in found:
             checked.add(fault.kind, "failed", fault.text, name)
         if not found:
@@ -117,119 +99,84 @@ def _entry(history: History, kind: type[T], run: str) -> tuple[int, T] | None:
     return None
 
 
-def _commitment(run: PublishedRun, history: History) -> Iterator[Fault]:
-    opening, settings = run.opening, run.opening.settings
+def _commitment(run: PublishedRun, history: History) -> Iterator[str | Fault]:
+    opening, settings, place = run.opening, run.opening.settings, run.record.committed
     numbered = _entry(history, Opened, opening.run)
     if numbered is None:
         yield Fault("journal", "the journal has no entry of this run")
         return
     number, entry = numbered
     if len(run.salt) != journal.SALT_BYTES:
-        yield Fault("commitment", f"its salt has {len(run.salt)} bytes instead of {journal.SALT_BYTES}")
+        yield f"its salt has {len(run.salt)} bytes instead of {journal.SALT_BYTES}"
     if journal.commitment(run.salt, run.opening_bytes) != entry.commitment:
-        yield Fault("commitment", "splits or settings are not those that were committed to")
-    declared = (entry.epoch, entry.entry, entry.model, entry.env, entry.exp_id, entry.repeat, entry.attempt)
-    ours = (opening.epoch, settings.entry, settings.model, settings.env, settings.exp_id)
-    if declared != (*ours, settings.repeat, settings.attempt):
-        yield Fault("commitment", "the journal opened it for another entry, environment, experiment or epoch")
-    place = run.record.committed
-    if place is None or (place.commitment, place.opened, place.opened_head, place.epoch) != (
-        entry.commitment,
-        number,
-        history.heads[number],
-        entry.epoch,
-    ):
+        yield "splits or settings are not those that were committed to"
+    names = ("entry", "model", "env", "exp_id", "repeat", "attempt")
+    if entry.epoch != opening.epoch or any(getattr(entry, name) != getattr(settings, name) for name in names):
+        yield "the journal opened it for another entry, environment, experiment or epoch"
+    fixed = (entry.commitment, number, history.heads[number], entry.epoch)
+    if place is None or (place.commitment, place.opened, place.opened_head, place.epoch) != fixed:
         yield Fault("record", "run.json tells another commitment or head of the journal than the journal has")
-    if settings.replay_of or entry.replay_of:
-        yield Fault(
-            "commitment",
-            f"it is a replay of run {settings.replay_of or entry.replay_of}, and no run of its own",
-        )
-    cases = {split: run.cases(split) for split in SPLITS}
-    if repeated := overlaps(cases):
-        yield Fault("commitment", f"its splits are not disjoint: {repeated[0]}")
+    if of := settings.replay_of or entry.replay_of:
+        yield f"it is a replay of run {of}, and no run of its own"
+    if repeated := overlaps({split: run.cases(split) for split in SPLITS}):
+        yield f"its splits are not disjoint: {repeated[0]}"
 
 
-def _disclosure(run: PublishedRun, history: History) -> Iterator[Fault]:
+def _disclosure(run: PublishedRun, history: History) -> Iterator[str]:
     epoch = run.opening.epoch
     if not any(isinstance(entry, Revealed) and entry.epoch == epoch for entry in history.entries):
-        yield Fault(
-            "disclosure", f"epoch {epoch} was not revealed: its cases may still be played as secret ones"
-        )
+        yield f"epoch {epoch} was not revealed: its cases may still be played as secret ones"
 
 
-def _result(run: PublishedRun, history: History) -> Iterator[Fault]:
-    numbered = _entry(history, Ended, run.opening.run)
+def _result(run: PublishedRun, history: History) -> Iterator[str | Fault]:
+    numbered, place = _entry(history, Ended, run.opening.run), run.record.committed
     if numbered is None:
-        yield Fault("result", "the journal has no end of this run")
+        yield "the journal has no end of this run"
         return
     number, entry = numbered
     if journal.digest(run.result_bytes) != entry.result or run.result.run != run.opening.run:
-        yield Fault("result", "result.json is not the result that the journal fixed when the run ended")
+        yield "result.json is not the result that the journal fixed when the run ended"
     if run.result.status != entry.status:
-        yield Fault("result", f"it ended as {entry.status}, not as {run.result.status}")
-    place = run.record.committed
+        yield f"it ended as {entry.status}, not as {run.result.status}"
     if place is None or (place.ended, place.ended_head) != (number, history.heads[number]):
         yield Fault("record", "run.json tells another end of the run than the journal has")
 
 
-def _record(run: PublishedRun, history: History) -> Iterator[Fault]:
+_RECORD_AS_SET = "env model exp_id repeat attempt sandbox_tier start replay_of"
+_DIMENSIONS_AS_SET = """
+    policy_scope observations simulation video limits finish step_limit profile feedback failed_episodes
+    hidden_evaluation hidden_cases
+"""
+"""Fields that a setting of the same name determines."""
+
+
+def _record(run: PublishedRun, history: History) -> Iterator[str]:
     """`run.json`, compared with the committed documents."""
     record, opening, result = run.record, run.opening, run.result
-    settings, dimensions = opening.settings, record.experiment_dimensions
-    # A run that ended before it had a workspace tells no counts.
-    staged = dimensions.n_train > 0 or bool(result.submits)
+    settings, dimensions, agent = opening.settings, record.experiment_dimensions, record.agent
     pairs: list[tuple[str, Any, Any]] = [
         ("protocol_version", record.protocol_version, PROTOCOL_VERSION),
         ("run", record.run, opening.run),
-        ("env", record.env, settings.env),
-        ("model", record.model, settings.model),
-        ("exp_id", record.exp_id, settings.exp_id),
-        ("repeat", record.repeat, settings.repeat),
-        ("attempt", record.attempt, settings.attempt),
-        ("agent.entry", record.agent.entry, settings.entry),
-        ("sandbox_tier", record.sandbox_tier, settings.sandbox_tier),
+        ("agent.entry", agent.entry, settings.entry),
+        ("agent.inputs", inputs_digest(agent.inputs), settings.inputs),
+        ("agent.prompts", agent.prompts, settings.prompts and f"sha256:{settings.prompts}"),
+        ("agents_md", dimensions.agents_md, settings.agents_md and f"sha256:{settings.agents_md}"),
         ("episode_budget", dimensions.episode_budget, opening.budget),
-        ("start", record.start, settings.start),
-        ("replay_of", record.replay_of, settings.replay_of),
         ("trees", record.trees, {str(one.submit_index): one.tree for one in result.submits if one.tree}),
         ("versions.data_secret", record.versions.data_secret, opening.cases_secret),
     ]
-    for name in (
-        "policy_scope",
-        "observations",
-        "simulation",
-        "video",
-        "limits",
-        "finish",
-        "step_limit",
-        "profile",
-        "feedback",
-        "failed_episodes",
-        "hidden_evaluation",
-    ):
-        pairs.append((name, getattr(dimensions, name), getattr(settings, name)))
-    pairs.append(("hidden_cases", dimensions.hidden_cases, settings.hidden_cases))
-    for name, here, fixed in (
-        ("agents_md", dimensions.agents_md, settings.agents_md),
-        ("agent.prompts", record.agent.prompts, settings.prompts),
-    ):
-        pairs.append((name, here, f"sha256:{fixed}" if fixed else ""))
-    pairs.append(("agent.inputs", inputs_digest(record.agent.inputs), settings.inputs))
-    for name, told in (
-        ("n_train", len(opening.train)),
-        ("min_episodes_per_submit", opening.min_episodes_per_submit),
-        ("max_episodes_per_submit", opening.max_episodes_per_submit),
-    ):
-        pairs.append((name, getattr(dimensions, name), told if staged else 0))
+    for part, names in ((record, _RECORD_AS_SET), (dimensions, _DIMENSIONS_AS_SET)):
+        pairs += [(name, getattr(part, name), getattr(settings, name)) for name in names.split()]
+    # A run that ended before it had a workspace tells no counts.
+    staged = dimensions.n_train > 0 or bool(result.submits)
+    pairs.append(("n_train", dimensions.n_train, staged * len(opening.train)))
+    for name in ("min_episodes_per_submit", "max_episodes_per_submit"):
+        pairs.append((name, getattr(dimensions, name), staged * getattr(opening, name)))
     suite = catalogue.suite_of(settings.env) if catalogue.is_shipped(settings.env) else catalogue.OTHER
-    for name, n, usual in (
-        ("n_validation", len(opening.validation), suite.n_validation),
-        ("n_heldout", len(opening.heldout), suite.n_heldout),
-    ):
+    for name, cases in (("n_validation", opening.validation), ("n_heldout", opening.heldout)):
         # Where files determine the cases, `run.json` may tell the suite's number.
-        if getattr(dimensions, name) != usual or getattr(settings, name) is not None:
-            pairs.append((name, getattr(dimensions, name), n))
+        if getattr(dimensions, name) != getattr(suite, name) or getattr(settings, name) is not None:
+            pairs.append((name, getattr(dimensions, name), len(cases)))
     for path, fixed in result.record.items():
         here = fields.value_at(run.as_written, path)
         if not _alike(here, fixed):
@@ -238,46 +185,42 @@ def _record(run: PublishedRun, history: History) -> Iterator[Fault]:
         pairs.append(("outcome.random_reference", record.outcome.random_reference, None))
     began, over = _entry(history, Opened, opening.run), _entry(history, Ended, opening.run)
     if began is not None and over is not None:
-        start, end = began[1].at, over[1].at
-        pairs.append(("timing.start_time", record.timing.start_time, utc_text(start)))
-        pairs.append(("timing.end_time", record.timing.end_time, utc_text(end)))
-        pairs.append(("timing.wall_time_seconds", record.timing.wall_time_seconds, round(end - start, 3)))
+        start, end, timing = began[1].at, over[1].at, record.timing
+        pairs += [
+            ("timing.start_time", timing.start_time, utc_text(start)),
+            ("timing.end_time", timing.end_time, utc_text(end)),
+            ("timing.wall_time_seconds", timing.wall_time_seconds, round(end - start, 3)),
+        ]
     for split in SPLITS:
         ours = f"sha256:{cases_hash(run.cases(split))}"
         pairs.append((f"the hash of the {FILE_STEMS[split]} cases", record.versions.cases_hash(split), ours))
-    for name, here, fixed in pairs:
-        if here != fixed:
-            yield Fault("record", f"run.json tells {name} {_short(here)}; committed to was {_short(fixed)}")
-    for name, here, fixed in outcome_pairs(record.outcome, result):
-        if here != fixed:
-            yield Fault(
-                "record", f"run.json tells {name} {_short(here)}; what came of the run is {_short(fixed)}"
-            )
+    for source, told in (
+        ("committed to was", pairs),
+        ("what came of the run is", outcome_pairs(record.outcome, result)),
+    ):
+        for name, here, fixed in told:
+            if here != fixed:
+                yield f"run.json tells {name} {_short(here)}; {source} {_short(fixed)}"
 
 
-def _budget(run: PublishedRun) -> Iterator[Fault]:
+def _budget(run: PublishedRun, history: History) -> Iterator[str]:
     opening, result = run.opening, run.result
     indexes = [submit.submit_index for submit in result.submits]
     if indexes != sorted(set(indexes)):
-        yield Fault("budget", "its submits are not in order")
+        yield "its submits are not in order"
     used = 0
     for submit in result.submits:
         n = len(submit.env_instances)
         used += n
         if not opening.min_episodes_per_submit <= n <= opening.max_episodes_per_submit:
-            yield Fault(
-                "budget", f"submit {submit.submit_index} has {n} episodes, which the settings do not allow"
-            )
+            yield f"submit {submit.submit_index} has {n} episodes, which the settings do not allow"
         if any(not 0 <= case < len(opening.train) for case in submit.env_instances):
-            yield Fault("budget", f"submit {submit.submit_index} plays a case that is not one of train")
+            yield f"submit {submit.submit_index} plays a case that is not one of train"
     if used != result.budget_used or used > opening.budget:
-        yield Fault(
-            "budget",
-            f"its submits take {used} episodes, {result.budget_used} are told, {opening.budget} were granted",
-        )
+        yield f"its submits take {used} episodes, {result.budget_used} are told, {opening.budget} were granted"
 
 
-def _selection(run: PublishedRun) -> Iterator[Fault]:
+def _selection(run: PublishedRun, history: History) -> Iterator[str]:
     result = run.result
     eligible = {
         submit.submit_index: submit.val_mean
@@ -288,95 +231,95 @@ def _selection(run: PublishedRun) -> Iterator[Fault]:
     }
     wanted = best_validated(eligible, run.opening.settings.profile)
     if result.status == "completed" and result.best_submit_index != wanted:
-        yield Fault(
-            "selection",
-            f"submit {result.best_submit_index} is told, submit {wanted} has the best validation mean",
-        )
+        yield f"submit {result.best_submit_index} is told, submit {wanted} has the best validation mean"
 
 
-def _scores(run: PublishedRun) -> Iterator[Fault]:
+def _scores(run: PublishedRun, history: History) -> Iterator[str]:
     result, opening = run.result, run.opening
     if len({group.name for group in run.groups}) != len(run.groups):
-        yield Fault("scores", "a list of episodes occurs twice")
-    wanted_names = [contents.group_name(split, index) for split, index, _ in contents.wanted_groups(result)]
+        yield "a list of episodes occurs twice"
+    wanted_groups = contents.wanted_groups(result)
+    wanted_names = [contents.group_name(split, index) for split, index, _ in wanted_groups]
     if odd := [group.name for group in run.groups if group.name not in wanted_names]:
-        yield Fault("scores", f"the result has no episodes of {odd[0]}")
+        yield f"the result has no episodes of {odd[0]}"
     groups = {(group.split, group.submit_index): group for group in run.groups}
     submits = {submit.submit_index: submit for submit in result.submits}
-    for split, index, n in contents.wanted_groups(result):
-        name = contents.group_name(split, index)
+    for name, (split, index, n) in zip(wanted_names, wanted_groups, strict=True):
         group = groups.get((split, index))
         if group is None:
-            yield Fault("scores", f"the episodes of {name} are not there")
+            yield f"the episodes of {name} are not there"
             continue
         wanted = len(opening.validation) if n < 0 else n
         if [episode.index for episode in group.episodes] != list(range(wanted)):
-            yield Fault(
-                "scores", f"{name} has {len(group.episodes)} episodes, or out of order, instead of {wanted}"
-            )
+            yield f"{name} has {len(group.episodes)} episodes, or out of order, instead of {wanted}"
             continue
         returns = tuple(episode.episode_return for episode in group.episodes)
         if split == "heldout":
             recorded = result.random_heldout_returns if index == contents.RANDOM else result.heldout_returns
             if returns != recorded:
-                yield Fault("scores", f"the returns of {name} are not those of the result")
+                yield f"the returns of {name} are not those of the result"
         else:
             submit = submits[index]
             told = submit.mean_return if split == "train" else submit.val_mean
             if returns and mean(returns) != told:
-                yield Fault("scores", f"the returns of {name} have the mean {mean(returns)!r}, not {told!r}")
+                yield f"the returns of {name} have the mean {mean(returns)!r}, not {told!r}"
     for split in ("validation", "heldout"):
         best = groups.get((split, -2 if result.best_submit_index is None else result.best_submit_index))
         failed = 0 if best is None else sum(episode.failure != "" for episode in best.episodes)
         if best is not None and failed != result.policy_failures.get(split, 0):
-            yield Fault(
-                "scores", f"{best.name} has {failed} failures of the policy, which the result does not tell"
-            )
+            yield f"{best.name} has {failed} failures of the policy, which the result does not tell"
     if result.status == "completed":
         n_heldout = len(result.heldout_returns)
         if n_heldout != len(opening.heldout) or result.final_score != mean(result.heldout_returns):
-            yield Fault("scores", "the score is not the mean return of all held-out cases")
+            yield "the score is not the mean return of all held-out cases"
+
+
+_RULES: dict[str, Callable[[PublishedRun, History], Iterator[str | Fault]]] = {
+    "commitment": _commitment,
+    "disclosure": _disclosure,
+    "result": _result,
+    "record": _record,
+    "budget": _budget,
+    "selection": _selection,
+    "scores": _scores,
+}
+"""By the kind of their findings; a `Fault` is of another kind."""
 
 
 def _recordings(files: Files, run: PublishedRun, damaged: set[str], checked: Checked) -> None:
-    name, fine = run.opening.run, True
+    name, lists = run.opening.run, f"{run.folder}/actions/"
     recorded: dict[str, tuple[int, int]] = {}
-    lists = f"{run.folder}/actions/"
-    odd = {each for each in files.names if each.startswith(lists)} - {
-        lists + each.name for each in run.groups
-    }
-    for path in sorted(odd):
-        checked.add("recordings", "failed", f"{path} is of no list of episodes", name)
-        fine = False
+    there = {each for each in files.names if each.startswith(lists)}
+    faults = [
+        f"{path} is of no list of episodes" for path in sorted(there - {lists + g.name for g in run.groups})
+    ]
     for number, group in enumerate(run.groups):
-        path, there = f"{lists}{group.name}", 0
         # The result has the returns of held-out episodes.
         claimed = ["length"] if group.split == "heldout" else ["length", "episode_return"]
         recordings: list[bytes | None] = []
-        if path in files.names and path not in damaged:
+        if lists + group.name not in damaged:
             try:
-                recordings = contents.unpack_recordings(files.read(path, contents.MAX_RECORDING_BYTES))
-                if len(recordings) != len(group.episodes):
+                recordings = run.recordings(files, group.name)
+                if lists + group.name in there and len(recordings) != len(group.episodes):
                     raise ProtocolError(f"{len(recordings)} recordings")
             except ProtocolError as error:
-                checked.add("recordings", "failed", f"{group.name}: {error}", name)
-                fine, recordings = False, []
+                faults.append(f"{group.name}: {error}")
+                recordings = []
+        n, of = recorded.get(group.part, (0, 0))
+        recorded[group.part] = n + sum(each is not None for each in recordings), of + len(group.episodes)
         for position, (episode, data) in enumerate(zip_longest(group.episodes, recordings)):
             if data is None:
                 place = f"{number}.episodes.{position}"
                 checked.claim(f"{run.folder}/{contents.EPISODES}", (f"{place}.{field}" for field in claimed))
-                continue
-            there += 1
-            if fault := recording_fault(episode, data):
-                checked.add("recordings", "failed", f"{group.name}, episode {episode.index}: {fault}", name)
-                fine = False
-        before = recorded.get(group.part, (0, 0))
-        recorded[group.part] = before[0] + there, before[1] + len(group.episodes)
+            elif fault := recording_fault(episode, data):
+                faults.append(f"{group.name}, episode {episode.index}: {fault}")
+    for text in faults:
+        checked.add("recordings", "failed", text, name)
     checked.recorded[name] = recorded
     if missing := checked.unrecorded(name):
         text = f"only {', '.join(missing)} episodes have a recording: the other returns rest on the publisher's word"
         checked.add("recordings", "open", text, name)
-    elif fine:
+    elif not faults:
         checked.add("recordings", "ok", counted(sum(n for n, _ in recorded.values()), "episode"), name)
 
 
@@ -412,46 +355,48 @@ def return_of(recording: Trajectory) -> float:
 
 
 def _checkpoints(files: Files, run: PublishedRun, damaged: set[str], checked: Checked) -> None:
-    name, withheld, there, fine = run.opening.run, 0, 0, True
-    places = {contents.checkpoint_path(each.submit_index): each for each in run.result.submits if each.bundle}
+    name, withheld, folder = run.opening.run, 0, f"{run.folder}/"
+    places = {
+        folder + contents.checkpoint_path(one.submit_index): one for one in run.result.submits if one.bundle
+    }
+    odd = sorted(path for path in files.names - places.keys() if path.startswith(f"{folder}checkpoints/"))
+    faults = [f"{path} is the policy of no submit" for path in odd]
     policies: dict[int, Bundle] = {}
-    for path in sorted(files.names):
-        if path.startswith(f"{run.folder}/checkpoints/") and path[len(run.folder) + 1 :] not in places:
-            checked.add("checkpoints", "failed", f"{path} is the policy of no submit", name)
-            fine = False
-    for place, submit in places.items():
-        path = f"{run.folder}/{place}"
+    for path, submit in places.items():
         if path not in files.names or path in damaged:
             withheld += 1
             continue
         try:
             data = files.read(path, contents.MAX_DOCUMENT_BYTES * 2)
             policies[submit.submit_index] = bundles.load(data, submit.bundle or "")
-            there += 1
         except (BundleError, ProtocolError) as error:
             text = f"submit {submit.submit_index}: another policy than the one that was submitted: {error}"
-            checked.add("checkpoints", "failed", text, name)
-            fine = False
+            faults.append(text)
+    for text in faults:
+        checked.add("checkpoints", "failed", text, name)
     if withheld:
         checked.add("checkpoints", "open", f"{withheld} policies were withheld", name)
-    elif fine:
-        checked.add("checkpoints", "ok", f"{there} policies", name)
-    for fault in _metrics(run, policies, checked):
-        checked.add(fault.kind, "failed", fault.text, name)
+    elif not faults:
+        checked.add("checkpoints", "ok", f"{len(policies)} policies", name)
+    for text in _metrics(run, policies, checked):
+        checked.add("record", "failed", text, name)
 
 
-def _metrics(run: PublishedRun, policies: dict[int, Bundle], checked: Checked) -> Iterator[Fault]:
+def _metrics(run: PublishedRun, policies: dict[int, Bundle], checked: Checked) -> Iterator[str]:
     """The metrics of code in `run.json`, compared with the policies."""
     told = run.record.outcome.auxiliary
+    if not told.keys() & {_BY_SUBMIT, "code_metrics_best", "code_metrics_trend"}:
+        return  # a run of an early version
     by_submit = told.get(_BY_SUBMIT, {})
     best = run.record.outcome.best_submit_index
     try:
         trend = {name: [each[name] for each in by_submit.values()] for name in TREND}
+        trend["submits"] = list(map(int, by_submit))
         pairs: list[tuple[str, Any, Any]] = [
             (_BY_SUBMIT, list(by_submit), [str(submit.submit_index) for submit in run.result.submits]),
             ("code_metrics_best", told.get("code_metrics_best"), by_submit.get(str(best))),
-            ("code_metrics_trend", told.get("code_metrics_trend"), {"submits": list(map(int, by_submit)), **trend}),
-        ]  # fmt: skip
+            ("code_metrics_trend", told.get("code_metrics_trend"), trend),
+        ]
         for index, here in by_submit.items():
             where = f"outcome.auxiliary.{_BY_SUBMIT}.{index}"
             if (policy := policies.get(int(index))) is None:
@@ -459,19 +404,16 @@ def _metrics(run: PublishedRun, policies: dict[int, Bundle], checked: Checked) -
                 continue
             own = msgspec.to_builtins(code_metrics({file.path: file.data for file in policy.files}))
             # Versions of Python differ in what they can parse.
-            parsed = () if own["parse_errors"] == tuple(here["parse_errors"]) else _PARSED
+            parsed = () if own["parse_errors"] == tuple(here["parse_errors"]) else _PARSED.split()
             checked.claim(f"{run.folder}/{contents.RUN}", [f"{where}.{name}" for name in parsed])
             pairs += [(where, here.get(name), value) for name, value in own.items() if name not in parsed]
             pairs.append((where, sorted(here), sorted(own)))
     except (AttributeError, KeyError, TypeError, ValueError):
-        yield Fault("record", "run.json tells metrics of code in another form than the software")
+        yield "run.json tells metrics of code in another form than the software"
         return
-    # Runs of early versions have none.
-    for name, here, fixed in (
-        pairs if told.keys() & {_BY_SUBMIT, "code_metrics_best", "code_metrics_trend"} else ()
-    ):
+    for name, here, fixed in pairs:
         if not _alike(here, fixed):
-            yield Fault("record", f"run.json tells {name} {_short(here)}; the policies give {_short(fixed)}")
+            yield f"run.json tells {name} {_short(here)}; the policies give {_short(fixed)}"
 
 
 def _alike(here: Any, fixed: Any) -> bool:

@@ -19,20 +19,7 @@ from evopolicy_common.records.secrets import Passed
 from evopolicy_results.publish.contents import Removed
 
 _MIN_NEEDLE = 4
-_SYSTEM_PATHS = (
-    "/usr",
-    "/bin",
-    "/sbin",
-    "/lib",
-    "/opt",
-    "/etc",
-    "/dev",
-    "/proc",
-    "/sys",
-    "/var",
-    "/run",
-    "/snap",
-)
+_SYSTEM_PATH = re.compile("/(?:usr|bin|sbin|lib|opt|etc|dev|proc|sys|var|run|snap)")
 _PLAIN_VARIABLES = re.compile(
     r"(LANG|LANGUAGE|LC_.*|TERM|COLORTERM|SHELL|TZ|PYTHON.*|PYTEST_.*|XDG_.*_TYPE|SHLVL|PAGER|EDITOR|LESS.*|LS_COLORS|DEBIAN_FRONTEND|OMP_.*|MKL_.*|CUDA_.*)"
 )
@@ -53,43 +40,39 @@ class Needle(msgspec.Struct, frozen=True):
 
 def record(full: RunRecord) -> tuple[RunRecord, list[Removed]]:
     """The part of a `run.json` that is published, and what was left out."""
-    removed = []
     settings = {name: each for name, each in full.agent.settings.items() if name in PUBLISHED_SETTINGS}
-    for name in sorted(full.agent.settings.keys() - settings.keys()):
-        removed.append(Removed(what=f"agent.settings.{name}", why="may name paths and commands of a machine"))
-    dropped = {
-        "audit": (full.audit is not None, "names workers; its counts are kept"),
-        "versions.fingerprint_overrides": (
-            bool(full.versions.fingerprint_overrides),
-            "an operator's own words",
-        ),
-        "outcome.error": (full.outcome.error is not None, "may name paths and hosts"),
-        "rejected_submits.message": (bool(full.rejected_submits), "free text"),
-        "artifacts": (full.artifacts != Artifacts(), "names folders"),
-        "replays": (bool(full.replays), "videos are not published"),
+    removed = {
+        f"agent.settings.{name}": "may name paths and commands of a machine"
+        for name in sorted(full.agent.settings.keys() - settings.keys())
     }
-    removed += [Removed(what=name, why=why) for name, (there, why) in dropped.items() if there]
-    audit = full.audit
-    kept = msgspec.structs.replace(
+    outcome, versions, replace = full.outcome, full.versions, msgspec.structs.replace
+    for name, is_there, why in (
+        ("audit", full.audit is not None, "names workers; its counts are kept"),
+        ("versions.fingerprint_overrides", versions.fingerprint_overrides, "an operator's own words"),
+        ("outcome.error", outcome.error is not None, "may name paths and hosts"),
+        ("rejected_submits.message", full.rejected_submits, "free text"),
+        ("artifacts", full.artifacts != Artifacts(), "names folders"),
+        ("replays", full.replays, "videos are not published"),
+    ):
+        if is_there:
+            removed[name] = why
+    kept = replace(
         full,
-        agent=msgspec.structs.replace(full.agent, settings=settings),
-        outcome=msgspec.structs.replace(
-            full.outcome,
-            error=None if full.outcome.error is None else "left out",
-            policy_failures=tuple(
-                msgspec.structs.replace(each, message="") for each in full.outcome.policy_failures
-            ),
+        agent=replace(full.agent, settings=settings),
+        outcome=replace(
+            outcome,
+            error=None if outcome.error is None else "left out",
+            policy_failures=tuple(replace(each, message="") for each in outcome.policy_failures),
         ),
-        rejected_submits=tuple(msgspec.structs.replace(each, message="") for each in full.rejected_submits),
+        rejected_submits=tuple(replace(each, message="") for each in full.rejected_submits),
         artifacts=Artifacts(),
         replays=(),
-        versions=msgspec.structs.replace(
-            full.versions,
-            fingerprint_overrides=tuple("left out" for _ in full.versions.fingerprint_overrides),
+        versions=replace(
+            versions, fingerprint_overrides=tuple("left out" for _ in versions.fingerprint_overrides)
         ),
-        audit=None if audit is None else audit.counts(),
+        audit=None if full.audit is None else full.audit.counts(),
     )
-    return kept, removed
+    return kept, [Removed(what=what, why=why) for what, why in removed.items()]
 
 
 def needles(
@@ -108,7 +91,7 @@ def needles(
     for secret in secrets:
         add(secret, "a token or password of the cluster", _MIN_NEEDLE)
     for path in paths:
-        if path.count("/") > 1 and not path.startswith(_SYSTEM_PATHS):
+        if path.count("/") > 1 and not _SYSTEM_PATH.match(path):
             add(path, "a folder of the publishing machine", 6)
     for name, what in names.items():
         add(name, what, 3)
@@ -116,7 +99,7 @@ def needles(
         if _PLAIN_VARIABLES.fullmatch(name):
             continue
         for part in value.split(":") if "/" in value else (value,):
-            if part.startswith("/") and (part.count("/") < 2 or part.startswith(_SYSTEM_PATHS)):
+            if part.startswith("/") and (part.count("/") < 2 or _SYSTEM_PATH.match(part)):
                 continue
             add(part, f"the value of the environment variable {name}", 8)
     return tuple(Needle(text, what) for text, what in sorted(found.items()))

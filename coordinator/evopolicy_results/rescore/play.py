@@ -13,7 +13,8 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-from collections.abc import Iterator, Sequence
+import itertools
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
@@ -39,11 +40,11 @@ from evopolicy_common.records.run_record import RunRecord
 from evopolicy_common.records.splits import FILE_STEMS, cases_hash, folder_of, read_split_file
 from evopolicy_common.records.words import in_words
 from evopolicy_common.refusals import WRONG_SETTINGS, Refusal
-from evopolicy_common.wire.transport import Link
-from evopolicy_results.evaluations import Evaluations, Tell
+from evopolicy_results.evaluations import RANDOM, Evaluations, unlike
 from evopolicy_results.reading.records import checkpoint_folder
 
-RANDOM = -1
+_FROM_OPTIONS = WRONG_SETTINGS | {Refusal.UNKNOWN_RUN, Refusal.UNKNOWN_SUBMIT, Refusal.MISSING_BUNDLE}
+"""Refusals that an option of the command causes."""
 
 
 class Wanted(msgspec.Struct, frozen=True, kw_only=True):
@@ -91,17 +92,14 @@ def read_finished(folders: Sequence[Path]) -> tuple[list[Finished], list[str], l
     reasons."""
     found, without, unreadable = [], [], []
     for folder in folders:
-        path = folder / RUN_JSON
         try:
             record = read_record(folder)
         except FileNotFoundError:
             unreadable.append(f"{folder} has no run.json: the run is not finished; re-score it when it is")
             continue
-        except OSError as error:
-            unreadable.append(f"{path} cannot be read: {error.strerror}")
-            continue
-        except ProtocolError as error:
-            unreadable.append(f"{path}: {error}")
+        except (OSError, ProtocolError) as error:
+            why = f" cannot be read: {error.strerror}" if isinstance(error, OSError) else f": {error}"
+            unreadable.append(f"{folder / RUN_JSON}{why}")
             continue
         best = record.outcome.best_submit_index
         if record.outcome.status != "completed" or best is None:
@@ -113,182 +111,160 @@ def read_finished(folders: Sequence[Path]) -> tuple[list[Finished], list[str], l
     return found, without, unreadable
 
 
-class Rescorer:
-    """Re-scores runs on one cluster."""
-
-    def __init__(self, link: Link, wanted: Wanted, tell: Tell, *, own_workers: bool) -> None:
-        """`own_workers`: the cluster's workers have just been started, so the first may still be starting."""
-        self._evaluations = Evaluations(link, tell, own=own_workers)
-        self._wanted = wanted
-        self._own_workers = own_workers
-
-    async def rescore(self, run: Finished) -> Written:
-        """Plays the missing episodes of one run and writes its file. Raises ConfigError for runs, cases or versions
-        that do not fit."""
-        with _refusals():
-            return await self._rescore(run)
-
-    async def _rescore(self, run: Finished) -> Written:
-        record, wanted = run.record, self._wanted
-        fingerprint_class = await self._class(record)
-        cases, secret, epoch = await self._cases(record)
-        digest = f"sha256:{cases_hash(cases)}"
-        try:
-            known = read_rescore(run.folder, wanted.name)
-        except ProtocolError as error:
-            raise ConfigError(f"{error}; remove the file to play it again") from error
-        if known is not None and (known.cases_hash, known.run) != (digest, record.run):
-            raise ConfigError(
-                f"{rescore_path(run.folder, wanted.name)} holds {known.n_cases} other cases, or another run; choose"
-                " another --name"
-            )
-        began = self._evaluations.played
-        result = known or RescoreRecord(
-            name=wanted.name,
-            run=record.run,
-            env=record.env,
-            selected=run.selected,
-            n_cases=len(cases),
-            cases_hash=digest,
-            cases_from="secret" if wanted.data is None else "files",
-            cases_secret=secret,
-            epoch=epoch,
-            software=version("evopolicy"),
-        )
-        missing = [index for index in run.submits(wanted) if result.checkpoint(index) is None]
-        if missing and not result.random_returns:
-            reference = await self._play(record, RANDOM, cases, digest, fingerprint_class)
-            result = msgspec.structs.replace(result, random_returns=reference.returns)
-        for index in missing:
-            await self._upload(run, index)
-            played = await self._play(record, index, cases, digest, fingerprint_class)
-            result = msgspec.structs.replace(
-                result,
-                played_at=datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ"),
-                checkpoints=tuple(sorted((*result.checkpoints, played), key=lambda each: each.submit_index)),
-            )
-            path = rescore_path(run.folder, wanted.name)
-            path.parent.mkdir(exist_ok=True)
-            write_atomically(path, encode_rescore(result))
-        selected = result.checkpoint(run.selected)
-        assert selected is not None
-        assert record.outcome.score is not None
-        return Written(
-            run=record.run,
-            path=str(rescore_path(run.folder, wanted.name)),
-            env=record.env,
-            entry=record.agent.entry,
-            score=record.outcome.score,
-            rescored=selected.mean,
-            episodes=self._evaluations.played - began,
-        )
-
-    async def _class(self, record: RunRecord) -> str:
-        """The fingerprint class of workers with the run's versions. Raises ConfigError when there are none."""
-        message = DescribeEnvironment(token="", env=record.env, run=record.run)
-        state = await self._evaluations.versions(message, wait=self._own_workers)
-        if not state.knows_run:
-            raise ConfigError(
-                f"this cluster's coordinator has no finished run {record.run}: it is still open there, or another one"
-                " played it; use that one (--connect, or --local with its --state)"
-            )
-        if not state.fingerprints:
-            remedy = (
-                f"`evopolicy-worker check-env {record.env}` tells why"
-                if self._own_workers
-                else f"start one with --env {record.env}"
-            )
-            raise ConfigError(f"no worker of this cluster offers {record.env}; {remedy}")
-        differences: list[str] = []
-        for number, fingerprint in enumerate(state.fingerprints):
-            then, here = comparable([record.versions.fingerprint, fingerprint.flat()])
-            names = sorted((then.keys() | here.keys()) - {"cpu"})
-            differing = [
-                f"{name} {then.get(name, 'none')} in the run, {here.get(name, 'none')} here"
-                for name in names
-                if then.get(name) != here.get(name)
-            ]
-            if not differing or not record.versions.fingerprint:
-                return state.classes[number] if state.classes else ""
-            differences = differences or differing
-        raise ConfigError(
-            f"no worker has the versions that run {record.run} was played with ({'; '.join(differences[:4])}): other"
-            " versions give other scores; start a worker with the run's versions"
-        )
-
-    async def _cases(self, record: RunRecord) -> tuple[tuple[Case, ...], bool, str]:
-        """The cases, whether they are secret, and the epoch of their secret."""
-        wanted = self._wanted
-        if wanted.data is None:
-            assert wanted.n_cases is not None
-            found = await self._evaluations.ask.further_cases(record.run, wanted.name, wanted.n_cases)
-            return found.cases, True, found.epoch
-        path = folder_of(wanted.data, record.env) / f"{FILE_STEMS['heldout']}.json"
-        content, _ = read_split_file(path)
-        if content.env != record.env:
-            raise ConfigError(f"{path} holds cases of {content.env!r}, not of {record.env!r}")
-        n = len(content.cases) if wanted.n_cases is None else wanted.n_cases
-        if not 1 <= n <= len(content.cases):
-            raise ConfigError(f"{path} has {len(content.cases)} cases, {n} are asked for")
-        return content.cases[:n], content.secret is True, ""
-
-    async def _upload(self, run: Finished, index: int) -> None:
-        """Uploads a checkpoint's policy, which garbage collection may have removed from the coordinator."""
-        folder = checkpoint_folder(run.folder, "checkpoints", index)
-        try:
-            bundle = bundle_of(folder)
-        except BundleError:
-            return  # the coordinator may still have the policy; it refuses otherwise
-        await self._evaluations.ask.upload(bundle.digest, bundle.packed)
-
-    async def _play(
-        self, record: RunRecord, index: int, cases: tuple[Case, ...], digest: str, fingerprint_class: str
-    ) -> Rescored:
-        """Plays all cases, in as many attempts as it takes; earlier attempts' outcomes are read, not played again."""
-        whole = record.experiment_dimensions.policy_scope == "submit" and index != RANDOM
-        found: dict[int, EpisodeOutcome] = {}
-        attempt = 0
-        while len(found) < len(cases):
-            if whole:
-                found.clear()
-            missing = tuple(place for place in range(len(cases)) if place not in found)
-            text = f"rescore {record.run} {index} {digest} {attempt}"
-            message = Rescore(
-                token="",
-                key=hashlib.sha256(text.encode()).hexdigest(),
-                run=record.run,
-                submit_index=index,
-                cases=cases,
-                indexes=missing,
-                fingerprint_class=fingerprint_class,
-            )
-            async for outcome in self._evaluations.outcomes(message):
-                found[missing[outcome.index]] = outcome
-            attempt += 1
-        played = [found[place] for place in range(len(cases))]
-        return Rescored(
-            submit_index=index,
-            returns=tuple(one.episode_return for one in played),
-            lengths=tuple(one.length for one in played),
-            failures={
-                str(n): one.failure.category for n, one in enumerate(played) if one.failure is not None
-            },
-            successes=tuple(one.success for one in played)
-            if any(one.success is not None for one in played)
-            else (),
-        )
-
-
-@contextlib.contextmanager
-def _refusals() -> Iterator[None]:
-    """Turns refusals that an option of the command causes into ConfigError."""
+async def rescore(run: Finished, wanted: Wanted, evaluations: Evaluations) -> Written:
+    """Plays the missing episodes of one run and writes its file. Raises ConfigError for runs, cases or versions that do
+    not fit."""
     try:
-        yield
+        return await _rescore(run, wanted, evaluations)
     except RefusedError as error:
-        if error.status in WRONG_SETTINGS | {
-            Refusal.UNKNOWN_RUN,
-            Refusal.UNKNOWN_SUBMIT,
-            Refusal.MISSING_BUNDLE,
-        }:
+        if error.status in _FROM_OPTIONS:
             raise ConfigError(error.message) from error
         raise
+
+
+async def _rescore(run: Finished, wanted: Wanted, evaluations: Evaluations) -> Written:
+    record, path = run.record, rescore_path(run.folder, wanted.name)
+    fingerprint_class = await class_of(record, evaluations)
+    cases, secret, epoch = await _cases(record, wanted, evaluations)
+    digest = f"sha256:{cases_hash(cases)}"
+    try:
+        known = read_rescore(run.folder, wanted.name)
+    except ProtocolError as error:
+        raise ConfigError(f"{error}; remove the file to play it again") from error
+    if known is not None and (known.cases_hash, known.run) != (digest, record.run):
+        raise ConfigError(f"{path} holds {known.n_cases} other cases, or another run; choose another --name")
+    began = evaluations.played
+    result = known or RescoreRecord(
+        name=wanted.name,
+        run=record.run,
+        env=record.env,
+        selected=run.selected,
+        n_cases=len(cases),
+        cases_hash=digest,
+        cases_from="secret" if wanted.data is None else "files",
+        cases_secret=secret,
+        epoch=epoch,
+        software=version("evopolicy"),
+    )
+    missing = [index for index in run.submits(wanted) if result.checkpoint(index) is None]
+    if missing and not result.random_returns:
+        missing.insert(0, RANDOM)
+    for index in missing:
+        # Garbage collection may have removed the policy from the coordinator, which otherwise refuses.
+        with contextlib.suppress(BundleError):
+            if index != RANDOM:
+                bundle = bundle_of(checkpoint_folder(run.folder, "checkpoints", index))
+                await evaluations.ask.upload(bundle.digest, bundle.packed)
+        played = await _play(record, index, cases, digest, fingerprint_class, evaluations)
+        if index == RANDOM:
+            result = msgspec.structs.replace(result, random_returns=played.returns)
+            continue
+        result = msgspec.structs.replace(
+            result,
+            played_at=datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ"),
+            checkpoints=tuple(sorted((*result.checkpoints, played), key=lambda each: each.submit_index)),
+        )
+        path.parent.mkdir(exist_ok=True)
+        write_atomically(path, encode_rescore(result))
+    selected = result.checkpoint(run.selected)
+    assert selected is not None
+    assert record.outcome.score is not None
+    return Written(
+        run=record.run,
+        path=str(path),
+        env=record.env,
+        entry=record.agent.entry,
+        score=record.outcome.score,
+        rescored=selected.mean,
+        episodes=evaluations.played - began,
+    )
+
+
+async def class_of(record: RunRecord, evaluations: Evaluations) -> str:
+    """The fingerprint class of workers with the run's versions. Raises ConfigError when there are none."""
+    message = DescribeEnvironment(token="", env=record.env, run=record.run)
+    # The first worker of a cluster of the command's own may still be starting.
+    state = await evaluations.versions(message, wait=evaluations.ask.own)
+    if not state.knows_run:
+        raise ConfigError(
+            f"this cluster's coordinator has no finished run {record.run}: it is still open there, or another one"
+            " played it; use that one (--connect, or --local with its --state)"
+        )
+    if not state.fingerprints:
+        own, other = (
+            f"`evopolicy-worker check-env {record.env}` tells why",
+            f"start one with --env {record.env}",
+        )
+        remedy = own if evaluations.ask.own else other
+        raise ConfigError(f"no worker of this cluster offers {record.env}; {remedy}")
+    differences: list[str] = []
+    for number, fingerprint in enumerate(state.fingerprints):
+        versions = comparable([record.versions.fingerprint, fingerprint.flat()])
+        for each in versions:
+            each.pop("cpu", None)
+        differing = unlike(*versions)
+        if not differing or not record.versions.fingerprint:
+            return state.classes[number] if state.classes else ""
+        differences = differences or differing
+    raise ConfigError(
+        f"no worker has the versions that run {record.run} was played with ({'; '.join(differences[:4])}): other"
+        " versions give other scores; start a worker with the run's versions"
+    )
+
+
+async def _cases(
+    record: RunRecord, wanted: Wanted, evaluations: Evaluations
+) -> tuple[tuple[Case, ...], bool, str]:
+    """The cases, whether they are secret, and the epoch of their secret."""
+    if wanted.data is None:
+        assert wanted.n_cases is not None
+        found = await evaluations.ask.further_cases(record.run, wanted.name, wanted.n_cases)
+        return found.cases, True, found.epoch
+    path = folder_of(wanted.data, record.env) / f"{FILE_STEMS['heldout']}.json"
+    content, _ = read_split_file(path)
+    if content.env != record.env:
+        raise ConfigError(f"{path} holds cases of {content.env!r}, not of {record.env!r}")
+    n = len(content.cases) if wanted.n_cases is None else wanted.n_cases
+    if not 1 <= n <= len(content.cases):
+        raise ConfigError(f"{path} has {len(content.cases)} cases, {n} are asked for")
+    return content.cases[:n], content.secret is True, ""
+
+
+async def _play(
+    record: RunRecord,
+    index: int,
+    cases: tuple[Case, ...],
+    digest: str,
+    fingerprint_class: str,
+    evaluations: Evaluations,
+) -> Rescored:
+    """Plays all cases, in as many attempts as it takes; earlier attempts' outcomes are read, not played again."""
+    whole = record.experiment_dimensions.policy_scope == "submit" and index != RANDOM
+    found: dict[int, EpisodeOutcome] = {}
+    for attempt in itertools.count():
+        if len(found) == len(cases):
+            break
+        if whole:
+            found.clear()
+        missing = tuple(place for place in range(len(cases)) if place not in found)
+        text = f"rescore {record.run} {index} {digest} {attempt}"
+        message = Rescore(
+            token="",
+            key=hashlib.sha256(text.encode()).hexdigest(),
+            run=record.run,
+            submit_index=index,
+            cases=cases,
+            indexes=missing,
+            fingerprint_class=fingerprint_class,
+        )
+        async for outcome in evaluations.outcomes(message):
+            found[missing[outcome.index]] = outcome
+    played = [found[place] for place in range(len(cases))]
+    solved = tuple(one.success for one in played)
+    return Rescored(
+        submit_index=index,
+        returns=tuple(one.episode_return for one in played),
+        lengths=tuple(one.length for one in played),
+        failures={str(n): one.failure.category for n, one in enumerate(played) if one.failure is not None},
+        successes=solved if any(each is not None for each in solved) else (),
+    )

@@ -12,37 +12,28 @@ Rules that this module owns:
 
 from __future__ import annotations
 
-import uuid
 from collections.abc import Iterator, Sequence
 from typing import Any
 
 import msgspec
 
 from evopolicy_common.errors import BundleError, ConfigError
-from evopolicy_common.messages.environment import Split
-from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome, Record, ResourceLimits, Tier
+from evopolicy_common.messages.episode import EpisodeOutcome, Tier
 from evopolicy_common.messages.gateway import CANCELLED
-from evopolicy_common.messages.operator import (
-    DescribeEnvironment,
-    EnvironmentState,
-    Evaluate,
-    PlayedAs,
-)
-from evopolicy_common.records.episodes import compare as verify_compare
+from evopolicy_common.messages.operator import DescribeEnvironment, EnvironmentState
+from evopolicy_common.records.aggregates import mean
+from evopolicy_common.records.episodes import compare
 from evopolicy_common.records.episodes.rendered import decode
 from evopolicy_common.records.episodes.trajectory import Trajectory
 from evopolicy_common.records.fingerprints import comparable
 from evopolicy_common.records.journal import Result
 from evopolicy_common.records.policies.checkpoints import bundle_of
 from evopolicy_common.records.rescores import FOLDER, rescore_names
-from evopolicy_common.records.summary import Summary
+from evopolicy_common.records.splits import SPLITS
 from evopolicy_common.wire.operator_client import TIMEOUT_S
-from evopolicy_common.wire.transport import Link
-from evopolicy_results.evaluations import Evaluations, Tell
-from evopolicy_results.verify import numbers as verify_numbers
-from evopolicy_results.verify.source import RANDOM, EpisodeList, RunUnderTest
-
-_SPLITS: tuple[Split, ...] = ("train", "validation", "heldout")
+from evopolicy_results.evaluations import Evaluations, unlike
+from evopolicy_results.verify import numbers
+from evopolicy_results.verify.source import EpisodeList, RunUnderTest
 
 
 class Finding(msgspec.Struct, frozen=True, kw_only=True):
@@ -84,7 +75,6 @@ class Report(msgspec.Struct, kw_only=True):
 class _Recording(msgspec.Struct, kw_only=True):
     """The data of one episode before its replay."""
 
-    index: int
     actions: bytes
     """Trajectory bytes with the actions to replay."""
     outcome: EpisodeOutcome | None
@@ -98,14 +88,17 @@ class _Recording(msgspec.Struct, kw_only=True):
 class Verifier:
     """One verification on one cluster."""
 
-    def __init__(
-        self, link: Link, run: RunUnderTest, tell: Tell, tier: Tier | None = None, *, own: bool = False
-    ) -> None:
-        """`own`: as for `Evaluations`."""
-        self._evaluations = Evaluations(link, tell, own=own)
+    def __init__(self, evaluations: Evaluations, run: RunUnderTest, tier: Tier | None = None) -> None:
+        self._evaluations = evaluations
         self._run = run
-        self._tier: Tier = tier or run.record.sandbox_tier
-        self._limits = run.record.experiment_dimensions.limits or ResourceLimits()
+        dimensions = run.record.experiment_dimensions
+        self._conditions: dict[str, Any] = {
+            "env": run.record.env,
+            "conditions": dimensions,
+            "run": run.record.run,
+            "tier": tier or run.record.sandbox_tier,
+            "limits": dimensions.limits,
+        }
         self._knows_run = False
         self._kept: dict[int, _Recording] = {}
         """Recordings of the list that was replayed last, by index."""
@@ -122,7 +115,7 @@ class Verifier:
                 " they are in the state folder of the coordinator that made it; use that one, with --state, or a"
                 " backup of it"
             )
-        for split in _SPLITS:
+        for split in SPLITS:
             ours = versions.cases_hash(split).removeprefix("sha256:")
             theirs = state.split_hashes.get(split, "")
             if not ours:
@@ -134,16 +127,8 @@ class Verifier:
                     " --data"
                 )
         self._knows_run = state.knows_run
-        self._check_numbers(state.result)
-        if not versions.env_deterministic:
-            self.report.notes.append(
-                "this environment is marked as not deterministic: differences are to be expected"
-            )
-        return self._knows_run
-
-    def _check_numbers(self, data: bytes) -> None:
-        result = msgspec.json.decode(data, type=Result) if data else None
-        for name, difference in verify_numbers.differences(self._run, result):
+        result = msgspec.json.decode(state.result, type=Result) if state.result else None
+        for name, difference in numbers.differences(self._run, result):
             self.report.differs(name, difference)
         for submit in self._run.submits:
             for name, content in (("summary.json", submit.summary), ("_meta.json", submit.meta)):
@@ -155,24 +140,35 @@ class Verifier:
                 f" --name {name} for a copy of the run directory without this file, and compare"
             )
             self.report.leaves_open(f"{FOLDER}/{name}.json", text)
+        if not versions.env_deterministic:
+            self.report.notes.append(
+                "this environment is marked as not deterministic: differences are to be expected"
+            )
+        return state.knows_run
 
     async def replay(self, played: EpisodeList, indexes: Sequence[int]) -> None:
         """Makes the exact check of these episodes of a list."""
-        recordings = await self._recordings(played, indexes)
-        if not recordings:
+        self._kept = await self._recordings(played, indexes)
+        if not self._kept:
             return
-        refs = [await self._evaluations.uploaded(recording.actions) for recording in recordings]
-        record: Record = "full" if played.split == "train" else "actions"
-        by_index = dict(enumerate(recordings))
-        returns: dict[int, float] = {}
-        message = self._evaluate(played, [one.index for one in recordings], record, replays=tuple(refs))
-        async for outcome in self._evaluations.outcomes(message):
-            recording = by_index.pop(outcome.index)
-            returns[recording.index] = outcome.episode_return
-            await self._compare(played, recording, outcome)
-        for recording in by_index.values():
-            self.report.differs(played.name(recording.index), "could not be played again")
-        if played.mean_differs(returns):
+        returns: list[float] = []
+        async for index, outcome in self._evaluations.replayed(
+            played,
+            list(self._kept),
+            actions=[recording.actions for recording in self._kept.values()],
+            record="full" if played.split == "train" else "actions",
+            **self._conditions,
+        ):
+            if outcome is None:
+                self.report.differs(played.name(index), "could not be played again")
+                continue
+            returns.append(outcome.episode_return)
+            self.report.episodes += 1
+            replayed = await self._evaluations.recording(outcome)
+            for difference in _differences(played, index, self._kept[index], outcome, replayed):
+                self.report.differs(played.name(index), difference)
+        whole = len(returns) == len(played.env_instances)
+        if whole and played.mean is not None and mean(returns) != played.mean:
             self.report.differs(
                 f"submit {played.submit_index}, {played.split}", f"run.json tells a mean of {played.mean!r}"
             )
@@ -196,17 +192,23 @@ class Verifier:
             return  # otherwise a difference that the check of numbers has found
         if bundle.digest != played.digest:
             return  # a difference that the check of numbers has found
-        await self._evaluations.ask.upload(bundle.digest, bundle.packed)
-        message = self._evaluate(played, indexes, "full", bundle=bundle.digest)
-        async for outcome in self._evaluations.outcomes(message):
-            recording = self._kept.get(indexes[outcome.index])
-            if recording is None:
+        async for index, outcome in self._evaluations.replayed(
+            played, indexes, bundle=bundle, record="full", **self._conditions
+        ):
+            if outcome is None or (recording := self._kept.get(index)) is None:
                 continue
             self.report.policy_episodes += 1
-            difference = await self._policy_difference(played, recording, outcome)
+            if outcome.failure is not None and outcome.trajectory is None:
+                difference: str | None = f"{outcome.failure.category}: {outcome.failure.message}"
+            else:
+                again = await self._evaluations.recording(outcome)
+                if recording.stored is not None:
+                    difference = compare.first_difference(decode(recording.stored), again)
+                else:
+                    difference = _of_files(played, index, again, actions=True)
             if difference is not None:
                 self.report.policy_differences.append(
-                    Finding(episode=played.name(recording.index), difference=difference)
+                    Finding(episode=played.name(index), difference=difference)
                 )
 
     async def check_fingerprint(self) -> None:
@@ -215,18 +217,23 @@ class Verifier:
         known = self._run.record.versions.fingerprint
         found: dict[str, None] = {}
         for fingerprint in (await self._describe()).fingerprints if known else ():
-            then, here = comparable([known, fingerprint.flat()])
-            for name in sorted(then.keys() | here.keys()):
-                ours, theirs = then.get(name, "none"), here.get(name, "none")
-                if ours != theirs:
-                    found[f"{name}: {ours} in the run, {theirs} on the workers"] = None
+            found |= dict.fromkeys(unlike(*comparable([known, fingerprint.flat()])))
         self.report.fingerprint_differences = list(found)
 
-    # Recordings.
+    async def _describe(self) -> EnvironmentState:
+        record, dimensions = self._run.record, self._run.record.experiment_dimensions
+        message = DescribeEnvironment(
+            token="",
+            env=record.env,
+            run=record.run,
+            n_validation=dimensions.n_validation,
+            n_heldout=dimensions.n_heldout,
+        )
+        return await self._evaluations.ask.describe(message)
 
-    async def _recordings(self, played: EpisodeList, indexes: Sequence[int]) -> list[_Recording]:
+    async def _recordings(self, played: EpisodeList, indexes: Sequence[int]) -> dict[int, _Recording]:
         known = await self._stored(played) if self._knows_run else {}
-        found = []
+        found: dict[int, _Recording] = {}
         for index in indexes:
             name = played.name(index)
             outcome = known.get(index)
@@ -234,10 +241,10 @@ class Verifier:
             stored: bytes | None = None
             if outcome is not None and outcome.trajectory is not None:
                 stored = await self._evaluations.ask.fetch(outcome.trajectory)
-                actions = verify_compare.action_log(decode(stored).actions)
+                actions = compare.action_log(decode(stored).actions)
             elif rows is not None:
                 try:
-                    actions = verify_compare.action_log(verify_compare.actions_of(rows))
+                    actions = compare.action_log(compare.actions_of(rows))
                 except Exception as error:
                     # JSON of any shape and size: an agent without a jail could have written it.
                     self.report.differs(
@@ -250,19 +257,14 @@ class Verifier:
                     self.report.unchecked_episodes += 1
                     self.report.leaves_open(name, "the coordinator has no record of it any more")
                 continue
-            found.append(
-                _Recording(
-                    index=index, actions=actions, outcome=outcome, stored=stored, files=rows is not None
-                )
-            )
-        self._kept = {recording.index: recording for recording in found}
+            found[index] = _Recording(actions=actions, outcome=outcome, stored=stored, files=rows is not None)
         return found
 
-    def _rows(self, played: EpisodeList, index: int) -> verify_compare.Rows | None:
+    def _rows(self, played: EpisodeList, index: int) -> compare.Rows | None:
         if not played.folders:
             return None
         try:
-            rows = verify_compare.read_rows(played.folders[index])
+            rows = compare.read_rows(played.folders[index])
         except (OSError, ValueError) as error:
             self.report.differs(played.name(index), f"trajectory.jsonl cannot be read: {error}")
             return None
@@ -278,133 +280,43 @@ class Verifier:
         )
         return {outcome.index: outcome async for outcome in recorded}
 
-    # Comparison.
 
-    async def _compare(self, played: EpisodeList, recording: _Recording, outcome: EpisodeOutcome) -> None:
-        self.report.episodes += 1
-        index, name = recording.index, played.name(recording.index)
-        replayed = await self._evaluations.recording(outcome)
-        for what, difference in (
-            ("the stored record", _stored_difference(recording, replayed, outcome)),
-            ("the feedback files", self._files_difference(played, recording, replayed)),
-        ):
-            if difference is not None:
-                self.report.differs(name, f"{what}: {difference}")
-        if played.returns is not None and not verify_compare.same(
-            played.returns[index], outcome.episode_return
-        ):
-            self.report.differs(
-                name, f"return {played.returns[index]!r} is told, {outcome.episode_return!r} came"
-            )
-        if played.lengths is not None and played.lengths[index] != outcome.length:
-            self.report.differs(name, f"{played.lengths[index]} steps are told, {outcome.length} came")
-        for what, told, came in _summarised(played.summary, index, outcome, recording.outcome):
-            if told != came:
-                self.report.differs(name, f"{what} {told!r} is told, {came!r} came")
-
-    def _files_difference(
-        self, played: EpisodeList, recording: _Recording, replayed: Trajectory
-    ) -> str | None:
-        if not recording.files:
-            return None
-        known = recording.stored is not None
-        return _of_files(
-            played, recording.index, decode(recording.stored) if recording.stored else replayed, actions=known
-        )
-
-    async def _policy_difference(
-        self, played: EpisodeList, recording: _Recording, outcome: EpisodeOutcome
-    ) -> str | None:
-        if outcome.failure is not None and outcome.trajectory is None:
-            return f"{outcome.failure.category}: {outcome.failure.message}"
-        again = await self._evaluations.recording(outcome)
-        if recording.stored is not None:
-            return verify_compare.first_difference(decode(recording.stored), again)
-        return _of_files(played, recording.index, again, actions=True)
-
-    # Requests to the cluster.
-
-    async def _describe(self) -> EnvironmentState:
-        record = self._run.record
-        dimensions = record.experiment_dimensions
-        message = DescribeEnvironment(
-            token="",
-            env=record.env,
-            run=record.run,
-            n_validation=dimensions.n_validation,
-            n_heldout=dimensions.n_heldout,
-        )
-        return await self._evaluations.ask.describe(message)
-
-    def _evaluate(
-        self,
-        played: EpisodeList,
-        indexes: Sequence[int],
-        record: Record,
-        *,
-        bundle: str | None = None,
-        replays: tuple[BlobRef, ...] = (),
-    ) -> Evaluate:
-        dimensions = self._run.record.experiment_dimensions
-        return Evaluate(
-            token="",
-            key=uuid.uuid4().hex,
-            env=self._run.record.env,
-            bundle=bundle,
-            split=played.split,
-            cases=tuple(played.env_instances[index] for index in indexes),
-            record=record,
-            sandbox_tier=self._tier,
-            limits=self._limits,
-            replays=replays,
-            step_limit=dimensions.step_limit,
-            as_in=PlayedAs(
-                run=self._run.record.run,
-                submit_index=played.submit_index,
-                env_instances=played.env_instances,
-                indexes=tuple(indexes),
-                modulo=played.modulo,
-                remaining_budget_after=played.remaining_budget_after,
-                policy_scope=dimensions.policy_scope,
-                # Random actions had no policy that could receive lists, and are recorded as arrays.
-                observations="arrays" if played.submit_index == RANDOM else dimensions.observations,
-                failed_episodes=dimensions.failed_episodes,
-                hidden_evaluation=dimensions.hidden_evaluation,
-            ),
-        )
-
-
-def _summarised(
-    summary: Summary | None, index: int, again: EpisodeOutcome, stored: EpisodeOutcome | None
-) -> Iterator[tuple[str, Any, Any]]:
-    """What a submit's summary tells of one episode besides return and length, and what came."""
+def _differences(
+    played: EpisodeList, index: int, recording: _Recording, again: EpisodeOutcome, replayed: Trajectory
+) -> Iterator[str]:
+    """All in which an episode that was played again differs from its records."""
+    then, summary = recording.outcome, played.summary
+    stored = None if recording.stored is None else decode(recording.stored)
+    if stored and then and (fault := compare.episode_difference(then, stored, again, replayed)):
+        yield f"the stored record: {fault}"
+    if recording.files and (fault := _of_files(played, index, stored or replayed, actions=bool(stored))):
+        yield f"the feedback files: {fault}"
+    if played.returns is not None and not compare.same(played.returns[index], again.episode_return):
+        yield f"return {played.returns[index]!r} is told, {again.episode_return!r} came"
+    if played.lengths is not None and played.lengths[index] != again.length:
+        yield f"{played.lengths[index]} steps are told, {again.length} came"
     if summary is None:
         return
+    pairs: list[tuple[str, Any, Any]] = []
     parts, solved = summary.reward_components_per_episode, summary.successes
     if parts is not None and index < len(parts):
-        yield "reward components", parts[index], again.reward_components
-    if stored is not None:
+        pairs.append(("reward components", parts[index], again.reward_components))
+    if then is not None:
         # A replay has no policy that could fail.
-        yield "policy failed", index in (summary.errors or ()), stored.failure is not None
+        pairs.append(("policy failed", index in (summary.errors or ()), then.failure is not None))
         if solved is not None and index < len(solved):
-            yield "success", solved[index], stored.success
+            pairs.append(("success", solved[index], then.success))
+    for what, told, came in pairs:
+        if told != came:
+            yield f"{what} {told!r} is told, {came!r} came"
 
 
 def _of_files(played: EpisodeList, index: int, episode: Trajectory, *, actions: bool) -> str | None:
     """Describes the first difference of an episode's feedback files from `episode`."""
     folder = played.folders[index]
     try:
-        rows = verify_compare.read_rows(folder)
-        return verify_compare.files_difference(
-            folder, rows, episode, actions=actions, pictures=played.pictures
-        )
+        rows = compare.read_rows(folder)
+        return compare.files_difference(folder, rows, episode, actions=actions, pictures=played.pictures)
     except Exception as error:
         # An agent without a jail could have written the files: damaged archives, arrays of any size.
         return f"cannot be read: {type(error).__name__}: {error}"
-
-
-def _stored_difference(recording: _Recording, replayed: Trajectory, outcome: EpisodeOutcome) -> str | None:
-    then = recording.outcome
-    if recording.stored is None or then is None:
-        return None
-    return verify_compare.episode_difference(then, decode(recording.stored), outcome, replayed)

@@ -6,7 +6,7 @@ trajectory (its submit was not `ok`) is not listed.
 
 from __future__ import annotations
 
-import random
+from collections.abc import Iterator
 from pathlib import Path
 
 import msgspec
@@ -14,32 +14,22 @@ import msgspec
 from evopolicy_common.errors import ConfigError, ProtocolError
 from evopolicy_common.messages.environment import Split
 from evopolicy_common.messages.gateway import REJECTED
-from evopolicy_common.records.aggregates import mean
 from evopolicy_common.records.newest import described
 from evopolicy_common.records.policies.checkpoints import CheckpointMeta, read_meta
 from evopolicy_common.records.run_files import RUN_JSON, read_record, submit_folders
 from evopolicy_common.records.run_record import RunRecord
 from evopolicy_common.records.summary import Summary, decode_summary
 from evopolicy_common.regular_files import read_regular
+from evopolicy_results.evaluations import RANDOM, Cases
 
-RANDOM = -1
-"""Submit index of the random reference."""
 _MAX_DIGITS = 9
 
 
-class EpisodeList(msgspec.Struct, frozen=True, kw_only=True):
-    """A list of cases that one policy played: a submit's, or a checkpoint's hidden ones."""
+class EpisodeList(Cases, frozen=True, kw_only=True):
+    """A list of cases that one policy played, and what the run directory has of its episodes."""
 
-    split: Split
-    submit_index: int
-    """`RANDOM` for the random reference."""
-    env_instances: tuple[int, ...]
-    """Ids in the split, in order."""
-    modulo: int
-    """Number of episodes of the policy's own submit."""
-    remaining_budget_after: int
     returns: tuple[float, ...] | None
-    """As recorded in the run directory; None when it records only `mean`."""
+    """None when the directory records only `mean`."""
     lengths: tuple[int, ...] | None = None
     summary: Summary | None = None
     """Of a submit's train episodes."""
@@ -59,12 +49,6 @@ class EpisodeList(msgspec.Struct, frozen=True, kw_only=True):
             return f"submit {self.submit_index}, {self.folders[index].name}"
         policy = "random actions" if self.submit_index == RANDOM else f"submit {self.submit_index}"
         return f"{policy}, {self.split} episode {index}"
-
-    def mean_differs(self, returns: dict[int, float]) -> bool:
-        """Whether all returns are present and their mean differs from the one in the run directory."""
-        if self.mean is None or len(returns) < len(self.env_instances):
-            return False
-        return mean(list(returns.values())) != self.mean
 
 
 class SubmitFiles(msgspec.Struct, frozen=True, kw_only=True):
@@ -118,32 +102,22 @@ def read_run(root: Path) -> RunUnderTest:
         ) from error
     except ProtocolError as error:
         raise ConfigError(f"{root / RUN_JSON}: {error}") from error
-    submits = _submits(root, record)
-    train = [played for submit in submits if (played := _train(record, submit))]
-    return RunUnderTest(
-        root=root,
-        record=record,
-        submits=submits,
-        train=tuple(train),
-        hidden=tuple(_hidden(record, {one.submit_index: one for one in train})),
-    )
-
-
-def _submits(root: Path, record: RunRecord) -> tuple[SubmitFiles, ...]:
     feedback, checkpoints = root / "workspace" / "feedback", root / "checkpoints"
-    found = []
-    for index, folder in sorted({**submit_folders(checkpoints), **submit_folders(feedback)}.items()):
-        of_feedback, checkpoint = feedback / folder.name, checkpoints / folder.name
-        found.append(
-            SubmitFiles(
-                index=index,
-                summary=_summary(of_feedback),
-                meta=_meta(checkpoint, record.experiment_dimensions.episode_budget),
-                feedback=of_feedback,
-                checkpoint=checkpoint,
-            )
+    folders = {**submit_folders(checkpoints), **submit_folders(feedback)}
+    found = [
+        SubmitFiles(
+            index=index,
+            summary=_summary(feedback / folder.name),
+            meta=_meta(checkpoints / folder.name, record.experiment_dimensions.episode_budget),
+            feedback=feedback / folder.name,
+            checkpoint=checkpoints / folder.name,
         )
-    return tuple(submit for submit in found if submit.status not in REJECTED)
+        for index, folder in sorted(folders.items())
+    ]
+    submits = tuple(submit for submit in found if submit.status not in REJECTED)
+    train = tuple(played for submit in submits if (played := _train(record, submit)))
+    hidden = tuple(_hidden(record, {one.submit_index: one for one in train}))
+    return RunUnderTest(root=root, record=record, submits=submits, train=train, hidden=hidden)
 
 
 def _train(record: RunRecord, submit: SubmitFiles) -> EpisodeList | None:
@@ -173,49 +147,38 @@ def _train(record: RunRecord, submit: SubmitFiles) -> EpisodeList | None:
     )
 
 
-def _hidden(record: RunRecord, train: dict[int, EpisodeList]) -> list[EpisodeList]:
+def _hidden(record: RunRecord, train: dict[int, EpisodeList]) -> Iterator[EpisodeList]:
     dimensions, outcome = record.experiment_dimensions, record.outcome
-    found: list[EpisodeList] = []
-
-    def add(
-        split: Split, own: EpisodeList, n: int, returns: tuple[float, ...] | None, mean: float | None
-    ) -> None:
-        found.append(
-            msgspec.structs.replace(
-                own,
+    best, returns = outcome.best_submit_index, outcome.heldout_returns
+    rows: list[tuple[Split, EpisodeList | None, int, tuple[float, ...] | None, float | None]] = [
+        ("validation", train.get(int(text)), dimensions.n_validation, None, mean)
+        for text, mean in (outcome.val_scores or {}).items()
+        if text.isdecimal() and len(text) <= _MAX_DIGITS
+    ]
+    if best is not None:
+        rows.append(("heldout", train.get(best), len(returns), returns, outcome.heldout_mean_return))
+    if (reference := outcome.random_reference) is not None and (n := len(reference.returns)):
+        own = EpisodeList(
+            split="heldout",
+            submit_index=RANDOM,
+            env_instances=(),
+            modulo=n,
+            remaining_budget_after=0,
+            returns=None,
+        )
+        rows.append(("heldout", own, n, reference.returns, reference.mean_return))
+    for split, of, n, told, mean in rows:
+        if of is not None:
+            yield msgspec.structs.replace(
+                of,
                 split=split,
                 env_instances=tuple(range(n)),
-                returns=returns,
+                returns=told,
                 lengths=None,
                 summary=None,
                 mean=mean,
                 folders=(),
             )
-        )
-
-    for text, told in (outcome.val_scores or {}).items():
-        index = int(text) if text.isdecimal() and len(text) <= _MAX_DIGITS else -1
-        if (own := train.get(index)) is not None:
-            add("validation", own, dimensions.n_validation, None, told)
-    if outcome.best_submit_index is not None and (own := train.get(outcome.best_submit_index)) is not None:
-        add(
-            "heldout", own, len(outcome.heldout_returns), outcome.heldout_returns, outcome.heldout_mean_return
-        )
-    reference = outcome.random_reference
-    if reference is not None and reference.returns:
-        n = len(reference.returns)
-        found.append(
-            EpisodeList(
-                split="heldout",
-                submit_index=RANDOM,
-                env_instances=tuple(range(n)),
-                modulo=n,
-                remaining_budget_after=0,
-                returns=reference.returns,
-                mean=reference.mean_return,
-            )
-        )
-    return found
 
 
 def _summary(folder: Path) -> Summary | None:
@@ -233,13 +196,3 @@ def _meta(checkpoint: Path, episode_budget: int) -> CheckpointMeta | None:
         return read_meta(checkpoint, episode_budget)
     except ProtocolError as error:
         raise ConfigError(f"{checkpoint} is damaged: {error}") from error
-
-
-def sample(lists: list[EpisodeList], n: int | None, seed: int) -> list[tuple[EpisodeList, tuple[int, ...]]]:
-    """Draws `n` episodes of all lists without replacement (None: all), as indexes of each list that has some."""
-    everything = [(k, index) for k, played in enumerate(lists) for index in range(len(played.env_instances))]
-    chosen = everything if n is None or n >= len(everything) else random.Random(seed).sample(everything, n)
-    by_list: dict[int, list[int]] = {}
-    for k, index in chosen:
-        by_list.setdefault(k, []).append(index)
-    return [(lists[k], tuple(sorted(by_list[k]))) for k in sorted(by_list)]

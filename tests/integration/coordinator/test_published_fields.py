@@ -32,11 +32,6 @@ FILES = {
 }
 
 
-@pytest.fixture(scope="module")
-def results(tmp_path_factory: pytest.TempPathFactory) -> Results:
-    return Results(tmp_path_factory.mktemp("fields"))
-
-
 def changed(leaf: Any) -> Any:
     if isinstance(leaf, bool):
         return not leaf
@@ -64,11 +59,9 @@ def checked(results: Results, forger: Forger) -> Checked:
 def claimed(found: Checked, file: str, path: tuple[str, ...]) -> bool:
     """Whether the output lists the field as a claim."""
     kind = (fields.file_kind(file) or "").removeprefix("runs/*/")
-    listed: list[str] = []
-    for each in found.findings:
-        begin = f"nobody can check, in {kind}: "
-        if each.kind == "claims" and each.text.startswith(begin):
-            listed += each.text.removeprefix(begin).split(", ")
+    begin = f"nobody can check, in {kind}: "
+    texts = [each.text.removeprefix(begin) for each in found.findings if each.text.startswith(begin)]
+    listed = [field for text in texts for field in text.split(", ")]
     # `a.*.b` for any element, `a.**` for everything below.
     return any(
         len(steps := pattern.split(".")) <= len(path)
@@ -78,16 +71,20 @@ def claimed(found: Checked, file: str, path: tuple[str, ...]) -> bool:
     )
 
 
+def in_manifest(results: Results, forger: Forger, file: str, digest: str) -> None:
+    manifest = json.loads(forger.files[contents.MANIFEST])
+    manifest["files"][file] = digest
+    forger.put(contents.MANIFEST, manifest)
+    forger.sign_manifest(results.root / "st")
+
+
 def signed(results: Results, forger: Forger, file: str) -> Checked:
     """A forger cannot make digests anew that contradict the files: the manifest's own fields are signed as they are."""
     if file in (contents.MANIFEST, contents.SIGNATURE):
         if file == contents.MANIFEST:
             forger.sign_manifest(results.root / "st")
     elif file.endswith(contents.DIGESTS):
-        manifest = json.loads(forger.files[contents.MANIFEST])
-        manifest["files"][file] = contents.digest(forger.files[file])
-        forger.put(contents.MANIFEST, manifest)
-        forger.sign_manifest(results.root / "st")
+        in_manifest(results, forger, file, contents.digest(forger.files[file]))
     else:
         forger.sign(results.root / "st")
     return checked(results, forger)
@@ -193,19 +190,13 @@ def test_files_of_no_kind_are_refused(results: Results) -> None:
         forger.files[name] = b"x"
         forger.sign(results.root / "st")
         if "/" not in name:
-            manifest = json.loads(forger.files[contents.MANIFEST])
-            manifest["files"][name] = contents.digest(b"x")
-            forger.put(contents.MANIFEST, manifest)
-            forger.sign_manifest(results.root / "st")
+            in_manifest(results, forger, name, contents.digest(b"x"))
         assert checked(results, forger).failed, name
 
 
 def test_a_digest_of_a_runs_file_in_the_manifest_is_refused(results: Results) -> None:
     forger = Forger(results.files)
-    manifest = json.loads(forger.files[contents.MANIFEST])
-    manifest["files"]["runs/0000/run.json"] = "00" * 32
-    forger.put(contents.MANIFEST, manifest)
-    forger.sign_manifest(results.root / "st")
+    in_manifest(results, forger, "runs/0000/run.json", "00" * 32)
     assert checked(results, forger).failed
 
 

@@ -3,25 +3,16 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
-from commands import evopolicy
+from commands import agent, evopolicy, words
 
 pytestmark = pytest.mark.system
 
 ROOT = Path(__file__).parents[3]
 AGENT = """
-import json, os, sys, urllib.request
-def submit(policy, ids):
-    with open("system/policy.py", "w") as file:
-        file.write(policy)
-    request = urllib.request.Request(
-        os.environ["EVOPOLICYGYM_SUBMIT_URL"], data=json.dumps({"env_instances": ids}).encode()
-    )
-    urllib.request.urlopen(request).read()
 POLICY = '''
 import random
 class Policy:
@@ -40,8 +31,8 @@ kinds = {
 }
 declared, action = kinds[sys.argv[1]]
 text = POLICY.replace("DECLARED", declared).replace("ACTION", action)
-submit(text, [0, 1, 0])
-submit(text + "#", [2, 3])
+submit_policy(text, [0, 1, 0])
+submit_policy(text + "#", [2, 3])
 """
 
 
@@ -57,17 +48,12 @@ def findings(cwd: Path, *options: str, kind: str = "policies") -> tuple[int, lis
 def test_deterministic_policies_give_the_recorded_actions_and_a_false_declaration_is_named(
     tmp_path: Path, scope: str
 ) -> None:
-    (tmp_path / "agent.py").write_text(AGENT)
-    numbers = ("--budget", "5", "--validation", "3", "--heldout", "4", "--policy-scope", scope)
+    program = agent(tmp_path, AGENT)
+    numbers = words(f"--env toy/line --state st --budget 5 --validation 3 --heldout 4 --policy-scope {scope}")
     for kind in ("honest", "lying", "silent"):
-        agent = f"command:{sys.executable} {tmp_path / 'agent.py'} {kind}"
-        done = evopolicy(
-            *(tmp_path, "local", "--env", "toy/line", "--state", "st", *numbers),
-            *("--agent", agent, "--entry", kind, "--exp-id", kind),
-        )
-        assert done.returncode == 0, done.stdout + done.stderr
-    done = evopolicy(tmp_path, "publish", "runs", "--out", "results.evp", "--local", "--state", "st")
-    assert done.returncode == 0, done.stderr
+        own = ("--agent", f"{program} {kind}", "--entry", kind, "--exp-id", kind)
+        evopolicy(tmp_path, "local", *numbers, *own, code=0)
+    done = evopolicy(tmp_path, "publish", "runs", "--out", "results.evp", "--local", "--state", "st", code=0)
     runs = {
         json.loads(path.read_text())["run"]: json.loads(path.read_text())["agent"]["entry"]
         for path in tmp_path.glob("runs/*/*/*/run.json")
@@ -109,13 +95,10 @@ def test_an_environment_that_does_not_repeat_episodes_is_not_played(
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: acme-moody\nVersion: 1.0\n")
     (info / "entry_points.txt").write_text("[evopolicy.environments]\nacme = acme_moody:environments.toml\n")
     monkeypatch.setenv("PYTHONPATH", f"{package.parent}:{ROOT / 'tests/support/foreign_package'}")
-    (tmp_path / "agent.py").write_text(AGENT)
-    agent = f"command:{sys.executable} {tmp_path / 'agent.py'} honest"
-    numbers = ("--budget", "5", "--validation", "1", "--heldout", "1", "--state", "st")
-    done = evopolicy(tmp_path, "local", "--env", "acme/moody", *numbers, "--agent", agent, "--entry", "mine")
-    assert done.returncode == 0, done.stdout + done.stderr
-    done = evopolicy(tmp_path, "publish", "runs", "--out", "results.evp", "--local", "--state", "st")
-    assert done.returncode == 0, done.stderr
+    own = ("--agent", f"{agent(tmp_path, AGENT)} honest", "--entry", "mine")
+    numbers = words("--env acme/moody --budget 5 --validation 1 --heldout 1 --state st")
+    evopolicy(tmp_path, "local", *numbers, *own, code=0)
+    evopolicy(tmp_path, *words("publish runs --out results.evp --local --state st"), code=0)
     for option, kind, left in (("--replay", "replay", 3), ("--policies", "policies", 0)):
         code, found = findings(tmp_path, option, "all", kind=kind)
         assert (code, [each["state"] for each in found]) == (left, ["open"]), found

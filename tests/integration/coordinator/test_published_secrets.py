@@ -7,28 +7,19 @@ import stat
 from pathlib import Path
 
 import pytest
-from commands import evopolicy
-
-from evopolicy_results.publish.archive import Archive
+from commands import agent, evopolicy, words
+from publications import read
 
 KEY = "sk-" + "a1B2c3D4e5" * 3
 PLAIN = "hunter2 hunter2"
 PASSED = "correct horse battery staple"
 AGENT = """
-import json, os, sys, urllib.request
 print(json.dumps({"got": sys.argv[1:]}), file=sys.stderr)
 assert sys.argv[1:] == json.loads(os.environ["EXPECTED"])
+with open("system/policy.py") as file:
+    old = file.read()
 for text in (f"# {os.environ['PHRASE']}\\n", "# harmless\\n"):
-    with open("system/policy.py") as file:
-        old = file.read()
-    with open("system/policy.py", "w") as file:
-        file.write("import numpy\\n" + text + old)
-    body = json.dumps({"env_instances": [0]}).encode()
-    headers = {"Content-Type": "application/json"}
-    request = urllib.request.Request(os.environ["EVOPOLICYGYM_SUBMIT_URL"], body, headers)
-    urllib.request.urlopen(request).read()
-    with open("system/policy.py", "w") as file:
-        file.write(old)
+    submit_policy("import numpy\\n" + text + old, [0])
 """
 
 
@@ -36,33 +27,15 @@ for text in (f"# {os.environ['PHRASE']}\\n", "# harmless\\n"):
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run whose agent got keys on its command line and a phrase in a variable, which it wrote into a policy."""
     root = tmp_path_factory.mktemp("secrets")
-    (root / "agent.py").write_text(AGENT)
-    words = ["--api-key", KEY, f"--token={PLAIN}", "-k", PLAIN, "--depth", "3"]
+    agent(root, AGENT)
+    secrets = ["--api-key", KEY, f"--token={PLAIN}", "-k", PLAIN, "--depth", "3"]
+    program = f"command:python3 agent.py --api-key {KEY} '--token={PLAIN}' -k '{PLAIN}' --depth 3"
+    options = words("--env toy/line --budget 2 --validation 2 --heldout 2 --state st --runs runs")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PHRASE", PASSED)
-        patch.setenv("EXPECTED", json.dumps(words))
-        done = evopolicy(
-            root,
-            *(
-                "local",
-                "--env",
-                "toy/line",
-                "--budget",
-                "2",
-                "--validation",
-                "2",
-                "--heldout",
-                "2",
-                "--state",
-                "st",
-            ),
-            *(
-                "--agent",
-                f"command:python3 agent.py --api-key {KEY} '--token={PLAIN}' -k '{PLAIN}' --depth 3",
-            ),
-            *("--jail-env", "PHRASE", "--jail-env", "EXPECTED", "--runs", "runs"),
-        )
-    assert done.returncode == 0, done.stdout + done.stderr
+        patch.setenv("EXPECTED", json.dumps(secrets))
+        passed = words("--jail-env PHRASE --jail-env EXPECTED")
+        evopolicy(root, "local", *options, *passed, "--agent", program, code=0)
     return next(root.glob("runs/*/*/*/run.json")).parent
 
 
@@ -80,15 +53,7 @@ def is_revealed(root: Path) -> bool:
 def test_keys_of_a_command_line_reach_the_agent_and_no_file(folder: Path) -> None:
     record = json.loads((folder / "run.json").read_bytes())
     program = record["agent"]["settings"]["program"]
-    assert program[-7:] == [
-        "--api-key",
-        "[redacted]",
-        "--token=[redacted]",
-        "-k",
-        "[redacted]",
-        "--depth",
-        "3",
-    ]
+    assert program[-7:] == words("--api-key [redacted] --token=[redacted] -k [redacted] --depth 3")
     files = [path for path in folder.parents[2].rglob("*") if path.is_file()]
     for path in files:
         assert KEY.encode() not in path.read_bytes(), path
@@ -117,11 +82,8 @@ def test_a_passed_value_in_a_policy_stops_publish_until_decided(folder: Path) ->
     assert is_revealed(root)
     code, text = publish(folder, "accepted.evp", "--accept-finding", f"./{place}")
     assert code == 0, text
-    held: dict[str, dict[str, bytes]] = {}
-    for name in ("removed.evp", "accepted.evp"):
-        with Archive(root / name) as archive:
-            held[name] = {each: archive.read(each, 1 << 24) for each in archive.names}
-        assert not any(".passed.json" in each for each in held[name])
+    held = {name: read(root / name) for name in ("removed.evp", "accepted.evp")}
+    assert not any(".passed.json" in each for files in held.values() for each in files)
     assert not any(PASSED.encode() in data for data in held["removed.evp"].values())
     policies = {name: {each for each in files if "/checkpoints/" in each} for name, files in held.items()}
     assert policies["removed.evp"] == {"runs/0000/checkpoints/001"}

@@ -7,16 +7,12 @@ Its policy also reads the clock, which a verification's second check is to find.
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
+from commands import agent, evopolicy, words
 
-PROGRAM = (
-    "from evopolicy_common.cli.frame import run_app; from evopolicy_results.cli.{0} import app; run_app(app)"
-)
 POLICY = """
 import time
 
@@ -32,17 +28,12 @@ class Policy:
         return [time.perf_counter_ns() % 1000 / 1000]
 """
 AGENT = f"""
-import json, os, urllib.request
-
-def ask(what, body=None):
-    request = urllib.request.Request(os.environ[f"EVOPOLICYGYM_{{what}}_URL"], data=body)
-    return urllib.request.urlopen(request).read()
+def ask(what):
+    return urllib.request.urlopen(os.environ[f"EVOPOLICYGYM_{{what}}_URL"]).read()
 
 with open("system/documents.json", "w") as file:
     json.dump({{"task": ask("TASK").decode(), "info": json.loads(ask("INFO"))}}, file)
-with open("system/policy.py", "w") as file:
-    file.write({POLICY!r})
-ask("SUBMIT", json.dumps({{"env_instances": [2, 0, 0, 1]}}).encode())
+submit_policy({POLICY!r}, [2, 0, 0, 1])
 """
 
 
@@ -50,32 +41,18 @@ class Played:
     """A run of either scope, made with one state folder."""
 
     def __init__(self, root: Path) -> None:
-        self.state = root / "st"
-        agent = root / "agent.py"
-        agent.write_text(AGENT)
+        self.root = root
+        own = ("--agent", agent(root, AGENT))
+        options = words("--jail none --budget 4 --validation 2 --heldout 2 --env toy/line --state st")
         self.runs: dict[str, Path] = {}
         for scope in ("submit", "episode"):
-            command = [
-                sys.executable,
-                "-m",
-                "evopolicy_gateway.cli",
-                "local",
-                "--jail",
-                "none",
-                "--budget",
-                "4",
-            ]
-            command += ["--agent", f"command:{sys.executable} {agent}", "--validation", "2", "--heldout", "2"]
-            command += ["--env", "toy/line", "--state", str(self.state), "--runs", str(root / scope)]
-            command += ["--policy-scope", scope]
-            done = subprocess.run(command, cwd=root, capture_output=True, text=True, timeout=150, check=False)
-            assert done.returncode == 0, done.stdout + done.stderr
+            where = words(f"--runs {scope} --policy-scope {scope}")
+            evopolicy(root, "local", *options, *own, *where, code=0)
             self.runs[scope] = next((root / scope).glob("*/*/*/run.json")).parent
 
     def documents(self, scope: str) -> dict[str, Any]:
-        found: dict[str, Any] = json.loads(
-            (self.runs[scope] / "checkpoints/submit_000/documents.json").read_text()
-        )
+        path = self.runs[scope] / "checkpoints/submit_000/documents.json"
+        found: dict[str, Any] = json.loads(path.read_text())
         return found
 
     def printed(self, scope: str) -> list[str]:
@@ -83,10 +60,8 @@ class Played:
         return [(folder / "stdout.txt").read_text().strip() for folder in sorted(episodes.iterdir())]
 
     def verify(self, scope: str, *options: str) -> dict[str, Any]:
-        command = [sys.executable, "-c", PROGRAM.format("verify"), str(self.runs[scope]), "--json", "--local"]
-        command += ["--state", str(self.state), *options]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=150, check=False)
-        assert done.returncode == 0, done.stdout + done.stderr
+        where = words("--json --local --state st")
+        done = evopolicy(self.root, "verify", str(self.runs[scope]), *where, *options, code=0)
         report: dict[str, Any] = json.loads(done.stdout)
         return report
 
@@ -105,14 +80,7 @@ def test_the_agent_is_told_the_scope(played: Played) -> None:
 
 def test_the_agent_is_told_every_limit(played: Played) -> None:
     limits = played.documents("submit")["info"]["resource_limits"]
-    assert {
-        "rollout_wall_s",
-        "act_wall_s",
-        "init_wall_s",
-        "cpu_s",
-        "memory_bytes",
-        "processes",
-    } < limits.keys()
+    assert limits.keys() >= set(words("rollout_wall_s act_wall_s init_wall_s cpu_s memory_bytes processes"))
     assert {"file_bytes", "files", "open_files", "output_bytes", "action_bytes"} < limits.keys()
 
 
@@ -125,10 +93,8 @@ def test_the_scope_is_recorded_and_kept_out_of_a_comparison(played: Played, tmp_
     for scope, folder in played.runs.items():
         record = json.loads((folder / "run.json").read_text())
         assert record["experiment_dimensions"]["policy_scope"] == scope
-    command = [sys.executable, "-c", PROGRAM.format("report"), *map(str, played.runs.values())]
-    command += ["--out", str(tmp_path / "report"), "--no-pages", "--jobs", "1"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=150, check=False)
-    assert done.returncode == 3, done.stdout + done.stderr
+    out = words("--out report --no-pages --jobs 1")
+    done = evopolicy(tmp_path, "report", *map(str, played.runs.values()), *out, code=3)
     assert "policy scope" in done.stderr
     assert not (tmp_path / "report").exists()
 

@@ -5,15 +5,14 @@ from __future__ import annotations
 import asyncio
 import json
 import re
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import pytest
-from commands import evopolicy
-from publications import AGENT, ENV, Forger
+from commands import agent, evopolicy, words
+from publications import AGENT, ENV, Forger, read
 
 from evopolicy_common.records import journal
 from evopolicy_common.records.aggregates import mean
@@ -159,16 +158,12 @@ class Labs:
 
     def __init__(self, root: Path) -> None:
         self.root = root
-        (root / "agent.py").write_text(AGENT)
-        self.call(
-            "data", "make", "--env", ENV, "--root", "cases", "--train", "4", "--valid", "2", "--heldout", "3"
-        )
+        program = agent(root, AGENT)
+        self.call(*words(f"data make --env {ENV} --root cases --train 4 --valid 2 --heldout 3"))
         for lab, runs in RUNS.items():
+            options = words(f"--env {ENV} --budget 5 --data cases --state {lab} --runs {lab}-runs")
             for entry, name in runs:
-                self.call(
-                    "local", "--env", ENV, "--budget", "5", "--data", "cases", "--state", lab, "--runs", f"{lab}-runs",
-                    "--agent", f"command:{sys.executable} {root / 'agent.py'}", "--entry", entry, "--exp-id", name,
-                )  # fmt: skip
+                self.call("local", *options, "--agent", program, "--entry", entry, "--exp-id", name)
         self.heads: dict[str, str] = {}
         for number, cheats in enumerate(BOARDS):
             for entry, (_, cheat) in cheats.items():
@@ -177,8 +172,7 @@ class Labs:
                 out = f"{entry}-{number}.evp"
                 folder = f"{lab}-runs/{entry}/{ENV.replace('/', '_')}/{name}"
                 self.call("publish", folder, "--out", out, "--local", "--state", lab)
-                with Archive(root / out) as archive:
-                    forger = Forger({each: archive.read(each, 1 << 30) for each in archive.names})
+                forger = Forger(read(root / out))
                 lines = contents.journal_entries(forger.files[contents.JOURNAL])
                 self.heads[entry] = journal.heads(lines)[-2]
                 cheat(forger)
@@ -188,8 +182,7 @@ class Labs:
                 forger.write(root / out)
 
     def call(self, *words: str) -> None:
-        done = evopolicy(self.root, *words)
-        assert done.returncode == 0, done.stdout + done.stderr
+        evopolicy(self.root, *words, code=0)
 
     def bundles(self, number: int) -> list[LabBundle]:
         """As the command reads the files of a board, with every episode played again."""
@@ -225,7 +218,9 @@ def test_a_board_shows_each_cheat_as_the_page_says(labs: Labs, number: int) -> N
         cheat, _ = BOARDS[number][bundle.file.partition("-")[0]]
         text, code, shown = TABLE[cheat]
         assert place[bundle.file] == shown, (cheat, bundle.refused)
-        states = {kind: bundle.state_of(kind) for kind in re.findall(r"`(\w+)`", text) if kind != "ok"}
+        states = {
+            kind: bundle.checked.state_of(kind) for kind in re.findall(r"`(\w+)`", text) if kind != "ok"
+        }
         wanted = "failed" if "FAILED" in text.partition(";")[0] else "open"
         assert set(states.values()) <= {wanted}, (cheat, states)
         failed = any(each.state == "failed" for each in bundle.checked.findings)
@@ -256,8 +251,7 @@ def test_the_table_of_the_page_has_the_cheats_of_the_boards() -> None:
 
 def test_the_site_says_why_a_run_stands_apart(labs: Labs) -> None:
     names = [f"{entry}-0.evp" for entry in BOARDS[0]]
-    done = evopolicy(labs.root, "leaderboard", *names, "--out", "site")
-    assert done.returncode == 0, done.stdout + done.stderr
+    done = evopolicy(labs.root, "leaderboard", *names, "--out", "site", code=0)
     text = (labs.root / "site" / "index.html").read_text()
     assert "no replay can contradict the returns" in text
     assert "5 of 6 files" in done.stdout

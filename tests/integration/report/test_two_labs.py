@@ -13,10 +13,8 @@ from pathlib import Path
 
 import pytest
 from browser import Page
-
-from evopolicy_common.records.run_record import decode_run_record
-from evopolicy_results.publish import contents
-from evopolicy_results.publish.archive import Archive, Writer
+from commands import words
+from publications import read, written
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(900)]
 ROOT = Path(__file__).parents[3]
@@ -112,11 +110,7 @@ def test_a_clean_installation_checks_both_files(labs: Path, tmp_path: Path) -> N
         shutil.copy(labs / f"{lab}.evp", tmp_path)
         command = [
             str(tmp_path / "venv" / "bin" / "evopolicy"),
-            "check",
-            f"{lab}.evp",
-            "--json",
-            "--replay",
-            "25%",
+            *words(f"check {lab}.evp --json --replay 25%"),
         ]
         done = run(tmp_path, *command, "--identity", key(labs, lab))
         document = json.loads(done.stdout)
@@ -125,45 +119,22 @@ def test_a_clean_installation_checks_both_files(labs: Path, tmp_path: Path) -> N
         assert (states["identity"], states["replay"]) == ("ok", "ok")
 
 
-def changed(source: Path, target: Path, name: str, change: bytes) -> None:
-    writer = Writer(target)
-    with Archive(source) as archive:
-        for each in sorted(archive.names):
-            writer.add(each, change if each == name else archive.read(each, contents.MAX_RECORDING_BYTES))
-    writer.close()
-
-
 def test_incomparable_and_failed_results_stand_apart_with_the_reason(labs: Path, tmp_path: Path) -> None:
-    with Archive(labs / "lab-b.evp") as archive:
-        record = decode_run_record(archive.read("runs/0000/run.json", 1 << 20))
-        document = json.loads(archive.read("runs/0000/run.json", 1 << 20))
-    assert record.agent.entry == "evolve"
+    files = read(labs / "lab-b.evp")
+    document = json.loads(files["runs/0000/run.json"])
+    assert document["agent"]["entry"] == "evolve"
     document["agent"]["entry"] = "<script>alert(1)</script>"
-    changed(
-        labs / "lab-b.evp", tmp_path / "<b>forged.evp", "runs/0000/run.json", json.dumps(document).encode()
-    )
+    written(tmp_path / "<b>forged.evp", files | {"runs/0000/run.json": json.dumps(document).encode()})
     (tmp_path / "torn.evp").write_bytes((labs / "lab-a.evp").read_bytes()[:5000])
     # Another budget: no comparison with the first two.
-    sweep = (
-        (labs / "sweep.toml").read_text().replace("budget = 8", "budget = 6").replace('"random"', '"evolve"')
-    )
-    (tmp_path / "third.toml").write_text(sweep)
-    state = ("--local", "--state", "lab-c")
-    run(
-        tmp_path,
-        "evopolicy",
-        "suite",
-        "third.toml",
-        *state,
-        "--data",
-        str(labs / "cases"),
-        "--runs",
-        "runs-c",
-    )
+    sweep = (labs / "sweep.toml").read_text().replace("budget = 8", "budget = 6")
+    (tmp_path / "third.toml").write_text(sweep.replace('"random"', '"evolve"'))
+    state, data = ("--local", "--state", "lab-c"), str(labs / "cases")
+    run(tmp_path, "evopolicy", "suite", "third.toml", *state, "--data", data, "--runs", "runs-c")
     run(tmp_path, "evopolicy", "publish", "runs-c", *state, "--out", "lab-c.evp")
-    files = [str(labs / "lab-a.evp"), str(labs / "lab-b.evp"), "lab-c.evp", "<b>forged.evp", "torn.evp"]
-    files.append(str(shutil.copy(labs / "lab-a.evp", tmp_path / "again.evp")))
-    done = run(tmp_path, "evopolicy", "leaderboard", *files, "--out", "site", "--json")
+    names = [str(labs / "lab-a.evp"), str(labs / "lab-b.evp"), "lab-c.evp", "<b>forged.evp", "torn.evp"]
+    names.append(str(shutil.copy(labs / "lab-a.evp", tmp_path / "again.evp")))
+    done = run(tmp_path, "evopolicy", "leaderboard", *names, "--out", "site", "--json")
     shown = {each["file"]: each for each in json.loads(done.stdout)["files"]}
     assert "run.json was changed" in shown["<b>forged.evp"]["refused"]
     assert "not published results" in shown["torn.evp"]["refused"]

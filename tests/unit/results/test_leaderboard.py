@@ -57,7 +57,7 @@ def test_files_of_one_signer_whose_journals_contradict_each_other_are_reported(t
     told = [[each.text for each in one.checked.findings if each.state == "failed"] for one in found]
     assert [len(each) for each in told] == [0, 1, 1, 0, 0]
     assert "the first 2 entries are others in 3.evp of the same signer" in told[2][0]
-    assert found[2].state_of("order") == "failed"
+    assert found[2].checked.state_of("order") == "failed"
     assert not any(each.refused for each in found)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 
-from evopolicy_results.publish.policies import not_allowed
+from evopolicy_results.publish.replay import not_allowed
 
 
 def test_a_packages_name_runs_no_command_in_a_shell() -> None:

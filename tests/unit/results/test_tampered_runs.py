@@ -21,6 +21,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
+from commands import words
 from invented.policies import Version, policy
 from invented.published_runs import write_published_run
 from invented.run_dirs import write_run
@@ -62,20 +63,7 @@ TEXTS = [
     "a" * 5000,
     "a\nb",
 ]
-NUMBERS = [
-    "NaN",
-    "-Infinity",
-    "1e400",
-    "1e308",
-    "-1",
-    "9" * 400,
-    "9" * 5000,
-    "null",
-    "true",
-    '"x"',
-    "[]",
-    "{}",
-]
+NUMBERS = [*words('NaN -Infinity 1e400 1e308 -1 null true "x" [] {}'), "9" * 400, "9" * 5000]
 NUMBERS += ['"\\ud800"', "[" * 3000 + "]" * 3000, "-9223372036854775809", "1e-400"]
 
 
@@ -84,14 +72,8 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     run = write_run(tmp_path_factory.mktemp("whole"), VERSIONS, heldout=[-95.0] * 32)
     for submit, n in ((0, 2), (1, 1)):
         for episode in range(n):
-            folder = (
-                run
-                / "workspace"
-                / "feedback"
-                / f"submit_{submit:03d}"
-                / "episodes"
-                / f"ep_{2 * submit + episode:03d}"
-            )
+            episodes = run / f"workspace/feedback/submit_{submit:03d}/episodes"
+            folder = episodes / f"ep_{2 * submit + episode:03d}"
             folder.mkdir(parents=True)
             (folder / "trajectory.jsonl").write_text(json.dumps(ROW) + "\n")
     return run
@@ -251,13 +233,7 @@ REPLACEMENTS: dict[str, Callable[[Path], object]] = {
 def test_nothing_in_place_of_a_file_stops_or_breaks_a_reader(whole: Path, tmp_path: Path, kind: str) -> None:
     # One file of each name.
     names = {path.name: path.relative_to(whole) for path in sorted(whole.rglob("*")) if path.is_file()}
-    assert names.keys() >= {
-        "run.json",
-        "summary.json",
-        "_meta.json",
-        "trajectory.jsonl",
-        "agent.jsonl",
-    }
+    assert names.keys() >= set(words("run.json summary.json _meta.json trajectory.jsonl agent.jsonl"))
     for number, name in enumerate(names.values()):
         run = copy(whole, tmp_path / str(number))
         REPLACEMENTS[kind](run / name)

@@ -15,13 +15,12 @@ from invented.run_dirs import write_run
 
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.operator import DescribeEnvironment, EnvironmentState, Evaluate
-from evopolicy_common.records.run_record import decode_run_record
+from evopolicy_common.records.run_record import RunRecord, decode_run_record
 from evopolicy_results import evaluations
 from evopolicy_results.evaluations import Evaluations
 from evopolicy_results.publish import replay
 from evopolicy_results.rescore import play
 
-WANTED = play.Wanted(name="more", n_cases=1, data=None, every=False)
 LINK = cast(Any, SimpleNamespace(credentials=SimpleNamespace(token="", cluster="local")))
 
 
@@ -53,10 +52,11 @@ def soon(work: Coroutine[Any, Any, Any]) -> Any:
     return asyncio.run(cast(Any, asyncio.wait_for(work, 30)))
 
 
-def rescorer(own: bool, cluster: Cluster) -> play.Rescorer:
-    found = play.Rescorer(LINK, WANTED, lambda count, waits_for: None, own_workers=own)
-    found._evaluations.ask = cast(Any, cluster)
-    return found
+def class_of(own: bool, cluster: Cluster, record: RunRecord) -> Any:
+    client = Evaluations(LINK, lambda count, waits_for: None, own=own)
+    cluster.own = own
+    client.ask = cast(Any, cluster)
+    return soon(play.class_of(record, client))
 
 
 def test_a_check_waits_for_no_worker_without_end(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -83,14 +83,14 @@ def test_a_re_score_waits_for_no_worker_without_end(
     folder = write_run(tmp_path, [Version(policy(gain=1.0), (1.0,), 1.0)], env="gym/acrobot")
     record = decode_run_record((folder / "run.json").read_bytes())
     with pytest.raises(ConfigError, match=remedy):
-        soon(rescorer(own, Cluster())._class(record))
+        class_of(own, Cluster(), record)
 
 
 def test_a_run_that_the_coordinator_does_not_know_is_not_waited_for(tmp_path: Path) -> None:
     folder = write_run(tmp_path, [Version(policy(gain=1.0), (1.0,), 1.0)])
     record = decode_run_record((folder / "run.json").read_bytes())
     with pytest.raises(ConfigError, match="no finished run"):
-        soon(rescorer(True, Cluster(knows_run=False))._class(msgspec.structs.replace(record, run="r")))
+        class_of(True, Cluster(knows_run=False), msgspec.structs.replace(record, run="r"))
 
 
 def test_progress_names_the_reason_for_waiting_until_the_evaluation_ends() -> None:
