@@ -29,6 +29,14 @@ MP4 = bytes.fromhex("000000206674797069736f6d0000020069736f6d69736f32617663316d7
 """The first box of a video file: enough to be copied and linked."""
 
 
+def reported(runs: Path, *options: str, code: int = 0) -> tuple[Path, str]:
+    """The folder with a report on `runs`, beside them, and what the command said."""
+    out = runs.parent / "report"
+    result = CliRunner().invoke(app, [str(runs), "--out", str(out), *options])
+    assert result.exit_code == code, result.output
+    return out, result.output
+
+
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("runs")
@@ -120,7 +128,7 @@ def test_agents_and_environments_are_listed_as_they_were_set_up(tmp_path: Path) 
         record = json.loads((folder / "run.json").read_text())
         record["agent"] |= {"settings": settings, "model_string": "m-1", "cli_version": "2.0"}
         (folder / "run.json").write_text(json.dumps(record))
-    assert CliRunner().invoke(app, [str(tmp_path / "runs"), "--out", str(tmp_path / "report")]).exit_code == 0
+    reported(tmp_path / "runs")
     agents = table(tmp_path / "report", "agents")
     assert [(r["entry"], r["cli_version"], r["model"], r["settings"], r["runs"]) for r in agents] == [
         ("Agent A", "2.0", "m-1", "effort high, retries 5", "1"),
@@ -208,7 +216,7 @@ def test_evopolicy_has_report_as_a_plain_command(tmp_path: Path) -> None:
 
 
 def test_left_out_run_is_listed_with_its_reason(report: Path) -> None:
-    (row,) = csv.DictReader((report / "tables/left_out.csv").read_text().splitlines())
+    (row,) = table(report, "left_out")
     assert row["path"].endswith("Tern/gym_racing/exp-1")
     assert row["reason"].startswith("run.json")
     assert row["path"] in (report / "index.html").read_text()
@@ -232,11 +240,8 @@ def test_report_is_the_same_whether_one_or_two_processes_make_it(tmp_path: Path)
 def test_papers_table_as_input_gives_its_aggregate_table(tmp_path: Path) -> None:
     source = tmp_path / "table.csv"
     source.write_text(paper.text("table1_heldout_returns"))
-    result = CliRunner().invoke(app, [str(source), "--out", str(tmp_path / "report")])
-    assert result.exit_code == 0, result.output
-    written = list(
-        csv.DictReader((tmp_path / "report/tables/leaderboard_core16.csv").read_text().splitlines())
-    )
+    out, _ = reported(source)
+    written = table(out, "leaderboard_core16")
     for row, printed in zip(written, paper.rows("table2_aggregate"), strict=True):
         assert row["entry"] == printed["entry"]
         assert f"{float(row['score']):.3f}" == printed["core16"]
@@ -246,40 +251,32 @@ def test_papers_table_as_input_gives_its_aggregate_table(tmp_path: Path) -> None
 def test_mixed_runs_are_refused_unless_told_and_then_marked(tmp_path: Path) -> None:
     write_run(tmp_path / "runs", [Version(policy(), (1.0,), 1.0)])
     write_run(tmp_path / "runs", [Version(policy(), (1.0,), 2.0)], entry="Other", scope="submit")
-    arguments = [str(tmp_path / "runs"), "--out", str(tmp_path / "report")]
-    refused = CliRunner().invoke(app, arguments)
-    assert refused.exit_code == 3
-    assert "policy scope on core16: episode (1 run), submit (1 run)" in refused.output
+    _, said = reported(tmp_path / "runs", code=3)
+    assert "policy scope on core16: episode (1 run), submit (1 run)" in said
     folders = {each.parent.parent.parent.name: each.parent for each in tmp_path.rglob("run.json")}
-    assert f"    submit: {folders['Other']}\n" in refused.output
+    assert f"    submit: {folders['Other']}\n" in said
     assert not (tmp_path / "report").exists()
-    invoked = CliRunner().invoke(app, [*arguments, "--allow-mixed"])
-    assert invoked.exit_code == 0
-    assert "policy scope on core16" in (tmp_path / "report/index.html").read_text()
+    out, _ = reported(tmp_path / "runs", "--allow-mixed")
+    assert "policy scope on core16" in (out / "index.html").read_text()
 
 
 def test_runs_of_unknown_isolation_are_warned_of_and_mixed_by_name(tmp_path: Path) -> None:
-    runs, out = tmp_path / "runs", tmp_path / "report"
+    runs = tmp_path / "runs"
     write_run(runs, [Version(policy(), (1.0,), 1.0)], hidden_isolation="unknown")
-    arguments = [str(runs), "--out", str(out)]
-    alone = CliRunner().invoke(app, arguments)
-    assert alone.exit_code == 0
-    assert "warning: 1 of 1 runs do not tell whether hidden episodes and agents shared" in alone.output
+    out, said = reported(runs)
+    assert "warning: 1 of 1 runs do not tell whether hidden episodes and agents shared" in said
     assert "1 of 1 runs do not tell whether" in (out / "index.html").read_text()
     write_run(runs, [Version(policy(), (1.0,), 2.0)], entry="Other", hidden_isolation="exclusive")
-    refused = CliRunner().invoke(app, [*arguments, "--allow-mixed"])
-    assert refused.exit_code == 3
-    assert "or --allow-unknown to compare them all the same" in refused.output
-    assert CliRunner().invoke(app, [*arguments, "--allow-unknown"]).exit_code == 0
+    assert "or --allow-unknown to compare them all the same" in reported(runs, "--allow-mixed", code=3)[1]
+    reported(runs, "--allow-unknown")
 
 
 def test_nothing_to_report_writes_nothing_and_says_why(tmp_path: Path) -> None:
     (tmp_path / "runs/x/workspace").mkdir(parents=True)
     (tmp_path / "runs/x/logs").mkdir()
-    result = CliRunner().invoke(app, [str(tmp_path / "runs"), "--out", str(tmp_path / "report")])
-    assert result.exit_code == 1
-    assert "unfinished" in result.output
-    assert not (tmp_path / "report").exists()
+    out, said = reported(tmp_path / "runs", code=1)
+    assert "unfinished" in said
+    assert not out.exists()
 
 
 def test_folder_with_other_files_is_not_written_to(runs: Path, tmp_path: Path) -> None:
@@ -298,8 +295,7 @@ def test_hostile_names_sources_and_messages_are_shown_as_text(tmp_path: Path) ->
         Version({"policy.py": source["policy.py"] + "x = 1\n"}, (1.0,), 2.0, says=f"{evil} again"),
     ]
     write_run(tmp_path / "runs", versions, entry="$\\frac{<b>evil</b> & co", exp_id="e")
-    result = CliRunner().invoke(app, [str(tmp_path / "runs"), "--out", str(tmp_path / "report")])
-    assert result.exit_code == 0, result.output
+    reported(tmp_path / "runs")
     for page in (tmp_path / "report").rglob("*.html"):
         text = page.read_text()
         assert evil not in text
@@ -315,8 +311,7 @@ def test_replays_are_copied_and_missing_ones_said(tmp_path: Path) -> None:
             replays={"heldout_000/video.mp4": MP4, "heldout_001/video.mp4": MP4},
         )
     (folder / "replays/heldout_001/video.mp4").unlink()
-    result = CliRunner().invoke(app, [str(tmp_path / "runs"), "--out", str(tmp_path / "report")])
-    assert result.exit_code == 0, result.output
+    reported(tmp_path / "runs")
     page = tmp_path / "report/replays/gym-acrobot.html"
     text = page.read_text()
     assert text.count("<video") == 3
@@ -334,7 +329,7 @@ def test_feedback_video_is_shown_beside_its_submit(tmp_path: Path) -> None:
     video = folder / "workspace/feedback/submit_001/episodes/ep_001/video.mp4"
     video.parent.mkdir(parents=True)
     video.write_bytes(MP4)
-    assert CliRunner().invoke(app, [str(tmp_path / "runs"), "--out", str(tmp_path / "report")]).exit_code == 0
+    reported(tmp_path / "runs")
     (page,) = (tmp_path / "report/traces").glob("*.html")
     (target,) = [target for target in links_of(page).targets if target.endswith(".mp4")]
     assert target.endswith("s001.mp4")
@@ -347,7 +342,7 @@ def test_replay_path_that_leads_out_of_the_run_is_not_followed(tmp_path: Path) -
     record = json.loads((folder / "run.json").read_text())
     record["replays"][0]["path"] = "../../../../secret.png"
     (folder / "run.json").write_text(json.dumps(record))
-    assert CliRunner().invoke(app, [str(tmp_path / "runs"), "--out", str(tmp_path / "report")]).exit_code == 0
+    reported(tmp_path / "runs")
     assert not list((tmp_path / "report").rglob("*.png.*"))
     assert "its file is missing" in (tmp_path / "report/replays/gym-acrobot.html").read_text()
 
@@ -355,10 +350,8 @@ def test_replay_path_that_leads_out_of_the_run_is_not_followed(tmp_path: Path) -
 def test_run_without_any_ok_submit_is_in_the_report(tmp_path: Path) -> None:
     write_run(tmp_path / "runs", [Version({"policy.py": "import x\n"}, (0.0,), None, "import_error")])
     write_run(tmp_path / "runs", [], entry="Idle")
-    result = CliRunner().invoke(app, [str(tmp_path / "runs"), "--out", str(tmp_path / "report")])
-    assert result.exit_code == 0, result.output
-    board = list(csv.DictReader((tmp_path / "report/tables/heldout_core16.csv").read_text().splitlines()))
-    assert [row["gym/acrobot"] for row in board] == ["-500.0", "", ""]
+    reported(tmp_path / "runs")
+    assert [row["gym/acrobot"] for row in table(tmp_path / "report", "heldout_core16")] == ["-500.0", "", ""]
 
 
 def test_notebook_example_of_the_package_works(runs: Path, tmp_path: Path) -> None:
