@@ -2,12 +2,12 @@
 
     from evopolicy_results.notebook import rows, study
 
-    found = study(["runs"])                     # reads every run below; damaged runs are in found.left_out
-    core16 = found.suites[0]
+    result = study(["runs"])                    # reads every run below; damaged runs are in result.left_out
+    core16 = result.suites[0]
     for row in core16.board.standings:          # typed records
         print(row.entry, row.score, row.wins)
     core16.statistics.pairs                     # pairwise comparisons with intervals and tests; see `statistics`
-    rows(found.evolutions)                      # a list of dicts for pandas.DataFrame
+    rows(result.evolutions)                     # a list of dicts for pandas.DataFrame
 
 `study` raises MixedRunsError for runs that are not a fair comparison, unless `allow_mixed=True`. `write_report`
 writes the pages of `evopolicy report`; `figures_of` draws the figures one by one; `heldout_returns` is the paper's
@@ -16,24 +16,18 @@ own table of scores. Nothing here runs a policy or needs a simulator. Matplotlib
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import TYPE_CHECKING
-
 from evopolicy_results.behaviour.edits import classify, edit_rates
 from evopolicy_results.behaviour.trace import trace
+from evopolicy_results.figures import figures_of
 from evopolicy_results.reading.comparability import MixedRunsError, mixtures
 from evopolicy_results.reading.reader import load_runs
 from evopolicy_results.reading.records import Run, Submit, rows
+from evopolicy_results.report import write_report
 from evopolicy_results.scoring.paper import heldout_returns
 from evopolicy_results.scoring.ranking import leaderboard
 from evopolicy_results.scoring.scores import score_table
 from evopolicy_results.studies.study import Study, study, study_of
 from evopolicy_results.tables.report_tables import tables_of
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from evopolicy_results.figures.plot import Plot
 
 __all__ = [
     "MixedRunsError",
@@ -55,17 +49,3 @@ __all__ = [
     "trace",
     "write_report",
 ]
-
-
-def figures_of(found: Study) -> Iterator[Plot]:
-    """Draws the report's figures one by one; see `figures.figures_of`."""
-    from evopolicy_results.figures import figures_of as draw
-
-    return draw(found)
-
-
-def write_report(found: Study, out: Path, *, title: str | None = None) -> Path:
-    """Writes the report of `found` into the folder `out` and returns its `index.html`; see `report.write_report`."""
-    from evopolicy_results.report import write_report as write
-
-    return write(found, out, title=title)

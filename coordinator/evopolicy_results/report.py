@@ -28,10 +28,10 @@ from evopolicy_results.figures.plot import Plot
 from evopolicy_results.html.pages import (
     FORMS,
     PlayedEpisode,
-    default_title,
-    failed_page,
     index_page,
+    page,
     replays_page,
+    run_title,
     trace_page,
 )
 from evopolicy_results.reading.environments import names_in_runs, ordered_environments
@@ -46,6 +46,7 @@ from evopolicy_results.tables.table import Table, to_csv, to_markdown
 
 REPORT_SCHEMA_VERSION = 1
 _OURS = frozenset({"index.html", "report.json", "figures", "tables", "traces", "replays"})
+_MEDIA = (".mp4", ".png", ".webm")
 _WRITTEN = {"csv": to_csv, "md": to_markdown, "tex": to_latex}
 
 Progress = Callable[[str, int, int], None]
@@ -71,11 +72,18 @@ def write_report(
     _prepare(out)
     look = looks(study.entries, study.reference)
     trace_links = {run.name: f"traces/{slug(run)}.html" for run in study.runs} if traces else {}
-    tables = tables_of(study, lambda run: trace_links.get(run, ""))
+    tables = tables_of(study)
     plots: list[Plot] = []
     submits: list[dict[str, Any]] = []
     drawings = drawings_of(study)
-    pages = _pages(study, out, look) if traces else []
+    by_env: dict[str, list[Run]] = {}
+    for run in study.runs if traces else ():
+        by_env.setdefault(run.env, []).append(run)
+    pages = [
+        partial(_page, run, out, look.get(run.entry), _beside(run, runs, look))
+        for runs in by_env.values()
+        for run in runs
+    ]
     stages: list[partial[Any]] = [*drawings, *pages]
     work = [(names_in_runs, each) for each in stages]
     for done, made in enumerate(processes.map(_made, work, _lost, at_once=1), start=1):
@@ -87,28 +95,24 @@ def write_report(
             tell("run pages", done - len(drawings), len(pages))
     plots += timelines_of(study)
     for plot in plots:
-        (out / "figures" / f"{plot.name}.svg").write_text(plot.svg, encoding="utf-8")
+        _write(out / "figures" / f"{plot.name}.svg", plot.svg)
     if traces:
         tables.append(feedback_use(submits))
     for done, table in enumerate(tables, start=1):
         for _, suffix in FORMS:
-            text = _WRITTEN[suffix](table)
-            (out / "tables" / f"{table.name}.{suffix}").write_text(text, encoding="utf-8", errors="replace")
+            _write(out / "tables" / f"{table.name}.{suffix}", _WRITTEN[suffix](table))
         tell("tables", done, len(tables))
-    replay_links = _write_replays(study, out, look)
-    page = index_page(
+    (out / "report.json").write_bytes(_report_json(study, tables, plots))
+    text = index_page(
         study,
-        title=title or default_title(study),
+        title=title,
         looks=look,
         tables=tables,
         figures=plots,
         trace_links=trace_links,
-        replay_links=replay_links,
+        replay_links=_write_replays(study, out, look),
     )
-    (out / "report.json").write_bytes(_report_json(study, tables, plots))
-    index = out / "index.html"
-    index.write_text(page, encoding="utf-8", errors="replace")
-    return index
+    return _write(out / "index.html", text)
 
 
 def slug(run: Run) -> str:
@@ -147,133 +151,90 @@ def _lost(item: tuple[Any, partial[Any]], why: str) -> Any:
     if item[1].func is not _page:
         raise ChildProcessError(why)
     run, out, *_ = item[1].args
-    _write_failed(run, out, why)
-    return []
-
-
-def _pages(study: Study, out: Path, look: Mapping[str, Look]) -> list[partial[list[dict[str, Any]]]]:
-    """Writes the page of each run and returns its submits."""
-    (out / "traces").mkdir(exist_ok=True)
-    by_env: dict[str, list[Run]] = {}
-    for run in study.runs:
-        by_env.setdefault(run.env, []).append(run)
-    return [
-        partial(
-            _page,
-            run,
-            out,
-            look.get(run.entry),
-            [
-                (other.entry, look.get(other.entry), f"{slug(other)}.html")
-                for other in _beside(run, by_env[run.env])
-            ],
-        )
-        for run in study.runs
-    ]
+    return _write_failed(run, out, why)
 
 
 def _page(
     run: Run, out: Path, look: Look | None, beside: Sequence[tuple[str, Look | None, str]]
 ) -> list[dict[str, Any]]:
+    """Writes the page of a run and returns its submits."""
     try:
         traced = trace(run)
-        _write_trace(traced, out, look, beside)
+        _write_trace(traced, out / "traces", look, beside)
         return submits_of(traced)
     except Exception as error:
         # A bad log or source that an agent wrote must spoil at most its own page.
-        _write_failed(run, out, f"{type(error).__name__}: {error}")
-        return []
+        return _write_failed(run, out, f"{type(error).__name__}: {error}")
 
 
-def _write_failed(run: Run, out: Path, why: str) -> None:
-    page = failed_page(run, why)
-    (out / "traces" / f"{slug(run)}.html").write_text(page, encoding="utf-8", errors="replace")
+def _write_failed(run: Run, out: Path, why: str) -> list[dict[str, Any]]:
+    _write(out / "traces" / f"{slug(run)}.html", page("failed", title=run_title(run), reason=why))
+    return []
 
 
-def _beside(run: Run, runs: Sequence[Run]) -> list[Run]:
-    """One run of each other agent on the same environment, with the same repeat number if there is one."""
+def _beside(run: Run, runs: Sequence[Run], look: Mapping[str, Look]) -> list[tuple[str, Look | None, str]]:
+    """One run of each other agent, with the same repeat number if there is one."""
     chosen: dict[str, Run] = {}
     for other in runs:
         if other.entry != run.entry:
             first = chosen.setdefault(other.entry, other)
             if first.record.repeat != run.record.repeat == other.record.repeat:
                 chosen[other.entry] = other
-    return list(chosen.values())
+    return [(entry, look.get(entry), f"{slug(other)}.html") for entry, other in chosen.items()]
 
 
 def _write_trace(
-    found: Trace, out: Path, look: Look | None, beside: Sequence[tuple[str, Look | None, str]]
+    traced: Trace, folder: Path, look: Look | None, beside: Sequence[tuple[str, Look | None, str]]
 ) -> None:
-    folder = out / "traces"
-    name = slug(found.run)
+    name = slug(traced.run)
     image_links: dict[int, list[tuple[str, str]]] = {}
     videos: dict[int, str] = {}
-    for row in found.rows:
+    for row in traced.rows:
+        stem, index = f"{name}/{row.submit.label}", row.submit.index
         for number, path in enumerate(row.images):
-            target = folder / name / f"{row.submit.label}-{number}{path.suffix.lower()}"
-            if _copy(path, target):
-                image_links.setdefault(row.submit.index, []).append((path.name, f"{name}/{target.name}"))
-        if row.video is not None and _copy(row.video, folder / name / f"{row.submit.label}.mp4"):
-            videos[row.submit.index] = f"{name}/{row.submit.label}.mp4"
-    page = trace_page(
-        found,
-        look=look,
-        image_links=image_links,
-        videos=videos,
-        beside=beside,
-    )
-    (folder / f"{name}.html").write_text(page, encoding="utf-8", errors="replace")
+            if copied := _copied(path, folder, f"{stem}-{number}"):
+                image_links.setdefault(index, []).append((path.name, copied))
+        if row.video is not None and (copied := _copied(row.video, folder, stem)):
+            videos[index] = copied
+    text = trace_page(traced, look=look, image_links=image_links, videos=videos, beside=beside)
+    _write(folder / f"{name}.html", text)
 
 
-def _copy(path: Path, target: Path) -> bool:
-    """Copies a file; returns False when it is missing or a link."""
+def _copied(path: Path, folder: Path, stem: str) -> str | None:
+    """Copies a file and returns its path in `folder`; None when it is missing or a link."""
     if not path.is_file() or path.is_symlink():
-        return False
+        return None
+    target = folder / f"{stem}{path.suffix.lower()}"
     target.parent.mkdir(parents=True, exist_ok=True)
     shutil.copyfile(path, target)
-    return True
+    return f"{stem}{path.suffix.lower()}"
 
 
 def _write_replays(study: Study, out: Path, look: Mapping[str, Look]) -> dict[str, str]:
     by_env: dict[str, list[PlayedEpisode]] = {}
+
+    def copied(run: Run, path: str | None, number: int) -> str | None:
+        """None too for what is outside the run directory, or no image or video."""
+        source = (run.path / (path or "")).resolve()
+        if not source.is_relative_to(run.path.resolve()) or source.suffix.lower() not in _MEDIA:
+            return None
+        return _copied(source, out / "replays", f"media/{slug(run)}-{number:03d}")
+
     for run in study.runs:
         for number, replay in enumerate(run.record.replays):
-            stem = f"media/{slug(run)}-{number:03d}"
-            video = _copied(run, replay.path, out / "replays", stem)
-            strip = _copied(run, replay.filmstrip, out / "replays", stem) if replay.filmstrip else None
-            by_env.setdefault(run.env, []).append(
-                PlayedEpisode(
-                    run=run,
-                    split=replay.split,
-                    episode=replay.episode,
-                    submit_index=replay.submit_index,
-                    episode_return=replay.episode_return,
-                    length=replay.length,
-                    video=video,
-                    strip=strip,
-                )
-            )
+            video, strip = copied(run, replay.path, number), copied(run, replay.filmstrip, number)
+            by_env.setdefault(run.env, []).append(PlayedEpisode(run, replay, video, strip))
     links: dict[str, str] = {}
     for env in ordered_environments(by_env):
-        name = f"replays/{re.sub(r'[^A-Za-z0-9.-]+', '-', env)}.html"
-        (out / "replays").mkdir(exist_ok=True)
-        (out / name).write_text(replays_page(env, by_env[env], look), encoding="utf-8", errors="replace")
-        links[env] = name
+        links[env] = f"replays/{re.sub(r'[^A-Za-z0-9.-]+', '-', env)}.html"
+        _write(out / links[env], replays_page(env, by_env[env], look))
     return links
 
 
-def _copied(run: Run, path: str, folder: Path, stem: str) -> str | None:
-    """Copies a run's file into the report; returns None when it is missing, outside the run directory, or no image or
-    video."""
-    source = (run.path / path).resolve()
-    if not source.is_relative_to(run.path.resolve()) or source.suffix.lower() not in (
-        ".mp4",
-        ".png",
-        ".webm",
-    ):
-        return None
-    target = folder / f"{stem}{source.suffix.lower()}"
-    return f"{stem}{source.suffix.lower()}" if _copy(source, target) else None
+def _write(path: Path, text: str) -> Path:
+    path.parent.mkdir(exist_ok=True)
+    path.write_text(text, encoding="utf-8", errors="replace")
+    return path
 
 
 def _report_json(study: Study, tables: list[Table], plots: list[Plot]) -> bytes:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from functools import lru_cache
 
 import numpy as np
@@ -44,17 +45,13 @@ def label_patterns(n_first: int, n_second: int, n_random: int) -> tuple[Floats, 
     """(patterns, n_first + n_second) with 1 for the first group and 0 for the second, and whether the patterns are
     complete. Read-only."""
     n = n_first + n_second
-    n_all = 1
-    for i in range(n_first):
-        n_all = n_all * (n - i) // (i + 1)
-    if n_all <= EXACT_UP_TO:
-        counts = np.zeros((n_all, n))
-        for row, chosen in zip(counts, itertools.combinations(range(n), n_first), strict=True):
-            row[list(chosen)] = 1.0
-        exact = True
+    exact = math.comb(n, n_first) <= EXACT_UP_TO
+    if exact:
+        firsts = np.array(list(itertools.combinations(range(n), n_first)))
+        counts = np.zeros((len(firsts), n))
+        np.put_along_axis(counts, firsts, 1.0, axis=1)
     else:
         order = np.random.default_rng([12, n_first, n_second]).random((n_random, n)).argsort(axis=1)
         counts = (order < n_first).astype(np.float64)
-        exact = False
     counts.setflags(write=False)
     return counts, exact

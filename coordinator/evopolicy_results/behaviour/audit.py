@@ -1,73 +1,41 @@
 """Audit signals and token accounting of each run (paper, appendix: audit signals, token and cost accounting).
 
-These are diagnostics: no score depends on them.
+These are diagnostics: no score depends on them. A run of the published software has no record of some of them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from statistics import fmean
-from typing import Any, TypeVar
 
 import msgspec
 
 from evopolicy_results.behaviour.edits import classify
-from evopolicy_results.reading.environments import ordered_environments
-from evopolicy_results.reading.records import Run
+from evopolicy_results.reading.environments import by_name
+from evopolicy_results.reading.records import Run, by_cell
 
-_Value = TypeVar("_Value")
+PHASES = ("agent_s", "queue_s", "rollout_s", "feedback_s", "finalise_s")
+"""Phases of a run's wall time, as fields of `Timing`."""
 
 
 class AuditSignals(msgspec.Struct, frozen=True, kw_only=True):
-    """Audit signals of one run."""
+    """What follows from one run's submits and counts; its record has the rest."""
 
-    run: str
-    entry: str
-    env: str
-    accepted: int
-    """Submits that were charged."""
-    rejected: int | None
-    """Requests refused before the snapshot, not charged. None, as in the fields below, if the run has no record of
-    them."""
+    run: Run
     not_ok: int
     """Accepted submits that are not ok."""
     invalid_rate: float | None
     """Invalid-transition rate: accepted submits that are not ok, of all accepted; None without any."""
     repaired_rate: float | None
     """Invalid-action rate: share of train steps whose action was repaired; None if the run has no record of it."""
-    budget: int
-    budget_used: int
-    """In episodes."""
     episodes_per_submit: float | None
     """Mean over accepted submits."""
     failed_episodes: int
     """Train episodes in which the policy failed."""
     score_drops: int
     """Score-bearing submits with a validation mean below that of the previous one."""
-    selected_index: int | None
     complexity_growth: float | None
     """AST nodes of the selected source bundle divided by those of the first score-bearing one."""
-    retries: int | None
-    turns: int | None
-    wall_s: float
-    agent_s: float | None
-    queue_s: float | None
-    rollout_s: float | None
-    feedback_s: float | None
-    finalise_s: float | None
-    secret_splits: bool
-    """False when the splits came from a small public seed."""
-    jail: str
-    hidden_isolation: str
-    """Whether hidden episodes and agents shared a kernel: `exclusive`, `shared`, `waived`, `unknown`."""
-    hidden_cases: str
-    """`shared`, or `per_run`."""
-    simulation: str
-    """Whether the run's rules let its agent simulate: `forbidden`, `allowed`."""
-    simulator_flags: int | None
-    """Places in its code that look like a simulator; None if simulation was allowed."""
-    signals: int
-    """Places in its log and code that deserve a look."""
 
 
 COUNTS_DIFFER = 0.05
@@ -89,64 +57,31 @@ class TokenUse(msgspec.Struct, frozen=True, kw_only=True):
     cost: float | None
     """US dollars per run; None when any of the runs has no price."""
     metering: str = ""
-    """Who counted: `relay`, `agent`, or both in different runs; empty in files of earlier versions."""
+    """The counter: `relay`, `agent`, or both in different runs; empty in files of earlier versions."""
     hosted_tools: str = ""
     """Kinds of tools of the provider that requests offered to the model."""
     differing: int = 0
     """Runs in which the agent's own count differs from the relay's by more than `COUNTS_DIFFER`."""
 
 
-def audit_signals(runs: Iterable[Run]) -> list[AuditSignals]:
-    """One record per run, in the order of `runs`."""
-    return [_signals(run) for run in runs]
-
-
-def _signals(run: Run) -> AuditSignals:
-    transitions = classify(run.submits)
-    scored = run.scored
-    selected = run.selected
-    accepted = len(run.submits)
-    not_ok = sum(submit.status != "ok" for submit in run.submits)
-    growth = None
-    if scored and selected is not None and selected.source is not None and scored[0].source is not None:
-        first = scored[0].source.features.nodes
-        growth = selected.source.features.nodes / first if first else None
-    timing = run.record.timing
+def audit_signals(run: Run) -> AuditSignals:
+    """One run's signals."""
+    accepted, selected = run.submits, run.selected
+    not_ok = sum(submit.status != "ok" for submit in accepted)
+    nodes = [each.source.features.nodes for each in (*run.scored[:1], selected) if each and each.source]
     return AuditSignals(
-        run=run.name,
-        entry=run.entry,
-        env=run.env,
-        accepted=accepted,
-        rejected=_recorded(run, len(run.record.rejected_submits)),
+        run=run,
         not_ok=not_ok,
-        invalid_rate=not_ok / accepted if accepted else None,
+        invalid_rate=not_ok / len(accepted) if accepted else None,
         repaired_rate=_repaired_rate(run.record.outcome.auxiliary.get("transitions")),
-        budget=run.budget,
-        budget_used=run.submits[-1].consumed if run.submits else 0,
-        episodes_per_submit=fmean(submit.n_episodes for submit in run.submits) if run.submits else None,
-        failed_episodes=sum(submit.n_failed_episodes for submit in run.submits),
-        score_drops=sum(t.val_drop for t in transitions),
-        selected_index=run.record.outcome.best_submit_index,
-        complexity_growth=growth,
-        retries=_recorded(run, run.record.agent.retries),
-        turns=_recorded(run, run.record.agent.turns),
-        wall_s=timing.wall_time_seconds,
-        agent_s=_recorded(run, timing.agent_s),
-        queue_s=_recorded(run, timing.queue_s),
-        rollout_s=_recorded(run, timing.rollout_s),
-        feedback_s=_recorded(run, timing.feedback_s),
-        finalise_s=_recorded(run, timing.finalise_s),
-        secret_splits=run.record.versions.data_secret,
-        jail=run.record.jail,
-        hidden_isolation=run.record.hidden_isolation,
-        hidden_cases=run.record.experiment_dimensions.hidden_cases,
-        simulation=run.record.experiment_dimensions.simulation,
-        simulator_flags=None if run.simulation_allowed else len(run.simulator_flags),
-        signals=len(run.signals),
+        episodes_per_submit=fmean(submit.n_episodes for submit in accepted) if accepted else None,
+        failed_episodes=sum(submit.n_failed_episodes for submit in accepted),
+        score_drops=sum(transition.val_drop for transition in classify(accepted)),
+        complexity_growth=nodes[1] / nodes[0] if len(nodes) == 2 and nodes[0] else None,
     )
 
 
-def _repaired_rate(transitions: Any) -> float | None:
+def _repaired_rate(transitions: object) -> float | None:
     counts = transitions if isinstance(transitions, dict) else {}
     steps, invalid = counts.get("steps"), counts.get("action_invalid")
     if not isinstance(steps, int) or not isinstance(invalid, int) or not 0 <= invalid <= steps or not steps:
@@ -154,25 +89,29 @@ def _repaired_rate(transitions: Any) -> float | None:
     return invalid / steps
 
 
-def _recorded(run: Run, value: _Value) -> _Value | None:
-    """Passes a value that the published software does not record; None for its runs."""
-    return None if run.is_published else value
-
-
-def token_use(runs: Sequence[Run]) -> list[TokenUse]:
-    """Every (environment, entry) that was played, environments in catalogue order, entries by name."""
-    cells: dict[tuple[str, str], list[Run]] = {}
+def mean_phases(runs: Iterable[Run]) -> dict[str, dict[str, float]]:
+    """By entry, the mean wall time of a run in each of `PHASES`, in seconds; without entries that record none."""
+    by_entry: dict[str, list[Run]] = {}
     for run in runs:
-        cells.setdefault((run.env, run.entry), []).append(run)
-    place = {env: i for i, env in enumerate(ordered_environments(env for env, _ in cells))}
-    keys = sorted(cells, key=lambda key: (place[key[0]], key[1].casefold(), key[1]))
-    return [_token_use(env, entry, cells[env, entry]) for env, entry in keys]
+        if not run.is_published:
+            by_entry.setdefault(run.entry, []).append(run)
+    return {
+        entry: {
+            phase: fmean(getattr(run.record.timing, phase) for run in by_entry[entry]) for phase in PHASES
+        }
+        for entry in sorted(by_entry, key=by_name)
+    }
+
+
+def token_use(runs: Iterable[Run]) -> list[TokenUse]:
+    """Every (environment, entry) that was played, environments in catalogue order, entries by name."""
+    return [_token_use(env, entry, several) for (env, entry), several in by_cell(runs).items()]
 
 
 def _token_use(env: str, entry: str, runs: list[Run]) -> TokenUse:
     counts = [run.record.agent.tokens for run in runs if run.record.agent.tokens is not None]
     uses = [(run.record.agent.model_use, run.record.agent.tokens) for run in runs]
-    apart = [use.difference(tokens) or 0.0 for use, tokens in uses if use is not None]
+    known = [(use, use.difference(tokens) or 0.0) for use, tokens in uses if use is not None]
     costs = [tokens.cost for tokens in counts if tokens.cost is not None]
     return TokenUse(
         entry=entry,
@@ -182,9 +121,7 @@ def _token_use(env: str, entry: str, runs: list[Run]) -> TokenUse:
         cache=fmean(t.cache_read + t.cache_creation for t in counts) / 1e6 if counts else None,
         output=fmean(t.output for t in counts) / 1e6 if counts else None,
         cost=fmean(costs) if counts and len(costs) == len(counts) else None,
-        metering=", ".join(sorted({use.metering for use, _ in uses if use is not None})),
-        hosted_tools=", ".join(
-            sorted({kind for use, _ in uses if use is not None for kind in use.hosted_tools})
-        ),
-        differing=sum(each > COUNTS_DIFFER for each in apart),
+        metering=", ".join(sorted({use.metering for use, _ in known})),
+        hosted_tools=", ".join(sorted({kind for use, _ in known for kind in use.hosted_tools})),
+        differing=sum(apart > COUNTS_DIFFER for _, apart in known),
     )

@@ -18,15 +18,19 @@ counted among the excluded. A transition is a *hit* when it strictly raises the 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Mapping, Sequence
 
 import msgspec
 
 from evopolicy_common import catalogue
+from evopolicy_results.reading.environments import by_name
 from evopolicy_results.reading.records import EditType, Run, Submit
 
 RATED: tuple[EditType, ...] = ("synthesis", "parametric")
 """The edit types that have a hit rate; the others are candidate management."""
+GROUPS = ("synthesis", "tuning", "all")
+"""Groups of environments by their demand, in the order of tables."""
 
 
 class Transition(msgspec.Struct, frozen=True, kw_only=True):
@@ -89,7 +93,7 @@ class EditRates(msgspec.Struct, frozen=True, kw_only=True):
 def classify(submits: Sequence[Submit]) -> list[Transition]:
     """One record for every score-bearing submit of a run, in order; the first has edit type `first`."""
     out: list[Transition] = []
-    seen: dict[str, int] = {}
+    by_topology: dict[str, int] = {}
     previous: Submit | None = None
     best = float("-inf")
     skipped = False
@@ -99,13 +103,15 @@ def classify(submits: Sequence[Submit]) -> list[Transition]:
             continue
         assert submit.source is not None
         assert submit.val_mean is not None
-        edit = _edit(previous, submit, seen)
+        edit = _edit(previous, submit, by_topology)
         hit = submit.val_mean > best
         best = max(best, submit.val_mean)
+        before = None if previous is None else previous.mean_return
+        after = submit.mean_return
         out.append(
             Transition(
                 index=submit.index,
-                previous=previous.index if previous is not None else None,
+                previous=None if previous is None else previous.index,
                 consumed_before=submit.consumed_before,
                 consumed=submit.consumed,
                 edit=edit,
@@ -113,19 +119,18 @@ def classify(submits: Sequence[Submit]) -> list[Transition]:
                 val_mean=submit.val_mean,
                 best=best,
                 val_drop=bool(out) and submit.val_mean < out[-1].val_mean,
-                mean_return=submit.mean_return,
-                mean_improved=_improved(previous, submit),
-                changed_lines=submit.changed_lines if previous is not None and not skipped else None,
-                back_to=seen.get(submit.source.topology) if edit == "rollback" else None,
+                mean_return=after,
+                mean_improved=None if before is None or after is None else after > before,
+                changed_lines=None if previous is None or skipped else submit.changed_lines,
+                back_to=by_topology.get(submit.source.topology) if edit == "rollback" else None,
             )
         )
-        seen[submit.source.topology] = submit.index
-        previous = submit
-        skipped = False
+        by_topology[submit.source.topology] = submit.index
+        previous, skipped = submit, False
     return out
 
 
-def _edit(previous: Submit | None, submit: Submit, seen: dict[str, int]) -> EditType:
+def _edit(previous: Submit | None, submit: Submit, by_topology: Mapping[str, int]) -> EditType:
     assert submit.source is not None
     if previous is None or previous.source is None:
         return "first"
@@ -134,39 +139,28 @@ def _edit(previous: Submit | None, submit: Submit, seen: dict[str, int]) -> Edit
         return "data" if known and submit.bundle_digest != previous.bundle_digest else "retest"
     if submit.source.topology == previous.source.topology:
         return "parametric"
-    return "rollback" if submit.source.topology in seen else "synthesis"
-
-
-def _improved(previous: Submit | None, submit: Submit) -> bool | None:
-    if previous is None or previous.mean_return is None or submit.mean_return is None:
-        return None
-    return submit.mean_return > previous.mean_return
+    return "rollback" if submit.source.topology in by_topology else "synthesis"
 
 
 def edit_rates(runs: Iterable[Run]) -> list[EditRates]:
     """Rows by entry (sorted) and demand group, with `all` last in each entry. Counts are pooled over runs."""
-    counts: dict[tuple[str, str], dict[str, int]] = {}
+    counts: dict[tuple[str, str], Counter[str]] = defaultdict(Counter)
     for run in runs:
         transitions = classify(run.submits)
-        demand = demand_of(run.env)
-        for group in ([demand] if demand else []) + ["all"]:
-            row = counts.setdefault((run.entry, group), {})
-            for transition in transitions:
-                _count(row, f"n_{transition.edit}")
-                if transition.hit and transition.edit in RATED:
-                    _count(row, f"hits_{transition.edit}")
-            for submit in run.submits:
-                if submit.status != "ok":
-                    _count(row, "n_not_ok")
-                elif not submit.is_scored:
-                    _count(row, "n_unscored")
-    order = {"synthesis": 0, "tuning": 1, "all": 2}
-    keys = sorted(counts, key=lambda key: (key[0].casefold(), key[0], order[key[1]]))
+        own = Counter(f"n_{each.edit}" for each in transitions)
+        own.update(f"hits_{each.edit}" for each in transitions if each.hit and each.edit in RATED)
+        unscored = (submit for submit in run.submits if not submit.is_scored)
+        own.update("n_unscored" if submit.status == "ok" else "n_not_ok" for submit in unscored)
+        for group in demand_groups(run.env):
+            counts[run.entry, group] += own
+    keys = sorted(counts, key=lambda key: (by_name(key[0]), GROUPS.index(key[1])))
     return [EditRates(entry=entry, demand=group, **counts[entry, group]) for entry, group in keys]
 
 
-def _count(row: dict[str, int], key: str) -> None:
-    row[key] = row.get(key, 0) + 1
+def demand_groups(env: str) -> list[str]:
+    """The groups in whose means an environment counts."""
+    demand = demand_of(env)
+    return [demand, "all"] if demand else ["all"]
 
 
 def demand_of(env: str) -> str | None:

@@ -9,9 +9,10 @@ from statistics import fmean
 
 import msgspec
 
-from evopolicy_results.behaviour.edits import Transition, classify, demand_of
+from evopolicy_results.behaviour.edits import GROUPS, Transition, classify, demand_groups
 from evopolicy_results.code.topology import Features
-from evopolicy_results.reading.records import Run
+from evopolicy_results.reading.environments import by_name
+from evopolicy_results.reading.records import EditType, Run
 
 FEATURES = ("functions", "branches", "loops", "depth", "state")
 """The paper's five columns, in its order."""
@@ -78,61 +79,53 @@ def structure_means(runs: Sequence[Run]) -> list[StructureMean]:
     harness = {run.entry: run.harness for run in runs}
     groups: dict[tuple[str, str], dict[str, list[Features]]] = {}
     for run in runs:
-        if run.selected is None or run.selected.source is None:
-            continue
-        demand = demand_of(run.env)
-        for group in ([demand] if demand else []) + ["all"]:
-            by_group = groups.setdefault((group, run.entry), {})
-            by_group.setdefault(run.env, []).append(run.selected.source.features)
-    order = {"synthesis": 0, "tuning": 1, "all": 2}
-    rows: list[StructureMean] = []
-    for (demand, entry), by_env in sorted(
-        groups.items(), key=lambda item: (order[item[0][0]], item[0][1].casefold(), item[0][1])
-    ):
-        means = {
-            name: fmean(fmean(getattr(one, name) for one in found) for found in by_env.values())
-            for name in (*FEATURES, "nodes", "lines")
-        }
-        n_runs = sum(len(found) for found in by_env.values())
-        rows.append(
-            StructureMean(
-                demand=demand,
-                entry=entry,
-                harness=harness[entry],
-                n_environments=len(by_env),
-                n_runs=n_runs,
-                **means,
-            )
+        if run.selected is not None and run.selected.source is not None:
+            for group in demand_groups(run.env):
+                by_env = groups.setdefault((group, run.entry), {})
+                by_env.setdefault(run.env, []).append(run.selected.source.features)
+    keys = sorted(groups, key=lambda key: (GROUPS.index(key[0]), by_name(key[1])))
+    return [
+        StructureMean(
+            demand=demand,
+            entry=entry,
+            harness=harness[entry],
+            n_environments=len(by_env),
+            n_runs=sum(map(len, by_env.values())),
+            **{
+                name: fmean(fmean(getattr(one, name) for one in several) for several in by_env.values())
+                for name in (*FEATURES, "nodes", "lines")
+            },
         )
-    return rows
+        for demand, entry in keys
+        for by_env in [groups[demand, entry]]
+    ]
 
 
 def edit_size_bins(runs: Iterable[Run]) -> list[EditSizeBin]:
     """Every transition with a known edit size, by entry (sorted) and bin (all bins, including empty ones)."""
-    by_entry: dict[str, list[Transition]] = {}
+    by_entry: dict[str, dict[str, list[Transition]]] = {}
     for run in runs:
-        found = [t for t in classify(run.submits) if t.previous is not None and t.changed_lines is not None]
-        by_entry.setdefault(run.entry, []).extend(found)
-    rows: list[EditSizeBin] = []
-    for entry in sorted(by_entry, key=lambda name: (name.casefold(), name)):
-        for label in BINS:
-            inside = [t for t in by_entry[entry] if bin_of(t) == label]
-            rows.append(
-                EditSizeBin(
-                    entry=entry,
-                    label=label,
-                    n=len(inside),
-                    n_visible=sum(t.mean_improved is not None for t in inside),
-                    visible_improved=sum(t.mean_improved is True for t in inside),
-                    validation_improved=sum(t.hit for t in inside),
-                )
-            )
-    return rows
+        bins = by_entry.setdefault(run.entry, {label: [] for label in BINS})
+        for transition in classify(run.submits):
+            if transition.previous is not None and transition.changed_lines is not None:
+                bins[_bin_of(transition.edit, transition.changed_lines)].append(transition)
+    return [
+        EditSizeBin(
+            entry=entry,
+            label=label,
+            n=len(inside),
+            n_visible=sum(t.mean_improved is not None for t in inside),
+            visible_improved=sum(t.mean_improved is True for t in inside),
+            validation_improved=sum(t.hit for t in inside),
+        )
+        for entry in sorted(by_entry, key=by_name)
+        for label, inside in by_entry[entry].items()
+    ]
 
 
-def bin_of(transition: Transition) -> str:
-    """The transition's key of `BINS`. A change without changed lines (line ends, empty module) counts as one line."""
-    if transition.edit in ("retest", "data"):
-        return UNCHANGED if transition.edit == "retest" else DATA_ONLY
-    size = max(1, transition.changed_lines or 0)
+def _bin_of(edit: EditType, changed_lines: int) -> str:
+    """A key of `BINS`. A change without changed lines (line ends, empty module) counts as one line."""
+    if edit in ("retest", "data"):
+        return UNCHANGED if edit == "retest" else DATA_ONLY
+    size = max(1, changed_lines)
     return next(label for label, (low, high) in BINS.items() if low and low <= size <= (high or math.inf))

@@ -7,7 +7,7 @@ how the policy changed, and the result. Sources and images stay on disk until a 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import msgspec
@@ -19,7 +19,7 @@ from evopolicy_results.behaviour.edits import Transition, classify
 from evopolicy_results.code.line_diff import unified
 from evopolicy_results.code.sources import read_python_files
 from evopolicy_results.reading.agent_log import Evidence, LogReading, read_agent_log
-from evopolicy_results.reading.records import Run, Submit, checkpoint_folder
+from evopolicy_results.reading.records import Run, Submit
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".gif", ".webp"})
 MAX_IMAGE_BYTES = 4 << 20
@@ -72,17 +72,11 @@ def trace(run: Run) -> Trace:
             transition=transitions.get(submit.index),
             evidence=reading.by_submit.get(submit.index),
             images=tuple(images.get(submit.index, ())),
-            video=_first_video(run, submit),
+            video=min(run.feedback(submit.index).glob("episodes/ep_*/video.mp4"), default=None),
         )
         for submit in run.submits
     ]
     return Trace(run=run, rows=tuple(rows), unplaced=reading.unplaced)
-
-
-def _first_video(run: Run, submit: Submit) -> Path | None:
-    workspace = run.path / (run.record.artifacts.workspace or "workspace")
-    episodes = checkpoint_folder(workspace, "feedback", submit.index) / "episodes"
-    return next((path for path in sorted(episodes.glob("ep_*/video.mp4"))), None)
 
 
 def sources(run: Run, submit: Submit) -> dict[str, str]:
@@ -106,10 +100,9 @@ def diff(before: Mapping[str, str], after: Mapping[str, str]) -> list[FileDiff]:
         old, new = before.get(path, ""), after.get(path, "")
         if old == new:
             continue
-        body = unified(old.splitlines(), new.splitlines())
-        out.append(
-            FileDiff(path=path, lines=tuple(body[:MAX_DIFF_LINES]), cut=max(0, len(body) - MAX_DIFF_LINES))
-        )
+        lines = unified(old.splitlines(), new.splitlines())
+        kept = tuple(lines[:MAX_DIFF_LINES])
+        out.append(FileDiff(path=path, lines=kept, cut=len(lines) - len(kept)))
     return out
 
 
@@ -119,35 +112,31 @@ def _images(run: Run, reading: LogReading) -> dict[int, list[Path]]:
 
     Workspace images that the log does not name are shown with the last submit.
     """
-    if not run.submits:
-        return {}
-    found: dict[int, list[Path]] = {}
-    known: set[tuple[str, int]] = set()
-    total = 0
-    for submit in run.submits:
-        for path in _image_files(policy_folder(run.checkpoint(submit.index)), MAX_IMAGES):
-            key = (path.name, path.stat().st_size)
-            if key not in known and total < MAX_IMAGES:
-                known.add(key)
-                found.setdefault(submit.index, []).append(path)
-                total += 1
     named = {
         Path(name).name: index for index, evidence in reading.by_submit.items() for name in evidence.images
     }
-    workspace = run.path / (run.record.artifacts.workspace or "workspace")
-    for path in _image_files(workspace, MAX_IMAGES, skip="feedback"):
+
+    def candidates() -> Iterator[tuple[int, Path]]:
+        for submit in run.submits:
+            for path in _image_files(policy_folder(run.checkpoint(submit.index))):
+                yield submit.index, path
+        for path in _image_files(run.workspace, skip="feedback") if run.submits else ():
+            yield named.get(path.name, run.submits[-1].index), path
+
+    images: dict[int, list[Path]] = {}
+    known: set[tuple[str, int]] = set()
+    for index, path in candidates():
         key = (path.name, path.stat().st_size)
-        if key not in known and total < MAX_IMAGES:
+        if key not in known and len(known) < MAX_IMAGES:
             known.add(key)
-            found.setdefault(named.get(path.name, run.submits[-1].index), []).append(path)
-            total += 1
-    return found
+            images.setdefault(index, []).append(path)
+    return images
 
 
-def _image_files(folder: Path, limit: int, skip: str | None = None) -> list[Path]:
-    found = (
+def _image_files(folder: Path, skip: str | None = None) -> Iterator[Path]:
+    images = (
         path
         for path, size in left_files(folder, enter=lambda name: name != skip and not name.startswith("."))
         if path.suffix.lower() in IMAGE_SUFFIXES and size <= MAX_IMAGE_BYTES
     )
-    return list(itertools.islice(found, limit))
+    return itertools.islice(images, MAX_IMAGES)

@@ -11,6 +11,8 @@ from __future__ import annotations
 
 import hashlib
 
+import msgspec
+
 _ROUNDS = 3
 PROTOCOL_NAMES = frozenset({"Policy", "act", "reset"})
 """Names defined by the contract, not by the bundle: never made canonical."""
@@ -19,39 +21,34 @@ Token = str | tuple[str, str]
 """Text, or a name with its kind: `n` bare name, `a` attribute, `m` attribute of a local module, `k` keyword."""
 
 
-class Names:
+class Names(msgspec.Struct):
     """Every name that the bundle defines, over all its modules."""
 
-    def __init__(self) -> None:
-        self.top_defs: set[str] = set()
-        self.method_defs: set[str] = set()
-        self.global_names: set[str] = set()
-        self.attribute_names: set[str] = set()
-        self.parameters: set[str] = set()
+    top_defs: set[str] = set()
+    method_defs: set[str] = set()
+    global_names: set[str] = set()
+    attribute_names: set[str] = set()
+    parameters: set[str] = set()
 
 
-class Scope:
+class Scope(msgspec.Struct):
     """The names that one module's import statements bind."""
 
-    def __init__(self) -> None:
-        self.external: dict[str, str] = {}
-        self.modules: set[str] = set()
-        self.aliases: dict[str, str] = {}
+    external: dict[str, str] = {}
+    modules: set[str] = set()
+    aliases: dict[str, str] = {}
 
 
-class Unit:
+class Unit(msgspec.Struct):
     """One function, class or statement of a module or class body: its tokens, and the names that it binds."""
 
-    __slots__ = ("children", "globals", "is_function", "module", "name", "stored", "tokens")
-
-    def __init__(self, module: Scope, name: str, is_function: bool) -> None:
-        self.module = module
-        self.name = name
-        self.is_function = is_function
-        self.tokens: list[Token] = []
-        self.children: list[Unit] = []
-        self.stored: set[str] = set()
-        self.globals: set[str] = set()
+    module: Scope
+    name: str
+    is_function: bool
+    tokens: list[Token] = []
+    children: list[Unit] = []
+    stored: set[str] = set()
+    globals: set[str] = set()
 
 
 def stable_hash(parts: list[str]) -> str:
@@ -77,9 +74,7 @@ def canonical(units: list[Unit], names: Names) -> str:
     labels: dict[str, str] = {}
     own = [""] * len(every)
     for turn in range(_ROUNDS):
-        for i in range(
-            len(every) - 1, -1, -1
-        ):  # a class precedes its children, and its label includes theirs
+        for i in reversed(range(len(every))):  # a class precedes its children, and its label includes theirs
             if turn and not references[i] and not every[i].children:
                 continue
             for at, name in references[i]:
@@ -89,51 +84,44 @@ def canonical(units: list[Unit], names: Names) -> str:
         for unit, label in zip(every, own, strict=True):
             if unit.name:
                 by_name.setdefault(unit.name, []).append(label)
-        labels = {name: stable_hash(sorted(found)) for name, found in by_name.items()}
+        labels = {name: stable_hash(sorted(several)) for name, several in by_name.items()}
     order = sorted(range(len(every)), key=lambda i: own[i])
     shared: dict[tuple[str, str], str] = {}
     final = {id(every[i]): stable_hash(_numbered(resolved[i], labels, shared)) for i in order}
 
     def fold(unit: Unit) -> str:
-        return stable_hash([final[id(unit)], *sorted(fold(child) for child in unit.children)])
+        return stable_hash([final[id(unit)], *sorted(map(fold, unit.children))])
 
-    return stable_hash(sorted(fold(unit) for unit in units))
+    return stable_hash(sorted(map(fold, units)))
 
 
 def _resolve(unit: Unit, names: Names) -> list[Token]:
     """Tokens whose names are marked local (`l`), definition (`d`), global (`g`), attribute (`a`), or plain text."""
     local = unit.stored - unit.globals if unit.is_function else frozenset()
     scope = unit.module
-    out: list[Token] = []
-    for token in unit.tokens:
+
+    def resolved(token: Token) -> Token:
         if isinstance(token, str):
-            out.append(token)
-            continue
+            return token
         kind, name = token
         if kind == "a":
             if name in names.method_defs and name not in PROTOCOL_NAMES and not name.startswith("__"):
-                out.append(("d", name))
-            else:
-                out.append(("a", name) if name in names.attribute_names else name)
-            continue
+                return "d", name
+            return ("a", name) if name in names.attribute_names else name
         if kind == "k":
-            out.append(("k", name) if name in names.parameters else name)
-            continue
+            return ("k", name) if name in names.parameters else name
         if kind == "n" and name in local:
-            out.append(("l", name))
-            continue
-        target = scope.aliases.get(name, name)
+            return "l", name
         if kind == "n" and name in scope.external:
-            out.append(scope.external[name])
-        elif target in names.top_defs:
-            out.append(("d", target))
-        elif target in names.global_names:
-            out.append(("g", target))
-        elif target in names.attribute_names and not unit.is_function:
-            out.append(("a", target))
-        else:
-            out.append(target)
-    return out
+            return scope.external[name]
+        target = scope.aliases.get(name, name)
+        if target in names.top_defs:
+            return "d", target
+        if target in names.global_names:
+            return "g", target
+        return ("a", target) if target in names.attribute_names and not unit.is_function else target
+
+    return list(map(resolved, unit.tokens))
 
 
 def _numbered(tokens: list[Token], labels: dict[str, str], shared: dict[tuple[str, str], str]) -> list[str]:

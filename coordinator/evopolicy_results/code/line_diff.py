@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import difflib
 from collections import Counter
-from collections.abc import Hashable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 MAX_STEPS = 3_000_000
@@ -23,7 +23,7 @@ class _TooAlikeError(Exception):
 
 class _Matcher(difflib.SequenceMatcher[Any]):
     def __init__(self, old: Sequence[Any], new: Sequence[Any]) -> None:
-        self._left = MAX_STEPS
+        self._steps = MAX_STEPS
         self._old = old
         super().__init__(None, old, new, autojunk=False)
 
@@ -32,16 +32,18 @@ class _Matcher(difflib.SequenceMatcher[Any]):
     ) -> difflib.Match:
         places: dict[Any, list[int]] = self.b2j  # type: ignore[attr-defined]
         end = len(self._old) if ahi is None else ahi
-        self._left -= sum(1 + len(places.get(self._old[i], ())) for i in range(alo, end))
-        if self._left < 0:
+        self._steps -= sum(1 + len(places.get(self._old[i], ())) for i in range(alo, end))
+        if self._steps < 0:
             raise _TooAlikeError
         return super().find_longest_match(alo, ahi, blo, bhi)
 
 
-def n_changed(old: Sequence[Hashable], new: Sequence[Hashable]) -> int:
+def n_changed(old: Sequence[Any], new: Sequence[Any]) -> int:
     """Number of lines removed plus lines added."""
-    head, tail = _equal_ends(old, new)
-    old, new = old[head : len(old) - tail], new[head : len(new) - tail]
+    for _ in range(2):  # without equal lines at the beginning, then at the end
+        unequal = (i for i, (a, b) in enumerate(zip(old, new, strict=False)) if a != b)
+        head = next(unequal, min(len(old), len(new)))
+        old, new = old[head:][::-1], new[head:][::-1]
     try:
         kept = sum(block.size for block in _Matcher(old, new).get_matching_blocks())
     except _TooAlikeError:
@@ -68,17 +70,7 @@ def unified(old: Sequence[str], new: Sequence[str]) -> list[str]:
     return out
 
 
-def _equal_ends(old: Sequence[Hashable], new: Sequence[Hashable]) -> tuple[int, int]:
-    """Numbers of equal lines at the beginning and, among the rest, at the end."""
-    shorter = min(len(old), len(new))
-    head = next((i for i in range(shorter) if old[i] != new[i]), shorter)
-    tail = next((i for i in range(shorter - head) if old[-1 - i] != new[-1 - i]), shorter - head)
-    return head, tail
-
-
 def _range(start: int, stop: int) -> str:
     """A range of lines as in `diff -u`."""
     length = stop - start
-    if length == 1:
-        return str(start + 1)
-    return f"{start + 1 if length else start},{length}"
+    return str(start + 1) if length == 1 else f"{start + 1 if length else start},{length}"

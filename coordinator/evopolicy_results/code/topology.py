@@ -101,11 +101,11 @@ class _Walker:
     def _bind_import(self, node: ast.Import | ast.ImportFrom, scope: Scope, module: Module) -> None:
         if isinstance(node, ast.Import):
             for alias in node.names:
-                bound = alias.asname or alias.name.split(".")[0]
-                if alias.name.split(".")[0] in self.local_modules:
-                    scope.modules.add(bound)
+                top = alias.name.split(".")[0]
+                if top in self.local_modules:
+                    scope.modules.add(alias.asname or top)
                 else:
-                    scope.external[bound] = alias.name if alias.asname else bound
+                    scope.external[alias.asname or top] = alias.name if alias.asname else top
             return
         base = absolute_import(node, module.name, module.path.endswith("__init__.py"))
         local = node.level > 0 or base.split(".")[0] in self.local_modules
@@ -131,7 +131,13 @@ class _Walker:
             defs.add(node.name)
             return self._class_unit(node, scope)
         unit = Unit(scope, "", is_function=False)
-        self._statement(node, unit, 0)
+        if isinstance(node, ast.AnnAssign) and defs is self.names.method_defs:
+            # A field to dataclasses, which differs from a plain assignment.
+            self._add(unit, "Field")
+            for part in filter(None, (node.target, node.value)):
+                self._node(part, unit, 0)
+        else:
+            self._statement(node, unit, 0)
         return unit
 
     def _class_unit(self, node: ast.ClassDef, scope: Scope) -> Unit:
@@ -141,26 +147,12 @@ class _Walker:
         for part in (*node.decorator_list, *node.bases, *node.keywords):
             self._node(part, unit, 0)
         for statement in node.body:
-            child = self._class_field(statement, scope) or self._statement_unit(
-                statement, scope, self.names.method_defs
-            )
+            child = self._statement_unit(statement, scope, self.names.method_defs)
             if child is not None:
                 unit.children.append(child)
                 if not child.is_function:
                     self.names.attribute_names |= child.stored
         self._class = outer
-        return unit
-
-    def _class_field(self, node: ast.stmt, scope: Scope) -> Unit | None:
-        """A unit for an annotated class variable, which is a field to dataclasses and differs from a plain
-        assignment."""
-        if not isinstance(node, ast.AnnAssign):
-            return None
-        unit = Unit(scope, "", is_function=False)
-        self._add(unit, "Field")
-        self._node(node.target, unit, 0)
-        if node.value is not None:
-            self._node(node.value, unit, 0)
         return unit
 
     def _function(self, node: ast.FunctionDef | ast.AsyncFunctionDef, unit: Unit, depth: int) -> None:
@@ -178,16 +170,12 @@ class _Walker:
 
     def _arguments(self, args: ast.arguments, unit: Unit, depth: int) -> None:
         self._add(unit, "(")
-        for group in (args.posonlyargs, args.args, args.kwonlyargs):
-            for argument in group:
+        named = (args.posonlyargs, args.args, args.kwonlyargs)
+        self.names.parameters.update(argument.arg for group in named for argument in group)
+        for group in (*named, [args.vararg], [args.kwarg]):
+            for argument in filter(None, group):
                 unit.stored.add(argument.arg)
-                self.names.parameters.add(argument.arg)
                 unit.tokens.append(("n", argument.arg))
-            self._add(unit, "/")
-        for extra in (args.vararg, args.kwarg):
-            if extra is not None:
-                unit.stored.add(extra.arg)
-                unit.tokens.append(("n", extra.arg))
             self._add(unit, "/")
         for default in (*args.defaults, *args.kw_defaults):
             if default is None:
@@ -205,39 +193,30 @@ class _Walker:
     def _statement(self, node: ast.stmt, unit: Unit, depth: int) -> None:
         if isinstance(node, _NO_STRUCTURE) or _is_docstring(node):
             return
-        if isinstance(node, ast.AnnAssign):
+        if isinstance(node, ast.Assign | ast.AnnAssign):
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
             if node.value is not None:
                 self._add(unit, "Assign")
-                self._node(node.target, unit, depth)
-                self._node(node.value, unit, depth)
-            return
-        if isinstance(node, _FUNCTIONS):
+                for part in (*targets, node.value):
+                    self._node(part, unit, depth)
+        elif isinstance(node, _FUNCTIONS):
             unit.stored.add(node.name)
             unit.tokens.append(("n", node.name))
             outer, self._class = self._class, ""
             self._function(node, unit, 0)
             self._class = outer
-            return
-        if isinstance(node, _DECLARATIONS):
-            if isinstance(node, ast.Global):
-                unit.globals.update(node.names)
-                self.names.global_names.update(node.names)
-                self.state.update(("", name) for name in node.names)
-            return
-        if isinstance(node, ast.Assign):
-            self._add(unit, "Assign")
-            for target in node.targets:
-                self._node(target, unit, depth)
-            self._node(node.value, unit, depth)
-            return
-        self._node(node, unit, depth)
+        elif isinstance(node, ast.Global):
+            unit.globals.update(node.names)
+            self.names.global_names.update(node.names)
+            self.state.update(("", name) for name in node.names)
+        elif not isinstance(node, ast.Nonlocal):
+            self._node(node, unit, depth)
 
     def _node(self, node: ast.AST, unit: Unit, depth: int) -> None:
-        handler = _HANDLERS.get(type(node))
-        if handler is not None:
+        kind = type(node)
+        if (handler := _HANDLERS.get(kind)) is not None:
             handler(self, node, unit, depth)
             return
-        kind = type(node)
         if kind in _NESTING:
             depth = self._nest(depth)
         if kind in _LOOPS:
@@ -265,9 +244,9 @@ class _Walker:
 
     def _fields(self, node: ast.AST, unit: Unit, depth: int) -> None:
         for name in node._fields:
-            value = getattr(node, name, None)
             if name in _SKIPPED_FIELDS:
                 continue
+            value = getattr(node, name, None)
             if isinstance(value, list):
                 self._add(unit, "[")
                 for item in value:
@@ -317,11 +296,10 @@ class _Walker:
                 unit.tokens.append(".".join([unit.module.external[root.id], *reversed(path)]))
                 return
             if root.id in unit.module.modules:
-                inside = list(reversed(path))
-                while len(inside) > 1 and inside[0] in self.submodules:
-                    inside.pop(0)
-                unit.tokens.append(("m", inside[0]))
-                unit.tokens.extend(("a", name) for name in inside[1:])
+                while len(path) > 1 and path[-1] in self.submodules:
+                    path.pop()
+                unit.tokens.append(("m", path.pop()))
+                unit.tokens.extend(("a", name) for name in reversed(path))
                 return
         self._node(node.value, unit, depth)
         unit.tokens.append(("a", node.attr))
@@ -354,8 +332,6 @@ class _Walker:
 
 
 _SKIPPED_FIELDS = frozenset({"ctx", "type_comment", "type_params", "annotation", "returns", "simple", "kind"})
-
-
 _HANDLERS: dict[type[ast.AST], Callable[..., None]] = {
     ast.Name: _Walker._name,
     ast.Constant: _Walker._constant,
@@ -366,7 +342,6 @@ _HANDLERS: dict[type[ast.AST], Callable[..., None]] = {
 }
 _NO_STRUCTURE = (ast.Import, ast.ImportFrom, ast.Pass)
 _FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
-_DECLARATIONS = (ast.Global, ast.Nonlocal)
 _LOOPS = frozenset({ast.For, ast.AsyncFor, ast.While})
 _CASES = frozenset({ast.IfExp, ast.match_case})
 _NESTING = _LOOPS | {ast.With, ast.AsyncWith, ast.Try, ast.TryStar, ast.Match}
@@ -377,11 +352,7 @@ def _own_name(name: str) -> str:
 
 
 def _is_docstring(node: ast.stmt) -> bool:
-    return (
-        isinstance(node, ast.Expr)
-        and isinstance(node.value, ast.Constant)
-        and isinstance(node.value.value, str)
-    )
+    return isinstance(node, ast.Expr) and isinstance(getattr(node.value, "value", None), str)
 
 
 def _is_number(node: ast.expr) -> bool:

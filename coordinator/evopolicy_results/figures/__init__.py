@@ -18,17 +18,17 @@ from evopolicy_results.studies.study import Study
 _OF_SUITE = (
     "scores.rank_scores",
     "scores.score_evolution",
-    "profiles.performance_profiles",
+    "scores.performance_profiles",
     "scores.normalised_performance",
 )
 """All but the second average over environments."""
 _OF_STUDY = (
-    "worlds.worlds",
-    "edits.hit_rates",
-    "edits.edit_size",
-    "cost.structure",
-    "cost.tokens",
-    "cost.wall_time",
+    "scores.worlds",
+    "policies.hit_rates",
+    "policies.edit_size",
+    "policies.structure",
+    "policies.tokens",
+    "policies.wall_time",
 )
 
 Drawing = partial[Plot | None]
@@ -38,13 +38,12 @@ Drawing = partial[Plot | None]
 def drawings_of(study: Study) -> list[Drawing]:
     """The figures that matplotlib draws, in order."""
     look = looks(study.entries, study.reference)
-    sent = msgspec.structs.replace(study, runs=(), timelines=())  # figures need no more
-    found = [
+    sent = msgspec.structs.replace(study, runs=(), audit=())  # figures need no more
+    return [
         partial(_draw, name, suite, sent, look)
         for suite in study.suites
         for name in (_OF_SUITE if suite.is_ranked else _OF_SUITE[1:2])
-    ]
-    return found + [partial(_draw, name, sent, look) for name in _OF_STUDY]
+    ] + [partial(_draw, name, sent, look) for name in _OF_STUDY]
 
 
 def _draw(function: str, *args: Any) -> Plot | None:
@@ -56,8 +55,9 @@ def _draw(function: str, *args: Any) -> Plot | None:
 def timelines_of(study: Study) -> Iterator[Plot]:
     """The code phases of each environment's runs, as SVG."""
     look = looks(study.entries, study.reference)
-    for env in ordered_environments(line.env for line in study.timelines):
-        plot = timeline_of(env, [line for line in study.timelines if line.env == env], look)
+    runs = [run for run in study.runs if run.record.start is None]
+    for env in ordered_environments(run.env for run in runs):
+        plot = timeline_of(env, [run for run in runs if run.env == env], look)
         if plot is not None:
             yield plot
 

@@ -1,74 +1,65 @@
-"""Figures of outcomes: rank scores, score evolution, normalised performance."""
+"""Figures of outcomes: rank scores, score evolution, performance profiles, normalised performance, worlds."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from statistics import fmean
 
-import matplotlib
+from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
+from evopolicy_common.statistics.intervals import Estimate
 from evopolicy_results.behaviour.edits import demand_of
 from evopolicy_results.figures.plot import GRID, INK, Plot
-from evopolicy_results.figures.style import RC, new_figure
+from evopolicy_results.figures.style import handles_of, legend_above, name_rows, new_figure, write_beside
 from evopolicy_results.reading.environments import family_of, family_title, title_of
 from evopolicy_results.reading.records import rows
 from evopolicy_results.scoring.evolution import Evolution, best_at
 from evopolicy_results.scoring.normalised import DEMANDS
+from evopolicy_results.statistics.aggregates import TAUS, Bounded
 from evopolicy_results.studies.palette import REFERENCE, Look
 from evopolicy_results.studies.study import Study, Suite
+
+MAX_CURVES = 3
+"""Maximum number of runs of one agent on one environment drawn separately; more are drawn as their mean and range."""
 
 
 def rank_scores(suite: Suite, study: Study, looks: Mapping[str, Look]) -> Plot | None:
     """Suite and family rank scores, one panel each, agents from best to worst."""
-    standings = suite.board.standings
+    standings, estimates = suite.board.standings, suite.statistics.standings
     if not any(row.score is not None for row in standings):
         return None
     families = list(dict.fromkeys(family_of(env) for env in suite.board.environments))
     panels = ["", *families] if len(families) > 1 else [""]
-    figure, axes = new_figure(
-        2.1 + 1.75 * len(panels), 0.9 + 0.3 * len(standings), ncols=len(panels), sharey=True, sharex=True
-    )
-    with matplotlib.rc_context(RC):
+    names = [row.entry for row in standings]
+    size = 2.1 + 1.75 * len(panels), 0.9 + 0.3 * len(standings)
+    with new_figure(*size, names=names, ncols=len(panels), sharey=True, sharex=True) as (figure, axes):
         for panel, family in zip(axes[0], panels, strict=True):
             panel.set_title(suite.title if not family else family_title(family))
             for place, row in enumerate(standings):
-                value = row.families.get(family) if family else row.score
+                end = value = row.families.get(family) if family else row.score
                 if value is None:
                     continue
                 look = looks[row.entry]
                 panel.hlines(place, 0.0, value, color=look.colour, linewidth=2.2, alpha=0.55)
                 panel.plot(value, place, look.marker, color=look.colour, markersize=6.5)
-                sure = suite.statistics.standings.of(row.entry)
-                end = value
-                if not family and sure is not None:
-                    ends = [sure.score_low, sure.score_high]
+                if not family and (estimate := estimates.of(row.entry)) is not None:
+                    ends = [estimate.score_low, estimate.score_high]
                     panel.plot(ends, [place, place], "|-", color=INK, markersize=9, linewidth=1.2, zorder=1.9)
-                    end = sure.score_high
-                panel.annotate(
-                    f"{value:.3f}",
-                    (end, place),
-                    xytext=(6, 0),
-                    textcoords="offset points",
-                    va="center",
-                    fontsize=8,
-                )
+                    end = estimate.score_high
+                write_beside(panel, end, place, f"{value:.3f}", 6)
             panel.set_xlim(-0.03, 1.32)
             panel.set_xticks([0.0, 0.5, 1.0])
-            panel.set_ylim(len(standings) - 0.5, -0.5)
-            panel.grid(axis="y", visible=False)
-        axes[0][0].set_yticks(range(len(standings)), [row.entry for row in standings])
         figure.supxlabel("Mean rank score (1 = best on every environment)", fontsize=9)
-    first = standings[0]
-    resampled = suite.statistics.standings
+    best = standings[0]
     return Plot(
         name=f"rank_scores_{suite.name}",
         title=f"{suite.title} rank scores",
         caption="Mean rank score over the suite and over each family of environments."
-        + (f" Bars with ends: 95 % interval over {resampled.over}." if resampled.rows else ""),
-        alt=f"Dot plot of rank scores, suite and {len(families)} families. Best: {first.entry}"
-        + (f" at {first.score:.2f}." if first.score is not None else "."),
+        + (f" Bars with ends: 95 % interval over {estimates.over}." if estimates.rows else ""),
+        alt=f"Dot plot of rank scores, suite and {len(families)} families. Best: {best.entry}"
+        + (f" at {best.score:.2f}." if best.score is not None else "."),
         data=rows(standings),
         figure=figure,
         group="leaderboard",
@@ -77,30 +68,27 @@ def rank_scores(suite: Suite, study: Study, looks: Mapping[str, Look]) -> Plot |
 
 def score_evolution(suite: Suite, study: Study, looks: Mapping[str, Look]) -> Plot | None:
     """Small multiples, one per environment: best validation mean over consumed episodes, one step curve per run."""
-    found = [one for one in study.evolutions if one.env in suite.table.environments and one.steps]
-    envs = [env for env in suite.table.environments if any(one.env == env for one in found)]
+    curves = [one for one in study.evolutions if one.env in suite.table.environments and one.steps]
+    envs = [env for env in suite.table.environments if any(one.env == env for one in curves)]
     if not envs:
         return None
     n_columns = min(4, len(envs))
     n_rows = math.ceil(len(envs) / n_columns)
-    width = 2.6 * n_columns if n_columns > 1 else 5.2
-    figure, axes = new_figure(width, 0.7 + 1.75 * n_rows, nrows=n_rows, ncols=n_columns)
-    shown = [entry for entry in suite.table.agents if any(one.entry == entry for one in found)]
-    with matplotlib.rc_context(RC):
+    shown = [entry for entry in suite.table.agents if any(one.entry == entry for one in curves)]
+    size = 2.6 * n_columns if n_columns > 1 else 5.2, 0.7 + 1.75 * n_rows
+    with new_figure(*size, nrows=n_rows, ncols=n_columns) as (figure, axes):
         panels = list(axes.flat)
         for panel, env in zip(panels, envs, strict=False):
-            _evolution_panel(panel, env, [one for one in found if one.env == env], suite, looks)
+            _evolution_panel(panel, env, [one for one in curves if one.env == env], suite, looks)
         for panel in panels[len(envs) :]:
             panel.set_visible(False)
         figure.supxlabel("Train episodes consumed", fontsize=9)
-        figure.supylabel(
-            "Best validation mean return so far" if n_rows > 1 else "Best validation mean\nreturn so far",
-            fontsize=9,
-        )
-        handles = [_handle(entry, looks) for entry in shown]
+        below = " " if n_rows > 1 else "\n"
+        figure.supylabel(f"Best validation mean{below}return so far", fontsize=9)
+        handles = handles_of(shown, looks)
         if suite.table.reference is not None:
             handles.append(Line2D([], [], color=REFERENCE, linestyle=":", label=suite.table.reference))
-        figure.legend(handles=handles, loc="outside upper center", ncols=min(5, len(handles)))
+        legend_above(figure, handles)
     return Plot(
         name=f"score_evolution_{suite.name}",
         title=f"{suite.title} score evolution",
@@ -110,40 +98,32 @@ def score_evolution(suite: Suite, study: Study, looks: Mapping[str, Look]) -> Pl
             " Reconstructed after the run: agents never see it. Dotted: random reference on the held-out cases."
         ),
         alt=f"Step curves for {len(envs)} environments and {len(shown)} agents.",
-        data=rows(found),
+        data=rows(curves),
         figure=figure,
         group="evolution",
     )
 
 
-MAX_CURVES = 3
-"""Maximum number of runs of one agent on one environment drawn separately; more are drawn as their mean and range."""
-
-
 def _evolution_panel(
-    panel: matplotlib.axes.Axes, env: str, found: list[Evolution], suite: Suite, looks: Mapping[str, Look]
+    panel: Axes, env: str, curves: Sequence[Evolution], suite: Suite, looks: Mapping[str, Look]
 ) -> None:
     panel.set_title(title_of(env))
-    by_entry: dict[str, list[Evolution]] = {}
-    for one in found:
-        by_entry.setdefault(one.entry, []).append(one)
-    for entry, curves in by_entry.items():
-        if len(curves) > MAX_CURVES:
-            _mean_curve(panel, curves, looks[entry])
+    for entry in dict.fromkeys(one.entry for one in curves):
+        own, look = [one for one in curves if one.entry == entry], looks[entry]
+        if len(own) > MAX_CURVES:
+            _mean_curve(panel, own, look)
             continue
-        thin = 1.0 if len(curves) == 1 else 0.55
-        for one in curves:
-            _one_curve(panel, one, looks[entry], thin)
-    if suite.table.reference is not None:
-        cell = suite.table.cells.get((suite.table.reference, env))
-        if cell is not None and cell.mean is not None:
-            panel.axhline(cell.mean, color=REFERENCE, linestyle=":", linewidth=1.1)
-    panel.set_xlim(0, max(one.budget for one in found) * 1.02)
+        for one in own:
+            _one_curve(panel, one, look, 1.0 if len(own) == 1 else 0.55)
+    cell = None if suite.table.reference is None else suite.table.cells.get((suite.table.reference, env))
+    if cell is not None and cell.mean is not None:
+        panel.axhline(cell.mean, color=REFERENCE, linestyle=":", linewidth=1.1)
+    panel.set_xlim(0, max(one.budget for one in curves) * 1.02)
     panel.locator_params(axis="y", nbins=4)
     panel.locator_params(axis="x", nbins=4, integer=True)
 
 
-def _one_curve(panel: matplotlib.axes.Axes, one: Evolution, look: Look, thin: float) -> None:
+def _one_curve(panel: Axes, one: Evolution, look: Look, thin: float) -> None:
     x = [step.consumed for step in one.steps]
     y = [step.best for step in one.steps]
     panel.plot(
@@ -157,13 +137,11 @@ def _one_curve(panel: matplotlib.axes.Axes, one: Evolution, look: Look, thin: fl
     )  # fmt: skip
 
 
-def _mean_curve(panel: matplotlib.axes.Axes, curves: list[Evolution], look: Look) -> None:
+def _mean_curve(panel: Axes, curves: Sequence[Evolution], look: Look) -> None:
     """The mean curve with a band from lowest to highest, starting where every run has a score."""
-    changes = sorted(
-        {step.consumed for one in curves for step in one.steps} | {max(one.budget for one in curves)}
-    )
+    changes = {step.consumed for one in curves for step in one.steps} | {max(one.budget for one in curves)}
     start = max(one.steps[0].consumed for one in curves)
-    x = [consumed for consumed in changes if consumed >= start]
+    x = sorted(consumed for consumed in changes if consumed >= start)
     levels = [[best_at(one.steps, consumed) for one in curves] for consumed in x]
     panel.fill_between(
         x, [min(level) for level in levels], [max(level) for level in levels],
@@ -175,11 +153,46 @@ def _mean_curve(panel: matplotlib.axes.Axes, curves: list[Evolution], look: Look
     )  # fmt: skip
 
 
-def _handle(entry: str, looks: Mapping[str, Look]) -> Line2D:
-    look = looks[entry]
-    return Line2D(
-        [], [], color=look.colour, marker=look.marker, linestyle=look.dash, markersize=5, label=entry
+def performance_profiles(suite: Suite, study: Study, looks: Mapping[str, Look]) -> Plot | None:
+    """One curve per agent, the share of its runs above each normalised score, with its pointwise 95 % band."""
+    aggregates = suite.statistics.aggregates
+    if not aggregates:
+        return None
+    with new_figure(6.4, 3.4) as (figure, axes):
+        panel = axes[0][0]
+        for one in aggregates:
+            look = looks[one.entry]
+            panel.plot(
+                TAUS, [share.value for share in one.profile], color=look.colour, linestyle=look.dash,
+                marker=look.marker, markersize=3.2, markevery=4, label=one.entry,
+            )  # fmt: skip
+            low, high = zip(*map(_ends, one.profile), strict=True)
+            panel.fill_between(TAUS, low, high, color=look.colour, alpha=0.13, linewidth=0)
+        panel.set_xlim(0.0, 1.0)
+        panel.set_ylim(-0.02, 1.02)
+        panel.set_xlabel("Normalised held-out score (0 = random, 1 = best agent's mean)")
+        panel.set_ylabel("Share of runs above it")
+        figure.legend(loc="outside upper center", ncols=min(4, len(aggregates)))
+    return Plot(
+        name=f"profiles_{suite.name}",
+        title=f"{suite.title} performance profiles",
+        caption=(
+            "Share of an agent's runs whose normalised score is above each value, over all environments with a scale;"
+            " higher is better. Bands: pointwise 95 % intervals of a stratified bootstrap over runs and their cases, or"
+            " over the cases of single runs; none where resamples show no spread."
+        ),
+        alt=f"Performance profiles of {len(aggregates)} agents.",
+        data=rows(aggregates),
+        figure=figure,
+        group="statistics",
     )
+
+
+def _ends(estimate: Estimate | Bounded) -> tuple[float, float]:
+    """The interval; the value alone where there is none."""
+    if estimate.low is None or estimate.high is None:
+        return estimate.value, estimate.value
+    return estimate.low, estimate.high
 
 
 def normalised_performance(suite: Suite, study: Study, looks: Mapping[str, Look]) -> Plot | None:
@@ -189,15 +202,12 @@ def normalised_performance(suite: Suite, study: Study, looks: Mapping[str, Look]
     demands = [demand for demand in DEMANDS if any(key[0] == demand for key in groups)]
     if not demands:
         return None
-    figure, axes = new_figure(
-        2.0 + 3.3 * len(demands), 1.0 + 0.42 * len(agents), ncols=len(demands), sharey=True
-    )
-    with matplotlib.rc_context(RC):
+    size = 2.0 + 3.3 * len(demands), 1.0 + 0.42 * len(agents)
+    with new_figure(*size, names=agents, ncols=len(demands), sharey=True) as (figure, axes):
         for panel, demand in zip(axes[0], demands, strict=True):
             n = max(g.n_environments for key, g in groups.items() if key[0] == demand)
             panel.set_title(f"{demand.capitalize()}-dominant (n = {n})")
             for place, agent in enumerate(agents):
-                look = looks[agent]
                 values = [
                     cell.value
                     for (entry, env), cell in suite.normalised.cells.items()
@@ -205,29 +215,19 @@ def normalised_performance(suite: Suite, study: Study, looks: Mapping[str, Look]
                 ]
                 if not values:
                     continue
-                group = groups.get((demand, agent))
+                colour, group = looks[agent].colour, groups.get((demand, agent))
                 mean = None if group is None else group.value
                 if mean is not None:
-                    panel.barh(place, mean, height=0.56, color=look.colour, alpha=0.35, linewidth=0)
-                    panel.vlines(mean, place - 0.28, place + 0.28, color=look.colour, linewidth=2.0)
+                    panel.barh(place, mean, height=0.56, color=colour, alpha=0.35, linewidth=0)
+                    panel.vlines(mean, place - 0.28, place + 0.28, color=colour, linewidth=2.0)
                 panel.plot(
-                    values, [place] * len(values), look.marker, color=look.colour, markersize=4.2, alpha=0.8,
+                    values, [place] * len(values), looks[agent].marker, color=colour, markersize=4.2, alpha=0.8,
                     markeredgewidth=0, clip_on=False,
                 )  # fmt: skip
-                panel.annotate(
-                    "incomplete" if mean is None else f"{mean:.2f}",
-                    (1.0, place),
-                    xytext=(9, 0),
-                    textcoords="offset points",
-                    va="center",
-                    fontsize=8,
-                )
+                write_beside(panel, 1.0, place, "incomplete" if mean is None else f"{mean:.2f}", 9)
             panel.axvline(1.0, color=GRID, linewidth=0.8)
             panel.set_xlim(0.0, 1.16)
             panel.set_xticks([0.0, 0.25, 0.5, 0.75, 1.0])
-            panel.grid(axis="y", visible=False)
-        axes[0][0].set_yticks(range(len(agents)), agents)
-        axes[0][0].set_ylim(len(agents) - 0.5, -0.5)
         figure.supxlabel("Normalised held-out return (0 = random, 1 = best agent)", fontsize=9)
     return Plot(
         name=f"normalised_{suite.name}",
@@ -241,3 +241,53 @@ def normalised_performance(suite: Suite, study: Study, looks: Mapping[str, Look]
         figure=figure,
         group="demand",
     )
+
+
+def worlds(study: Study, looks: Mapping[str, Look]) -> Plot | None:
+    """Left: each entry's mean in unchanged environments and in worlds. Right: its best so far over episodes."""
+    if study.worlds is None:
+        return None
+    overall = {one.entry: one for one in reversed(study.worlds.paired)}  # an entry's first row is its widest
+    entries = [entry for entry in looks if entry in overall]
+    with new_figure(9.0, max(2.8, 1.2 + 0.45 * len(entries)), ncols=2) as (figure, axes):
+        left, right = axes[0]
+        for place, entry in enumerate(entries):
+            look, row = looks[entry], overall[entry]
+            for shift, estimate, face in ((-0.12, row.unchanged, look.colour), (0.12, row.worlds, "none")):
+                left.hlines(place + shift, *_ends(estimate), color=look.colour, linewidth=1.4, alpha=0.7)
+                left.plot(estimate.value, place + shift, look.marker, color=look.colour, markerfacecolor=face)
+        for entry, points in study.worlds.curves.items():
+            x, colour = [point.episodes for point in points], looks[entry].colour
+            _curve(right, x, [point.unchanged for point in points], colour, "-")
+            _curve(right, x, [point.worlds for point in points], colour, "--")
+        for end in (0.0, 1.0):
+            left.axvline(end, color=GRID, linewidth=0.9)
+        name_rows(left, entries)
+        left.grid(axis="y", visible=False)
+        left.set_xlabel("Held-out score (0 = random, 1 = best known)")
+        right.set_xlabel("Train episodes consumed")
+        right.set_ylabel("Best validation so far")
+        right.set_ylim(bottom=-0.02)
+    return Plot(
+        name="worlds",
+        title="Environments and their worlds",
+        caption=(
+            "Left: filled in unchanged environments, open in their worlds, mean over environments with 95 %"
+            " intervals. Right: best validation mean so far, solid in unchanged environments, dashed in worlds;"
+            " random actions count from the start. Bands: pointwise 95 % intervals over new worlds and runs; none"
+            " where there is one of each."
+        ),
+        alt=f"Scores and learning curves of {len(entries)} entries in unchanged environments and in worlds.",
+        data={
+            "scores": rows(overall[entry] for entry in entries),
+            "curves": {entry: rows(points) for entry, points in study.worlds.curves.items()},
+        },
+        figure=figure,
+        group="worlds",
+    )
+
+
+def _curve(panel: Axes, x: list[int], estimates: Sequence[Estimate], colour: str, style: str) -> None:
+    panel.plot(x, [each.value for each in estimates], style, drawstyle="steps-post", color=colour)
+    low, high = zip(*map(_ends, estimates), strict=True)
+    panel.fill_between(x, low, high, step="post", color=colour, alpha=0.1, linewidth=0)

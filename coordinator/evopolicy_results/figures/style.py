@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import matplotlib
 import msgspec
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from evopolicy_common.terminal import harmless
 from evopolicy_results.figures.plot import GRID, INK, MUTED, Plot
+from evopolicy_results.studies.palette import Look
 
 _POINTS_PER_REM = 11.0
 """Points per rem of the page: figures are shown slightly larger than printed."""
@@ -55,12 +60,48 @@ RC: dict[str, Any] = {
 }
 
 
-def new_figure(width: float, height: float, **subplots: Any) -> tuple[Figure, Any]:
-    """A figure of that size in inches with constrained layout, and its axes as `Figure.subplots` returns them."""
+@contextmanager
+def new_figure(
+    width: float, height: float, *, names: Sequence[str] = (), **subplots: Any
+) -> Iterator[tuple[Figure, Any]]:
+    """A figure of that size in inches with constrained layout, and its axes as `Figure.subplots` returns them.
+
+    With `names` the axes' rows have these names, from top to bottom.
+    """
     with matplotlib.rc_context(RC):
         figure = Figure(figsize=(width, height), layout="constrained")
         FigureCanvasAgg(figure)
-        return figure, figure.subplots(squeeze=False, **subplots)
+        axes = figure.subplots(squeeze=False, **subplots)
+        if names:
+            name_rows(axes[0][0], names)
+            for panel in axes[0]:
+                panel.grid(axis="y", visible=False)
+        yield figure, axes
+
+
+def name_rows(panel: Axes, names: Sequence[str]) -> None:
+    """Labels the rows 0, 1, … of a panel, the first at the top."""
+    panel.set_yticks(range(len(names)), names)
+    panel.set_ylim(len(names) - 0.5, -0.5)
+
+
+def write_beside(panel: Axes, x: float, y: float, text: str, points: int, size: float = 8) -> None:
+    """Writes `text` in that font size, so many points to the right of a place."""
+    offset = {"xytext": (points, 0), "textcoords": "offset points"}
+    panel.annotate(text, (x, y), **offset, va="center", fontsize=size)
+
+
+def handles_of(entries: Iterable[str], looks: Mapping[str, Look]) -> list[Line2D]:
+    """A legend's entries."""
+    return [
+        Line2D([], [], color=look.colour, marker=look.marker, linestyle=look.dash, label=entry)
+        for entry in entries
+        for look in [looks[entry]]
+    ]
+
+
+def legend_above(figure: Figure, handles: Sequence[Line2D]) -> None:
+    figure.legend(handles=handles, loc="outside upper center", ncols=min(5, len(handles)))
 
 
 def drawn(plot: Plot) -> Plot:

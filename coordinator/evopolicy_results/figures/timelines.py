@@ -3,19 +3,18 @@ library."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 
 import msgspec
 
 from evopolicy_common.catalogue import folder_name
 from evopolicy_common.terminal import one_line
-from evopolicy_results.behaviour.edits import Transition, events_of, phases
+from evopolicy_results.behaviour.edits import Transition, classify, events_of, phases
 from evopolicy_results.figures.plot import INK, MUTED, Plot
 from evopolicy_results.reading.environments import title_of
-from evopolicy_results.reading.records import Submit, rows
+from evopolicy_results.reading.records import Run, Submit, rows
 from evopolicy_results.studies.palette import EDIT_COLOURS, Look
-from evopolicy_results.studies.study import Timeline
 
 MAX_ROWS = 24
 """Maximum number of runs in one environment's figure; every run's own page has its own timeline."""
@@ -55,14 +54,21 @@ class Row(msgspec.Struct, frozen=True, kw_only=True):
     """All submits: they are named above the band, and those without a score are marked too."""
 
 
-def timeline_of(env: str, lines: Sequence[Timeline], looks: Mapping[str, Look]) -> Plot | None:
+def timeline_of(env: str, runs: Iterable[Run], looks: Mapping[str, Look]) -> Plot | None:
     """One environment's runs, one row each."""
-    found = [line for line in lines if line.transitions]
-    if not found:
+    drawn = [(run, transitions) for run in runs if (transitions := classify(run.submits))]
+    if not drawn:
         return None
-    cut = sorted(found, key=lambda line: (line.repeat, line.entry.casefold()))[:MAX_ROWS]
-    cut.sort(key=lambda line: (line.entry.casefold(), line.repeat))
-    dropped = len(found) - len(cut)
+    cut = sorted(drawn, key=lambda one: (one[0].record.repeat, one[0].entry.casefold()))[:MAX_ROWS]
+    cut.sort(key=lambda one: (one[0].entry.casefold(), one[0].record.repeat))
+    dropped = len(drawn) - len(cut)
+    data, lines = [], []
+    for run, transitions in cut:
+        entry, repeat, budget = run.entry, run.record.repeat, run.budget
+        about = {"run": run.name, "entry": entry, "env": env, "repeat": repeat, "budget": budget}
+        data.append({**about, "transitions": rows(transitions)})
+        label = f"{entry} #{repeat}" if repeat else entry
+        lines.append(Row(transitions=transitions, budget=budget, label=label, look=looks[entry]))
     return Plot(
         name=f"timeline_{folder_name(env)}",
         title=f"{title_of(env)} code phases",
@@ -70,18 +76,8 @@ def timeline_of(env: str, lines: Sequence[Timeline], looks: Mapping[str, Look]) 
         "events within a phase. A filled star raises the best validation mean so far."
         + (f" {dropped} more runs have their timelines on their own pages." if dropped else ""),
         alt=f"Timelines of {len(cut)} runs on {title_of(env)}: bands of synthesis and parametric edits with outcome marks.",
-        data=rows(cut),
-        svg=timeline_svg(
-            [
-                Row(
-                    transitions=line.transitions,
-                    budget=line.budget,
-                    label=f"{line.entry} #{line.repeat}" if line.repeat else line.entry,
-                    look=looks[line.entry],
-                )
-                for line in cut
-            ]
-        ),
+        data=data,
+        svg=timeline_svg(lines),
         group="timelines",
     )
 

@@ -18,7 +18,7 @@ from __future__ import annotations
 import bisect
 import itertools
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -99,14 +99,11 @@ def read_agent_log(path: Path, submits: Sequence[Submit]) -> LogReading:
 
 def place(events: Sequence[LogEvent], submits: Sequence[Submit]) -> LogReading:
     """Assigns each event to the submit that it precedes."""
-    expected = [submit.index for submit in submits]
-    groups = _by_results(events, expected)
-    if groups is None:
-        groups = _by_times(events, submits)
+    groups = _by_results(events, [submit.index for submit in submits]) or _by_times(events, submits)
     if groups is None:
         return LogReading(unplaced=tuple(event.message for event in events if event.message))
     placed, rest = groups
-    by_submit = {index: _evidence(found) for index, found in placed.items()}
+    by_submit = {index: _evidence(several) for index, several in placed.items()}
     return LogReading(by_submit=by_submit, unplaced=tuple(event.message for event in rest if event.message))
 
 
@@ -148,18 +145,12 @@ def _by_times(
     return placed, rest
 
 
-def _evidence(events: Iterable[LogEvent]) -> Evidence:
-    read: dict[str, None] = {}
-    images: dict[str, None] = {}
-    messages: list[str] = []
-    for event in events:
-        read.update(dict.fromkeys(event.read))
-        images.update(dict.fromkeys(event.images))
-        if event.message:
-            messages.append(event.message)
+def _evidence(events: Sequence[LogEvent]) -> Evidence:
+    read = dict.fromkeys(path for event in events for path in event.read)
+    images = dict.fromkeys(path for event in events for path in event.images)
     return Evidence(
         read=tuple(itertools.islice(read, MAX_PATHS)),
-        messages=tuple(messages),
+        messages=tuple(event.message for event in events if event.message),
         images=tuple(itertools.islice(images, MAX_PATHS)),
     )
 
@@ -228,12 +219,9 @@ def _codex_item(item: dict[str, Any], at: float | None) -> Iterator[LogEvent]:
 
 
 def _call(texts: Sequence[str], at: float | None) -> LogEvent:
-    read: dict[str, None] = {}
-    images: dict[str, None] = {}
-    for text in texts:
-        read.update(dict.fromkeys(path.rstrip("./,") for path in _FEEDBACK.findall(text) if _is_short(path)))
-        images.update(dict.fromkeys(filter(_is_short, _images(text))))
-    return LogEvent(read=tuple(read), images=tuple(images), at=at)
+    read = (path.rstrip("./,") for text in texts for path in _FEEDBACK.findall(text) if _is_short(path))
+    images = (path for text in texts for path in _images(text) if _is_short(path))
+    return LogEvent(read=tuple(dict.fromkeys(read)), images=tuple(dict.fromkeys(images)), at=at)
 
 
 def _images(text: str) -> Iterator[str]:
@@ -249,25 +237,16 @@ def _is_short(path: str) -> bool:
 
 
 def _answered_submits(texts: Sequence[str]) -> tuple[int, ...]:
-    found: dict[int, None] = {}
-    for text in texts:
-        for match in _ANSWER.finditer(text):
-            if len(match.group(1)) <= 9:
-                found[int(match.group(1))] = None
-    return tuple(found)
+    numbers = (match[1] for text in texts for match in _ANSWER.finditer(text))
+    return tuple(dict.fromkeys(int(number) for number in numbers if len(number) <= 9))
 
 
 def _strings(value: Any, depth: int = 0) -> list[str]:
     """Every string inside a JSON value, in order."""
     if isinstance(value, str):
         return [value]
-    if depth > 6:
-        return []
-    if isinstance(value, dict):
-        return [text for item in value.values() for text in _strings(item, depth + 1)]
-    if isinstance(value, list):
-        return [text for item in value for text in _strings(item, depth + 1)]
-    return []
+    items = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
+    return [text for item in items for text in _strings(item, depth + 1)] if depth <= 6 else []
 
 
 def _stamp(value: dict[str, Any]) -> float | None:

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import islice
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
 
@@ -41,8 +41,8 @@ class Mixture(msgspec.Struct, frozen=True, kw_only=True):
     """Each value to the folders of the runs with it; empty if the runs have none, or the value names its run."""
 
     def __str__(self) -> str:
-        found = ", ".join(f"{value} ({counted(n, 'run')})" for value, n in self.values.items())
-        return f"{self.what} on {self.where}" + (f": {found}" if found else "")
+        counts = ", ".join(f"{value} ({counted(n, 'run')})" for value, n in self.values.items())
+        return f"{self.what} on {self.where}" + (f": {counts}" if counts else "")
 
 
 class MixedRunsError(EvopolicyError):
@@ -79,8 +79,6 @@ IN_QUESTION = "results in dispute, or of a forger,"
 UNKNOWN_ISOLATION = "hidden isolation, where some runs do not tell it,"
 """Older runs without this record beside runs with it; their comparison needs an option of its own."""
 
-_SAME_CASES = "the same cases (one --state or --data for all, none with --fresh, all in the same --jail)"
-
 
 class _Setting(NamedTuple):
     """A setting in which compared runs have to agree."""
@@ -88,76 +86,27 @@ class _Setting(NamedTuple):
     of: Callable[[Run], str]
     remedy: str = ""
     """How to play runs that agree in it; empty where no option decides it."""
+    concerns: Callable[[Run], object] = lambda run: True
+    """Other runs may stand beside those that it concerns."""
 
 
-def _dimension(name: str, remedy: str) -> _Setting:
-    return _Setting(lambda run: str(getattr(run.record.experiment_dimensions, name)), remedy)
+def _dimension(name: str, option: str) -> _Setting:
+    return _Setting(lambda run: str(getattr(run.record.experiment_dimensions, name)), f"the same --{option}")
 
 
-_BY_SUITE = {
-    "episode budget": _dimension("episode_budget", "the same --budget"),
-    "policy scope": _dimension("policy_scope", "the same --policy-scope"),
-    "observation form": _dimension("observations", "the same --observations"),
-    "simulation rule": _dimension("simulation", "the same --simulation"),
-    "finish rule": _dimension("finish", "the same --finish"),
-    "feedback detail": _dimension("feedback", "the same --feedback"),
-    "text of AGENTS.md": _Setting(
-        lambda run: _text(run.record.experiment_dimensions.agents_md), "the same --agents-md"
-    ),
-    "failed episodes": _dimension("failed_episodes", "the same --failed-episodes"),
-    "hidden evaluation": _dimension("hidden_evaluation", "the same --profile"),
-    "profile": _dimension("profile", "the same --profile"),
-    "jail": _Setting(lambda run: run.record.jail, "the same --jail"),
-    "hidden cases": _dimension("hidden_cases", "the same --hidden-cases"),
-}
-_ISOLATION = _Setting(lambda run: run.record.hidden_isolation)
-_MODEL_LIMITS = {
-    "model limits": _Setting(
-        lambda run: _model_limits(run), "the same max_requests, max_tokens, and max_cost in the agents' files"
+def _split(split: Split) -> _Setting:
+    def of(run: Run) -> str:
+        if split != "train" and run.record.experiment_dimensions.hidden_cases == "per_run":
+            return "its own"
+        return _short(run.record.versions.cases_hash(split))
+
+    return _Setting(
+        of, "the same cases (one --state or --data for all, none with --fresh, all in the same --jail)"
     )
-}
-_AGENT_LIMITS = {
-    "agent limits": _Setting(
-        lambda run: _agent_limits(run),
-        "the same --agent-cpus, --agent-memory, --agent-pids, and --agent-disk, on machines that can keep"
-        " them",
-    )
-}
-_BY_ENTRY = {
-    "prompts": _Setting(
-        lambda run: _text(run.record.agent.prompts), "the same --prompts, or another --entry for each"
-    ),
-    "skills and MCP servers": _Setting(
-        lambda run: inputs_digest(run.record.agent.inputs)[:12] or "none",
-        "the same `skills` and `[mcp]` in the agent's file, or another --entry for each",
-    ),
-}
-_BY_ENVIRONMENT = {
-    "train split": _Setting(lambda run: _split(run, "train"), _SAME_CASES),
-    "validation split": _Setting(lambda run: _split(run, "validation"), _SAME_CASES),
-    "held-out split": _Setting(lambda run: _split(run, "heldout"), _SAME_CASES),
-    "environment version": _Setting(lambda run: run.record.versions.env),
-    "episodes a submit": _Setting(lambda run: run.submit_size, "the same --min-episodes and --max-episodes"),
-    "policy limits": _Setting(lambda run: _limits(run), "the same --limit"),
-    "step limit": _Setting(lambda run: _step_limit(run), "the same --step-limit"),
-    "videos in feedback": _dimension("video", "the same --video"),
-}
-REMEDIES = {
-    what: setting.remedy
-    for what, setting in (_BY_SUITE | _BY_ENTRY | _MODEL_LIMITS | _AGENT_LIMITS | _BY_ENVIRONMENT).items()
-    if setting.remedy
-}
-"""By `Mixture.what`: how to play runs that agree in it."""
 
 
-def _split(run: Run, split: Split) -> str:
-    if split != "train" and run.record.experiment_dimensions.hidden_cases == "per_run":
-        return "its own"
-    return run.record.versions.cases_hash(split).removeprefix("sha256:")[:12]
-
-
-def _text(digest: str) -> str:
-    return digest.removeprefix("sha256:")[:12] or "standard"
+def _short(digest: str) -> str:
+    return digest.removeprefix("sha256:")[:12]
 
 
 def _step_limit(run: Run) -> str:
@@ -167,24 +116,71 @@ def _step_limit(run: Run) -> str:
     return run.record.experiment_dimensions.step_limit if both else ""
 
 
-def _model_limits(run: Run) -> str:
-    use = run.record.agent.model_use
-    return _words(use and use.limits)
-
-
-def _agent_limits(run: Run) -> str:
-    resources = run.record.agent.resources
-    return _words(resources and resources.limits)
-
-
-def _limits(run: Run) -> str:
-    return _words(run.record.experiment_dimensions.limits)
-
-
-def _words(limits: msgspec.Struct | None) -> str:
-    """As `name=value` words; empty if the run has no record of them."""
+def _limits(holder: Any) -> str:
+    """Its limits as `name=value` words; empty if the run has no record of them."""
+    limits = getattr(holder, "limits", None)
     given = {} if limits is None else msgspec.to_builtins(limits)
     return " ".join(f"{name}={value}" for name, value in given.items() if value is not None)
+
+
+_BY_SUITE = {
+    "episode budget": _dimension("episode_budget", "budget"),
+    "policy scope": _dimension("policy_scope", "policy-scope"),
+    "observation form": _dimension("observations", "observations"),
+    "simulation rule": _dimension("simulation", "simulation"),
+    "finish rule": _dimension("finish", "finish"),
+    "feedback detail": _dimension("feedback", "feedback"),
+    "text of AGENTS.md": _Setting(
+        lambda run: _short(run.record.experiment_dimensions.agents_md) or "standard", "the same --agents-md"
+    ),
+    "failed episodes": _dimension("failed_episodes", "failed-episodes"),
+    "hidden evaluation": _dimension("hidden_evaluation", "profile"),
+    "profile": _dimension("profile", "profile"),
+    "jail": _Setting(lambda run: run.record.jail, "the same --jail"),
+    "hidden cases": _dimension("hidden_cases", "hidden-cases"),
+    "hidden isolation": _Setting(
+        lambda run: run.record.hidden_isolation,
+        concerns=lambda run: run.record.hidden_isolation != "unknown",
+    ),
+    UNKNOWN_ISOLATION: _Setting(lambda run: run.record.hidden_isolation),
+    "model limits": _Setting(
+        lambda run: _limits(run.record.agent.model_use),
+        "the same max_requests, max_tokens, and max_cost in the agents' files",
+        lambda run: run.record.agent.model_use is not None,
+    ),
+    "agent limits": _Setting(
+        lambda run: _limits(run.record.agent.resources),
+        "the same --agent-cpus, --agent-memory, --agent-pids, and --agent-disk, on machines that can keep"
+        " them",
+        lambda run: run.record.agent.resources is not None,
+    ),
+}
+_BY_ENTRY = {
+    "prompts": _Setting(
+        lambda run: _short(run.record.agent.prompts) or "standard",
+        "the same --prompts, or another --entry for each",
+    ),
+    "skills and MCP servers": _Setting(
+        lambda run: inputs_digest(run.record.agent.inputs)[:12],
+        "the same `skills` and `[mcp]` in the agent's file, or another --entry for each",
+    ),
+}
+_BY_ENVIRONMENT = {
+    "train split": _split("train"),
+    "validation split": _split("validation"),
+    "held-out split": _split("heldout"),
+    "environment version": _Setting(lambda run: run.record.versions.env),
+    "episodes a submit": _Setting(lambda run: run.submit_size, "the same --min-episodes and --max-episodes"),
+    "policy limits": _Setting(lambda run: _limits(run.record.experiment_dimensions), "the same --limit"),
+    "step limit": _Setting(_step_limit, "the same --step-limit"),
+    "videos in feedback": _dimension("video", "video"),
+}
+REMEDIES = {
+    what: setting.remedy
+    for what, setting in (_BY_SUITE | _BY_ENTRY | _BY_ENVIRONMENT).items()
+    if setting.remedy
+}
+"""By `Mixture.what`: how to play runs that agree in it."""
 
 
 def mixtures(runs: Iterable[Run]) -> list[Mixture]:
@@ -196,20 +192,15 @@ def mixtures(runs: Iterable[Run]) -> list[Mixture]:
     for suite, envs in suites_of(by_env).items():
         together = [run for env in envs for run in by_env[env]]
         out += _differences(_BY_SUITE, suite, together)
-        out += _isolation(suite, together)
-        # Agents without a model have no limits, and stand beside those with any.
-        limited = [run for run in together if run.record.agent.model_use is not None]
-        out += _differences(_MODEL_LIMITS, suite, limited)
-        measured = [run for run in together if run.record.agent.resources is not None]
-        out += _differences(_AGENT_LIMITS, suite, measured)
         for entry in sorted({run.entry for run in together}):
-            out += _differences(
-                _BY_ENTRY, f"{suite}, {entry}", [run for run in together if run.entry == entry]
-            )
+            own = [run for run in together if run.entry == entry]
+            out += _differences(_BY_ENTRY, f"{suite}, {entry}", own)
     for env in ordered_environments(by_env):
-        out += _differences(_BY_ENVIRONMENT, env, by_env[env])
-        out += _differences({"fingerprint": _Setting(_fingerprint_beside(by_env[env]))}, env, by_env[env])
-        out += _in_question(env, by_env[env])
+        fingerprint = {"fingerprint": _Setting(_fingerprint_beside(by_env[env]))}
+        out += _differences(_BY_ENVIRONMENT | fingerprint, env, by_env[env])
+        audits = [(run.name, run.record.audit) for run in by_env[env]]
+        if forged := [name for name, audit in audits if audit is not None and audit.in_question]:
+            out.append(Mixture(what=IN_QUESTION, where=env, values=dict.fromkeys(forged, 1)))
     return out
 
 
@@ -228,29 +219,14 @@ def _fingerprint_beside(runs: list[Run]) -> Callable[[Run], str]:
     return beside
 
 
-def _isolation(suite: str, runs: list[Run]) -> list[Mixture]:
-    """Differences among runs with a record of their isolation, and runs without one beside them."""
-    known = [run for run in runs if run.record.hidden_isolation != "unknown"]
-    found = _differences({"hidden isolation": _ISOLATION}, suite, known)
-    if 0 < len(known) < len(runs):
-        found += _differences({UNKNOWN_ISOLATION: _ISOLATION}, suite, runs)
-    return found
-
-
-def _in_question(env: str, runs: list[Run]) -> list[Mixture]:
-    """Runs whose results may be forged, according to their own audits."""
-    names = [run.name for run in runs if run.record.audit is not None and run.record.audit.in_question]
-    return [Mixture(what=IN_QUESTION, where=env, values=dict.fromkeys(names, 1))] if names else []
-
-
 def _differences(settings: dict[str, _Setting], where: str, runs: list[Run]) -> list[Mixture]:
-    found: list[Mixture] = []
+    out: list[Mixture] = []
     for what, setting in settings.items():
         by_value: dict[str, list[str]] = {}
-        for run in runs:
+        for run in filter(setting.concerns, runs):
             by_value.setdefault(setting.of(run) or "none", []).append(path_text(run.path))
-        if len(by_value) > 1:
+        if len(by_value) > 1 and (what != UNKNOWN_ISOLATION or "unknown" in by_value):
             folders = {value: tuple(those) for value, those in sorted(by_value.items())}
             counts = {value: len(those) for value, those in folders.items()}
-            found.append(Mixture(what=what, where=where, values=counts, folders=folders))
-    return found
+            out.append(Mixture(what=what, where=where, values=counts, folders=folders))
+    return out

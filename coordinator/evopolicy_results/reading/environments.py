@@ -17,6 +17,11 @@ def ordered_environments(envs: Iterable[str]) -> list[str]:
     return sorted(set(envs), key=lambda env: (order.get(env, len(order)), env))
 
 
+def by_name(name: str) -> tuple[str, str]:
+    """A key that sorts entries in every table and figure."""
+    return name.casefold(), name
+
+
 names_in_runs: dict[str, set[tuple[str, str]]] = {}
 """Titles and families that runs tell of environments which do not ship, by id, for this process."""
 _MAX_TITLE = 60

@@ -35,6 +35,7 @@ PUBLISHED = 0
 HARNESS = "published software"
 UNKNOWN = "unknown"
 
+_HASHES = ("agents_md_hash", "data_train_hash", "data_valid_hash", "data_heldout_hash")
 _ARTIFACTS = ("workspace", "feedback", "checkpoints", "logs_harness", "logs_agent", "logs_env")
 
 
@@ -81,9 +82,7 @@ def read_record(folder: Path, record: dict[str, Any]) -> RunRecord:
     outcome, timing, versions = (_object(record, name) for name in ("outcome", "timing", "versions"))
     artifacts = {name: place for name, place in _object(record, "artifacts").items() if name in _ARTIFACTS}
     feedback = folder / str(artifacts.get("feedback", "workspace/feedback"))
-    summaries = [
-        found for path in sorted(feedback.glob("submit_*/summary.json")) if (found := read_summary(path))
-    ]
+    summaries = list(filter(None, map(read_summary, sorted(feedback.glob("submit_*/summary.json")))))
     model, env = _names(folder, record, summaries)
     heldout = outcome.get("heldout_returns") or ()
     try:
@@ -117,11 +116,9 @@ def read_record(folder: Path, record: dict[str, Any]) -> RunRecord:
             timing=msgspec.convert(timing, Timing),
             outcome=msgspec.convert(
                 {
+                    **{name: outcome.get(name) for name in ("error", "final_score", "val_scores")},
                     "status": outcome.get("status") or "error",
-                    "error": outcome.get("error"),
-                    "final_score": outcome.get("final_score"),
                     "best_submit_index": _best(outcome),
-                    "val_scores": outcome.get("val_scores"),
                     "heldout_returns": heldout,
                 },
                 Outcome,
@@ -131,10 +128,7 @@ def read_record(folder: Path, record: dict[str, Any]) -> RunRecord:
                 harness=str(versions.get("harness", UNKNOWN)),
                 env=str(versions.get("env", UNKNOWN)),
                 data_secret=False,
-                agents_md_hash=str(versions.get("agents_md_hash", "")),
-                data_train_hash=str(versions.get("data_train_hash", "")),
-                data_valid_hash=str(versions.get("data_valid_hash", "")),
-                data_heldout_hash=str(versions.get("data_heldout_hash", "")),
+                **{name: str(versions.get(name, "")) for name in _HASHES},
             ),
         )
     except (msgspec.ValidationError, TypeError) as error:
@@ -150,12 +144,9 @@ def _names(folder: Path, record: dict[str, Any], summaries: list[PublishedSummar
     """Model and environment: as recorded, or from `runs/<model>/<env>/<exp-id>`, where `_` may replace an
     environment's `/`."""
     above = folder.parent
-    by_path = {env: above.parent.name for env in catalogue.entries() if env.replace("/", "_") == above.name}
-    by_path |= {
-        env: above.parent.parent.name
-        for env in catalogue.entries()
-        if env == f"{above.parent.name}/{above.name}"
-    }
+    name, parents = f"{above.parent.name}/{above.name}", (above.parent, above.parent.parent)
+    by_path = {env: parents[0].name for env in catalogue.entries() if env.replace("/", "_") == above.name}
+    by_path |= {env: parents[1].name for env in catalogue.entries() if env == name}
     recorded_env = record.get("env") or next((one.env for one in summaries if one.env), None)
     env = str(recorded_env or next(iter(by_path), above.name))
     return str(record.get("model") or by_path.get(env, above.parent.name)), env
@@ -185,12 +176,13 @@ def _best(outcome: dict[str, Any]) -> int | None:
     if wanted is None:
         return None
     scores = _object(outcome, "val_scores")
-    found = [int(index) for index, metrics in by_submit.items() if metrics == wanted and index.isdecimal()]
-    return max(found, key=lambda index: (_number(scores.get(str(index))), index), default=None)
 
+    def rank(index: int) -> tuple[float, int]:
+        score = scores.get(str(index))
+        return (float(score) if isinstance(score, int | float) else -math.inf), index
 
-def _number(value: Any) -> float:
-    return float(value) if isinstance(value, int | float) else -math.inf
+    equal = (int(index) for index, metrics in by_submit.items() if metrics == wanted and index.isdecimal())
+    return max(equal, key=rank, default=None)
 
 
 def decode(data: bytes) -> Any:

@@ -145,20 +145,17 @@ def read_run(folder: Path) -> Run:
 
 
 def _signals(run: Run) -> tuple[Signal, ...]:
-    artifacts = run.record.artifacts
-    workspace = run.path / (artifacts.workspace or "workspace")
     checkpoints = (
         (submit.index, policy_files(policy_folder(run.checkpoint(submit.index)))) for submit in run.submits
     )
-    log = run.path / (artifacts.logs_agent or "logs/agent.jsonl")
+    log = log_lines(run.path / (run.record.artifacts.logs_agent or "logs/agent.jsonl"))
 
     def trajectories(index: int) -> Iterator[list[Any]]:
-        return feedback_actions(checkpoint_folder(workspace, "feedback", index))
+        return feedback_actions(run.feedback(index))
 
     if run.simulation_allowed:
-        return scan(checkpoints, log_lines(log), trajectories)
-    files = workspace_files(workspace)
-    return scan(checkpoints, log_lines(log), trajectories, env=run.env, workspace=files)
+        return scan(checkpoints, log, trajectories)
+    return scan(checkpoints, log, trajectories, env=run.env, workspace=workspace_files(run.workspace))
 
 
 def _read_record(folder: Path) -> RunRecord:

@@ -16,6 +16,7 @@ import msgspec
 from evopolicy_common.records.rescores import RescoreRecord
 from evopolicy_common.records.run_record import RunRecord
 from evopolicy_results.code.topology import Features
+from evopolicy_results.reading.environments import by_name, ordered_environments
 from evopolicy_results.reading.published import PUBLISHED
 from evopolicy_results.scan.signals import Signal
 
@@ -145,6 +146,14 @@ class Run(msgspec.Struct, frozen=True, kw_only=True):
         repeat = f" #{self.record.repeat}" if self.record.repeat else ""
         return f"{self.entry} / {self.env} / {self.record.exp_id}{repeat}"
 
+    @property
+    def workspace(self) -> Path:
+        return self.path / (self.record.artifacts.workspace or "workspace")
+
+    def feedback(self, index: int) -> Path:
+        """Folder of the feedback on a submit, whether or not it exists."""
+        return checkpoint_folder(self.workspace, "feedback", index)
+
     def checkpoint(self, index: int) -> Path:
         """Folder of a submit's checkpoint, whether or not it exists."""
         return checkpoint_folder(self.path, self.record.artifacts.checkpoints or "checkpoints", index)
@@ -159,11 +168,17 @@ class LeftOut(msgspec.Struct, frozen=True, kw_only=True):
 
 def checkpoint_folder(run: Path, folder: str, index: int) -> Path:
     """`checkpoints/submit_NNN`: NNN has at least three digits, more if the budget has more."""
-    for width in (3, 4, 5, 6, 7):
-        found = run / folder / f"submit_{index:0{width}d}"
-        if found.is_dir():
-            return found
-    return run / folder / f"submit_{index:03d}"
+    places = [run / folder / f"submit_{index:0{width}d}" for width in (3, 4, 5, 6, 7)]
+    return next((place for place in places if place.is_dir()), places[0])
+
+
+def by_cell(runs: Iterable[Run]) -> dict[tuple[str, str], list[Run]]:
+    """The runs by (environment, entry): environments in catalogue order, entries by name."""
+    cells: dict[tuple[str, str], list[Run]] = {}
+    for run in runs:
+        cells.setdefault((run.env, run.entry), []).append(run)
+    place = {env: i for i, env in enumerate(ordered_environments(env for env, _ in cells))}
+    return {key: cells[key] for key in sorted(cells, key=lambda key: (place[key[0]], by_name(key[1])))}
 
 
 def path_text(path: Path) -> str:

@@ -70,8 +70,7 @@ def iqm(scores: Floats) -> Floats:
     cut = n // 4
     middle = np.sort(scores, axis=-1)[..., cut : n - cut]
     with np.errstate(invalid="ignore"):  # the mean of both infinities
-        found: Floats = np.asarray(middle.mean(axis=-1), dtype=np.float64)
-    return found
+        return np.asarray(middle.mean(axis=-1), dtype=np.float64)
 
 
 def profile(scores: Floats, taus: Sequence[float] = TAUS) -> Floats:
@@ -83,31 +82,21 @@ def probability_of_improvement(first: Floats, second: Floats) -> Floats:
     """P(X > Y) + P(X = Y)/2 for scores of runs along the last axes: Mann and Whitney's U over the number of pairs."""
     above = (first[..., :, None] > second[..., None, :]).mean(axis=(-2, -1))
     equal = (first[..., :, None] == second[..., None, :]).mean(axis=(-2, -1))
-    found: Floats = above + 0.5 * equal
-    return found
-
-
-class _Draws(msgspec.Struct, frozen=True, kw_only=True):
-    """Resampled returns of one entry on one environment, (resamples, runs)."""
-
-    plain: Floats
-    stretched: Floats
-    """Stretched to the variance of that many runs."""
-    over: str
+    return np.asarray(above + 0.5 * equal, dtype=np.float64)
 
 
 class _Cell(msgspec.Struct, frozen=True, kw_only=True):
-    """Normalised scores of one entry on one environment, and resamples of them, (resamples, runs)."""
+    """Scores of one entry's runs on one environment, and resamples of them, (resamples, runs)."""
 
     scores: Floats
-    stretched: Floats | None
-    """None if nothing can be resampled."""
-    counted: Floats | None
-    """Not stretched; None too if resampled from too few runs."""
-    returns: Floats | None
-    """`counted` before it was normalised: only the order matters for a probability of improvement."""
-    n_runs: int
-    over: str
+    returns: Floats | None = None
+    """None if nothing can be resampled; of a normalised cell, also if resampled from too few runs. Never normalised:
+    only the order matters for a probability of improvement."""
+    counted: Floats | None = None
+    """`returns` of a normalised cell, normalised."""
+    stretched: Floats | None = None
+    """Stretched to the variance of that many runs; None if nothing can be resampled."""
+    over: str = ""
 
 
 def aggregates(
@@ -121,105 +110,93 @@ def aggregates(
     cells: dict[tuple[str, str], _Cell] = {}
     for place, (env, scale) in enumerate(scales.items()):
         here = [sample for (_, e), sample in samples.items() if e == env]
-        draws = {
-            sample.entry: _draws(sample, (place, number), resamples) for number, sample in enumerate(here)
+        drawn = {
+            sample.entry: _drawn(sample, (place, number), resamples) for number, sample in enumerate(here)
         }
-        low, width = _drawn_scale(here, draws, scale)
-        for sample in here:
-            if sample.entry in agents:
-                cells[sample.entry, env] = _cell(sample, draws[sample.entry], scale, low, width)
+        low, width = _drawn_scale(here, drawn, scale)
+        for agent in drawn.keys() & set(agents):
+            cells[agent, env] = _normalised(drawn[agent], scale, low, width)
     by_entry = {
         agent: {env: cells[agent, env] for env in scales if (agent, env) in cells} for agent in agents
     }
-    found = [_aggregate(agent, list(own.values())) for agent, own in by_entry.items() if own]
+    alone = [_aggregate(agent, list(own.values())) for agent, own in by_entry.items() if own]
     against = [
         _improvement(one, other, [(by_entry[one][env], by_entry[other][env]) for env in common])
         for one, other in itertools.combinations(agents, 2)
         if (common := [env for env in by_entry[one] if env in by_entry[other]])
     ]
-    return found, against
+    return alone, against
 
 
-def _draws(sample: Sample, seed: tuple[int, int], resamples: int) -> _Draws | None:
-    """Resamples of runs about the mean of resampled cases; None if there is nothing to draw."""
-    known = [-np.inf if run.score is None else run.score for run in sample.runs]
-    scores = np.array(known, dtype=np.float64)
+def _drawn(sample: Sample, seed: tuple[int, int], resamples: int) -> _Cell:
+    """Resamples of runs about the mean of resampled cases."""
+    scores = np.array([-np.inf if run.score is None else run.score for run in sample.runs], dtype=np.float64)
     n = len(scores)
     common = matched([sample])
     shift = np.zeros((resamples, 1))
     if common is not None and (n_cases := common.returns[0].shape[1]) > 1:
         # All entries share the draws of cases, as they share the cases.
         by_case = common.returns[0].mean(axis=0)
-        shift = (weights(n_cases, n_cases, resamples, seed[0]) @ (by_case - by_case.mean()) / n_cases)[
-            :, None
-        ]
+        drawn = weights(n_cases, n_cases, resamples, seed[0]) @ (by_case - by_case.mean()) / n_cases
+        shift = drawn[:, None]
     elif n == 1 and np.isfinite(scores[0]):
-        return None
+        return _Cell(scores=scores)
     if n == 1:
-        return _Draws(plain=scores + shift, stretched=scores + shift, over="cases")
+        return _Cell(scores=scores, returns=scores + shift, stretched=scores + shift, over="cases")
+    stretched = returns = scores[np.random.default_rng([21, *seed]).integers(0, n, (resamples, n))] + shift
+    if np.isfinite(scores).all():
+        middle = scores.mean() + shift
+        stretched = middle + np.sqrt(n / (n - 1)) * (returns - middle)
     over = "runs" if common is None else "runs and cases"
-    plain = scores[np.random.default_rng([21, *seed]).integers(0, n, (resamples, n))] + shift
-    if not np.isfinite(scores).all():
-        return _Draws(plain=plain, stretched=plain, over=over)
-    middle = scores.mean() + shift
-    stretched = middle + np.sqrt(n / (n - 1)) * (plain - middle)
-    return _Draws(plain=plain, stretched=stretched, over=over)
+    return _Cell(scores=scores, returns=returns, stretched=stretched, over=over)
 
 
-def _drawn_scale(
-    here: Sequence[Sample], draws: Mapping[str, _Draws | None], scale: Scale
-) -> tuple[Floats, Floats]:
+def _drawn_scale(here: Sequence[Sample], cells: Mapping[str, _Cell], scale: Scale) -> tuple[Floats, Floats]:
     """Resampled low end and width of a scale, (resamples, 1). The best agent stays the observed one, and an end that
     cannot be resampled stays fixed. A width that is not above 0 becomes 0."""
     ends = {False: np.array([[scale.best]]), True: np.array([[scale.random]])}
     for sample in here:
         known, end = sample.scores, scale.random if sample.is_fixed else scale.best
-        drawn = draws[sample.entry]
+        drawn = cells[sample.entry].stretched
         if drawn is not None and known is not None and np.isclose(np.mean(known), end, rtol=1e-12, atol=0.0):
-            ends[sample.is_fixed] = drawn.stretched.mean(axis=1, keepdims=True)
+            ends[sample.is_fixed] = drawn.mean(axis=1, keepdims=True)
     return ends[True], np.maximum(0.0, ends[False] - ends[True])
 
 
-def _cell(sample: Sample, draws: _Draws | None, scale: Scale, low: Floats, width: Floats) -> _Cell:
-    known = [-np.inf if run.score is None else run.score for run in sample.runs]
-    scores = (np.array(known, dtype=np.float64) - scale.random) / (scale.best - scale.random)
-
-    def normalised(drawn: Floats) -> Floats:
+def _normalised(cell: _Cell, scale: Scale, low: Floats, width: Floats) -> _Cell:
+    def normalised(drawn: Floats | None) -> Floats | None:
         # Without a width, a resample's scores are infinite: the interval of an aggregate that rests on them has no
         # bounds.
         with np.errstate(divide="ignore", invalid="ignore"):
-            found: Floats = np.nan_to_num((drawn - low) / width, nan=0.0, posinf=np.inf, neginf=-np.inf)
-        return found
+            return (
+                None
+                if drawn is None
+                else np.nan_to_num((drawn - low) / width, nan=0.0, posinf=np.inf, neginf=-np.inf)
+            )
 
-    n = len(scores)
-    returns = None if draws is None or 1 < n < LEAST_RUNS else draws.plain
+    returns = None if 1 < len(cell.scores) < LEAST_RUNS else cell.returns
     return _Cell(
-        scores=scores,
-        stretched=None if draws is None else normalised(draws.stretched),
-        counted=None if returns is None else normalised(returns),
+        scores=(cell.scores - scale.random) / (scale.best - scale.random),
         returns=returns,
-        n_runs=n,
-        over="" if draws is None else draws.over,
+        counted=normalised(returns),
+        stretched=normalised(cell.stretched),
+        over=cell.over,
     )
 
 
 def _aggregate(entry: str, cells: Sequence[_Cell]) -> Aggregate:
     scores = np.concatenate([cell.scores for cell in cells])
-    drawn, counted = (
-        _together([cell.stretched for cell in cells]),
-        _together([cell.counted for cell in cells]),
-    )
+    drawn = _together([cell.stretched for cell in cells])
+    counted = _together([cell.counted for cell in cells])
     middle = float(iqm(scores))
-    shares = profile(scores)
-    drawn_shares = None if counted is None else profile(counted)
+    drawn_middle = None if drawn is None else iqm(drawn)
+    drawn_shares = [None] * len(TAUS) if counted is None else list(profile(counted).T)
     return Aggregate(
         entry=entry,
-        iqm=_bounded(middle, None if drawn is None else iqm(drawn), len(scores))
-        if np.isfinite(middle)
-        else None,
+        iqm=_bounded(middle, drawn_middle, len(scores)) if np.isfinite(middle) else None,
         profile=tuple(
-            _bounded(float(share), None if drawn_shares is None else drawn_shares[:, i], len(scores))
-            for i, share in enumerate(shares)
+            _bounded(float(share), resampled, len(scores))
+            for share, resampled in zip(profile(scores), drawn_shares, strict=True)
         ),
         n_runs=len(scores),
         n_environments=len(cells),
@@ -239,7 +216,7 @@ def _improvement(first: str, second: str, cells: Sequence[tuple[_Cell, _Cell]]) 
         for one, other in cells
         if one.returns is not None and other.returns is not None
     ]
-    n_runs = sum(one.n_runs + other.n_runs for one, other in cells)
+    n_runs = sum(len(one.scores) + len(other.scores) for one, other in cells)
     return Improvement(
         first=first,
         second=second,

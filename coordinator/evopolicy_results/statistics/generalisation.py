@@ -14,8 +14,8 @@ from statistics import fmean
 import msgspec
 
 from evopolicy_common.statistics.intervals import Estimate, of_runs
-from evopolicy_results.reading.environments import family_of, ordered_environments
-from evopolicy_results.reading.records import Run
+from evopolicy_results.reading.environments import family_of
+from evopolicy_results.reading.records import Run, by_cell
 from evopolicy_results.scoring.normalised import Scale
 
 SUCCESS_ABOVE = {"minigrid": 0.0, "gym/acrobot": -500.0, "gym/continuouscar": 0.0}
@@ -53,20 +53,14 @@ class Optimism(msgspec.Struct, frozen=True, kw_only=True):
 
 def generalisation(runs: Iterable[Run], scales: Mapping[str, Scale]) -> list[Generalisation]:
     """Every entry on every environment with a completed run, environments in catalogue order."""
-    cells: dict[tuple[str, str], list[Run]] = {}
-    for run in runs:
-        if run.score is not None:
-            cells.setdefault((run.env, run.entry), []).append(run)
-    place = {env: i for i, env in enumerate(ordered_environments(env for env, _ in cells))}
-    keys = sorted(cells, key=lambda key: (place[key[0]], key[1].casefold(), key[1]))
-    return [_cell(entry, env, cells[env, entry], scales.get(env)) for env, entry in keys]
+    completed = by_cell(run for run in runs if run.score is not None)
+    return [_cell(entry, env, several, scales.get(env)) for (env, entry), several in completed.items()]
 
 
-def optimism_of(entry: str, found: Iterable[Generalisation]) -> Optimism | None:
+def optimism_of(entry: str, cells: Iterable[Generalisation]) -> Optimism | None:
     """The entry's optimism; None if no environment has a normalised optimism."""
-    values = [
-        one.normalised_optimism for one in found if one.entry == entry and one.normalised_optimism is not None
-    ]
+    known = [cell.normalised_optimism for cell in cells if cell.entry == entry]
+    values = [value for value in known if value is not None]
     return Optimism(entry=entry, mean=of_runs(values), n_environments=len(values)) if values else None
 
 
@@ -75,6 +69,7 @@ def _cell(entry: str, env: str, runs: Sequence[Run], scale: Scale | None) -> Gen
     train = _mean([run.selected.mean_return if run.selected is not None else None for run in runs])
     validation = _mean([run.selected.val_mean if run.selected is not None else None for run in runs])
     optimism = None if validation is None else validation - heldout
+    width = None if scale is None else scale.best - scale.random
     return Generalisation(
         entry=entry,
         env=env,
@@ -83,9 +78,7 @@ def _cell(entry: str, env: str, runs: Sequence[Run], scale: Scale | None) -> Gen
         validation=validation,
         heldout=heldout,
         optimism=optimism,
-        normalised_optimism=None
-        if optimism is None or scale is None
-        else optimism / (scale.best - scale.random),
+        normalised_optimism=None if optimism is None or width is None else optimism / width,
         success=_success(env, runs),
     )
 

@@ -26,8 +26,7 @@ def label_test(first: Sequence[float], second: Sequence[float], n_random: int = 
     pooled = np.array([*first, *second])
     pooled = pooled - pooled.mean()
     patterns, exact = label_patterns(n_first, n_second, n_random)
-    own = np.zeros((1, len(pooled)))
-    own[0, :n_first] = 1.0
+    own = np.repeat([[1.0, 0.0]], [n_first, n_second], axis=1)
     observed = float(_welch(own, pooled, n_first, n_second)[0])
     reached = 0
     for start in range(0, len(patterns), _CHUNK):

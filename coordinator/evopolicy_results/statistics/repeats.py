@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import bisect
 import math
 
 import msgspec
 
-from evopolicy_common.statistics.distributions import ALPHA, t_quantile, t_two_sided
+from evopolicy_common.statistics.distributions import ALPHA, t_two_sided
 from evopolicy_common.statistics.intervals import components
 from evopolicy_common.statistics.resampling import Floats
 
@@ -24,14 +25,6 @@ class Spread(msgspec.Struct, frozen=True, kw_only=True):
     n_cases: int
 
 
-class Repeats(msgspec.Struct, frozen=True, kw_only=True):
-    """Number of runs per agent that resolve a gap."""
-
-    gap: float
-    n: int | None
-    """None if no number up to `MAX_REPEATS` does: the gap needs more cases."""
-
-
 def spread_of(*returns: Floats) -> Spread:
     """Variances of two agents, from matrices runs × the same cases. A matrix of one row is one fixed policy."""
     parts = [components(matrix) for matrix in returns]
@@ -43,34 +36,23 @@ def spread_of(*returns: Floats) -> Spread:
     )
 
 
-def half_width(spread: Spread, n: int) -> float:
-    """Half width of the 95 % interval of a difference between two agents of n ≥ 2 runs each."""
-    error, df = _error(spread, n)
-    return t_quantile(1.0 - ALPHA / 2.0, df) * error if error > 0.0 else 0.0
-
-
-def repeats_needed(spread: Spread, gap: float, *, level: float = ALPHA) -> Repeats:
+def repeats_needed(spread: Spread, gap: float, *, level: float = ALPHA) -> int | None:
     """The fewest runs per agent, from 2, whose interval of a difference, at 1 − `level`, is no wider than ± `gap`. A
-    true gap of that size is then distinguished from 0 in half of all experiments. Raises ValueError for a gap that is
-    not above 0."""
+    true gap of that size is then distinguished from 0 in half of all experiments. None if no number up to
+    `MAX_REPEATS` does: the gap needs more cases. Raises ValueError for a gap that is not above 0."""
     if not gap > 0.0:
         raise ValueError(f"a gap of {gap} cannot be resolved; give one above 0")
-    if not _resolves(spread, MAX_REPEATS, gap, level):
-        return Repeats(gap=gap, n=None)
-    low, high = 1, MAX_REPEATS
-    while high - low > 1:
-        middle = (low + high) // 2
-        low, high = (low, middle) if _resolves(spread, middle, gap, level) else (middle, high)
-    return Repeats(gap=gap, n=high)
+
+    def resolves(n: int) -> bool:
+        error, df = standard_error(spread, n)
+        return error <= 0.0 or t_two_sided(gap / error, df) <= level
+
+    n = 2 + bisect.bisect_left(range(2, MAX_REPEATS + 1), True, key=resolves)
+    return n if n <= MAX_REPEATS else None
 
 
-def _resolves(spread: Spread, n: int, gap: float, level: float) -> bool:
-    error, df = _error(spread, n)
-    return error <= 0.0 or t_two_sided(gap / error, df) <= level
-
-
-def _error(spread: Spread, n: int) -> tuple[float, float]:
-    """Standard error of a difference, and its degrees of freedom."""
+def standard_error(spread: Spread, n: int) -> tuple[float, float]:
+    """Standard error of a difference between two agents of n ≥ 2 runs each, and its degrees of freedom."""
     by_run, by_case = 2.0 * spread.run / n, max(0.0, spread.case)
     total = by_run + by_case
     if total <= 0.0:

@@ -6,12 +6,13 @@ import itertools
 import math
 from collections.abc import Mapping, Sequence
 from statistics import fmean, median
+from typing import Literal
 
 import msgspec
 
 from evopolicy_results.scoring.normalised import Scale
 from evopolicy_results.statistics.pairs import Pair
-from evopolicy_results.statistics.repeats import Repeats, Spread, repeats_needed, spread_of
+from evopolicy_results.statistics.repeats import Spread, repeats_needed, spread_of
 from evopolicy_results.statistics.samples import Sample, matched
 
 GAPS = (0.05, 0.1, 0.2)
@@ -37,16 +38,16 @@ class Resolution(msgspec.Struct, frozen=True, kw_only=True):
         """`gap` as a share of the scale."""
         return None if self.gap is None or self.scale is None else self.gap / self.scale
 
-    def repeats(self, share: float) -> Repeats | None:
-        """Runs per agent that resolve a gap of `share` of the scale; None if unknown."""
+    def repeats(self, share: float) -> int | Literal["more cases"] | None:
+        """Runs per agent that resolve a gap of `share` of the scale, or that no number does; None if unknown."""
         if self.spread is None or self.scale is None:
             return None
-        return repeats_needed(self.spread, share * self.scale)
+        return repeats_needed(self.spread, share * self.scale) or "more cases"
 
 
 def resolutions(
     samples: Mapping[tuple[str, str], Sample],
-    found: Sequence[Pair],
+    compared: Sequence[Pair],
     agents: Sequence[str],
     scales: Mapping[str, Scale],
     environments: Sequence[str],
@@ -55,7 +56,7 @@ def resolutions(
     out: list[Resolution] = []
     for env in environments:
         here = [samples[agent, env] for agent in agents if (agent, env) in samples]
-        own = [pair for pair in found if pair.env == env and {pair.first, pair.second} <= set(agents)]
+        own = [pair for pair in compared if pair.env == env and {pair.first, pair.second} <= set(agents)]
         if len(here) < 2:
             continue
         halves = [
@@ -77,29 +78,29 @@ def resolutions(
     return out
 
 
-def overall(found: Sequence[Resolution]) -> Resolution | None:
+def overall(resolved: Sequence[Resolution]) -> Resolution | None:
     """Resolution of the mean of normalised scores over environments, on which the scale is 1; None unless each
     environment has a scale and a gap. Environments are fixed: the suite is not a sample."""
-    gaps = [one.normalised_gap for one in found]
-    if not found or any(gap is None for gap in gaps):
+    gaps = [one.normalised_gap for one in resolved]
+    known = [gap for gap in gaps if gap is not None]
+    if not known or len(known) < len(gaps):
         return None
-    n = len(found)
-    spread = None
-    spreads = [(one.spread, one.scale) for one in found]
-    if all(one is not None for one, _ in spreads):
-        known = [(one, scale) for one, scale in spreads if one is not None and scale is not None]
-        spread = Spread(
-            run=sum(one.run / scale**2 for one, scale in known) / n**2,
-            case=sum(one.case / scale**2 for one, scale in known) / n**2,
-            n_cases=sum(one.n_cases for one, _ in known),
-        )
+    n = len(resolved)
+    spreads = [
+        (one.spread, one.scale**2) for one in resolved if one.spread is not None and one.scale is not None
+    ]
+    spread = Spread(
+        run=sum(one.run / square for one, square in spreads) / n**2,
+        case=sum(one.case / square for one, square in spreads) / n**2,
+        n_cases=sum(one.n_cases for one, _ in spreads),
+    )
     return Resolution(
         env="",
-        gap=math.sqrt(sum(gap**2 for gap in gaps if gap is not None)) / n,
+        gap=math.sqrt(sum(gap**2 for gap in known)) / n,
         scale=1.0,
-        n_cases=sum(one.n_cases for one in found),
-        n_runs=(min(one.n_runs[0] for one in found), max(one.n_runs[1] for one in found)),
-        spread=spread,
+        n_cases=sum(one.n_cases for one in resolved),
+        n_runs=(min(one.n_runs[0] for one in resolved), max(one.n_runs[1] for one in resolved)),
+        spread=spread if len(spreads) == n else None,
     )
 
 
@@ -107,9 +108,9 @@ def _spread(samples: Sequence[Sample]) -> Spread | None:
     common = matched(samples)
     if common is None or any(len(matrix) < 2 for matrix in common.returns):
         return None
-    found = [spread_of(one, other) for one, other in itertools.combinations(common.returns, 2)]
+    spreads = [spread_of(one, other) for one, other in itertools.combinations(common.returns, 2)]
     return Spread(
-        run=fmean(one.run for one in found),
-        case=fmean(one.case for one in found),
+        run=fmean(one.run for one in spreads),
+        case=fmean(one.case for one in spreads),
         n_cases=common.returns[0].shape[1],
     )

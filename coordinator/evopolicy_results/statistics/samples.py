@@ -90,27 +90,26 @@ def samples_of(runs: Iterable[Run], table: ScoreTable) -> dict[tuple[str, str], 
 
     The random reference has the returns recorded by the runs on the case set that most of them played.
     """
-    found: dict[tuple[str, str], list[RunReturns]] = {}
-    reference: dict[str, list[RunReturns]] = {}
+    played: dict[tuple[str, str], list[RunReturns]] = {}
+    random: dict[str, list[RunReturns]] = {}
     for run in runs:
-        played = returns_of(run)
-        found.setdefault((run.entry, run.env), []).append(played)
-        case_set, recorded = played.case_set, run.record.outcome.random_reference
-        if recorded is not None and recorded.returns and recorded.seeded_by == "case" and case_set:
-            reference.setdefault(run.env, []).append(
-                RunReturns(score=recorded.mean_return, returns=recorded.returns, case_set=case_set)
+        own, recorded = returns_of(run), run.record.outcome.random_reference
+        played.setdefault((run.entry, run.env), []).append(own)
+        if recorded is not None and recorded.returns and recorded.seeded_by == "case" and own.case_set:
+            random.setdefault(run.env, []).append(
+                RunReturns(score=recorded.mean_return, returns=recorded.returns, case_set=own.case_set)
             )
     out: dict[tuple[str, str], Sample] = {}
     for (entry, env), cell in table.cells.items():
         is_reference = entry == table.reference
-        references = found.get((entry, env), [])
-        if is_reference and env in reference:
-            sets = [one.case_set for one in reference[env]]
-            references = [max(reference[env], key=lambda one: (sets.count(one.case_set), one.case_set))]
+        several = played.get((entry, env), [])
+        if is_reference and env in random:
+            sets = [one.case_set for one in random[env]]
+            several = [max(random[env], key=lambda one: (sets.count(one.case_set), one.case_set))]
         out[entry, env] = Sample(
             entry=entry,
             env=env,
-            runs=tuple(references or (RunReturns(score=score) for score in cell.scores)),
+            runs=tuple(several or (RunReturns(score=score) for score in cell.scores)),
             is_fixed=is_reference,
         )
     return out

@@ -22,6 +22,7 @@ import numpy as np
 
 from evopolicy_common.statistics.distributions import ALPHA, holm
 from evopolicy_common.statistics.resampling import RESAMPLES, Floats, t_weights
+from evopolicy_results.reading.environments import by_name
 from evopolicy_results.statistics.pairs import Pair
 from evopolicy_results.statistics.samples import Sample, matched
 
@@ -62,15 +63,16 @@ def standings(
     scores: Mapping[str, float | None],
     environments: Sequence[str],
     *,
-    found: Sequence[Pair] = (),
+    compared: Sequence[Pair] = (),
     resamples: int = RESAMPLES,
 ) -> Standings:
     """Rank estimates of the entries of `scores` (entry to its observed rank score), best first. All have a sample on
     each environment.
 
-    On a single environment two entries are distinguished only if `found` tells them apart as well.
+    On a single environment two entries are distinguished only if `compared` tells them apart as well.
     """
-    entries = sorted(scores, key=lambda entry: (-_or_least(scores[entry]), entry.casefold(), entry))
+    known = {entry: -math.inf if score is None else score for entry, score in scores.items()}
+    entries = sorted(scores, key=lambda entry: (-known[entry], by_name(entry)))
     n_pairs = len(entries) * (len(entries) - 1) // 2
     resamples = max(resamples, math.ceil(4 * n_pairs / ALPHA))
     if len(entries) < 2:
@@ -81,8 +83,10 @@ def standings(
         return Standings(rows=(), gap=None, over="")
     apart = _distinguished(drawn, sure)
     if len(environments) == 1:
-        told = {frozenset((pair.first, pair.second)) for pair in found if pair.verdict in ("first", "second")}
-        failed = {entry for entry in entries if _known_failure(samples[entry, environments[0]])}
+        told = {
+            frozenset((pair.first, pair.second)) for pair in compared if pair.verdict in ("first", "second")
+        }
+        failed = {entry for entry in entries if samples[entry, environments[0]].scores is None}
         apart = {
             (a, b)
             for a, b in apart
@@ -103,7 +107,8 @@ def standings(
                 ties=letters[i],
             )
         )
-    agents = [i for i in sure if not _is_fixed(samples, entries[i])]
+    fixed = {sample.entry for sample in samples.values() if sample.is_fixed}
+    agents = [i for i in sure if entries[i] not in fixed]
     halves = [
         float(np.diff(np.quantile(drawn[i] - drawn[j], [ALPHA / 2.0, 1.0 - ALPHA / 2.0]))[0]) / 2.0
         for i, j in itertools.combinations(agents, 2)
@@ -111,14 +116,6 @@ def standings(
     kinds = {len(sample.runs) > 1 for sample in samples.values() if not sample.is_fixed}
     over = " or ".join(text for many, text in ((False, "cases"), (True, "runs and cases")) if many in kinds)
     return Standings(rows=tuple(rows), gap=float(np.median(halves)) if halves else None, over=over)
-
-
-def _or_least(score: float | None) -> float:
-    return -math.inf if score is None else score
-
-
-def _is_fixed(samples: Mapping[tuple[str, str], Sample], entry: str) -> bool:
-    return any(sample.is_fixed for (name, _), sample in samples.items() if name == entry)
 
 
 def _drawn_scores(
@@ -131,34 +128,22 @@ def _drawn_scores(
     total = np.zeros((len(entries), resamples))
     spread = set(entries)
     for number, env in enumerate(environments):
-        here = [samples[entry, env] for entry in entries]
-        drawn = [_drawn_mean(sample, i, number, resamples) for i, sample in enumerate(here)]
-        spread -= {
-            sample.entry
-            for sample, found in zip(here, drawn, strict=True)
-            if found is None and not _known_failure(sample)
-        }
-        means = np.stack(
-            [
-                _fixed_mean(sample, resamples) if found is None else found
-                for sample, found in zip(here, drawn, strict=True)
-            ]
-        )
+        means = np.empty_like(total)
+        for i, entry in enumerate(entries):
+            sample = samples[entry, env]
+            drawn = _drawn_mean(sample, i, number, resamples)
+            if sample.scores is None:  # a run without an ok submit has the worst rank in every resample
+                means[i] = -math.inf
+            elif drawn is None:
+                spread.discard(entry)
+                means[i] = np.mean(sample.scores)
+            else:
+                means[i] = drawn
         above = np.zeros_like(means)
         for row in means:
             above += row > means
-        total += 1.0 - above / (len(here) - 1)
+        total += 1.0 - above / (len(entries) - 1)
     return total / len(environments), spread
-
-
-def _known_failure(sample: Sample) -> bool:
-    """Whether the sample has a run without an ok submit: it has the worst rank in every resample."""
-    return sample.scores is None
-
-
-def _fixed_mean(sample: Sample, resamples: int) -> Floats:
-    value = -math.inf if sample.scores is None else float(np.mean(sample.scores))
-    return np.full(resamples, value)
 
 
 def _drawn_mean(sample: Sample, entry: int, env: int, resamples: int) -> Floats | None:
@@ -188,11 +173,12 @@ def _distinguished(drawn: Floats, sure: Sequence[int]) -> set[tuple[int, int]]:
         gap = drawn[sure[a]] - drawn[sure[b]]
         n_below, n_above = int((gap <= 1e-12).sum()), int((gap >= -1e-12).sum())
         tails.append((min(1.0, 2.0 * (min(n_below, n_above) + 1) / (len(gap) + 1)), n_below <= n_above))
-    found: set[tuple[int, int]] = set()
-    for (a, b), (_, a_better), p in zip(places, tails, holm([p for p, _ in tails]), strict=True):
-        if p is not None and p <= ALPHA:
-            found.add((a, b) if a_better else (b, a))
-    return found
+    corrected = holm([p for p, _ in tails])
+    return {
+        (a, b) if a_better else (b, a)
+        for (a, b), (_, a_better), p in zip(places, tails, corrected, strict=True)
+        if p is not None and p <= ALPHA
+    }
 
 
 def _letters(n: int, apart: set[tuple[int, int]]) -> list[str]:
@@ -207,10 +193,5 @@ def _letters(n: int, apart: set[tuple[int, int]]) -> list[str]:
         if len(groups) > MAX_GROUPS:
             return ["…"] * n
     groups.sort(key=sorted)
-    names = [_letter(i) for i in range(len(groups))]
-    return ["".join(name for name, group in zip(names, groups, strict=True) if i in group) for i in range(n)]
-
-
-def _letter(i: int) -> str:
-    more, last = divmod(i, 26)
-    return string.ascii_lowercase[last] + (str(more) if more else "")
+    letters = [string.ascii_lowercase[i % 26] + (str(i // 26) if i >= 26 else "") for i in range(len(groups))]
+    return ["".join(one for one, group in zip(letters, groups, strict=True) if i in group) for i in range(n)]

@@ -55,7 +55,7 @@ def suite_statistics(
     return SuiteStatistics(
         means=means,
         pairs=tuple(compared),
-        standings=standings(samples, scores, environments, found=compared, resamples=resamples),
+        standings=standings(samples, scores, environments, compared=compared, resamples=resamples),
         resolutions=tuple(resolved),
         overall=overall(resolved),
         aggregates=tuple(shares),

@@ -8,11 +8,17 @@ from pathlib import Path
 import msgspec
 
 from evopolicy_common.statistics.resampling import RESAMPLES
-from evopolicy_results.behaviour.audit import AuditSignals, TokenUse, audit_signals, token_use
-from evopolicy_results.behaviour.edits import EditRates, Transition, classify, edit_rates
+from evopolicy_results.behaviour.audit import AuditSignals, TokenUse, audit_signals, mean_phases, token_use
+from evopolicy_results.behaviour.edits import EditRates, edit_rates
 from evopolicy_results.behaviour.structure import EditSizeBin, StructureMean, edit_size_bins, structure_means
 from evopolicy_results.reading.comparability import UNKNOWN_ISOLATION, MixedRunsError, Mixture, mixtures
-from evopolicy_results.reading.environments import learn_names, ordered_environments, suite_title, suites_of
+from evopolicy_results.reading.environments import (
+    by_name,
+    learn_names,
+    ordered_environments,
+    suite_title,
+    suites_of,
+)
 from evopolicy_results.reading.parallel import Processes
 from evopolicy_results.reading.reader import load_runs
 from evopolicy_results.reading.records import LeftOut, Run
@@ -46,17 +52,6 @@ class Suite(msgspec.Struct, frozen=True, kw_only=True):
         return len(self.table.environments) > 1
 
 
-class Timeline(msgspec.Struct, frozen=True, kw_only=True):
-    """One run's score-bearing submits with their edit types, for its code-phase timeline."""
-
-    run: str
-    entry: str
-    env: str
-    repeat: int
-    budget: int
-    transitions: tuple[Transition, ...]
-
-
 class Study(msgspec.Struct, frozen=True, kw_only=True):
     """All metrics of a set of runs. `records.rows` turns each list of records into rows for a data frame."""
 
@@ -67,11 +62,12 @@ class Study(msgspec.Struct, frozen=True, kw_only=True):
     suites: tuple[Suite, ...]
     evolutions: tuple[Evolution, ...]
     edit_rates: tuple[EditRates, ...]
-    timelines: tuple[Timeline, ...]
     structure: tuple[StructureMean, ...]
     edit_sizes: tuple[EditSizeBin, ...]
     tokens: tuple[TokenUse, ...]
     audit: tuple[AuditSignals, ...]
+    phases: dict[str, dict[str, float]]
+    """By entry, the mean wall time of a run in each phase, in seconds."""
     starts: tuple[StartGroup, ...] = ()
     """Runs that start from a submit of an earlier run: all other metrics but `audit` leave them out."""
     worlds: Worlds | None = None
@@ -80,18 +76,17 @@ class Study(msgspec.Struct, frozen=True, kw_only=True):
     @property
     def entries(self) -> list[str]:
         """All agents by name, without the random reference."""
-        found = {entry for suite in self.suites for entry in suite.table.agents}
-        return sorted(found, key=lambda entry: (entry.casefold(), entry))
+        return sorted({entry for suite in self.suites for entry in suite.table.agents}, key=by_name)
 
     @property
     def post_hoc(self) -> str:
         """The name of the re-score that the held-out scores come from; empty for the runs' own scores."""
-        found = next((run.rescore for run in self.runs if run.rescore is not None), None)
-        if found is None:
+        rescore = next((run.rescore for run in self.runs if run.rescore is not None), None)
+        if rescore is None:
             return ""
         return (
-            f"Held-out scores are those of the re-score {found.name}: {found.n_cases} further hidden cases, played post"
-            " hoc, after the runs had ended. The selected checkpoints are those of the runs."
+            f"Held-out scores are those of the re-score {rescore.name}: {rescore.n_cases} further hidden cases, played"
+            " post hoc, after the runs had ended. The selected checkpoints are those of the runs."
         )
 
     @property
@@ -132,7 +127,12 @@ def study_of(
     if refused:
         raise MixedRunsError(refused)
     every, ordered = _in_order(runs), _in_order(whole)
-    found = tuple(evolutions(ordered, _reference_of(table)))
+    references = {
+        env: cell.mean
+        for (entry, env), cell in table.cells.items()
+        if entry == table.reference and cell.mean is not None
+    }
+    curves = tuple(evolutions(ordered, references))
     return Study(
         runs=tuple(every),
         left_out=tuple(left_out),
@@ -141,25 +141,15 @@ def study_of(
             _suite(name, table.restricted(envs), ordered, resamples)
             for name, envs in suites_of(table.environments).items()
         ),
-        evolutions=found,
+        evolutions=curves,
         edit_rates=tuple(edit_rates(ordered)),
-        timelines=tuple(
-            Timeline(
-                run=run.name,
-                entry=run.entry,
-                env=run.env,
-                repeat=run.record.repeat,
-                budget=run.budget,
-                transitions=tuple(classify(run.submits)),
-            )
-            for run in ordered
-        ),
         structure=tuple(structure_means(ordered)),
         edit_sizes=tuple(edit_size_bins(ordered)),
         tokens=tuple(token_use(ordered)),
-        audit=tuple(audit_signals(every)),
+        audit=tuple(map(audit_signals, every)),
+        phases=mean_phases(every),
         starts=tuple(start_groups(every, resamples=resamples)),
-        worlds=worlds_of(ordered, table, found),
+        worlds=worlds_of(ordered, table, curves),
     )
 
 
@@ -195,14 +185,6 @@ def _in_order(runs: Sequence[Run]) -> list[Run]:
     return sorted(runs, key=lambda run: (place[run.env], run.entry.casefold(), run.record.repeat, run.name))
 
 
-def _reference_of(table: ScoreTable) -> dict[str, float]:
-    return {
-        env: cell.mean
-        for (entry, env), cell in table.cells.items()
-        if entry == table.reference and cell.mean is not None
-    }
-
-
 def _merged(table: ScoreTable, scores: ScoreTable) -> tuple[ScoreTable, list[Mixture]]:
     """Merges both tables, and returns the mixtures of environments on which both have scores."""
     twice = set(table.agents) & set(scores.agents)
@@ -218,8 +200,8 @@ def _merged(table: ScoreTable, scores: ScoreTable) -> tuple[ScoreTable, list[Mix
         del harness[scores.reference]
     reference = table.reference or scores.reference
     shared = set(table.environments) & set(scores.environments)
-    found = [
+    mixed = [
         Mixture(what="scores from runs and from a CSV", where=env, values={"runs": 1, "CSV": 1})
         for env in ordered_environments(shared)
     ]
-    return ScoreTable(cells=cells, harness=harness, reference=reference), found
+    return ScoreTable(cells=cells, harness=harness, reference=reference), mixed

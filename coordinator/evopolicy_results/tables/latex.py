@@ -10,8 +10,10 @@ from __future__ import annotations
 import re
 import unicodedata
 from collections.abc import Sequence
+from textwrap import wrap
 
 import msgspec
+from msgspec.structs import replace
 
 from evopolicy_results.tables.table import DASH, Column, Table, shown
 
@@ -79,21 +81,15 @@ def _character(character: str) -> str:
     return "".join(_CHARACTERS.get(one, one) for one in plain if one.isprintable()) or "?"
 
 
-class _Type(msgspec.Struct, frozen=True):
-    """A size of type: average width of a character and extra width of a column, both in points."""
-
-    character: float
-    gap: float
-
-
-_NORMAL = _Type(5.0, 12.0)
-_SMALL = _Type(3.8, 6.0)
+_NORMAL, _SMALL = (5.0, 12.0), (3.8, 6.0)
+"""By size of type: average width of a character and extra width of a column, both in points."""
 
 
 class _Fit(msgspec.Struct, frozen=True):
-    """The width of one column, in characters."""
+    """One column with its texts by row; widths in characters."""
 
     column: Column
+    texts: list[str]
     least: int
     natural: int
     """Width with its heading broken between words and its text unbroken."""
@@ -103,45 +99,57 @@ class _Fit(msgspec.Struct, frozen=True):
 
 def to_latex(table: Table) -> str:
     """The table as `table`, or as `longtable` if it is longer than a page."""
-    cells = [[shown(row.get(column.key), column) for column in table.columns] for row in table.rows]
+    fits = [
+        _fit(column, [shown(row.get(column.key), column) for row in table.rows]) for column in table.columns
+    ]
+    full = [max(len(fit.column.title), fit.natural) for fit in fits]
+    if _room(full, _NORMAL) <= _WIDTH and len(table.rows) <= _LINES // 2:
+        small = []
+        panels = [[replace(fit, natural=n, width=n) for fit, n in zip(fits, full, strict=True)]]
+    else:
+        small = ["\\scriptsize", "\\setlength{\\tabcolsep}{3pt}"]
+        panels = _panels(fits)
     caption = f"\\caption{{{latex_text(table.caption or table.title)}}}"
     label = f"\\label{{tab:{table.name}}}"
-    full = [max([len(column.title), *map(len, texts)]) for column, texts in _columns(table, cells)]
-    if _room(full, _NORMAL) <= _WIDTH and len(cells) <= _LINES // 2:
-        fits = [[_Fit(column, n, n, n) for column, n in zip(table.columns, full, strict=True)]]
-        small = []
-    else:
-        fits = _panels([_fit(column, texts) for column, texts in _columns(table, cells)])
-        small = ["\\scriptsize", "\\setlength{\\tabcolsep}{3pt}"]
-    lines = sum(_height(table, panel, cells) for panel in fits)
-    if lines > _LINES:
+    is_long = sum(map(_height, panels)) > _LINES
+    if is_long:
         out = ["% needs \\usepackage{array,booktabs,longtable}", "\\begingroup", *small]
-        for number, panel in enumerate(fits):
-            above = [] if number else [f"{caption}{label}\\\\"]
-            out += _longtable(table, panel, cells, above)
-        return "\n".join([*out, "\\endgroup", ""])
-    out = ["% needs \\usepackage{array,booktabs}", "\\begin{table}", "\\centering", caption, label, *small]
-    out.append("\\par\\vspace{0.5em}")
-    for number, panel in enumerate(fits):
-        out += ["\\par\\vspace{0.75em}"] * bool(number) + _tabular(table, panel, cells)
-    return "\n".join([*out, "\\end{table}", ""])
+    else:
+        out = [
+            "% needs \\usepackage{array,booktabs}",
+            "\\begin{table}",
+            "\\centering",
+            caption,
+            label,
+            *small,
+        ]
+        out.append("\\par\\vspace{0.5em}")
+    for number, panel in enumerate(panels):
+        spec = "".join(map(_spec, panel))
+        heading = ["\\toprule", " & ".join(map(_heading, panel)) + " \\\\", "\\midrule"]
+        rows = _rows(table, panel)
+        if is_long:
+            out += [f"\\begin{{longtable}}{{{spec}}}", *([] if number else [f"{caption}{label}\\\\"])]
+            out += [*heading, "\\endfirsthead", *heading, "\\endhead", "\\bottomrule", "\\endfoot"]
+            out += [*rows, "\\end{longtable}"]
+        else:
+            out += ["\\par\\vspace{0.75em}"] * bool(number)
+            out += [f"\\begin{{tabular}}{{{spec}}}", *heading, *rows, "\\bottomrule", "\\end{tabular}"]
+    return "\n".join([*out, "\\endgroup" if is_long else "\\end{table}", ""])
 
 
-def _columns(table: Table, cells: list[list[str]]) -> list[tuple[Column, list[str]]]:
-    return [(column, [row[i] for row in cells]) for i, column in enumerate(table.columns)]
-
-
-def _room(widths: Sequence[int], type_: _Type) -> float:
-    return sum(type_.character * width + type_.gap for width in widths)
+def _room(widths: Sequence[int], size: tuple[float, float]) -> float:
+    character, gap = size
+    return sum(character * width + gap for width in widths)
 
 
 def _fit(column: Column, texts: list[str]) -> _Fit:
     natural = max(map(len, [*column.title.split(), *texts]), default=1)
     if column.kind != "text":
-        return _Fit(column, natural, natural, natural)
+        return _Fit(column, texts, natural, natural)
     pieces = max((len(piece) for text in [column.title, *texts] for piece in _pieces(text)), default=1)
     fewest = _FEWEST_OF_PROSE if natural >= _PROSE else _FEWEST
-    return _Fit(column, min(natural, max(fewest, pieces)), natural, natural)
+    return _Fit(column, texts, min(natural, max(fewest, pieces)), natural)
 
 
 def _pieces(text: str) -> list[str]:
@@ -158,12 +166,13 @@ def _panels(fits: list[_Fit]) -> list[list[_Fit]]:
     names, rest = fits[:head], fits[head:]
     if _least(fits) <= _WIDTH or not rest:
         return [_set(fits)]
+    panels: list[list[_Fit]] = []
     for n in range(2, len(rest) + 1):
         size = -(-len(rest) // n)
         panels = [[*names, *rest[i : i + size]] for i in range(0, len(rest), size)]
-        if all(_least(panel) <= _WIDTH for panel in panels) or n == len(rest):
-            return [_set(panel) for panel in panels]
-    return [_set(fits)]
+        if all(_least(panel) <= _WIDTH for panel in panels):
+            break
+    return [_set(panel) for panel in panels or [fits]]
 
 
 def _least(fits: Sequence[_Fit]) -> float:
@@ -172,81 +181,48 @@ def _least(fits: Sequence[_Fit]) -> float:
 
 def _set(panel: list[_Fit]) -> list[_Fit]:
     """Sets the columns' widths to the available room, breaking the longest texts first."""
-    cap = min(max(fit.natural for fit in panel), int(_WIDTH / _SMALL.character))
+    cap = min(max(fit.natural for fit in panel), int(_WIDTH / _SMALL[0]))
     while cap > 0 and _room([_capped(fit, cap) for fit in panel], _SMALL) > _WIDTH:
         cap -= 1
-    return [msgspec.structs.replace(fit, width=_capped(fit, cap)) for fit in panel]
+    return [replace(fit, width=_capped(fit, cap)) for fit in panel]
 
 
 def _capped(fit: _Fit, cap: int) -> int:
     return min(fit.natural, max(fit.least, cap))
 
 
-def _height(table: Table, panel: list[_Fit], cells: list[list[str]]) -> int:
+def _height(panel: list[_Fit]) -> int:
     """Number of lines of a panel, including its heading and rules."""
-    places = [(table.columns.index(fit.column), fit.width) for fit in panel]
-    return 4 + sum(max(-(-len(row[i]) // max(1, width)) for i, width in places) for row in cells)
+    lines = ([-(-len(text) // max(1, fit.width)) for text in fit.texts] for fit in panel)
+    return 4 + sum(map(max, zip(*lines, strict=True)))
 
 
-def _tabular(table: Table, panel: list[_Fit], cells: list[list[str]]) -> list[str]:
-    begin = f"\\begin{{tabular}}{{{_spec(panel)}}}"
-    rows = _rows(table, panel, cells)
-    return [begin, "\\toprule", _heading(panel), "\\midrule", *rows, "\\bottomrule", "\\end{tabular}"]
+def _spec(fit: _Fit) -> str:
+    if fit.width < fit.natural:
+        return f">{{\\raggedright\\arraybackslash}}p{{{_SMALL[0] * fit.width:.0f}pt}}"
+    return "l" if fit.column.kind == "text" else "r"
 
 
-def _longtable(table: Table, panel: list[_Fit], cells: list[list[str]], above: list[str]) -> list[str]:
-    heading = ["\\toprule", _heading(panel), "\\midrule"]
-    return [
-        f"\\begin{{longtable}}{{{_spec(panel)}}}",
-        *above,
-        *heading,
-        "\\endfirsthead",
-        *heading,
-        "\\endhead",
-        "\\bottomrule",
-        "\\endfoot",
-        *_rows(table, panel, cells),
-        "\\end{longtable}",
-    ]
-
-
-def _spec(panel: list[_Fit]) -> str:
-    def one(fit: _Fit) -> str:
-        if fit.width < fit.natural:
-            return f">{{\\raggedright\\arraybackslash}}p{{{_SMALL.character * fit.width:.0f}pt}}"
-        return "l" if fit.column.kind == "text" else "r"
-
-    return "".join(map(one, panel))
-
-
-def _heading(panel: list[_Fit]) -> str:
-    def one(fit: _Fit) -> str:
-        lines: list[str] = []
-        for word in fit.column.title.split():
-            if lines and len(lines[-1]) + 1 + len(word) <= fit.width:
-                lines[-1] += f" {word}"
-            else:
-                lines.append(word)
-        side = "l" if fit.column.kind == "text" else "r"
-        words = "\\\\".join(map(latex_text, lines))
-        return f"\\shortstack[{side}]{{{words}}}" if len(lines) > 1 else words
-
-    return " & ".join(map(one, panel)) + " \\\\"
+def _heading(fit: _Fit) -> str:
+    title = " ".join(fit.column.title.split())
+    lines = wrap(title, max(1, fit.width), break_long_words=False, break_on_hyphens=False)
+    side = "l" if fit.column.kind == "text" else "r"
+    words = "\\\\".join(map(latex_text, lines))
+    return f"\\shortstack[{side}]{{{words}}}" if len(lines) > 1 else words
 
 
 _MARKED = {0: "{}", 1: "\\textbf{{{}}}", 2: "\\underline{{{}}}"}
 
 
-def _rows(table: Table, panel: list[_Fit], cells: list[list[str]]) -> list[str]:
-    places = [(table.columns.index(fit.column), fit) for fit in panel]
-    return [
-        " & ".join(
-            _MARKED[table.marks.get((number, fit.column.key), 0)].format(_cell(row[i], fit))
-            for i, fit in places
-        )
-        + " \\\\"
-        for number, row in enumerate(cells)
+def _rows(table: Table, panel: list[_Fit]) -> list[str]:
+    columns = [
+        [
+            _MARKED[table.marks.get((number, fit.column.key), 0)].format(_cell(text, fit))
+            for number, text in enumerate(fit.texts)
+        ]
+        for fit in panel
     ]
+    return [" & ".join(cells) + " \\\\" for cells in zip(*columns, strict=True)]
 
 
 def _cell(text: str, fit: _Fit) -> str:

@@ -6,10 +6,9 @@ from collections.abc import Callable
 from statistics import fmean
 from typing import Any
 
-import msgspec
+from msgspec.structs import replace
 
 from evopolicy_common import catalogue
-from evopolicy_common.statistics.intervals import Estimate
 from evopolicy_results.behaviour import structure
 from evopolicy_results.behaviour.audit import TokenUse
 from evopolicy_results.behaviour.edits import demand_of
@@ -24,22 +23,20 @@ from evopolicy_results.tables.run_tables import (
     HARNESS,
     RUN,
     RUNS,
-    LinkOf,
-    no_link,
     one_or_all,
     tables_of_runs,
 )
 from evopolicy_results.tables.statistics_tables import (
-    CHECKPOINTS,
-    has_single_runs,
-    interval_text,
-    span,
+    INTERVAL,
+    OVER,
+    checkpoints,
     starts_table,
     statistics_tables,
 )
-from evopolicy_results.tables.table import Column, Table, best_marks, tabulated
+from evopolicy_results.tables.table import Column, Table, best_marks, interval_text, span, tabulated
 
 _DEMAND = Column("demand", "Demand")
+_BUDGET = Column("budget", "Budget", "integer", note="Train episodes of a run.")
 _KNOWN = Column(
     "known",
     "Normalised",
@@ -49,45 +46,50 @@ _KNOWN = Column(
 )
 
 
-def tables_of(study: Study, link_of: LinkOf = no_link) -> list[Table]:
+def tables_of(study: Study) -> list[Table]:
     """Every table of the report in order. Tables without rows are omitted, except for `left_out`."""
-    found: list[Table] = []
+    tables: list[Table] = []
     for suite in study.suites:
-        scored = [_aggregate(suite, study), _incomplete(suite), _heldout(suite), _cells(suite)]
-        scored += [*statistics_tables(suite), _normalised(suite)]
-        found += [_labelled(table, study.post_hoc) for table in scored]
-    found += [
+        tables += [_aggregate(suite, study), _incomplete(suite), _heldout(suite), _cells(suite)]
+        tables += [*statistics_tables(suite), _normalised(suite)]
+    scored = [*tables, _worlds(study)]
+    if study.post_hoc:
+        scored = [replace(table, caption=f"{table.caption} {study.post_hoc}") for table in scored]
+    tables = [
+        *scored[:-1],
         starts_table(study.starts),
-        _labelled(_worlds(study), study.post_hoc),
-        _evolution(study, link_of),
+        scored[-1],
+        _evolution(study),
         _edit_types(study),
         _structure(study),
         _edit_sizes(study),
         _tokens(study),
-        *tables_of_runs(study, link_of),
+        *tables_of_runs(study),
     ]
-    return [table for table in found if table.rows or table.name == "left_out"]
-
-
-def _labelled(table: Table, post_hoc: str) -> Table:
-    return msgspec.structs.replace(table, caption=f"{table.caption} {post_hoc}") if post_hoc else table
+    return [table for table in tables if table.rows or table.name == "left_out"]
 
 
 def _aggregate(suite: Suite, study: Study) -> Table:
     families = list(dict.fromkeys(family_of(env) for env in suite.board.environments))
-    families = families if len(families) > 1 else []
-    budgets = _budgets(suite, study)
+    # Families that do not ship could have the name of another column.
+    keys = {each: each if each in catalogue.families() else f"family_{each}" for each in families}
+    keys = keys if len(keys) > 1 else {}
+    budgets: dict[str, list[int]] = {}
+    for run in study.runs:
+        if run.env in suite.board.environments:
+            budgets.setdefault(run.entry, []).append(run.budget)
     whole = suite_size(suite.name) or len(suite.board.environments)
+    standings = suite.statistics.standings
     rows: list[dict[str, Any]] = [
         {
             "entry": row.entry,
             "harness": row.harness,
-            **{_key(family): row.families.get(family) for family in families},
+            **{key: row.families.get(family) for family, key in keys.items()},
             "score": row.score,
-            **_sure(suite.statistics.standings.of(row.entry)),
+            **_uncertainty(standings.of(row.entry)),
             "known": _known_mean(suite, row.entry),
             "rank": row.rank,
-            "budget": None if row.is_reference else budgets.get(row.entry),
+            "budget": None if row.is_reference else one_or_all(sorted(budgets.get(row.entry, []))),
             "wins": row.wins,
             "top2": row.top2,
             "environments": f"{row.n_environments} of {whole}",
@@ -95,47 +97,55 @@ def _aggregate(suite: Suite, study: Study) -> Table:
         }
         for row in suite.board.standings
     ]
-    columns = [ENTRY, HARNESS]
-    columns += [Column(_key(family), family_title(family), "number") for family in families]
-    columns.append(Column("score", suite.title, "number"))
-    standings = suite.statistics.standings
-    if standings.rows:
-        columns.append(Column("score_interval", "95 % interval"))
-        columns.append(Column("rank_interval", "Rank interval"))
-        columns.append(
-            Column("ties", "Tie group", note="Entries that share a letter do not differ significantly.")
-        )
-    if any(row["known"] is not None for row in rows):
-        columns.append(_KNOWN)
-    if budgets:
-        columns.append(Column("budget", "Budget", "integer", note="Train episodes of a run."))
-    columns += [
+    note = "Entries that share a letter do not differ significantly."
+    columns = (
+        ENTRY,
+        HARNESS,
+        *(Column(key, family_title(family), "number") for family, key in keys.items()),
+        Column("score", suite.title, "number"),
+        *(
+            (Column("score_interval", INTERVAL), Column("rank_interval", "Rank interval"))
+            if standings.rows
+            else ()
+        ),
+        *((Column("ties", "Tie group", note=note),) if standings.rows else ()),
+        *((_KNOWN,) if any(row["known"] is not None for row in rows) else ()),
+        *((_BUDGET,) if budgets else ()),
         Column("wins", "Wins", "integer", note="Environments on which it ranks first."),
         Column("top2", "Top-2", "integer", note="Environments on which it ranks first or second."),
         Column("environments", "Environments"),
-        Column("runs", "Runs", "integer"),
-    ]
-    budget = " Budget: train episodes of a run." if budgets else ""
+        RUNS,
+    )
     caption = (
         "Rank scores: within each environment entries are ranked by held-out mean return, ties sharing the better rank,"
-        " and s = 1 − (rank − 1)/(N − 1); families and the suite are means over their environments." + budget
+        " and s = 1 − (rank − 1)/(N − 1); families and the suite are means over their environments."
     )
+    caption += " Budget: train episodes of a run." if budgets else ""
     if standings.rows:
         caption += (
             f" 95 % interval: of the rank score that a repetition with new {standings.over} would give on average. Tie"
             " group: entries that share a letter do not differ significantly (all pairs together at 5 %, Holm); the"
-            " rank interval is what these comparisons leave."
+            f" rank interval is what these comparisons leave.{checkpoints(suite)}"
         )
-        if has_single_runs(suite):
-            caption += f" {CHECKPOINTS}"
     return Table(
         name=f"leaderboard_{suite.name}",
         title=f"{suite.title} leaderboard",
         caption=caption,
-        columns=tuple(columns),
+        columns=columns,
         rows=tuple(rows),
-        marks=best_marks(rows, [*map(_key, families), "score"]),
+        marks=best_marks(rows, [*keys.values(), "score"]),
     )
+
+
+def _uncertainty(row: RankEstimate | None) -> dict[str, Any]:
+    if row is None:
+        return {}
+    interval = span(row.score_low, row.score_high, 3) if row.score_low < row.score_high else None
+    return {
+        "score_interval": interval or "no spread: the same in each draw",
+        "rank_interval": f"{row.rank_low} to {row.rank_high}",
+        "ties": row.ties,
+    }
 
 
 def _incomplete(suite: Suite) -> Table:
@@ -147,7 +157,7 @@ def _incomplete(suite: Suite) -> Table:
             HARNESS,
             Column("environments", "Environments", of=lambda one: f"{one.n_environments} of {n}"),
             Column("missing", "Not played", of=lambda one: ", ".join(map(title_of, one.missing))),
-            Column("runs", "Runs", "integer", of=lambda one: None if one.is_reference else one.n_runs),
+            replace(RUNS, of=lambda one: None if one.is_reference else one.n_runs),
         ),
         name=f"incomplete_{suite.name}",
         title=f"{suite.title} incomplete entries",
@@ -159,43 +169,13 @@ def _incomplete(suite: Suite) -> Table:
     )
 
 
-def _key(family: str) -> str:
-    """A column's key. Families that do not ship could have the name of another column."""
-    return family if family in catalogue.families() else f"family_{family}"
-
-
-def _sure(row: RankEstimate | None) -> dict[str, Any]:
-    if row is None:
-        return {}
-    return {
-        "score_interval": (
-            span(row.score_low, row.score_high, 3)
-            if row.score_low < row.score_high
-            else "no spread: the same in each draw"
-        ),
-        "rank_interval": f"{row.rank_low} to {row.rank_high}",
-        "ties": row.ties,
-    }
-
-
-def _budgets(suite: Suite, study: Study) -> dict[str, Any]:
-    """By entry, the train episode budget of its runs."""
-    found: dict[str, set[int]] = {}
-    for run in study.runs:
-        if run.env in suite.board.environments:
-            found.setdefault(run.entry, set()).add(run.budget)
-    return {entry: one_or_all(sorted(budgets)) for entry, budgets in found.items()}
-
-
 def _heldout(suite: Suite) -> Table:
     rows: list[dict[str, Any]] = []
     marks: dict[tuple[int, str], int] = {}
-    entries = [row.entry for row in suite.board.standings] + [row.entry for row in suite.board.incomplete]
-    for i, entry in enumerate(entries):
-        row: dict[str, Any] = {"entry": entry, "harness": suite.table.harness[entry]}
+    for i, standing in enumerate([*suite.board.standings, *suite.board.incomplete]):
+        row: dict[str, Any] = {"entry": standing.entry, "harness": standing.harness}
         for env in suite.board.environments:
-            cell = suite.board.cells.get((entry, env))
-            if cell is not None:
+            if (cell := suite.board.cells.get((standing.entry, env))) is not None:
                 row[env] = cell.mean
                 if cell.mean is not None and cell.rank in (1, 2) and len(suite.board.standings) > 1:
                     marks[i, env] = cell.rank
@@ -217,12 +197,11 @@ def _heldout(suite: Suite) -> Table:
 
 
 def _cells(suite: Suite) -> Table:
-    def mean(cell: CellResult) -> Estimate | None:
-        return suite.statistics.means.get((cell.entry, cell.env))
+    means = suite.statistics.means
 
     def over(cell: CellResult) -> str | None:
-        average = mean(cell)
-        return None if average is None or average.low is None else average.over
+        mean = means.get((cell.entry, cell.env))
+        return None if mean is None or mean.low is None else mean.over
 
     place = {env: i for i, env in enumerate(suite.board.environments)}
     table = tabulated(
@@ -235,15 +214,10 @@ def _cells(suite: Suite) -> Table:
             Column("family", "Family", of=lambda cell: family_title(family_of(cell.env))),
             ENTRY,
             Column("mean", "Held-out mean", "number"),
-            Column("interval", "95 % interval", of=lambda cell: interval_text(mean(cell))),
-            Column(
-                "over",
-                "Over",
-                note="What a repetition would draw anew: cases, runs, or runs and cases.",
-                of=over,
-            ),
+            Column("interval", INTERVAL, of=lambda cell: interval_text(means.get((cell.entry, cell.env)))),
+            replace(OVER, of=over),
             RUNS,
-            msgspec.structs.replace(_KNOWN, of=lambda cell: on_known_scale(cell.mean, cell.env)),
+            replace(_KNOWN, of=lambda cell: on_known_scale(cell.mean, cell.env)),
             Column("rank", "Rank", "integer"),
             Column("score", "Rank score", "number"),
         ),
@@ -255,10 +229,8 @@ def _cells(suite: Suite) -> Table:
             " of these intervals may overlap where the difference is sure: compare by the table of differences."
         ),
     )
-    left_out: tuple[str, ...] = () if suite.is_ranked else ("score",)
-    left_out += () if any(row["known"] is not None for row in table.rows) else ("known",)
-    columns = tuple(column for column in table.columns if column.key not in left_out)
-    return msgspec.structs.replace(table, columns=columns)
+    has = {"score": suite.is_ranked, "known": any(row["known"] is not None for row in table.rows)}
+    return replace(table, columns=tuple(c for c in table.columns if has.get(c.key, True)))
 
 
 def _normalised(suite: Suite) -> Table:
@@ -285,11 +257,7 @@ def _normalised(suite: Suite) -> Table:
             " A dash: no agent beats random, no reference, or no score; for a mean, no score on one of the group's"
             " environments."
         ),
-        columns=(
-            ENV,
-            _DEMAND,
-            *(Column(agent, agent, "number", digits=2) for agent in agents),
-        ),
+        columns=(ENV, _DEMAND, *(Column(agent, agent, "number", digits=2) for agent in agents)),
         rows=tuple(rows),
         marks=bold,
     )
@@ -310,9 +278,7 @@ def _worlds(study: Study) -> Table:
     def estimates(key: str, title: str) -> tuple[Column, Column]:
         return (
             Column(key, title, "number", digits=2, of=lambda row: getattr(row, key).value),
-            Column(
-                f"{key}_interval", "95 % interval", of=lambda row: interval_text(getattr(row, key), digits=2)
-            ),
+            Column(f"{key}_interval", INTERVAL, of=lambda row: interval_text(getattr(row, key), 2)),
         )
 
     return tabulated(
@@ -338,7 +304,7 @@ def _worlds(study: Study) -> Table:
     )
 
 
-def _evolution(study: Study, link_of: LinkOf) -> Table:
+def _evolution(study: Study) -> Table:
     return tabulated(
         study.evolutions,
         (
@@ -363,7 +329,7 @@ def _evolution(study: Study, link_of: LinkOf) -> Table:
             Column("to_50", "To 50 % (episodes)", "integer"),
             Column("to_80", "To 80 % (episodes)", "integer"),
         ),
-        link=lambda one: link_of(one.run),
+        run=lambda one: one.run,
         name="evolution",
         title="Score evolution of each run",
         caption=(

@@ -3,17 +3,23 @@ with the preceding feedback, and the omitted runs."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterable
+from operator import itemgetter
 from typing import Any
 
+from msgspec.structs import replace
+
 from evopolicy_common import catalogue
+from evopolicy_results.behaviour.audit import PHASES, AuditSignals
 from evopolicy_results.behaviour.edits import demand_of
-from evopolicy_results.behaviour.trace import Trace, TraceRow
+from evopolicy_results.behaviour.trace import Trace
+from evopolicy_results.reading.agent_log import Evidence
 from evopolicy_results.reading.environments import family_of, family_title, ordered_environments, title_of
 from evopolicy_results.reading.records import Run, path_text
 from evopolicy_results.scan.signals import TITLES, Signal
 from evopolicy_results.studies.study import Study
-from evopolicy_results.tables.table import Column, Table, tabulated
+from evopolicy_results.tables.table import Column, Table, rows_of, tabulated
 
 ENTRY = Column("entry", "Agent")
 HARNESS = Column("harness", "Harness")
@@ -25,31 +31,32 @@ _COUNTERS = frozenset({"reprompted", "paused_s", "requests_failed", "resumed"})
 """Counters of a run's course that a harness stores among its settings; they are not settings."""
 _MAX_QUOTE = 240
 
-LinkOf = Callable[[str], str]
-"""Returns the page about a run by its name, or the empty string."""
 
-
-def no_link(run: str) -> str:
-    return ""
-
-
-def tables_of_runs(study: Study, link_of: LinkOf) -> list[Table]:
+def tables_of_runs(study: Study) -> list[Table]:
+    signals = [(run, each) for run in study.runs for each in run.signals]
+    simulators = [(run, each) for run in study.runs for each in run.simulator_flags]
     return [
-        _runs(study, link_of),
-        _audit(study, link_of),
-        _signals(study, link_of),
-        _simulators(study, link_of),
+        _runs(study),
+        _audit(study),
+        _evidence(signals, "signals", "What deserves a look", _SIGNALS),
+        _evidence(simulators, "simulator_flags", "Code that looks like a simulator", _SIMULATORS),
         _agents(study),
         _environments(study),
         _missing(study),
-        _left_out(study),
+        tabulated(
+            study.left_out,
+            (Column("path", "Folder", of=lambda item: path_text(item.path)), Column("reason", "Reason")),
+            name="left_out",
+            title="Left out",
+            caption="Folders that are no complete run, and why. They are in no table and no figure.",
+        ),
     ]
 
 
 def one_or_all(values: Iterable[Any]) -> Any:
-    """The common value of all, or `A or B` if different runs were mixed."""
-    found = list(dict.fromkeys(values))
-    return found[0] if len(found) == 1 else " or ".join(str(value) for value in found)
+    """The common value of all, or `A or B` if different runs were mixed; None without any."""
+    distinct = list(dict.fromkeys(values))
+    return distinct[0] if len(distinct) == 1 else " or ".join(map(str, distinct)) or None
 
 
 def _short(run: str) -> str:
@@ -57,58 +64,51 @@ def _short(run: str) -> str:
     return run.rsplit(" / ", 1)[-1]
 
 
-def _runs(study: Study, link_of: LinkOf) -> Table:
+def _runs(study: Study) -> Table:
+    def journal(run: Run) -> str | None:
+        """None for runs from before the journal existed."""
+        place = run.record.committed
+        return None if place is None or place.ended is None else f"{place.ended} {place.ended_head[:16]}"
+
+    note = (
+        "Entry with the run's result, and the journal's head there. A head that you noted earlier shows whether the"
+        " journal was rewritten."
+    )
     return tabulated(
         study.runs,
         (
             ENV,
             ENTRY,
-            Column("run", "Run", of=lambda run: _short(run.name)),
+            replace(RUN, of=lambda run: _short(run.name)),
             Column("submits", "Submits", "integer", of=lambda run: len(run.submits)),
             Column("score", "Held-out mean", "number"),
-            Column(
-                "journal",
-                "Journal",
-                note=(
-                    "Entry with the run's result, and the journal's head there. A head that you noted earlier shows"
-                    " whether the journal was rewritten."
-                ),
-                of=_journal,
-            ),
+            Column("journal", "Journal", note=note, of=journal),
         ),
-        link=lambda run: link_of(run.name),
+        run=lambda run: run.name,
         name="runs",
         title="Runs",
         caption="Open a run for its feedback use, timeline, checkpoints and differences.",
     )
 
 
-def _journal(run: Run) -> str | None:
-    """Position of the run's result in the coordinator's journal; None for runs from before the journal existed."""
-    place = run.record.committed
-    return None if place is None or place.ended is None else f"{place.ended} {place.ended_head[:16]}"
-
-
 def _agents(study: Study) -> Table:
     """One row per setup of an entry: several rows show that its runs differ."""
-    counts: dict[tuple[str, ...], int] = {}
-    for run in study.runs:
-        agent = run.record.agent
-        setup = (
-            run.entry,
-            run.harness,
-            agent.cli_version or "",
-            agent.model_string or "",
-            _settings(run),
-            run.record.jail,
-            run.record.hidden_isolation,
-        )
-        counts[setup] = counts.get(setup, 0) + 1
-    keys = ("entry", "harness", "cli_version", "model", "settings", "jail", "hidden_isolation")
-    rows = [
-        {**{key: value or None for key, value in zip(keys, setup, strict=True)}, "runs": n}
-        for setup, n in sorted(counts.items(), key=lambda item: (item[0][0].casefold(), item[0]))
-    ]
+    note = "exclusive: hidden episodes and agents never shared a kernel."
+    setup = (
+        ENTRY,
+        HARNESS,
+        Column(
+            "cli_version",
+            "Version",
+            note="Of the harness's program.",
+            of=lambda run: run.record.agent.cli_version,
+        ),
+        Column("model", "Model string", of=lambda run: run.record.agent.model_string),
+        Column("settings", "Settings", of=_settings),
+        Column("jail", "Jail", of=lambda run: run.record.jail),
+        Column("hidden_isolation", "Hidden isolation", note=note, of=lambda run: run.record.hidden_isolation),
+    )
+    counts = Counter(tuple(value or "" for value in row.values()) for row in rows_of(study.runs, setup))
     return Table(
         name="agents",
         title="Agents",
@@ -116,21 +116,11 @@ def _agents(study: Study) -> Table:
             "How each agent was set up, as its run directories tell; an agent with several rows was not the same in all"
             " of its runs."
         ),
-        columns=(
-            ENTRY,
-            HARNESS,
-            Column("cli_version", "Version", note="Of the harness's program."),
-            Column("model", "Model string"),
-            Column("settings", "Settings"),
-            Column("jail", "Jail"),
-            Column(
-                "hidden_isolation",
-                "Hidden isolation",
-                note="exclusive: hidden episodes and agents never shared a kernel.",
-            ),
-            Column("runs", "Runs", "integer"),
+        columns=(*setup, RUNS),
+        rows=tuple(
+            {**{c.key: value or None for c, value in zip(setup, values, strict=True)}, "runs": counts[values]}
+            for values in sorted(counts, key=lambda values: (values[0].casefold(), values))
         ),
-        rows=tuple(rows),
     )
 
 
@@ -156,81 +146,76 @@ def _environments(study: Study) -> Table:
     for run in study.runs:
         by_env.setdefault(run.env, []).append(run)
 
-    def common(runs: list[Run], value_of: Callable[[Run], Any]) -> Any:
-        return one_or_all(value_of(run) for run in runs)
+    def common(value_of: Callable[[Run], Any]) -> Callable[[str], Any]:
+        return lambda env: one_or_all(map(value_of, by_env[env]))
 
-    rows: list[dict[str, Any]] = []
-    for env in ordered_environments(by_env):
-        runs, known = by_env[env], catalogue.entries().get(env)
-        rows.append(
-            {
-                "env": title_of(env),
-                "family": family_title(family_of(env)),
-                "id": env,
-                "version": common(runs, lambda run: run.record.versions.env),
-                "spaces": f"{known.observation}/{known.action}" if known is not None else None,
-                "demand": demand_of(env),
-                "steps": known.max_episode_steps if known is not None else None,
-                "budget": common(runs, lambda run: run.budget),
-                "submit": common(runs, lambda run: run.submit_size),
-                "validation": common(runs, lambda run: run.record.experiment_dimensions.n_validation or None),
-                "heldout": common(runs, lambda run: run.record.experiment_dimensions.n_heldout or None),
-                "scope": common(runs, lambda run: run.record.experiment_dimensions.policy_scope),
-            }
-        )
-    return Table(
+    def dimension(name: str) -> Callable[[str], Any]:
+        return common(lambda run: getattr(run.record.experiment_dimensions, name) or None)
+
+    known = catalogue.entries().get
+    version = Column("version", "Version", of=common(lambda run: run.record.versions.env))
+    columns = (
+        replace(ENV, of=title_of),
+        Column("family", "Family", of=lambda env: family_title(family_of(env))),
+        Column("id", "Suite id", of=str),
+        version,
+        Column("spaces", "Obs./action", of=lambda env: (e := known(env)) and f"{e.observation}/{e.action}"),
+        Column("demand", "Demand", of=demand_of),
+        Column(
+            "steps",
+            "Longest episode (steps)",
+            "integer",
+            of=lambda env: (e := known(env)) and e.max_episode_steps,
+        ),
+        Column(
+            "budget", "Budget", "integer", note="Train episodes of a run.", of=common(lambda run: run.budget)
+        ),
+        Column("submit", "Episodes a submit", note="Fewest to most.", of=common(lambda run: run.submit_size)),
+        Column("validation", "Validation cases", "integer", of=dimension("n_validation")),
+        Column("heldout", "Held-out cases", "integer", of=dimension("n_heldout")),
+        Column(
+            "scope", "Policy scope", note="How long one policy object lives.", of=dimension("policy_scope")
+        ),
+    )
+    table = tabulated(
+        ordered_environments(by_env),
+        columns,
         name="environments",
         title="Environments",
         caption="What was played: cases of a run's hidden splits, and the train episodes that it could spend.",
-        columns=(
-            ENV,
-            Column("family", "Family"),
-            Column("id", "Suite id"),
-            Column("spaces", "Obs./action"),
-            Column("demand", "Demand"),
-            Column("steps", "Longest episode (steps)", "integer"),
-            Column("budget", "Budget", "integer", note="Train episodes of a run."),
-            Column("submit", "Episodes a submit", note="Fewest to most."),
-            Column("validation", "Validation cases", "integer"),
-            Column("heldout", "Held-out cases", "integer"),
-            Column("scope", "Policy scope", note="How long one policy object lives."),
-            Column("version", "Version"),
-        ),
-        rows=tuple(rows),
     )
+    return replace(table, columns=(*(column for column in columns if column is not version), version))
+
+
+_FEEDBACK = (
+    Column("env", "Environment", of=lambda one: title_of(one[0].env)),
+    Column("entry", "Agent", of=lambda one: one[0].entry),
+    Column("run", "Run", of=lambda one: _short(one[0].name)),
+    Column("submit", "Submit", of=lambda one: one[1].submit.label),
+    Column("before", "Budget before", "integer", of=lambda one: one[1].submit.consumed_before),
+    Column("after", "Budget after", "integer", of=lambda one: one[1].submit.consumed),
+    Column("read", "Evidence read", of=lambda one: ", ".join(getattr(one[1].evidence, "read", ())) or None),
+    Column("said", "The agent's own words", of=lambda one: _quote(one[1].evidence)),
+    Column("status", "Status", of=lambda one: one[1].submit.status),
+    Column("edit", "Edit", of=lambda one: getattr(one[1].transition, "edit", None)),
+    Column("changed_lines", "Changed lines", "integer", of=lambda one: one[1].submit.changed_lines),
+    Column("visible", "Visible mean", "number", of=lambda one: one[1].submit.mean_return),
+    Column("validation", "Validation mean", "number", of=lambda one: one[1].submit.val_mean),
+    Column(
+        "best", "New validation best", of=lambda one: (t := one[1].transition) and ("yes" if t.hit else "no")
+    ),
+    Column("selected", "Selected", of=lambda one: "yes" if one[1].submit is one[0].selected else None),
+)
 
 
 def submits_of(trace: Trace) -> list[dict[str, Any]]:
     """A run's rows of the table of feedback use."""
-    run = trace.run
-    return [
-        {
-            "env": title_of(run.env),
-            "entry": run.entry,
-            "run": _short(run.name),
-            **_submit(row),
-            "selected": "yes" if row.submit.index == run.record.outcome.best_submit_index else None,
-        }
-        for row in trace.rows
-    ]
+    return rows_of([(trace.run, row) for row in trace.rows], _FEEDBACK)
 
 
-def _submit(row: TraceRow) -> dict[str, Any]:
-    submit, transition, evidence = row.submit, row.transition, row.evidence
+def _quote(evidence: Evidence | None) -> str:
     quote = " ".join(evidence.attribution.split()) if evidence is not None else ""
-    return {
-        "submit": submit.label,
-        "before": submit.consumed_before,
-        "after": submit.consumed,
-        "read": ", ".join(evidence.read) or None if evidence is not None else None,
-        "said": quote if len(quote) <= _MAX_QUOTE else quote[: _MAX_QUOTE - 1] + "…",
-        "status": submit.status,
-        "edit": transition.edit if transition is not None else None,
-        "changed_lines": submit.changed_lines,
-        "visible": submit.mean_return,
-        "validation": submit.val_mean,
-        "best": ("yes" if transition.hit else "no") if transition is not None else None,
-    }
+    return quote if len(quote) <= _MAX_QUOTE else quote[: _MAX_QUOTE - 1] + "…"
 
 
 def feedback_use(rows: Iterable[dict[str, Any]]) -> Table:
@@ -242,43 +227,54 @@ def feedback_use(rows: Iterable[dict[str, Any]]) -> Table:
             "One row a submit: what the agent had read and said since the submit before, how the policy changed, and"
             " what came of it. Budget: train episodes consumed before and after. Validation is hidden from agents."
         ),
-        columns=(
-            ENV,
-            ENTRY,
-            RUN,
-            Column("submit", "Submit"),
-            Column("before", "Budget before", "integer"),
-            Column("after", "Budget after", "integer"),
-            Column("read", "Evidence read"),
-            Column("said", "The agent's own words"),
-            Column("status", "Status"),
-            Column("edit", "Edit"),
-            Column("changed_lines", "Changed lines", "integer"),
-            Column("visible", "Visible mean", "number"),
-            Column("validation", "Validation mean", "number"),
-            Column("best", "New validation best"),
-            Column("selected", "Selected"),
-        ),
+        columns=_FEEDBACK,
         rows=tuple(rows),
     )
 
 
-def _audit(study: Study, link_of: LinkOf) -> Table:
-    rows: list[dict[str, Any]] = []
-    for audited in study.audit:
-        row = {key: getattr(audited, key) for key in audited.__struct_fields__}
-        selected = audited.selected_index
-        row |= {
-            "env": title_of(audited.env),
-            "run": _short(audited.run),
-            "selected": None if selected is None else f"s{selected:03d}",
-            "splits": "secret" if audited.secret_splits else "public",
-        }
-        rows.append(row)
+def _audit_row(signals: AuditSignals) -> dict[str, Any]:
+    run, record = signals.run, signals.run.record
+    selected = record.outcome.best_submit_index
 
-    def seconds(key: str, title: str) -> Column:
-        return Column(key, f"{title} (s)", "number", digits=0)
+    def recorded(value: Any) -> Any:
+        return None if run.is_published else value
 
+    return {
+        "run": _short(run.name),
+        "entry": run.entry,
+        "env": title_of(run.env),
+        "accepted": len(run.submits),
+        "rejected": recorded(len(record.rejected_submits)),
+        "not_ok": signals.not_ok,
+        "invalid_rate": signals.invalid_rate,
+        "repaired_rate": signals.repaired_rate,
+        "budget": run.budget,
+        "budget_used": run.submits[-1].consumed if run.submits else 0,
+        "episodes_per_submit": signals.episodes_per_submit,
+        "failed_episodes": signals.failed_episodes,
+        "score_drops": signals.score_drops,
+        "selected_index": selected,
+        "complexity_growth": signals.complexity_growth,
+        "retries": recorded(record.agent.retries),
+        "turns": recorded(record.agent.turns),
+        "wall_s": record.timing.wall_time_seconds,
+        **{phase: recorded(getattr(record.timing, phase)) for phase in PHASES},
+        "secret_splits": record.versions.data_secret,
+        "jail": record.jail,
+        "hidden_isolation": record.hidden_isolation,
+        "hidden_cases": record.experiment_dimensions.hidden_cases,
+        "simulation": record.experiment_dimensions.simulation,
+        "simulator_flags": None if run.simulation_allowed else len(run.simulator_flags),
+        "signals": len(run.signals),
+        "selected": None if selected is None else f"s{selected:03d}",
+        "splits": "secret" if record.versions.data_secret else "public",
+    }
+
+
+def _audit(study: Study) -> Table:
+    flags = "Places in its code that look like a simulator: a signal to read, never a verdict."
+    repaired = "Share of the train steps whose action was outside the action space."
+    splits = "`public`: of case files or a public seed that anybody may know."
     return Table(
         name="audit",
         title="Audit signals",
@@ -295,14 +291,7 @@ def _audit(study: Study, link_of: LinkOf) -> Table:
             Column("accepted", "Accepted", "integer"),
             Column("rejected", "Rejected", "integer"),
             Column("invalid_rate", "Invalid submits", "percent"),
-            Column(
-                "repaired_rate",
-                "Repaired actions",
-                "number",
-                digits=4,
-                below=True,
-                note="Share of the train steps whose action was outside the action space.",
-            ),
+            Column("repaired_rate", "Repaired actions", "number", digits=4, below=True, note=repaired),
             Column("budget_used", "Budget used", "integer"),
             Column("episodes_per_submit", "Episodes / submit", "number", digits=1),
             Column("failed_episodes", "Failed episodes", "integer"),
@@ -311,78 +300,49 @@ def _audit(study: Study, link_of: LinkOf) -> Table:
             Column("complexity_growth", "Growth (×)", "number", digits=2),
             Column("turns", "Turns", "integer"),
             Column("retries", "Retries", "integer"),
-            Column(
-                "splits", "Splits", note="`public`: of case files or a public seed that anybody may know."
-            ),
+            Column("splits", "Splits", note=splits),
             Column("simulation", "Simulation", note="Whether the run's rules let the agent simulate."),
-            Column(
-                "simulator_flags",
-                "Simulator flags",
-                "integer",
-                note="Places in its code that look like a simulator: a signal to read, never a verdict.",
-            ),
+            Column("simulator_flags", "Simulator flags", "integer", note=flags),
             Column(
                 "signals",
                 "Signals",
                 "integer",
                 note="Places in its log and code that deserve a look: no verdict.",
             ),
-            seconds("wall_s", "Wall"),
-            seconds("agent_s", "Agent"),
-            seconds("queue_s", "Queue"),
-            seconds("rollout_s", "Rollout"),
-            seconds("feedback_s", "Feedback"),
-            seconds("finalise_s", "Finalise"),
+            *(
+                Column(phase, f"{phase.removesuffix('_s').capitalize()} (s)", "number", digits=0)
+                for phase in ("wall_s", *PHASES)
+            ),
         ),
-        rows=tuple(rows),
-        links={i: link for i, audited in enumerate(study.audit) if (link := link_of(audited.run))},
+        rows=tuple(map(_audit_row, study.audit)),
+        runs=tuple(signals.run.name for signals in study.audit),
     )
 
 
-def _simulators(study: Study, link_of: LinkOf) -> Table:
-    return _evidence(
-        [(run, each) for run in study.runs for each in run.simulator_flags],
-        link_of,
-        name="simulator_flags",
-        title="Code that looks like a simulator",
-        caption=(
-            "A signal to read, never a verdict: imports and installations of a simulator, and code with a loop and"
-            " several numbers of the environment's dynamics. Simulators that an agent writes itself are seldom found."
-            " Runs whose rules allow simulation are left out."
-        ),
-    )
+_SIMULATORS = (
+    "A signal to read, never a verdict: imports and installations of a simulator, and code with a loop and several"
+    " numbers of the environment's dynamics. Simulators that an agent writes itself are seldom found. Runs whose rules"
+    " allow simulation are left out."
+)
+_SIGNALS = (
+    "Signals to read, never verdicts: commands that reach for the network, for files outside the workspace or for a"
+    " simulator, policies with tables keyed by hashes of observations or by case, and policies that hold recorded train"
+    " actions. Honest agents can raise a signal, and an agent can hide from the search."
+)
 
 
-def _signals(study: Study, link_of: LinkOf) -> Table:
-    return _evidence(
-        [(run, each) for run in study.runs for each in run.signals],
-        link_of,
-        name="signals",
-        title="What deserves a look",
-        caption=(
-            "Signals to read, never verdicts: commands that reach for the network, for files outside the workspace or"
-            " for a simulator, policies with tables keyed by hashes of observations or by case, and policies that hold"
-            " recorded train actions. Honest agents can raise a signal, and an agent can hide from the search."
-        ),
-    )
-
-
-def _evidence(
-    found: list[tuple[Run, Signal]], link_of: LinkOf, *, name: str, title: str, caption: str
-) -> Table:
+def _evidence(signals: list[tuple[Run, Signal]], name: str, title: str, caption: str) -> Table:
     return tabulated(
-        found,
+        signals,
         (
-            Column("env", "Environment", of=lambda one: title_of(one[0].env)),
-            Column("entry", "Agent", of=lambda one: one[0].entry),
-            Column("run", "Run", of=lambda one: _short(one[0].name)),
+            *_FEEDBACK[:3],
             Column("signal", "Signal", of=lambda one: TITLES[one[1].kind]),
             Column("file", "File", of=lambda one: one[1].place),
             Column("submits", "Submits", of=lambda one: submits_text(one[1].submits) or None),
             Column("reason", "Why", of=lambda one: one[1].reason),
             Column("quote", "Evidence", of=lambda one: one[1].quote[:_MAX_QUOTE]),
         ),
-        link=lambda one: link_of(one[0].name),
+        run=lambda one: one[0].name,
         name=name,
         title=title,
         caption=caption,
@@ -400,23 +360,19 @@ def submits_text(indices: Iterable[int]) -> str:
     return ", ".join(f"s{a:03d}" if a == b else f"s{a:03d}–s{b:03d}" for a, b in spans)
 
 
-def _no_reference(run: Run) -> bool:
-    return run.record.outcome.random_reference is None
-
-
-def _no_validation(run: Run) -> bool:
-    return not run.record.outcome.val_scores
-
-
 _MISSING: tuple[tuple[str, str, Callable[[Run], bool]], ...] = (
-    ("Normalised performance", "the random reference on the held-out cases", _no_reference),
+    (
+        "Normalised performance",
+        "the random reference on the held-out cases",
+        lambda run: run.record.outcome.random_reference is None,
+    ),
     (
         "Score evolution",
         "the random reference: the scale begins at the lowest first score instead",
-        _no_reference,
+        lambda run: run.record.outcome.random_reference is None,
     ),
-    ("Score evolution", "validation means, so no curve", _no_validation),
-    ("Edit types, edit size", "validation means, so no hits", _no_validation),
+    ("Score evolution", "validation means, so no curve", lambda run: not run.record.outcome.val_scores),
+    ("Edit types, edit size", "validation means, so no hits", lambda run: not run.record.outcome.val_scores),
     (
         "Realised structure",
         "the selected policy's source",
@@ -434,24 +390,14 @@ def _missing(study: Study) -> Table:
     """The information missing from the published software's run directories, by table."""
     runs = [run for run in study.runs if run.is_published]
     counts = [(table, what, sum(map(lacks, runs))) for table, what, lacks in _MISSING]
-    return Table(
+    return tabulated(
+        [each for each in counts if each[2]],
+        (
+            Column("table", "Table", of=itemgetter(0)),
+            Column("what", "Missing value", of=itemgetter(1)),
+            Column("runs", "Runs", "integer", of=itemgetter(2)),
+        ),
         name="not_told",
         title="Missing values",
         caption="Values that run directories of the published software lack, by table. They are left empty.",
-        columns=(
-            Column("table", "Table"),
-            Column("what", "Missing value"),
-            Column("runs", "Runs", "integer"),
-        ),
-        rows=tuple({"table": table, "what": what, "runs": n} for table, what, n in counts if n),
-    )
-
-
-def _left_out(study: Study) -> Table:
-    return tabulated(
-        study.left_out,
-        (Column("path", "Folder", of=lambda item: path_text(item.path)), Column("reason", "Reason")),
-        name="left_out",
-        title="Left out",
-        caption="Folders that are no complete run, and why. They are in no table and no figure.",
     )

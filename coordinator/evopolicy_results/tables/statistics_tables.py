@@ -5,21 +5,27 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from msgspec.structs import replace
+
 from evopolicy_common.statistics.distributions import ALPHA
-from evopolicy_common.statistics.intervals import Estimate
 from evopolicy_results.reading.environments import title_of
-from evopolicy_results.statistics.aggregates import LEAST_RUNS, TAUS, Bounded
+from evopolicy_results.statistics.aggregates import LEAST_RUNS, TAUS
 from evopolicy_results.statistics.pairs import Pair
-from evopolicy_results.statistics.repeats import MAX_REPEATS, Repeats
-from evopolicy_results.statistics.resolution import GAPS, Resolution
+from evopolicy_results.statistics.repeats import MAX_REPEATS
+from evopolicy_results.statistics.resolution import GAPS
 from evopolicy_results.statistics.starts import StartGroup
 from evopolicy_results.studies.study import Suite
-from evopolicy_results.tables.run_tables import ENTRY, ENV
-from evopolicy_results.tables.table import Column, Table, tabulated
+from evopolicy_results.tables.run_tables import ENTRY, ENV, RUNS
+from evopolicy_results.tables.table import Column, Table, interval_text, rows_of, tabulated
 
-CHECKPOINTS = "With one run a cell this compares the selected checkpoints, not the agents: how an agent's runs vary is not known."  # noqa: E501
-OVER = "What a repetition would draw anew: cases, runs, or runs and cases."
+_CHECKPOINTS = (
+    " With one run a cell this compares the selected checkpoints, not the agents: how an agent's runs vary is not"
+    " known."
+)
 _SHOWN_TAUS = (0.1, 0.25, 0.5, 0.75, 0.9)
+ENVIRONMENTS = Column("environments", "Environments", "integer", of=lambda one: one.n_environments)
+INTERVAL = "95 % interval"
+OVER = Column("over", "Over", note="What a repetition would draw anew: cases, runs, or runs and cases.")
 
 
 def statistics_tables(suite: Suite) -> list[Table]:
@@ -33,142 +39,74 @@ def statistics_tables(suite: Suite) -> list[Table]:
     ]
 
 
-def starts_table(groups: Sequence[StartGroup]) -> Table:
-    """Runs from the same submit of an earlier run, compared with each other; no rows without such runs."""
-
-    def pair_row(pair: Pair) -> dict[str, Any]:
-        return {
-            "first": pair.first,
-            "second": pair.second,
-            "runs": "{} and {}".format(*pair.n_runs),
-            "gap": None if pair.gap is None else pair.gap.value,
-            "interval": interval_text(pair.gap) or pair.reason or None,
-            "over": None if pair.gap is None or pair.gap.low is None else pair.gap.over,
-            "p_holm": pair.p_holm,
-            "told_apart": _told_apart(pair),
-            "cases": pair.n_cases or None,
-        }
-
-    rows: list[dict[str, Any]] = []
-    for group in groups:
-        of = {
-            "env": title_of(group.env),
-            "start": f"{group.parent}, submit {group.start.submit_index}",
-            "scored": "yes" if group.parent_scored else "no",
-        }
-        found = [pair_row(pair) for pair in group.pairs]
-        lone = [
-            {"first": label, "runs": str(n), "interval": "no other agent or setting"}
-            for label, n in group.variants.items()
-        ]
-        rows += [of | row for row in found or lone]
-    return Table(
-        name="starts",
-        title="Differences between runs from one state",
-        caption=(
-            "Runs that start from a submit of an earlier run, compared with those from the same submit: first minus"
-            " second, in held-out returns, paired by case, with the 95 % interval and Holm's correction over all pairs"
-            " from one state. They are on no leaderboard and in no other table of scores. Parent scored: the agent of"
-            " the earlier run, or of a run before it, had ended when one of these started, so a result may have chosen"
-            " the submit. The differences between runs from it stay valid; their level is not a score from scratch."
-        ),
-        columns=(
-            ENV,
-            Column("start", "From"),
-            Column("scored", "Parent scored"),
-            Column("first", "First"),
-            Column("second", "Second"),
-            Column("gap", "Difference", "number"),
-            Column("interval", "95 % interval"),
-            Column("over", "Over", note=OVER),
-            Column("p_holm", "Corrected p", "number", digits=4, below=True),
-            Column("told_apart", "Significantly better"),
-            Column("runs", "Runs"),
-            Column("cases", "Cases", "integer"),
-        ),
-        rows=tuple(rows),
-    )
+def checkpoints(suite: Suite) -> str:
+    """A caption's sentence where an agent has one run on an environment; else empty."""
+    return _CHECKPOINTS if any(pair.compares == "checkpoints" for pair in suite.statistics.pairs) else ""
 
 
-def span(low: float | None, high: float | None, digits: int) -> str | None:
-    """`low to high`; None without bounds."""
-    return None if low is None or high is None else f"{_rounded(low, digits)} to {_rounded(high, digits)}"
+def _with_interval(field: str) -> Callable[[Pair], str | None]:
+    return lambda pair: None if pair.gap is None or pair.gap.low is None else getattr(pair.gap, field)
 
 
-def _rounded(value: float, digits: int) -> str:
-    text = f"{value:.{digits}f}"
-    return text.removeprefix("-") if float(text) == 0.0 else text
-
-
-def interval_text(estimate: Estimate | None, digits: int = 3) -> str | None:
-    """The interval, or the reason why there is none."""
-    if estimate is None:
+def _told_apart(pair: Pair) -> str | None:
+    if pair.verdict in ("first", "second"):
+        return pair.first if pair.verdict == "first" else pair.second
+    if pair.verdict == "not comparable":
         return None
-    return span(estimate.low, estimate.high, digits) or estimate.reason or None
+    is_of_checkpoints = pair.compares == "checkpoints"
+    # One run is that of the random reference.
+    n = str(pair.n_cases) if is_of_checkpoints else " and ".join(map(str, sorted({*pair.n_runs} - {1})))
+    # The interval beside it is for this pair alone.
+    alone = pair.p is not None and pair.p <= ALPHA
+    text = "not after the correction for all pairs" if alone else "not distinguishable"
+    text += f" on {n} cases" if is_of_checkpoints else f" with {n} runs"
+    if pair.n_needed is not None:
+        return f"{text}; about {pair.n_needed} would be needed"
+    more_cases = not is_of_checkpoints and pair.n_cases and pair.gap is not None and pair.gap.value != 0.0
+    return f"{text}; more cases would be needed" if more_cases else text
 
 
-def _bounds(bounded: Bounded | None, digits: int = 2) -> str | None:
-    return None if bounded is None else span(bounded.low, bounded.high, digits) or bounded.reason or None
-
-
-def has_single_runs(suite: Suite) -> bool:
-    """Whether an agent has one run on an environment."""
-    return any(pair.compares == "checkpoints" for pair in suite.statistics.pairs)
+_PAIR = (
+    Column("first", "First"),
+    Column("second", "Second"),
+    Column("gap", "Difference", "number", of=lambda pair: None if pair.gap is None else pair.gap.value),
+    Column("interval", INTERVAL, of=lambda pair: interval_text(pair.gap) or pair.reason or None),
+    replace(OVER, of=_with_interval("over")),
+    Column("method", "Method", of=_with_interval("method")),
+    Column("p", "p", "number", digits=4, below=True),
+    Column("p_holm", "Corrected p", "number", digits=4, below=True),
+    Column(
+        "told_apart",
+        "Significantly better",
+        note="The better entry, or the reason for none.",
+        of=_told_apart,
+    ),
+    Column(
+        "needed",
+        "Needed",
+        "integer",
+        note="Runs of each agent, or cases of checkpoints.",
+        of=lambda pair: pair.n_needed,
+    ),
+    Column("p_these_cases", "p, these cases only", "number", digits=4, below=True),
+    Column("compares", "Compares", note="Checkpoints, where an entry has one run; else agents."),
+    Column("runs", "Runs", of=lambda pair: "{} and {}".format(*pair.n_runs)),
+    Column("cases", "Cases", "integer", of=lambda pair: pair.n_cases or None),
+    Column(
+        "left_out",
+        "Cases left out",
+        "integer",
+        note="Cases that only some of the runs have.",
+        of=lambda pair: pair.n_left_out,
+    ),
+)
 
 
 def _pairs(suite: Suite) -> Table:
-    pairs = suite.statistics.pairs
-    left_out = sum(pair.n_left_out > 0 for pair in pairs)
-
-    def with_interval(field: str) -> Callable[[Pair], str | None]:
-        return lambda pair: None if pair.gap is None or pair.gap.low is None else getattr(pair.gap, field)
-
+    n_unpaired = sum(pair.n_left_out > 0 for pair in suite.statistics.pairs)
     return tabulated(
-        pairs,
-        (
-            ENV,
-            Column("first", "First"),
-            Column("second", "Second"),
-            Column(
-                "gap", "Difference", "number", of=lambda pair: None if pair.gap is None else pair.gap.value
-            ),
-            Column(
-                "interval", "95 % interval", of=lambda pair: interval_text(pair.gap) or pair.reason or None
-            ),
-            Column(
-                "over",
-                "Over",
-                note=OVER,
-                of=with_interval("over"),
-            ),
-            Column("method", "Method", of=with_interval("method")),
-            Column("p", "p", "number", digits=4, below=True),
-            Column("p_holm", "Corrected p", "number", digits=4, below=True),
-            Column(
-                "told_apart",
-                "Significantly better",
-                note="The better entry, or the reason for none.",
-                of=_told_apart,
-            ),
-            Column(
-                "needed",
-                "Needed",
-                "integer",
-                note="Runs of each agent, or cases of checkpoints.",
-                of=lambda pair: pair.n_needed,
-            ),
-            Column("p_these_cases", "p, these cases only", "number", digits=4, below=True),
-            Column("compares", "Compares", note="Checkpoints, where an entry has one run; else agents."),
-            Column("runs", "Runs", of=lambda pair: "{} and {}".format(*pair.n_runs)),
-            Column("cases", "Cases", "integer", of=lambda pair: pair.n_cases or None),
-            Column(
-                "left_out",
-                "Cases left out",
-                "integer",
-                note="Cases that only some of the runs have.",
-                of=lambda pair: pair.n_left_out,
-            ),
-        ),
+        suite.statistics.pairs,
+        (ENV, *_PAIR),
         name=f"pairs_{suite.name}",
         title=f"{suite.title} differences",
         caption=(
@@ -182,41 +120,62 @@ def _pairs(suite: Suite) -> Table:
             " given; with other cases the difference may vanish, and no verdict rests on it. The tie groups of the"
             " leaderboard are a second family of comparisons at 5 %, so both together have at most 10 %."
         )
-        + (f" {CHECKPOINTS}" if has_single_runs(suite) else "")
-        + (
-            f" In {left_out} rows the entries' cases differ: only common cases pair, and the others are left out."
-            if left_out
-            else ""
-        ),
+        + checkpoints(suite)
+        + f" In {n_unpaired} rows the entries' cases differ: only common cases pair, and the others are left out."
+        * bool(n_unpaired),
     )
 
 
-def _told_apart(pair: Pair) -> str | None:
-    named = {"first": pair.first, "second": pair.second, "not told apart": _not_told(pair)}
-    return named.get(pair.verdict)
-
-
-def _not_told(pair: Pair) -> str:
-    checkpoints = pair.compares == "checkpoints"
-    # One run is that of the random reference.
-    n = str(pair.n_cases) if checkpoints else " and ".join(map(str, sorted({*pair.n_runs} - {1})))
-    # The interval beside it is for this pair alone.
-    alone = pair.p is not None and pair.p <= ALPHA
-    text = "not after the correction for all pairs" if alone else "not distinguishable"
-    text += f" on {n} cases" if checkpoints else f" with {n} runs"
-    if pair.n_needed is not None:
-        return f"{text}; about {pair.n_needed} would be needed"
-    more_cases = not checkpoints and pair.n_cases and pair.gap is not None and pair.gap.value != 0.0
-    return f"{text}; more cases would be needed" if more_cases else text
+def starts_table(groups: Sequence[StartGroup]) -> Table:
+    """Runs from the same submit of an earlier run, compared with each other; no rows without such runs."""
+    by_key = {column.key: column for column in _PAIR}
+    by_key["told_apart"] = replace(by_key["told_apart"], note="")
+    kept = [by_key[key] for key in ("first", "second", "gap", "interval", "over", "p_holm", "told_apart")]
+    kept += [by_key["runs"], by_key["cases"]]
+    rows: list[dict[str, Any]] = []
+    for group in groups:
+        of = {
+            "env": title_of(group.env),
+            "start": f"{group.parent}, submit {group.start.submit_index}",
+            "scored": "yes" if group.parent_scored else "no",
+        }
+        rows += [of | row for row in rows_of(group.pairs, (*kept[:2], kept[7], *kept[2:7], kept[8]))] or [
+            {**of, "first": label, "runs": str(n), "interval": "no other agent or setting"}
+            for label, n in group.variants.items()
+        ]
+    return Table(
+        name="starts",
+        title="Differences between runs from one state",
+        caption=(
+            "Runs that start from a submit of an earlier run, compared with those from the same submit: first minus"
+            " second, in held-out returns, paired by case, with the 95 % interval and Holm's correction over all pairs"
+            " from one state. They are on no leaderboard and in no other table of scores. Parent scored: the agent of"
+            " the earlier run, or of a run before it, had ended when one of these started, so a result may have chosen"
+            " the submit. The differences between runs from it stay valid; their level is not a score from scratch."
+        ),
+        columns=(ENV, Column("start", "From"), Column("scored", "Parent scored"), *kept),
+        rows=tuple(rows),
+    )
 
 
 def _resolution(suite: Suite) -> Table:
-    resolutions = suite.statistics.resolutions
-    rows = [_resolved(title_of(one.env), one) for one in resolutions]
-    if rows and suite.statistics.overall is not None:
-        rows.append({**_resolved("Mean of all", suite.statistics.overall), "gap": None})
-    gap = suite.statistics.standings.gap
-    return Table(
+    gap, whole = suite.statistics.standings.gap, suite.statistics.overall
+    rows = [*suite.statistics.resolutions, *([whole] if whole is not None else [])]
+
+    def repeats(share: float) -> Column:
+        key = f"repeats_{share:g}".replace(".", "_")
+        return Column(key, f"Repeats for {share:g}", of=lambda one: (n := one.repeats(share)) and str(n))
+
+    return tabulated(
+        rows,
+        (
+            replace(ENV, of=lambda one: "Mean of all" if one is whole else title_of(one.env)),
+            Column("gap", "Smallest difference", "number", of=lambda one: None if one is whole else one.gap),
+            Column("normalised_gap", "Normalised", "number", note="As a share of the random-to-best scale."),
+            Column("runs", "Runs a cell", of=lambda one: " to ".join(map(str, dict.fromkeys(one.n_runs)))),
+            Column("cases", "Cases", "integer", of=lambda one: one.n_cases or None),
+            *map(repeats, GAPS),
+        ),
         name=f"resolution_{suite.name}",
         title=f"{suite.title} resolution",
         caption=(
@@ -232,58 +191,30 @@ def _resolution(suite: Suite) -> Table:
             if gap is None
             else f" Of the suite's rank score, a difference of {gap:.3f} is the smallest that is resolved."
         ),
-        columns=(
-            ENV,
-            Column("gap", "Smallest difference", "number"),
-            Column("normalised_gap", "Normalised", "number", note="As a share of the random-to-best scale."),
-            Column("runs", "Runs a cell"),
-            Column("cases", "Cases", "integer"),
-            *(Column(_gap_key(gap), f"Repeats for {gap:g}") for gap in GAPS),
-        ),
-        rows=tuple(rows),
     )
 
 
-def _gap_key(gap: float) -> str:
-    return f"repeats_{gap:g}".replace(".", "_")
-
-
-def _resolved(env: str, one: Resolution) -> dict[str, Any]:
-    fewest, most = one.n_runs
-    return {
-        "env": env,
-        "gap": one.gap,
-        "normalised_gap": one.normalised_gap,
-        "runs": str(fewest) if fewest == most else f"{fewest} to {most}",
-        "cases": one.n_cases or None,
-        **{_gap_key(gap): _repeats(one.repeats(gap)) for gap in GAPS},
-    }
-
-
-def _repeats(found: Repeats | None) -> str | None:
-    if found is None:
-        return None
-    return "more cases" if found.n is None else str(found.n)
-
-
 def _aggregates(suite: Suite) -> Table:
-    rows = [
-        {
-            "entry": one.entry,
-            "iqm": one.iqm.value if one.iqm is not None else None,
-            "iqm_interval": _bounds(one.iqm),
-            **{
-                key: value
-                for tau in _SHOWN_TAUS
-                for key, value in _share(tau, one.profile[TAUS.index(tau)]).items()
-            },
-            "environments": one.n_environments,
-            "runs": one.n_runs,
-            "over": one.over,
-        }
-        for one in suite.statistics.aggregates
-    ]
-    return Table(
+    def above(tau: float) -> tuple[Column, Column]:
+        key, place = f"above_{tau:g}".replace(".", "_"), TAUS.index(tau)
+        return (
+            Column(key, f"Above {tau:g}", "number", digits=2, of=lambda one: one.profile[place].value),
+            Column(f"{key}_interval", INTERVAL, of=lambda one: interval_text(one.profile[place], 2)),
+        )
+
+    return tabulated(
+        suite.statistics.aggregates,
+        (
+            ENTRY,
+            Column(
+                "iqm", "IQM", "number", note="Interquartile mean.", of=lambda one: one.iqm and one.iqm.value
+            ),
+            Column("iqm_interval", INTERVAL, of=lambda one: interval_text(one.iqm, 2)),
+            *(column for tau in _SHOWN_TAUS for column in above(tau)),
+            ENVIRONMENTS,
+            RUNS,
+            Column("over", "Over", note="What the bootstrap draws anew."),
+        ),
         name=f"aggregates_{suite.name}",
         title=f"{suite.title} aggregates",
         caption=(
@@ -295,44 +226,18 @@ def _aggregates(suite: Suite) -> Table:
             " average, IQMs are too low, and their intervals miss: compare such agents by their differences. Two runs"
             f" to {LEAST_RUNS - 1} are too few for the intervals of shares."
         )
-        + (f" {CHECKPOINTS}" if has_single_runs(suite) else ""),
-        columns=(
-            ENTRY,
-            Column("iqm", "IQM", "number", note="Interquartile mean."),
-            Column("iqm_interval", "95 % interval"),
-            *(
-                column
-                for tau in _SHOWN_TAUS
-                for column in (
-                    Column(_tau_key(tau), f"Above {tau:g}", "number", digits=2),
-                    Column(f"{_tau_key(tau)}_interval", "95 % interval"),
-                )
-            ),
-            Column("environments", "Environments", "integer"),
-            Column("runs", "Runs", "integer"),
-            Column("over", "Over", note="What the bootstrap draws anew."),
-        ),
-        rows=tuple(rows),
+        + checkpoints(suite),
     )
-
-
-def _tau_key(tau: float) -> str:
-    return f"above_{tau:g}".replace(".", "_")
-
-
-def _share(tau: float, share: Bounded) -> dict[str, Any]:
-    return {_tau_key(tau): share.value, f"{_tau_key(tau)}_interval": _bounds(share)}
 
 
 def _improvements(suite: Suite) -> Table:
     return tabulated(
         suite.statistics.improvements,
         (
-            Column("first", "First"),
-            Column("second", "Second"),
+            *_PAIR[:2],
             Column("probability", "Probability", "number", of=lambda one: one.probability.value),
-            Column("interval", "95 % interval", of=lambda one: _bounds(one.probability, 3)),
-            Column("environments", "Environments", "integer", of=lambda one: one.n_environments),
+            Column("interval", INTERVAL, of=lambda one: interval_text(one.probability)),
+            ENVIRONMENTS,
         ),
         name=f"improvement_{suite.name}",
         title=f"{suite.title} probability of improvement",
@@ -341,25 +246,24 @@ def _improvements(suite: Suite) -> Table:
             " environments that have a scale (Agarwal et al. 2021). Interval: 95 %, stratified bootstrap over runs and"
             " their cases, or over the cases of single runs."
         )
-        + (f" {CHECKPOINTS}" if has_single_runs(suite) else ""),
+        + checkpoints(suite),
     )
 
 
 def _generalisation(suite: Suite) -> Table:
-    rows: list[dict[str, Any]] = [
-        {
-            "env": title_of(one.env),
-            "entry": one.entry,
-            "train": one.train,
-            "validation": one.validation,
-            "heldout": one.heldout,
-            "optimism": one.optimism,
-            "normalised_optimism": one.normalised_optimism,
-            "success": one.success,
-            "runs": one.n_runs,
-        }
-        for one in suite.statistics.generalisation
-    ]
+    columns = (
+        ENV,
+        ENTRY,
+        Column("train", "Train mean", "number"),
+        Column("validation", "Validation mean", "number"),
+        Column("heldout", "Held-out mean", "number"),
+        Column("optimism", "Optimism", "number"),
+        Column("normalised_optimism", "Normalised optimism", "number"),
+        Column("optimism_interval", INTERVAL),
+        Column("success", "Success", "percent"),
+        RUNS,
+    )
+    rows = rows_of(suite.statistics.generalisation, [c for c in columns if c.key != "optimism_interval"])
     rows += [
         {
             "env": "Mean of all",
@@ -380,17 +284,6 @@ def _generalisation(suite: Suite) -> Table:
             " is the environment. Success: share of held-out episodes that reached the goal, where the environment"
             " reports it (Fetch, parking), or the return tells it exactly (MiniGrid, Acrobot, continuous MountainCar)."
         ),
-        columns=(
-            ENV,
-            ENTRY,
-            Column("train", "Train mean", "number"),
-            Column("validation", "Validation mean", "number"),
-            Column("heldout", "Held-out mean", "number"),
-            Column("optimism", "Optimism", "number"),
-            Column("normalised_optimism", "Normalised optimism", "number"),
-            Column("optimism_interval", "95 % interval"),
-            Column("success", "Success", "percent"),
-            Column("runs", "Runs", "integer"),
-        ),
+        columns=columns,
         rows=tuple(rows),
     )

@@ -14,7 +14,9 @@ from typing import Any, Literal
 
 import msgspec
 
+from evopolicy_common.statistics.intervals import Estimate
 from evopolicy_common.terminal import csv_cell, one_line
+from evopolicy_results.statistics.aggregates import Bounded
 
 Kind = Literal["text", "integer", "number", "percent"]
 DASH = "–"
@@ -49,8 +51,16 @@ class Table(msgspec.Struct, frozen=True, kw_only=True):
     rows: tuple[dict[str, Any], ...]
     marks: dict[tuple[int, str], int] = {}
     """(row, column key) to 1 for the best and 2 for the second-best of its column."""
-    links: dict[int, str] = {}
-    """By row, the page about it, relative to the report."""
+    runs: tuple[str, ...] = ()
+    """By row, the name of the run that it is about; empty if the table is not about runs."""
+
+
+def rows_of(records: Iterable[Any], columns: Sequence[Column]) -> list[dict[str, Any]]:
+    """A row a record."""
+    return [
+        {column.key: column.of(each) if column.of else getattr(each, column.key) for column in columns}
+        for each in records
+    ]
 
 
 def tabulated(
@@ -60,35 +70,48 @@ def tabulated(
     name: str,
     title: str,
     caption: str,
-    link: Callable[[Any], str] = lambda record: "",
+    run: Callable[[Any], str] | None = None,
 ) -> Table:
-    """A row a record. `link`: the page about a record, relative to the report; empty for none."""
+    """A row a record. `run`: the name of the run that a record is about."""
     records = list(records)
     return Table(
         name=name,
         title=title,
         caption=caption,
         columns=tuple(columns),
-        rows=tuple(
-            {column.key: column.of(each) if column.of else getattr(each, column.key) for column in columns}
-            for each in records
-        ),
-        links={i: href for i, each in enumerate(records) if (href := link(each))},
+        rows=tuple(rows_of(records, columns)),
+        runs=tuple(map(run, records)) if run is not None else (),
     )
 
 
+def rounded(value: float, digits: int) -> str:
+    """Without a minus before a 0; an ASCII minus else, so that numbers can be copied."""
+    text = f"{value:.{digits}f}"
+    return text.removeprefix("-") if float(text) == 0.0 else text
+
+
+def span(low: float | None, high: float | None, digits: int) -> str | None:
+    """`low to high`; None without bounds."""
+    return None if low is None or high is None else f"{rounded(low, digits)} to {rounded(high, digits)}"
+
+
+def interval_text(estimate: Estimate | Bounded | None, digits: int = 3) -> str | None:
+    """The interval, or the reason why there is none."""
+    if estimate is None:
+        return None
+    return span(estimate.low, estimate.high, digits) or estimate.reason or None
+
+
 def shown(value: Any, column: Column) -> str:
-    """`value` as display text, with an ASCII minus so that numbers can be copied."""
+    """`value` as display text."""
     if value is None:
         return DASH
     if column.kind == "percent":
         return f"{100.0 * value:.0f} %"
     if column.kind == "number" and isinstance(value, int | float):
         least = 10.0**-column.digits
-        if column.below and 0.0 < value < least:
-            return f"<{least:.{column.digits}f}"
-        text = f"{value:.{column.digits}f}"
-        return text.removeprefix("-") if float(text) == 0.0 else text
+        is_below = column.below and 0.0 < value < least
+        return f"<{least:.{column.digits}f}" if is_below else rounded(value, column.digits)
     return str(value)
 
 
@@ -121,16 +144,13 @@ def to_markdown(table: Table) -> str:
 
 
 _MARKUP = re.compile(r"[\\|`\[\]<>]")
+_ENTITIES = {"<": "&lt;", ">": "&gt;"}
+"""Not every renderer accepts a backslash before these two."""
 
 
 def _pipe(text: str) -> str:
     """A cell's text, escaped so that it neither ends the cell nor becomes HTML, code, a link or an image."""
-    return _MARKUP.sub(_escaped, one_line(text))
-
-
-def _escaped(found: re.Match[str]) -> str:
-    # Not every renderer accepts a backslash before these two.
-    return {"<": "&lt;", ">": "&gt;"}.get(found[0], f"\\{found[0]}")
+    return _MARKUP.sub(lambda match: _ENTITIES.get(match[0], f"\\{match[0]}"), one_line(text))
 
 
 def best_marks(rows: Sequence[dict[str, Any]], keys: Sequence[str]) -> dict[tuple[int, str], int]:

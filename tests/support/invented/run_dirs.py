@@ -68,8 +68,10 @@ def write_run(
     feedback: FeedbackDetail = "pictures",
     start: Start | None = None,
     run: str = "",
+    change: Mapping[str, Any] | None = None,
 ) -> Path:
-    """Writes one run directory under `runs` and returns it. `heldout` defaults to the best validation score alone."""
+    """Writes one run directory under `runs` and returns it. `heldout` defaults to the best validation score alone.
+    `change`: as of `amend`."""
     folder = (
         runs / entry.replace(" ", "-") / env.replace("/", "_") / (exp_id + (f"-{repeat}" if repeat else ""))
     )
@@ -169,7 +171,21 @@ def write_run(
         lines = LOGS[log](versions)
         (folder / "logs" / "agent.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
     (folder / "run.json").write_bytes(encode_run_record(record))
+    amend(folder, change or {})
     return folder
+
+
+def amend(folder: Path, change: Mapping[str, Any]) -> None:
+    """Puts fields into the run's `run.json`, into nested objects too; the value `...` removes a field."""
+
+    def merged(old: Any, new: Any) -> Any:
+        if not isinstance(old, dict) or not isinstance(new, Mapping):
+            return new
+        whole = old | {key: merged(old.get(key), value) for key, value in new.items()}
+        return {key: value for key, value in whole.items() if value is not ...}
+
+    path = folder / "run.json"
+    path.write_text(json.dumps(merged(json.loads(path.read_bytes()), change)))
 
 
 def _write_submit(

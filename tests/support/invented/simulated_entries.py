@@ -11,12 +11,13 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from evopolicy_common.statistics.distributions import t_quantile
 from evopolicy_common.statistics.intervals import difference, mean, of_runs
 from evopolicy_common.statistics.resampling import RESAMPLES
 from evopolicy_results.scoring.normalised import Scale
 from evopolicy_results.statistics.aggregates import aggregates
 from evopolicy_results.statistics.pairs import pairs
-from evopolicy_results.statistics.repeats import Spread, half_width, repeats_needed
+from evopolicy_results.statistics.repeats import Spread, repeats_needed, standard_error
 from evopolicy_results.statistics.samples import RunReturns, Sample
 from evopolicy_results.statistics.standings import standings
 
@@ -406,6 +407,12 @@ def aggregate_rates(
     return AggregateRates(**rates)
 
 
+def half_width(spread: Spread, n: int) -> float:
+    """Half width of the 95 % interval of a difference between two agents of n ≥ 2 runs each."""
+    error, df = standard_error(spread, n)
+    return t_quantile(0.975, df) * error if error > 0.0 else 0.0
+
+
 def resolved(n_runs: int, trials: int, *, level: float = 0.05, seed: int = 0) -> Rate:
     """How often a true gap as large as the smallest difference of `n_runs` runs is resolved; for 0 runs, a gap of 1
     with the runs that it needs at `level`."""
@@ -414,7 +421,7 @@ def resolved(n_runs: int, trials: int, *, level: float = 0.05, seed: int = 0) ->
     if n_runs:
         gap = half_width(spread, n_runs)
     else:
-        gap, needed = 1.0, repeats_needed(spread, 1.0, level=level).n
+        gap, needed = 1.0, repeats_needed(spread, 1.0, level=level)
         assert needed is not None
         n_runs = needed
     held = 0

@@ -12,13 +12,14 @@ from invented.policies import Version, policy
 from invented.run_dirs import write_run
 
 from evopolicy_common.records.run_record import Tokens
-from evopolicy_results.behaviour.audit import audit_signals, token_use
+from evopolicy_results.behaviour.audit import audit_signals, mean_phases, token_use
 from evopolicy_results.behaviour.edits import classify, edit_rates
 from evopolicy_results.behaviour.structure import edit_size_bins, structure_means
 from evopolicy_results.reading.reader import load_runs, read_run
 from evopolicy_results.scoring.evolution import CurvePoint, area, best_at, episodes_to
 from evopolicy_results.scoring.scores import RANDOM_ENTRY, references, score_table
 from evopolicy_results.studies.study import study_of
+from evopolicy_results.tables.report_tables import tables_of
 
 BROKEN = Version({"policy.py": "import nothing\n"}, (0.0,) * 2, None, "import_error")
 VERSIONS = [
@@ -148,19 +149,20 @@ def test_edit_sizes_are_binned_with_unchanged_bundles_apart(tmp_path: Path) -> N
 
 
 def test_audit_signals_of_a_run_are_as_counted_by_hand(tmp_path: Path) -> None:
-    (signals,) = audit_signals([read_run(write_run(tmp_path, VERSIONS, rejected=3))])
-    assert (signals.accepted, signals.rejected, signals.not_ok) == (9, 3, 1)
+    run = read_run(write_run(tmp_path, VERSIONS, rejected=3))
+    signals = audit_signals(run)
+    assert signals.not_ok == 1
     assert signals.invalid_rate == pytest.approx(1 / 9)
-    assert signals.budget_used == 8 * 8 + 2
     assert signals.episodes_per_submit == pytest.approx(66 / 9)
-    assert signals.score_drops == 2
-    assert signals.selected_index == 8
+    assert (signals.score_drops, signals.failed_episodes) == (2, 0)
     assert signals.complexity_growth is not None
     assert signals.complexity_growth > 1.0
-    assert signals.rollout_s == 16.0 * 9
-    assert (signals.agent_s, signals.queue_s, signals.feedback_s) == (60.0 * 9, 1.5 * 9, 2.5 * 9)
-    assert (signals.finalise_s, signals.turns, signals.retries) == (90.0, 9, 0)
-    assert (signals.budget, signals.failed_episodes) == (128, 0)
+    (row,) = next(table for table in tables_of(study_of([run])) if table.name == "audit").rows
+    assert (row["accepted"], row["rejected"], row["budget_used"], row["budget"]) == (9, 3, 8 * 8 + 2, 128)
+    assert (row["selected"], row["turns"], row["retries"]) == ("s008", 9, 0)
+    phases = {"agent_s": 60.0 * 9, "queue_s": 1.5 * 9, "rollout_s": 16.0 * 9, "feedback_s": 2.5 * 9}
+    assert mean_phases([run]) == {run.entry: {**phases, "finalise_s": 90.0}}
+    assert {phase: row[phase] for phase in phases} == phases
 
 
 def test_tokens_are_in_millions_and_missing_ones_are_none(tmp_path: Path) -> None:

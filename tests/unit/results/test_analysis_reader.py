@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import operator
 import os
 import signal
@@ -69,33 +68,36 @@ def test_a_run_whose_agent_never_played_is_left_out(tmp_path: Path) -> None:
     assert "failed before it used any budget" in left.reason
 
 
-def test_a_replay_is_left_out_as_no_run_of_its_own(tmp_path: Path) -> None:
-    folder = write_run(tmp_path, VERSIONS)
-    record = json.loads((folder / "run.json").read_text())
-    (folder / "run.json").write_text(json.dumps({**record, "replay_of": "r-1"}))
-    (left,) = load_runs([tmp_path]).left_out
-    assert left.reason == "a replay of run r-1, and no run of its own"
+def left_out(runs: Path) -> str:
+    """The reason why the only run there is left out."""
+    loaded = load_runs([runs])
+    assert loaded.runs == ()
+    (left,) = loaded.left_out
+    return left.reason
+
+
+@pytest.mark.parametrize(
+    ("how", "reason"),
+    [
+        ({"change": {"replay_of": "r-1"}}, "a replay of run r-1, and no run of its own"),
+        ({"status": "cancelled"}, "was cancelled"),
+        ({"status": "error"}, "worker lost"),
+        *(
+            ({"change": {"artifacts": {name: place}}}, f"artifacts.{name} is outside the run directory")
+            for name in ("workspace", "checkpoints", "logs_agent")
+            for place in ("/etc", "../other", "logs/../../other")
+        ),
+    ],
+)
+def test_a_run_that_is_no_finished_one_is_left_out_with_its_reason(
+    tmp_path: Path, how: dict[str, Any], reason: str
+) -> None:
+    write_run(tmp_path, VERSIONS, **how)
+    assert reason in left_out(tmp_path)
 
 
 def test_unknown_fields_are_skipped(tmp_path: Path) -> None:
-    folder = write_run(tmp_path, VERSIONS)
-    record = json.loads((folder / "run.json").read_text())
-    record["mood"] = {"of": "the day"}
-    (folder / "run.json").write_text(json.dumps(record))
-    assert read_run(folder).score == -95.0
-
-
-@pytest.mark.parametrize("name", ["workspace", "checkpoints", "logs_agent"])
-@pytest.mark.parametrize("place", ["/etc", "../other", "logs/../../other"])
-def test_a_run_that_names_folders_outside_its_own_is_left_out(tmp_path: Path, name: str, place: str) -> None:
-    folder = write_run(tmp_path, VERSIONS)
-    record = json.loads((folder / "run.json").read_text())
-    record["artifacts"][name] = place
-    (folder / "run.json").write_text(json.dumps(record))
-    found = load_runs([tmp_path])
-    assert found.runs == ()
-    (left,) = found.left_out
-    assert f"artifacts.{name} is outside the run directory" in left.reason
+    assert read_run(write_run(tmp_path, VERSIONS, change={"mood": {"of": "the day"}})).score == -95.0
 
 
 def test_a_rescore_in_which_episodes_report_no_success_has_no_success_rate(tmp_path: Path) -> None:
@@ -115,79 +117,38 @@ def test_a_rescore_in_which_episodes_report_no_success_has_no_success_rate(tmp_p
         assert found.record.outcome.heldout_successes == expected
 
 
-def damage(folder: Path, how: str) -> None:
-    path = folder / "run.json"
-    record = json.loads(path.read_text())
-    match how:
-        case "no run.json":
-            path.unlink()
-        case "half a run.json":
-            path.write_bytes(path.read_bytes()[:500])
-        case "empty":
-            path.write_bytes(b"")
-        case "not utf-8":
-            path.write_bytes(b"\xff\xfe{}")
-        case "wrong type":
-            record["outcome"]["final_score"] = "high"
-            path.write_text(json.dumps(record))
-        case "newer schema":
-            record["schema_version"] = 99
-            path.write_text(json.dumps(record))
-        case "completed without score":
-            record["outcome"]["final_score"] = None
-            path.write_text(json.dumps(record))
-        case "selected submit is gone":
-            record["outcome"]["best_submit_index"] = 77
-            path.write_text(json.dumps(record))
-        case "truncated summary":
-            (folder / "workspace/feedback/submit_000/summary.json").write_text('{"schema_version": 1,')
-        case "damaged metrics":
-            (folder / "checkpoints/submit_000/_meta.json").write_text("[]")
-        case "run.json is a folder":
-            path.unlink()
-            path.mkdir()
-        case "deeply nested":
-            path.write_text("[" * 200_000)
+DAMAGES: dict[str, tuple[str, bytes | None]] = {
+    "unfinished": ("run.json", None),
+    "run.json: ": ("run.json", b'{"schema_version": 1, "outcome"'),
+    "run.json": ("run.json", b""),
+    "run.json: not": ("run.json", b"\xff\xfe{}"),
+    "run.json: not a": ("run.json", b"[" * 200_000),
+    "submit_000/summary.json": ("workspace/feedback/submit_000/summary.json", b'{"schema_version": 1,'),
+    "_meta.json": ("checkpoints/submit_000/_meta.json", b"[]"),
+}
+"""Reason to the file and what becomes of it; None: it goes."""
+CHANGES: dict[str, dict[str, Any]] = {
+    "final_score": {"outcome": {"final_score": "high"}},
+    "schema_version 99": {"schema_version": 99},
+    "no final_score": {"outcome": {"final_score": None}},
+    "selected submit 77": {"outcome": {"best_submit_index": 77}},
+}
 
 
-@pytest.mark.parametrize(
-    ("how", "reason"),
-    [
-        ("no run.json", "unfinished"),
-        ("half a run.json", "run.json"),
-        ("empty", "run.json"),
-        ("not utf-8", "run.json"),
-        ("wrong type", "final_score"),
-        ("newer schema", "schema_version 99"),
-        ("completed without score", "no final_score"),
-        ("selected submit is gone", "selected submit 77"),
-        ("truncated summary", "submit_000/summary.json"),
-        ("damaged metrics", "_meta.json"),
-        ("run.json is a folder", "not a regular file"),
-        ("deeply nested", "run.json"),
-    ],
-)
-def test_damaged_run_is_left_out_with_its_reason(tmp_path: Path, how: str, reason: str) -> None:
+@pytest.mark.parametrize("reason", [*DAMAGES, *CHANGES, "not a regular file"])
+def test_damaged_run_is_left_out_with_its_reason(tmp_path: Path, reason: str) -> None:
     good = write_run(tmp_path, VERSIONS, exp_id="good")
-    bad = write_run(tmp_path, VERSIONS, exp_id="bad")
-    damage(bad, how)
+    bad = write_run(tmp_path, VERSIONS, exp_id="bad", change=CHANGES.get(reason))
+    if reason in DAMAGES:
+        name, content = DAMAGES[reason]
+        (bad / name).unlink() if content is None else (bad / name).write_bytes(content)
+    elif reason not in CHANGES:
+        (bad / "run.json").unlink()
+        (bad / "run.json").mkdir()
     loaded = load_runs([tmp_path])
     assert [run.path for run in loaded.runs] == [good]
     assert [left.path for left in loaded.left_out] == [bad]
     assert reason in loaded.left_out[0].reason
-
-
-def test_a_cancelled_run_is_left_out_as_what_it_is(tmp_path: Path) -> None:
-    write_run(tmp_path, VERSIONS, status="cancelled")
-    (left,) = load_runs([tmp_path]).left_out
-    assert "was cancelled" in left.reason
-
-
-def test_run_that_ended_in_an_error_is_left_out(tmp_path: Path) -> None:
-    write_run(tmp_path, VERSIONS, status="error")
-    loaded = load_runs([tmp_path])
-    assert not loaded.runs
-    assert "worker lost" in loaded.left_out[0].reason
 
 
 def test_run_without_an_ok_submit_stays_in_without_a_score(tmp_path: Path) -> None:
@@ -299,6 +260,10 @@ def test_changed_lines_count_both_sides_of_every_file() -> None:
     assert count_changed_lines({"a": big}, {"a": big + b"more\n"}) == 1
 
 
+def mixed(runs: Path) -> list[str]:
+    return [mixture.what for mixture in mixtures(load_runs([runs]).runs)]
+
+
 @pytest.mark.parametrize(
     ("change", "what"),
     [
@@ -335,11 +300,8 @@ def test_runs_that_are_no_fair_comparison_are_refused(tmp_path: Path, change: di
 )
 def test_runs_whose_agents_had_other_means_are_refused(tmp_path: Path, change: dict, what: str) -> None:
     write_run(tmp_path, VERSIONS)
-    run = write_run(tmp_path, VERSIONS, entry="Agent B")
-    record = json.loads((run / "run.json").read_text())
-    record["experiment_dimensions"] |= change
-    (run / "run.json").write_text(json.dumps(record))
-    assert [mixture.what for mixture in mixtures(load_runs([tmp_path]).runs)] == [what]
+    write_run(tmp_path, VERSIONS, entry="Agent B", change={"experiment_dimensions": change})
+    assert mixed(tmp_path) == [what]
 
 
 @pytest.mark.parametrize(
@@ -353,10 +315,8 @@ def test_limits_must_agree_among_agents_that_have_any(
     tmp_path: Path, what: str, field: str, limits: dict[str, Any], other: dict[str, Any]
 ) -> None:
     for entry, given in (("A", limits), ("B", limits), ("C", {**limits, **other}), ("D", None)):
-        run = write_run(tmp_path, VERSIONS, entry=entry)
-        record = json.loads((run / "run.json").read_text())
-        record["agent"][field] = given and {"metering": "relay", "limits": given}
-        (run / "run.json").write_text(json.dumps(record))
+        use = given and {"metering": "relay", "limits": given}
+        write_run(tmp_path, VERSIONS, entry=entry, change={"agent": {field: use}})
     runs = load_runs([tmp_path]).runs
     (mixture,) = mixtures(runs)
     assert (mixture.what, list(mixture.values.values())) == (what, [2, 1])
@@ -365,10 +325,8 @@ def test_limits_must_agree_among_agents_that_have_any(
 
 def test_prompts_must_agree_within_an_entry_and_may_differ_between_entries(tmp_path: Path) -> None:
     for entry, digest in (("Agent A", ""), ("Agent B", "a"), ("Agent B", "b")):
-        run = write_run(tmp_path, VERSIONS, entry=entry, exp_id=f"e{digest}")
-        record = json.loads((run / "run.json").read_text())
-        record["agent"]["prompts"] = digest and f"sha256:{digest * 64}"
-        (run / "run.json").write_text(json.dumps(record))
+        prompts = {"agent": {"prompts": digest and f"sha256:{digest * 64}"}}
+        write_run(tmp_path, VERSIONS, entry=entry, exp_id=f"e{digest}", change=prompts)
     runs = load_runs([tmp_path]).runs
     (mixture,) = mixtures(runs)
     assert mixture.what == "prompts"
@@ -377,7 +335,7 @@ def test_prompts_must_agree_within_an_entry_and_may_differ_between_entries(tmp_p
 
 
 @pytest.mark.parametrize(
-    ("found", "refused"),
+    ("audit", "refused"),
     [
         ({"share": 0.05, "sampled": 4, "audited": 4, "agreed": 4}, False),
         ({"share": 0.05, "sampled": 4, "not_audited": {"one worker only": 4}}, False),
@@ -386,20 +344,15 @@ def test_prompts_must_agree_within_an_entry_and_may_differ_between_entries(tmp_p
         ({"share": 0.0, "forgers": {"w": 7}}, True),
     ],
 )
-def test_a_run_that_its_audits_put_in_question_is_refused(tmp_path: Path, found: dict, refused: bool) -> None:
-    run = write_run(tmp_path, VERSIONS)
-    record = json.loads((run / "run.json").read_text())
-    (run / "run.json").write_text(json.dumps({**record, "audit": found}))
-    runs = load_runs([tmp_path]).runs
-    assert [mixture.what for mixture in mixtures(runs)] == [IN_QUESTION] * refused
+def test_a_run_that_its_audits_put_in_question_is_refused(tmp_path: Path, audit: dict, refused: bool) -> None:
+    write_run(tmp_path, VERSIONS, change={"audit": audit})
+    assert mixed(tmp_path) == [IN_QUESTION] * refused
 
 
 def test_a_run_continued_by_other_versions_is_set_apart(tmp_path: Path) -> None:
+    overrides = {"versions": {"fingerprint_overrides": ["a → b: the old workers are gone"]}}
     write_run(tmp_path, VERSIONS)
-    run = write_run(tmp_path, VERSIONS, entry="Agent B")
-    record = json.loads((run / "run.json").read_text())
-    record["versions"]["fingerprint_overrides"] = ["a → b: the old workers are gone"]
-    (run / "run.json").write_text(json.dumps(record))
+    write_run(tmp_path, VERSIONS, entry="Agent B", change=overrides)
     (mixture,) = mixtures(load_runs([tmp_path]).runs)
     assert mixture.what == "fingerprint"
     assert mixture.values == {"none": 1, "then a → b: the old workers are gone": 1}
@@ -419,11 +372,9 @@ def test_an_error_names_five_values_and_five_runs_of_each(tmp_path: Path) -> Non
 
 
 def test_runs_from_before_isolation_was_recorded_are_mixed_only_by_name(tmp_path: Path) -> None:
+    before: dict[str, Any] = {"hidden_isolation": ..., "experiment_dimensions": {"hidden_cases": ...}}
     write_run(tmp_path, VERSIONS)
-    old = write_run(tmp_path, VERSIONS, entry="Agent B")
-    record = json.loads((old / "run.json").read_text())
-    del record["hidden_isolation"], record["experiment_dimensions"]["hidden_cases"]
-    (old / "run.json").write_text(json.dumps(record))
+    write_run(tmp_path, VERSIONS, entry="Agent B", change=before)
     for refused in ({}, {"allow_mixed": True}):
         with pytest.raises(MixedRunsError, match=UNKNOWN_ISOLATION):
             study([tmp_path], **refused)
@@ -437,26 +388,25 @@ def test_runs_from_before_isolation_was_recorded_are_mixed_only_by_name(tmp_path
     assert len(study([tmp_path], allow_unknown=True, allow_mixed=True).mixtures) == 2
 
 
-def test_runs_that_all_do_not_tell_their_isolation_are_compared(tmp_path: Path) -> None:
-    write_run(tmp_path, VERSIONS, hidden_isolation="unknown")
-    write_run(tmp_path, VERSIONS, entry="Agent B", hidden_isolation="unknown")
-    assert mixtures(load_runs([tmp_path]).runs) == []
-
-
-def test_runs_with_hidden_cases_of_their_own_differ_in_them_by_design(tmp_path: Path) -> None:
-    for number in range(2):
-        run = write_run(tmp_path, VERSIONS, exp_id=f"e{number}", hidden_cases="per_run")
-        record = json.loads((run / "run.json").read_text())
-        record["versions"] |= {"data_valid_hash": f"v{number}", "data_heldout_hash": f"h{number}"}
-        (run / "run.json").write_text(json.dumps(record))
-    assert mixtures(load_runs([tmp_path]).runs) == []
-
-
-def test_equal_runs_and_other_environments_splits_are_no_mixture(tmp_path: Path) -> None:
-    write_run(tmp_path, VERSIONS)
-    write_run(tmp_path, VERSIONS, entry="Agent B")
-    write_run(tmp_path, VERSIONS, env="gym/ant5", fingerprint={"numpy": "2.4.6", "mujoco": "3.10.0"})
-    assert mixtures(load_runs([tmp_path]).runs) == []
+@pytest.mark.parametrize(
+    "others",
+    [
+        [{"hidden_isolation": "unknown"}, {"hidden_isolation": "unknown", "entry": "Agent B"}],
+        [  # runs with hidden cases of their own differ in them by design
+            {
+                "exp_id": f"e{number}",
+                "hidden_cases": "per_run",
+                "change": {"versions": {"data_valid_hash": f"v{number}", "data_heldout_hash": f"h{number}"}},
+            }
+            for number in range(2)
+        ],
+        [{}, {"entry": "Agent B"}, {"env": "gym/ant5", "fingerprint": {"numpy": "2", "mujoco": "3.10.0"}}],
+    ],
+)
+def test_runs_that_differ_in_nothing_that_counts_are_compared(tmp_path: Path, others: list[dict]) -> None:
+    for other in others:
+        write_run(tmp_path, VERSIONS, **other)
+    assert mixed(tmp_path) == []
 
 
 OF_THE_WORKER = {
@@ -477,31 +427,32 @@ OF_THE_ENVIRONMENT = {
 
 
 @pytest.mark.parametrize(
-    ("there", "here", "mixed"),
+    ("there", "here", "mixed_by"),
     [
-        (OF_THE_WORKER, OF_THE_ENVIRONMENT, False),
-        (OF_THE_ENVIRONMENT, OF_THE_ENVIRONMENT | {"evopolicy-worker": "0.3", "adapter": "1.1+ee"}, False),
-        (OF_THE_WORKER | {"numpy": "1.26"}, OF_THE_ENVIRONMENT, True),
-        (OF_THE_WORKER, OF_THE_ENVIRONMENT | {"adapter": "1.2+bb"}, True),
-        (OF_THE_ENVIRONMENT, OF_THE_ENVIRONMENT | {"definition": "ff"}, True),
-        (OF_THE_WORKER, OF_THE_WORKER | {"evopolicy-worker": "0.1+bb"}, True),
+        (OF_THE_WORKER, OF_THE_ENVIRONMENT, []),
+        (OF_THE_ENVIRONMENT, OF_THE_ENVIRONMENT | {"evopolicy-worker": "0.3", "adapter": "1.1+ee"}, []),
+        (OF_THE_WORKER | {"numpy": "1.26"}, OF_THE_ENVIRONMENT, ["fingerprint"]),
+        (OF_THE_WORKER, OF_THE_ENVIRONMENT | {"adapter": "1.2+bb"}, ["fingerprint"]),
+        (OF_THE_ENVIRONMENT, OF_THE_ENVIRONMENT | {"definition": "ff"}, ["fingerprint"]),
+        (OF_THE_WORKER, OF_THE_WORKER | {"evopolicy-worker": "0.1+bb"}, ["fingerprint"]),
     ],
 )
 def test_runs_of_before_fingerprints_of_single_environments_stay_comparable(
-    tmp_path: Path, there: dict[str, str], here: dict[str, str], mixed: bool
+    tmp_path: Path, there: dict[str, str], here: dict[str, str], mixed_by: list[str]
 ) -> None:
     write_run(tmp_path, VERSIONS, fingerprint=there)
     write_run(tmp_path, VERSIONS, entry="Agent B", fingerprint=here)
-    found = [mixture.what for mixture in mixtures(load_runs([tmp_path]).runs)]
-    assert found == (["fingerprint"] if mixed else [])
+    assert mixed(tmp_path) == mixed_by
 
 
-def test_step_limits_are_compared_where_an_environment_has_two(tmp_path: Path) -> None:
-    for env, found in (("gym/acrobot", []), ("gymnasium/MiniGrid-DoorKey-16x16-v0", ["step limit"])):
-        runs = tmp_path / env
-        write_run(runs, VERSIONS, env=env)
-        run = write_run(runs, VERSIONS, env=env, entry="Agent B")
-        record = json.loads((run / "run.json").read_text())
-        record["experiment_dimensions"]["step_limit"] = "published"
-        (run / "run.json").write_text(json.dumps(record))
-        assert [mixture.what for mixture in mixtures(load_runs([runs]).runs)] == found
+@pytest.mark.parametrize(
+    ("env", "mixed_by"),
+    [("gym/acrobot", []), ("gymnasium/MiniGrid-DoorKey-16x16-v0", ["step limit"])],
+)
+def test_step_limits_are_compared_where_an_environment_has_two(
+    tmp_path: Path, env: str, mixed_by: list[str]
+) -> None:
+    write_run(tmp_path, VERSIONS, env=env)
+    change = {"experiment_dimensions": {"step_limit": "published"}}
+    write_run(tmp_path, VERSIONS, env=env, entry="Agent B", change=change)
+    assert mixed(tmp_path) == mixed_by

@@ -16,8 +16,8 @@ from invented.small_table import TABLE
 from evopolicy_common import catalogue
 from evopolicy_results.behaviour.edits import classify, events_of, phases
 from evopolicy_results.behaviour.trace import diff, trace
-from evopolicy_results.figures.edits import wilson
 from evopolicy_results.figures.plot import inline_svg
+from evopolicy_results.figures.policies import wilson
 from evopolicy_results.figures.style import new_figure, svg_text
 from evopolicy_results.figures.timelines import MAX_ROWS
 from evopolicy_results.notebook import figures_of
@@ -131,9 +131,9 @@ def test_wilson_interval_is_the_published_one() -> None:
 
 
 def test_inline_svg_is_themed_named_and_has_ids_of_its_own() -> None:
-    figure, axes = new_figure(2.0, 1.0)
-    axes[0][0].plot([0, 1], [0, 1])
-    axes[0][0].set_title("cost in $ of a_b$")
+    with new_figure(2.0, 1.0) as (figure, axes):
+        axes[0][0].plot([0, 1], [0, 1])
+        axes[0][0].set_title("cost in $ of a_b$")
     svg = svg_text(figure, "a")
     assert svg == svg_text(figure, "a")
     one, two = inline_svg(svg, "a", 'an "alt" <text>'), inline_svg(svg, "b", "b")

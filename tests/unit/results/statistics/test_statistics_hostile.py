@@ -155,7 +155,7 @@ def test_a_run_without_an_ok_submit_has_no_gap_and_stays_last() -> None:
     found = pairs(samples, ["A", "B", "C"], ["env"])
     assert [one.reason for one in found] == ["", NO_SCORE, NO_SCORE]
     assert found[1].gap is None
-    board = standings(samples, {"A": 1.0, "B": 0.5, "C": 0.0}, ["env"], found=found)
+    board = standings(samples, {"A": 1.0, "B": 0.5, "C": 0.0}, ["env"], compared=found)
     assert [(row.entry, row.ties) for row in board.rows] == [("A", "a"), ("B", "b"), ("C", "c")]
     (a, _, c), _ = aggregates(samples, ["A", "B", "C"], {"env": Scale(random=0.0, best=20.0)})
     assert a.iqm is not None
@@ -267,7 +267,7 @@ def test_a_verdict_never_contradicts_the_interval_beside_it(world: World, seed: 
         found = pairs(samples, world.names, world.environments, resamples=200)
         told = {frozenset((one.first, one.second)) for one in found if one.verdict in ("first", "second")}
         scores = observed_scores(world, samples)
-        rows = standings(samples, scores, world.environments, found=found, resamples=200).rows
+        rows = standings(samples, scores, world.environments, compared=found, resamples=200).rows
         for one, other in itertools.combinations(rows, 2):
             if not set(one.ties) & set(other.ties):
                 assert frozenset((one.entry, other.entry)) in told
@@ -289,7 +289,7 @@ def test_any_numbers_give_finite_intervals_or_a_reason(every: list[list[list[flo
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         found = pairs(samples, names, ["env"], resamples=50)
-        board = standings(samples, dict.fromkeys(names, 0.5), ["env"], found=found, resamples=50)
+        board = standings(samples, dict.fromkeys(names, 0.5), ["env"], compared=found, resamples=50)
     for one in found:
         assert one.p is None or 0.0 < one.p <= 1.0
         if one.gap is not None and one.gap.low is not None:

@@ -7,13 +7,14 @@ import math
 
 import numpy as np
 import pytest
+from invented.simulated_entries import half_width
 
 from evopolicy_common.statistics.distributions import holm, t_quantile
 from evopolicy_common.statistics.intervals import difference, of_runs, over_cases
 from evopolicy_results.scoring.normalised import Scale
 from evopolicy_results.statistics.aggregates import TAUS, aggregates, iqm, probability_of_improvement, profile
 from evopolicy_results.statistics.permutation import label_test
-from evopolicy_results.statistics.repeats import Spread, half_width, repeats_needed
+from evopolicy_results.statistics.repeats import Spread, repeats_needed
 from evopolicy_results.statistics.samples import RunReturns, Sample
 
 A = np.array([[0.1, 0.9, 0.35], [0.2, 0.7, 0.5], [0.15, 1.1, 0.45], [0.05, 0.8, 0.65], [0.3, 0.95, 0.2]])
@@ -135,10 +136,10 @@ def test_crossed_interval_is_the_analysis_of_variance_by_hand() -> None:
 def test_repeats_are_the_fewest_whose_interval_is_narrow_enough() -> None:
     spread = Spread(run=1.0, case=0.01, n_cases=32)
     for gap in (0.25, 0.5, 1.0):
-        n = repeats_needed(spread, gap).n
+        n = repeats_needed(spread, gap)
         assert n is not None
         assert half_width(spread, n) <= gap < half_width(spread, n - 1)
-    assert repeats_needed(spread, 0.19).n is None  # the cases alone leave ±0.2
-    assert repeats_needed(Spread(run=0.0, case=0.0, n_cases=32), 0.1).n == 2
+    assert repeats_needed(spread, 0.19) is None  # the cases alone leave ±0.2
+    assert repeats_needed(Spread(run=0.0, case=0.0, n_cases=32), 0.1) == 2
     with pytest.raises(ValueError, match="above 0"):
         repeats_needed(spread, 0.0)
