@@ -43,7 +43,6 @@ class Features(msgspec.Struct, frozen=True, kw_only=True):
     """AST nodes that the topology includes: a size independent of formatting."""
     lines: int = 0
     """Source lines, including blank lines and comments."""
-    modules: int = 0
 
 
 def describe(modules: Mapping[str, Module]) -> tuple[str, Features]:
@@ -68,7 +67,6 @@ def describe(modules: Mapping[str, Module]) -> tuple[str, Features]:
         lines=sum(
             module.source.count(b"\n") + (not module.source.endswith(b"\n")) for module in modules.values()
         ),
-        modules=len(modules),
     )
     return stable_hash([canonical(walker.units, walker.names), *sorted(opaque)]), features
 

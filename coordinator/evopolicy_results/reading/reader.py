@@ -10,14 +10,16 @@ from __future__ import annotations
 
 import math
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import msgspec
+from msgspec.structs import replace
 
 from evopolicy_common.errors import ProtocolError
 from evopolicy_common.messages.bounds import check_plausible
+from evopolicy_common.messages.environment import Split
 from evopolicy_common.messages.gateway import REJECTED
 from evopolicy_common.records.newest import described
 from evopolicy_common.records.policies.checkpoints import policy_folder, read_meta
@@ -32,7 +34,6 @@ from evopolicy_results.reading import published
 from evopolicy_results.reading.parallel import ALONE, Processes
 from evopolicy_results.reading.published import PUBLISHED, PublishedSummary
 from evopolicy_results.reading.records import LeftOut, Run, Source, Submit, checkpoint_folder
-from evopolicy_results.reading.softwares import reconciled
 from evopolicy_results.scan.run import feedback_actions, log_lines, policy_files, scan, workspace_files
 from evopolicy_results.scan.signals import Signal
 
@@ -103,6 +104,48 @@ def load_runs(
     return Loaded(runs=reconciled(runs), left_out=tuple(left_out))
 
 
+SPLITS: tuple[Split, ...] = ("train", "validation", "heldout")
+
+
+def reconciled(runs: Sequence[Run]) -> tuple[Run, ...]:
+    """The runs, where a published run has the splits of our runs on its files, and an entry of its own if one of ours
+    has its name.
+
+    The published software records the hash of a case file's bytes, and we also that of the cases which a run used. A
+    run of ours on the same file therefore tells which cases a published run used.
+    """
+    ours = [run for run in runs if not run.is_published]
+    entries = {run.entry for run in ours}
+    used: dict[tuple[Split, str], dict[str, set[int]]] = {}
+    for run in ours:
+        for split in SPLITS:
+            versions = run.record.versions
+            by_cases = used.setdefault((split, versions.file_hash(split)), {})
+            by_cases.setdefault(versions.cases_hash(split), set()).add(_n_cases(run, split))
+
+    def reconcile(run: Run) -> Run:
+        agent, versions = run.record.agent, run.record.versions
+        hashes: dict[Split, str] = {}
+        for split in SPLITS:
+            n, known = _n_cases(run, split), used.get((split, versions.file_hash(split)), {})
+            # Several runs of ours may have used different numbers of cases of the file.
+            fitting = [cases for cases, counts in known.items() if not n or n in counts]
+            if len(fitting) == 1:
+                hashes[split] = fitting[0]
+        if run.entry in entries:
+            agent = replace(agent, entry=f"{run.entry} ({published.HARNESS})")
+        versions = replace(versions, cases_hashes={**versions.cases_hashes, **hashes})
+        return replace(run, record=replace(run.record, agent=agent, versions=versions))
+
+    return tuple(reconcile(run) if run.is_published else run for run in runs)
+
+
+def _n_cases(run: Run, split: Split) -> int:
+    """0 if unknown."""
+    n: int = getattr(run.record.experiment_dimensions, f"n_{split}")
+    return n
+
+
 def read_or_explain(folder: Path) -> Run | LeftOut:
     """The run in `folder`, or the reason why it is left out."""
     try:
@@ -136,7 +179,7 @@ def read_run(folder: Path) -> Run:
     if outcome.status == "completed" and selected is None:
         raise UnreadableRunError(f"the selected submit {outcome.best_submit_index} has no files")
     run = Run(path=folder, record=record, submits=submits)
-    run = msgspec.structs.replace(run, signals=_signals(run))
+    run = replace(run, signals=_signals(run))
     try:
         check_plausible({"run.json": run.record, "submits": run.submits})
     except ValueError as error:

@@ -6,7 +6,7 @@
     for pair in core16.pairs:                    # typed records
         print(pair.env, pair.first, pair.second, pair.gap, pair.p_holm, pair.verdict)
 
-Pure: arrays in, records out, seeded. `samples` is the input; `intervals` and `permutation` hold the methods; `pairs`,
-`standings`, `resolution`, `aggregates` and `generalisation` hold a report's results; `suite` combines them. Only runs
-that the report compares are used, so unfair mixtures occur only if the operator allowed them.
+Pure: arrays in, records out, seeded. `samples` is the input; `pairs`, `standings`, `resolution`, `aggregates`
+and `generalisation` hold a report's results. Only runs that the report compares are used, so unfair mixtures occur only
+if the operator allowed them.
 """

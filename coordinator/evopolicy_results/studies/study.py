@@ -7,6 +7,7 @@ from pathlib import Path
 
 import msgspec
 
+from evopolicy_common.statistics.intervals import Estimate
 from evopolicy_common.statistics.resampling import RESAMPLES
 from evopolicy_results.behaviour.audit import AuditSignals, TokenUse, audit_signals, mean_phases, token_use
 from evopolicy_results.behaviour.edits import EditRates, edit_rates
@@ -24,12 +25,33 @@ from evopolicy_results.reading.reader import load_runs
 from evopolicy_results.reading.records import LeftOut, Run
 from evopolicy_results.reading.rescored import rescored
 from evopolicy_results.scoring.evolution import Evolution, evolutions
-from evopolicy_results.scoring.normalised import Normalised, normalised
+from evopolicy_results.scoring.normalised import Normalised, normalised, scales_of
 from evopolicy_results.scoring.ranking import Leaderboard, leaderboard
 from evopolicy_results.scoring.scores import ScoreTable, score_table
+from evopolicy_results.statistics.aggregates import Aggregate, Improvement, aggregates
+from evopolicy_results.statistics.generalisation import Generalisation, Optimism, generalisation, optimism_of
+from evopolicy_results.statistics.pairs import Pair, cell_mean, pairs
+from evopolicy_results.statistics.resolution import Resolution, overall, resolutions
+from evopolicy_results.statistics.samples import samples_of
+from evopolicy_results.statistics.standings import Standings, standings
 from evopolicy_results.statistics.starts import VARIED, StartGroup, grouped, start_groups
-from evopolicy_results.statistics.suite import SuiteStatistics, suite_statistics
 from evopolicy_results.statistics.worlds import Worlds, worlds_of
+
+
+class SuiteStatistics(msgspec.Struct, frozen=True, kw_only=True):
+    """The uncertainty of a suite's scores."""
+
+    means: dict[tuple[str, str], Estimate]
+    """Held-out mean by (entry, env); cells without a mean are absent."""
+    pairs: tuple[Pair, ...]
+    standings: Standings
+    resolutions: tuple[Resolution, ...]
+    overall: Resolution | None
+    """Resolution of the mean of normalised scores over all environments."""
+    aggregates: tuple[Aggregate, ...]
+    improvements: tuple[Improvement, ...]
+    generalisation: tuple[Generalisation, ...]
+    optimism: tuple[Optimism, ...]
 
 
 class Suite(msgspec.Struct, frozen=True, kw_only=True):
@@ -170,13 +192,31 @@ def study(
 
 
 def _suite(name: str, table: ScoreTable, runs: Sequence[Run], resamples: int) -> Suite:
-    board = leaderboard(table)
+    """`runs` supply the returns by case, and may include others than those of `table`."""
+    board, environments, scales = leaderboard(table), table.environments, scales_of(table)
+    samples = samples_of(runs, table)
+    compared = pairs(samples, table.entries, environments, resamples=resamples)
+    means = {key: mean for key, sample in samples.items() if (mean := cell_mean(sample, resamples=resamples))}
+    resolved = resolutions(samples, compared, table.agents, scales, environments)
+    alone, against = aggregates(samples, board.agents, scales, resamples=resamples)
+    general = generalisation((run for run in runs if run.env in set(environments)), scales)
+    scores = {row.entry: row.score for row in board.standings}
     return Suite(
         name=name,
         table=table,
         board=board,
         normalised=normalised(table),
-        statistics=suite_statistics(runs, table, board, resamples=resamples),
+        statistics=SuiteStatistics(
+            means=means,
+            pairs=tuple(compared),
+            standings=standings(samples, scores, environments, compared=compared, resamples=resamples),
+            resolutions=tuple(resolved),
+            overall=overall(resolved),
+            aggregates=tuple(alone),
+            improvements=tuple(against),
+            generalisation=tuple(general),
+            optimism=tuple(filter(None, (optimism_of(agent, general) for agent in board.agents))),
+        ),
     )
 
 

@@ -245,5 +245,4 @@ class Map:
     assert features.loops == 2
     assert features.depth == 4  # for, while, elif, with
     assert features.state == 5  # Policy: x, y, cells; Map: x; global CALLS
-    assert features.modules == 1
     assert features.lines == source.count(b"\n")

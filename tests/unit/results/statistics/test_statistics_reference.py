@@ -13,7 +13,7 @@ from evopolicy_common.statistics.distributions import holm, t_quantile
 from evopolicy_common.statistics.intervals import difference, of_runs, over_cases
 from evopolicy_results.scoring.normalised import Scale
 from evopolicy_results.statistics.aggregates import TAUS, aggregates, iqm, probability_of_improvement, profile
-from evopolicy_results.statistics.permutation import label_test
+from evopolicy_results.statistics.pairs import label_test
 from evopolicy_results.statistics.repeats import Spread, repeats_needed
 from evopolicy_results.statistics.samples import RunReturns, Sample
 
