@@ -64,24 +64,23 @@ def _incomplete_beta(a: float, b: float, x: float) -> float:
     if x > (a + 1.0) / (a + b + 2.0):
         return 1.0 - _incomplete_beta(b, a, 1.0 - x)
     log_front = math.lgamma(a + b) - math.lgamma(a) - math.lgamma(b) + a * math.log(x) + b * math.log1p(-x)
-    tiny = 1e-300
-    c, d = 1.0, 1.0 / _away(1.0 - (a + b) * x / (a + 1.0), tiny)
+    c, d = 1.0, 1.0 / _away_from_0(1.0 - (a + b) * x / (a + 1.0))
     value = d
     for m in range(1, 500):
         for numerator in (
             m * (b - m) * x / ((a + 2 * m - 1.0) * (a + 2 * m)),
             -(a + m) * (a + b + m) * x / ((a + 2 * m) * (a + 2 * m + 1.0)),
         ):
-            d = 1.0 / _away(1.0 + numerator * d, tiny)
-            c = _away(1.0 + numerator / c, tiny)
+            d = 1.0 / _away_from_0(1.0 + numerator * d)
+            c = _away_from_0(1.0 + numerator / c)
             value *= d * c
         if abs(d * c - 1.0) < 1e-15:
             break
     return math.exp(log_front) * value / a
 
 
-def _away(value: float, tiny: float) -> float:
-    return value if abs(value) > tiny else tiny
+def _away_from_0(value: float) -> float:
+    return value if abs(value) > 1e-300 else 1e-300
 
 
 def holm(p_values: Sequence[float | None]) -> list[float | None]:

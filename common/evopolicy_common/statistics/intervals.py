@@ -130,7 +130,8 @@ def of_runs(first: Sequence[float], second: Sequence[float] = ()) -> Estimate:
         return Estimate(value=value, reason=TOO_FEW_RUNS)
     variances = [float(group.var(ddof=1)) / len(group) for group in groups]
     total = sum(variances)
-    if _is_zero(total, groups):
+    scale = max(float(np.abs(group).max()) for group in groups)
+    if total <= (_RELATIVE_ZERO * scale) ** 2:
         return Estimate(value=value, reason=no_spread(min(map(len, groups))))
     return _t_interval(value, total, _runs_df(variances, [len(one) for one in groups]), "Welch t", "runs")
 
@@ -181,16 +182,24 @@ def over_cases(values: Floats, returns: Sequence[Floats] = (), *, resamples: int
     value = float(values.mean())
     if n < LEAST_CASES:
         return Estimate(value=value, method="none", over="cases", reason=TOO_FEW_CASES)
-    levels = _two_levels(returns)
-    if levels is not None and len(returns) > 1:
-        return score_interval(values, levels[1] - levels[0])
-    if levels is not None:
-        low, high = (levels[0] + bound for bound in adjusted_wald(values - levels[0], levels[1] - levels[0]))
+    levels: NDArray[np.float64] = np.unique(np.concatenate([one.ravel() for one in returns] or [np.zeros(0)]))
+    if len(levels) == 2:
+        least, step = float(levels[0]), float(levels[1] - levels[0])
+        if len(returns) > 1:
+            return score_interval(values, step)
+        # Agresti and Coull 1998.
+        z = normal_quantile(1.0 - ALPHA / 2.0)
+        total = n + z * z
+        centre = (float((values - least > 0.5 * step).sum()) + 0.5 * z * z) / total
+        width = z * math.sqrt(centre * (1.0 - centre) / total)
+        low, high = (least + step * bound for bound in (max(0.0, centre - width), min(1.0, centre + width)))
         return Estimate(value=value, low=low, high=high, method="adjusted Wald", over="cases")
     half = float(bootstrap_t(values[:, None], resamples=resamples)[0])
     if not math.isfinite(half):
-        reason = no_spread(n, "cases") if _constant(values) else TOO_FEW_CASES
-        return Estimate(value=value, over="cases", reason=reason)
+        is_constant = float(np.ptp(values)) <= _RELATIVE_ZERO * float(np.abs(values).max(initial=0.0))
+        return Estimate(
+            value=value, over="cases", reason=no_spread(n, "cases") if is_constant else TOO_FEW_CASES
+        )
     # Few resamples have no small quantiles, so the tail is that of Student's t, on the scale of the 95 % quantile.
     p = t_two_sided(abs(value) / half * t_quantile(1.0 - ALPHA / 2.0, n - 1), n - 1)
     return Estimate(value=value, low=value - half, high=value + half, method="bootstrap-t", over="cases", p=p)
@@ -215,16 +224,6 @@ def bootstrap_t(columns: Floats, *, resamples: int = RESAMPLES, seed: int = 0) -
     quantile = np.quantile(t, CONFIDENCE, axis=0, method="inverted_cdf")
     half: Floats = np.where(varies, np.where(varies, quantile, 0.0) * spread / math.sqrt(n), np.inf)
     return half
-
-
-def adjusted_wald(values: Floats, step: float) -> tuple[float, float]:
-    """Interval of the mean of two-valued returns, 0 or `step` (Agresti and Coull 1998)."""
-    z = normal_quantile(1.0 - ALPHA / 2.0)
-    n = len(values)
-    total = n + z * z
-    centre = (float((values > 0.5 * step).sum()) + 0.5 * z * z) / total
-    half = z * math.sqrt(centre * (1.0 - centre) / total)
-    return step * max(0.0, centre - half), step * min(1.0, centre + half)
 
 
 def score_interval(values: Floats, step: float) -> Estimate:
@@ -305,20 +304,3 @@ def _t_interval(value: float, variance: float, df: float, method: Method, over: 
     half = t_quantile(1.0 - ALPHA / 2.0, df) * error
     p = t_two_sided(abs(value) / error, df)
     return Estimate(value=value, low=value - half, high=value + half, method=method, over=over, p=p)
-
-
-def _two_levels(returns: Sequence[Floats]) -> tuple[float, float] | None:
-    """The two values that all returns take; None if they take one, or more than two."""
-    if not returns:
-        return None
-    values: NDArray[np.float64] = np.unique(np.concatenate([one.ravel() for one in returns]))
-    return (float(values[0]), float(values[1])) if len(values) == 2 else None
-
-
-def _constant(values: Floats) -> bool:
-    return float(np.ptp(values)) <= _RELATIVE_ZERO * float(np.abs(values).max(initial=0.0))
-
-
-def _is_zero(variance: float, groups: Sequence[Floats]) -> bool:
-    scale = max(float(np.abs(group).max()) for group in groups)
-    return variance <= (_RELATIVE_ZERO * scale) ** 2

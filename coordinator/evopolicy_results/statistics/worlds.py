@@ -89,10 +89,12 @@ def worlds_of(runs: Sequence[Run], table: ScoreTable, evolutions: Iterable[Evolu
             scopes |= {family: [one for one in cells if family_of(one.env) == family] for family in families}
         paired += [_paired(entry, scope, own) for scope, own in scopes.items()]
         paired += [_paired(entry, cell.env, [cell]) for cell in cells]
-    found = list(evolutions)
-    curves = {entry: _curve([one for one in found if one.entry == entry], pairs) for entry in table.agents}
     if not paired:
         return None
+    by_entry: dict[str, list[Evolution]] = {entry: [] for entry in table.agents}
+    for one in evolutions:
+        by_entry[one.entry].append(one)
+    curves = {entry: _curve(several, pairs) for entry, several in by_entry.items()}
     return Worlds(paired=tuple(paired), curves={entry: curve for entry, curve in curves.items() if curve})
 
 
@@ -128,29 +130,30 @@ def _paired(entry: str, scope: str, cells: Sequence[_Cell]) -> Paired:
     )
 
 
-def _curve(found: Sequence[Evolution], pairs: dict[str, list[str]]) -> tuple[CurvePoint, ...]:
+def _curve(evolutions: Sequence[Evolution], pairs: dict[str, list[str]]) -> tuple[CurvePoint, ...]:
     """The curve over the environments of which the entry has played all of the report's worlds."""
     by_env: dict[str, list[Evolution]] = {}
-    for one in found:
+    for one in evolutions:
         by_env.setdefault(one.env, []).append(one)
     whole = {env: worlds for env, worlds in pairs.items() if all(each in by_env for each in (env, *worlds))}
-    budget = max((one.budget for env in whole for one in by_env[env]), default=0)
-    share = [1.0 / len(whole)] * len(whole) if whole else []
-    points = []
-    for episodes in sorted({round(x) for x in np.linspace(0, budget, N_POINTS + 1)}) if whole else ():
-        level = {
-            env: [_level(one, episodes) for one in by_env[env]]
-            for env in (each for base, worlds in whole.items() for each in (base, *worlds))
-        }
-        after = [stratum_of([fmean(level[each]) for each in worlds]) for worlds in whole.values()]
-        points.append(
-            CurvePoint(
-                episodes=episodes,
-                unchanged=stratified([stratum_of(level[env]) for env in whole], share, "runs"),
-                worlds=stratified(after, share, "worlds, runs, and cases"),
-            )
+    if not whole:
+        return ()
+    played = [env for base, worlds in whole.items() for env in (base, *worlds)]
+    budget = max(one.budget for env in whole for one in by_env[env])
+    share = [1.0 / len(whole)] * len(whole)
+
+    def point(episodes: int) -> CurvePoint:
+        levels = {env: [_level(one, episodes) for one in by_env[env]] for env in played}
+        after = [stratum_of([fmean(levels[each]) for each in worlds]) for worlds in whole.values()]
+        return CurvePoint(
+            episodes=episodes,
+            unchanged=stratified([stratum_of(levels[env]) for env in whole], share, "runs"),
+            worlds=stratified(after, share, "worlds, runs, and cases"),
         )
-    return tuple(points)
+
+    return tuple(
+        point(episodes) for episodes in sorted({round(x) for x in np.linspace(0, budget, N_POINTS + 1)})
+    )
 
 
 def _level(one: Evolution, episodes: int) -> float:

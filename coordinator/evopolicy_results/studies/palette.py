@@ -55,14 +55,14 @@ class Look(msgspec.Struct, frozen=True, kw_only=True):
 def looks(agents: Sequence[str], reference: str | None) -> dict[str, Look]:
     """Assigns each agent a look by the place of its name among all agents of the report; the reference is grey and
     dashed."""
-    out: dict[str, Look] = {}
-    for place, agent in enumerate(sorted(agents, key=lambda name: (name.casefold(), name))):
-        lap = place // len(COLOURS)
-        out[agent] = Look(
+    out = {
+        agent: Look(
             colour=COLOURS[place % len(COLOURS)],
             marker=MARKERS[place % len(MARKERS)],
-            dash=DASHES[lap % len(DASHES)],
+            dash=DASHES[place // len(COLOURS) % len(DASHES)],
         )
-    if reference is not None:
-        out[reference] = Look(colour=REFERENCE, marker="|", dash=DASHES[1])
-    return out
+        for place, agent in enumerate(sorted(agents, key=lambda name: (name.casefold(), name)))
+    }
+    return (
+        out if reference is None else {**out, reference: Look(colour=REFERENCE, marker="|", dash=DASHES[1])}
+    )
