@@ -168,7 +168,7 @@ def _lines(path: Path) -> Iterator[bytes]:
 
 def _events_of(value: dict[str, Any]) -> Iterator[LogEvent]:
     at = _stamp(value)
-    if "type" not in value and "turn" not in value and "message" not in value:
+    if not {"type", "turn", "message"} & value.keys():
         inner = next((value[key] for key in _WRAPPERS if key in value), None)
         if isinstance(inner, str):
             try:
@@ -177,8 +177,7 @@ def _events_of(value: dict[str, Any]) -> Iterator[LogEvent]:
                 return
         if not isinstance(inner, dict):
             return
-        value = inner
-        at = at if at is not None else _stamp(value)
+        value, at = inner, _stamp(inner) if at is None else at
     kind = value.get("type")
     if kind in ("assistant", "user"):
         message = value.get("message")
@@ -190,11 +189,11 @@ def _events_of(value: dict[str, Any]) -> Iterator[LogEvent]:
                 yield from _claude_block(block, kind == "assistant", at)
     elif kind == "item.completed" and isinstance(value.get("item"), dict):
         yield from _codex_item(value["item"], at)
-    elif kind == "stdout" and isinstance(value.get("text"), str):
-        named = _NAMED.match(value["text"])
-        yield LogEvent(message=_clip(value["text"]), answered=(int(named.group(1)),) if named else (), at=at)
-    elif isinstance(value.get("turn"), int) and isinstance(value.get("text"), str):
-        yield LogEvent(message=_clip(value["text"]), at=at)
+    elif isinstance(text := value.get("text"), str) and (
+        kind == "stdout" or isinstance(value.get("turn"), int)
+    ):
+        named = _NAMED.match(text) if kind == "stdout" else None
+        yield LogEvent(message=_clip(text), answered=(int(named[1]),) if named else (), at=at)
 
 
 def _claude_block(block: dict[str, Any], by_agent: bool, at: float | None) -> Iterator[LogEvent]:

@@ -252,9 +252,11 @@ def _read_submits(folder: Path, record: RunRecord) -> tuple[Submit, ...]:
         if status in REJECTED:
             continue
         before, consumed = consumed, budget - after
-        files, source = _read_source(checkpoint) if status == "ok" else (None, None)
+        files, source = None, None
+        if status == "ok" and checkpoint.is_dir():
+            files, source = describe_files(read_python_files(policy_folder(checkpoint)))
         changed = None if files is None or previous is None else count_changed_lines(previous, files)
-        previous = files if files is not None else previous
+        previous = previous if files is None else files
         submits.append(
             Submit(
                 index=index,
@@ -288,12 +290,6 @@ def _read_summary(folder: Path, record: RunRecord) -> Summary | PublishedSummary
 
 _described: OrderedDict[str, Source] = OrderedDict()
 _MAX_DESCRIBED = 4096
-
-
-def _read_source(checkpoint: Path) -> tuple[Files | None, Source | None]:
-    if not checkpoint.is_dir():
-        return None, None
-    return describe_files(read_python_files(policy_folder(checkpoint)))
 
 
 def describe_files(files: Files) -> tuple[Files, Source | None]:

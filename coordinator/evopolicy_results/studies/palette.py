@@ -18,7 +18,6 @@ COLOURS = (
     "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9",
     "#aa4499", "#999933", "#882255",
 )  # fmt: skip
-MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">")
 DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (1.5, 1)), (0, (6, 1.5, 1.5, 1.5)))
 
 EDIT_COLOURS = {"first": "#b9bec6", "synthesis": "#7b6fd0", "parametric": "#c9a227", "data": "#5f9e98"}
@@ -37,6 +36,8 @@ MARKER_PATHS = {
     "|": "M6.5 1h3v14h-3z",
 }
 """The markers as SVG paths in a 16 × 16 box, for pages."""
+MARKERS = tuple(MARKER_PATHS)[:-1]
+"""Without the reference's."""
 
 
 class Look(msgspec.Struct, frozen=True, kw_only=True):

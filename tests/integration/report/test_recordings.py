@@ -228,13 +228,11 @@ def test_a_harnesss_log_tells_what_was_read_and_said_before_each_submit(runs: Pa
     found = trace(run)
     assert [row.submit.index for row in found.rows] == [0, 1, 2]
     first, second, third = (row.evidence for row in found.rows)
-    assert first is not None
     assert (first.read, first.messages) == ((), ())
     for evidence, row, plan in (
         (second, found.rows[0], "add a term"),
         (third, found.rows[1], "change a constant"),
     ):
-        assert evidence is not None
         name = f"submit_{row.submit.index:03d}"
         assert evidence.read == (f"feedback/{name}/summary.json",)
         quote = f"{name} came to a mean return of {row.submit.mean_return:.4g}. I {plan} next."

@@ -12,8 +12,9 @@ from pathlib import Path
 from urllib.parse import unquote
 
 import pytest
+from click.testing import Result
 from invented.policies import Version, png, policy
-from invented.run_dirs import write_run
+from invented.run_dirs import amend, write_run
 from invented.study import AGENTS, write_suite
 from typer.testing import CliRunner
 
@@ -29,14 +30,6 @@ MP4 = bytes.fromhex("000000206674797069736f6d0000020069736f6d69736f32617663316d7
 """The first box of a video file: enough to be copied and linked."""
 
 
-def reported(runs: Path, *options: str, code: int = 0) -> tuple[Path, str]:
-    """The folder with a report on `runs`, beside them, and what the command said."""
-    out = runs.parent / "report"
-    result = CliRunner().invoke(app, [str(runs), "--out", str(out), *options])
-    assert result.exit_code == code, result.output
-    return out, result.output
-
-
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("runs")
@@ -46,12 +39,26 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+PLAIN = [Version(policy(), (1.0,), 1.0)]
+
+
+def reported(runs: Path, out: Path, *options: str, code: int = 0) -> Result:
+    """`evopolicy report` in this process, which ends with `code`."""
+    result = CliRunner().invoke(app, [str(runs), "--out", str(out), *options])
+    assert result.exit_code == code, result.output
+    return result
+
+
+def report_on(folder: Path, *options: str) -> Path:
+    """The report on `folder/runs`."""
+    reported(folder / "runs", folder / "report", *options)
+    return folder / "report"
+
+
 @pytest.fixture(scope="module")
 def report(runs: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("out") / "report"
-    result = CliRunner().invoke(app, [str(runs), "--out", str(out), "--jobs", "1", "--json"])
-    assert result.exit_code == 0, result.output
-    found = json.loads(result.stdout)
+    found = json.loads(reported(runs, out, "--jobs", "1", "--json").stdout)
     assert (found["runs"], len(found["left_out"])) == (23, 1)
     assert found["index"] == str(out / "index.html")
     return out
@@ -124,21 +131,19 @@ def test_agents_and_environments_are_listed_as_they_were_set_up(tmp_path: Path) 
     for repeat, settings in enumerate(
         ({"effort": "high", "retries": 5, "requests_failed": 3, "folder": "/home/me"}, {"effort": "low"})
     ):
-        folder = write_run(tmp_path / "runs", [Version(policy(), (1.0,), 1.0)], repeat=repeat, budget=64)
-        record = json.loads((folder / "run.json").read_text())
-        record["agent"] |= {"settings": settings, "model_string": "m-1", "cli_version": "2.0"}
-        (folder / "run.json").write_text(json.dumps(record))
-    reported(tmp_path / "runs")
-    agents = table(tmp_path / "report", "agents")
+        agent = {"settings": settings, "model_string": "m-1", "cli_version": "2.0"}
+        write_run(tmp_path / "runs", PLAIN, repeat=repeat, budget=64, settings={}, change={"agent": agent})
+    report = report_on(tmp_path)
+    agents = table(report, "agents")
     assert [(r["entry"], r["cli_version"], r["model"], r["settings"], r["runs"]) for r in agents] == [
         ("Agent A", "2.0", "m-1", "effort high, retries 5", "1"),
         ("Agent A", "2.0", "m-1", "effort low", "1"),
     ]
-    (env,) = table(tmp_path / "report", "environments")
+    (env,) = table(report, "environments")
     assert (env["id"], env["family"], env["demand"], env["budget"], env["steps"]) == (
         "gym/acrobot", "Gym / Box2D", "tuning", "64", "500",
     )  # fmt: skip
-    board = table(tmp_path / "report", "leaderboard_core16")
+    board = table(report, "leaderboard_core16")
     assert {r["entry"]: r["budget"] for r in board} == {"Agent A": "64", "Random policy": ""}
 
 
@@ -206,7 +211,7 @@ def test_columns_without_any_value_are_not_on_the_page(report: Path) -> None:
 
 
 def test_evopolicy_has_report_as_a_plain_command(tmp_path: Path) -> None:
-    write_run(tmp_path / "runs", [Version(policy(), (1.0,), 1.0)])
+    write_run(tmp_path / "runs", PLAIN)
     command = [sys.executable, "-c", "from evopolicy_gateway.cli.main import main; main()", "report"]
     arguments = [str(tmp_path / "runs"), "--out", str(tmp_path / "report"), "--no-pages"]
     done = subprocess.run([*command, *arguments], capture_output=True, text=True, timeout=120, check=False)
@@ -224,24 +229,21 @@ def test_left_out_run_is_listed_with_its_reason(report: Path) -> None:
 
 def test_report_is_the_same_whether_one_or_two_processes_make_it(tmp_path: Path) -> None:
     for folder in write_suite(tmp_path / "runs", environments=("gym/racing", "my/glider"), n_submits=4):
-        record = json.loads((folder / "run.json").read_text())
-        title = {"env_title": "Glider"} if record["env"] == "my/glider" else {}
-        (folder / "run.json").write_text(json.dumps({**record, **title}))
-    one, two = tmp_path / "one", tmp_path / "two"
-    for out, jobs in ((one, "1"), (two, "2")):
-        arguments = [str(tmp_path / "runs"), "--out", str(out), "--jobs", jobs]
-        assert CliRunner().invoke(app, arguments).exit_code == 0
-    written = sorted(path.relative_to(one) for path in one.rglob("*") if path.is_file())
-    assert written == sorted(path.relative_to(two) for path in two.rglob("*") if path.is_file())
-    for path in written:
-        assert (one / path).read_bytes() == (two / path).read_bytes(), path
+        amend(folder, {"env_title": "Glider"} if "glider" in str(folder) else {})
+    written = []
+    for jobs in ("1", "2"):
+        reported(tmp_path / "runs", tmp_path / jobs, "--jobs", jobs)
+        files = [path for path in (tmp_path / jobs).rglob("*") if path.is_file()]
+        written.append({path.relative_to(tmp_path / jobs): path.read_bytes() for path in files})
+    assert written[0].keys() == written[1].keys()
+    assert [path for path, content in written[0].items() if written[1][path] != content] == []
 
 
 def test_papers_table_as_input_gives_its_aggregate_table(tmp_path: Path) -> None:
     source = tmp_path / "table.csv"
     source.write_text(paper.text("table1_heldout_returns"))
-    out, _ = reported(source)
-    written = table(out, "leaderboard_core16")
+    reported(source, tmp_path / "report")
+    written = table(tmp_path / "report", "leaderboard_core16")
     for row, printed in zip(written, paper.rows("table2_aggregate"), strict=True):
         assert row["entry"] == printed["entry"]
         assert f"{float(row['score']):.3f}" == printed["core16"]
@@ -249,88 +251,75 @@ def test_papers_table_as_input_gives_its_aggregate_table(tmp_path: Path) -> None
 
 
 def test_mixed_runs_are_refused_unless_told_and_then_marked(tmp_path: Path) -> None:
-    write_run(tmp_path / "runs", [Version(policy(), (1.0,), 1.0)])
-    write_run(tmp_path / "runs", [Version(policy(), (1.0,), 2.0)], entry="Other", scope="submit")
-    _, said = reported(tmp_path / "runs", code=3)
-    assert "policy scope on core16: episode (1 run), submit (1 run)" in said
-    folders = {each.parent.parent.parent.name: each.parent for each in tmp_path.rglob("run.json")}
-    assert f"    submit: {folders['Other']}\n" in said
+    write_run(tmp_path / "runs", PLAIN)
+    other = write_run(tmp_path / "runs", PLAIN, entry="Other", scope="submit")
+    refused = reported(tmp_path / "runs", tmp_path / "report", code=3).output
+    assert "policy scope on core16: episode (1 run), submit (1 run)" in refused
+    assert f"    submit: {other}\n" in refused
     assert not (tmp_path / "report").exists()
-    out, _ = reported(tmp_path / "runs", "--allow-mixed")
-    assert "policy scope on core16" in (out / "index.html").read_text()
+    assert "policy scope on core16" in (report_on(tmp_path, "--allow-mixed") / "index.html").read_text()
 
 
 def test_runs_of_unknown_isolation_are_warned_of_and_mixed_by_name(tmp_path: Path) -> None:
-    runs = tmp_path / "runs"
-    write_run(runs, [Version(policy(), (1.0,), 1.0)], hidden_isolation="unknown")
-    out, said = reported(runs)
-    assert "warning: 1 of 1 runs do not tell whether hidden episodes and agents shared" in said
+    runs, out = tmp_path / "runs", tmp_path / "report"
+    write_run(runs, PLAIN, hidden_isolation="unknown")
+    alone = reported(runs, out).output
+    assert "warning: 1 of 1 runs do not tell whether hidden episodes and agents shared" in alone
     assert "1 of 1 runs do not tell whether" in (out / "index.html").read_text()
-    write_run(runs, [Version(policy(), (1.0,), 2.0)], entry="Other", hidden_isolation="exclusive")
-    assert "or --allow-unknown to compare them all the same" in reported(runs, "--allow-mixed", code=3)[1]
-    reported(runs, "--allow-unknown")
+    write_run(runs, PLAIN, entry="Other", hidden_isolation="exclusive")
+    refused = reported(runs, out, "--allow-mixed", code=3).output
+    assert "or --allow-unknown to compare them all the same" in refused
+    reported(runs, out, "--allow-unknown")
 
 
 def test_nothing_to_report_writes_nothing_and_says_why(tmp_path: Path) -> None:
     (tmp_path / "runs/x/workspace").mkdir(parents=True)
     (tmp_path / "runs/x/logs").mkdir()
-    out, said = reported(tmp_path / "runs", code=1)
-    assert "unfinished" in said
-    assert not out.exists()
+    assert "unfinished" in reported(tmp_path / "runs", tmp_path / "report", code=1).output
+    assert not (tmp_path / "report").exists()
 
 
 def test_folder_with_other_files_is_not_written_to(runs: Path, tmp_path: Path) -> None:
     (tmp_path / "thesis.txt").write_text("mine")
-    result = CliRunner().invoke(app, [str(runs), "--out", str(tmp_path)])
-    assert result.exit_code == 2
-    assert "thesis.txt" in result.output
+    assert "thesis.txt" in reported(runs, tmp_path, code=2).output
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]
 
 
 def test_hostile_names_sources_and_messages_are_shown_as_text(tmp_path: Path) -> None:
     evil = "<script>alert(1)</script>"
-    source = {"policy.py": f'"""{evil}</pre>"""\n\n\nclass Policy:\n    pass\n'}
+    source = f'"""{evil}</pre>"""\n\n\nclass Policy:\n    pass\n'
     versions = [
-        Version(source, (1.0,), 1.0, says=evil),
-        Version({"policy.py": source["policy.py"] + "x = 1\n"}, (1.0,), 2.0, says=f"{evil} again"),
+        Version({"policy.py": source}, (1.0,), 1.0, says=evil),
+        Version({"policy.py": source + "x = 1\n"}, (1.0,), 2.0, says=f"{evil} again"),
     ]
     write_run(tmp_path / "runs", versions, entry="$\\frac{<b>evil</b> & co", exp_id="e")
-    reported(tmp_path / "runs")
-    for page in (tmp_path / "report").rglob("*.html"):
+    for page in report_on(tmp_path).rglob("*.html"):
         text = page.read_text()
         assert evil not in text
         assert "<b>evil" not in text
 
 
 def test_replays_are_copied_and_missing_ones_said(tmp_path: Path) -> None:
+    replays = {"heldout_000/video.mp4": MP4, "heldout_001/video.mp4": MP4}
     for entry in ("A", "B"):
-        folder = write_run(
-            tmp_path / "runs",
-            [Version(policy(), (1.0,), 1.0)],
-            entry=entry,
-            replays={"heldout_000/video.mp4": MP4, "heldout_001/video.mp4": MP4},
-        )
+        folder = write_run(tmp_path / "runs", PLAIN, entry=entry, replays=replays)
     (folder / "replays/heldout_001/video.mp4").unlink()
-    reported(tmp_path / "runs")
-    page = tmp_path / "report/replays/gym-acrobot.html"
+    report = report_on(tmp_path)
+    page = report / "replays/gym-acrobot.html"
     text = page.read_text()
     assert text.count("<video") == 3
     assert "its file is missing" in text
-    assert 'href="replays/gym-acrobot.html"' in (tmp_path / "report/index.html").read_text()
-    assert all(
-        (page.parent / target).exists() for target in links_of(page).targets if target.startswith("media")
-    )
+    assert 'href="replays/gym-acrobot.html"' in (report / "index.html").read_text()
+    media = [target for target in links_of(page).targets if target.startswith("media")]
+    assert all((page.parent / target).exists() for target in media)
 
 
 def test_feedback_video_is_shown_beside_its_submit(tmp_path: Path) -> None:
-    folder = write_run(
-        tmp_path / "runs", [Version(policy(), (1.0,), 1.0), Version(policy(gain=2.0), (1.0,), 2.0)]
-    )
+    folder = write_run(tmp_path / "runs", [*PLAIN, Version(policy(gain=2.0), (1.0,), 2.0)])
     video = folder / "workspace/feedback/submit_001/episodes/ep_001/video.mp4"
     video.parent.mkdir(parents=True)
     video.write_bytes(MP4)
-    reported(tmp_path / "runs")
-    (page,) = (tmp_path / "report/traces").glob("*.html")
+    (page,) = (report_on(tmp_path) / "traces").glob("*.html")
     (target,) = [target for target in links_of(page).targets if target.endswith(".mp4")]
     assert target.endswith("s001.mp4")
     assert (page.parent / target).read_bytes() == MP4
@@ -338,20 +327,19 @@ def test_feedback_video_is_shown_beside_its_submit(tmp_path: Path) -> None:
 
 def test_replay_path_that_leads_out_of_the_run_is_not_followed(tmp_path: Path) -> None:
     (tmp_path / "secret.png").write_bytes(png())
-    folder = write_run(tmp_path / "runs", [Version(policy(), (1.0,), 1.0)], replays={"a.mp4": MP4})
+    folder = write_run(tmp_path / "runs", PLAIN, replays={"a.mp4": MP4})
     record = json.loads((folder / "run.json").read_text())
-    record["replays"][0]["path"] = "../../../../secret.png"
-    (folder / "run.json").write_text(json.dumps(record))
-    reported(tmp_path / "runs")
-    assert not list((tmp_path / "report").rglob("*.png.*"))
-    assert "its file is missing" in (tmp_path / "report/replays/gym-acrobot.html").read_text()
+    amend(folder, {"replays": [record["replays"][0] | {"path": "../../../../secret.png"}]})
+    report = report_on(tmp_path)
+    assert not list(report.rglob("*.png.*"))
+    assert "its file is missing" in (report / "replays/gym-acrobot.html").read_text()
 
 
 def test_run_without_any_ok_submit_is_in_the_report(tmp_path: Path) -> None:
     write_run(tmp_path / "runs", [Version({"policy.py": "import x\n"}, (0.0,), None, "import_error")])
     write_run(tmp_path / "runs", [], entry="Idle")
-    reported(tmp_path / "runs")
-    assert [row["gym/acrobot"] for row in table(tmp_path / "report", "heldout_core16")] == ["-500.0", "", ""]
+    board = table(report_on(tmp_path), "heldout_core16")
+    assert [row["gym/acrobot"] for row in board] == ["-500.0", "", ""]
 
 
 def test_notebook_example_of_the_package_works(runs: Path, tmp_path: Path) -> None:
@@ -360,5 +348,5 @@ def test_notebook_example_of_the_package_works(runs: Path, tmp_path: Path) -> No
     assert [row.entry for row in core16.board.standings][-1] == "Random policy"
     assert {row["entry"] for row in rows(found.evolutions)} == set(AGENTS)
     assert next(figures_of(found)).name == "rank_scores_core16"
-    write_run(tmp_path / "runs", [Version(policy(), (1.0,), 1.0)])
+    write_run(tmp_path / "runs", PLAIN)
     assert "Mine" in write_report(study([tmp_path / "runs"]), tmp_path / "report", title="Mine").read_text()

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Mapping
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
 from statistics import NormalDist
 
 import msgspec
@@ -12,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evopolicy_common.statistics.distributions import t_quantile
-from evopolicy_common.statistics.intervals import difference, mean, of_runs
+from evopolicy_common.statistics.intervals import Estimate, difference, mean, of_runs
 from evopolicy_common.statistics.resampling import RESAMPLES
 from evopolicy_results.scoring.normalised import Scale
-from evopolicy_results.statistics.aggregates import aggregates
+from evopolicy_results.statistics.aggregates import Bounded, aggregates
 from evopolicy_results.statistics.pairs import pairs
 from evopolicy_results.statistics.repeats import Spread, repeats_needed, standard_error
 from evopolicy_results.statistics.samples import RunReturns, Sample
@@ -37,6 +38,19 @@ class Rate(msgspec.Struct, frozen=True, kw_only=True):
     @property
     def share(self) -> float:
         return self.held / self.given if self.given else math.nan
+
+
+def rated(outcomes: Iterable[bool | None]) -> Rate:
+    """None: no interval or verdict."""
+    listed = list(outcomes)
+    given = [one for one in listed if one is not None]
+    return Rate(held=sum(given), given=len(given), trials=len(listed))
+
+
+def holds(estimate: Estimate | Bounded, true: float) -> bool | None:
+    if estimate.low is None or estimate.high is None:
+        return None
+    return estimate.low - 1e-9 <= true <= estimate.high + 1e-9
 
 
 def _normal(g: Generator, n: int) -> tuple[Floats, Floats, float]:
@@ -142,19 +156,15 @@ def coverage(
 ) -> Rate:
     """How often the interval of a difference holds the true gap."""
     generator = np.random.default_rng(seed)
-    held = given = 0
-    methods: dict[str, int] = {}
+    outcomes: list[bool | None] = []
+    methods: Counter[str] = Counter()
     for _ in range(trials):
         one, other, gap = draw(generator)
         found = difference(np.atleast_2d(one), np.atleast_2d(other), resamples=resamples)
-        if found.low is None or found.high is None:
-            continue
-        methods[found.method] = methods.get(found.method, 0) + 1
-        given += 1
-        held += found.low - 1e-9 <= gap <= found.high + 1e-9
-    return Rate(
-        held=held, given=given, trials=trials, methods=tuple(sorted(methods, key=lambda m: -methods[m]))
-    )
+        outcomes.append(holds(found, gap))
+        methods[found.method] += found.low is not None
+    used = tuple(method for method, n in methods.most_common() if n)
+    return msgspec.structs.replace(rated(outcomes), methods=used)
 
 
 def case_coverage(shape: str, n_cases: int, trials: int, *, seed: int = 0) -> Rate:
@@ -335,26 +345,21 @@ def mean_coverage(n_runs: int, shape: str, trials: int, *, seed: int = 0) -> Rat
     g = np.random.default_rng(seed)
     world = World(n_runs=(n_runs,), interaction=0.5, n_entries=1, n_environments=1, shape=shape)
     true = 0.5 if shape == "0/1" else 0.0
-    held = given = 0
-    for _ in range(trials):
+
+    def trial() -> bool | None:
         (returns,) = world.returns(g, np.zeros((1, 1))).values()
-        found = mean(returns)
-        if found.low is not None and found.high is not None:
-            given += 1
-            held += found.low <= true <= found.high
-    return Rate(held=held, given=given, trials=trials)
+        return holds(mean(returns), true)
+
+    return rated(trial() for _ in range(trials))
 
 
 def welch_coverage(kind: str, n_runs: int, trials: int, *, seed: int = 0) -> Rate:
     """How often the interval over runs with cases of their own holds the true gap of 0.5."""
     g = np.random.default_rng(seed)
-    held = 0
-    for _ in range(trials):
-        found = of_runs(_run_effects(kind, g, n_runs) + 0.5, 2.0 * _run_effects(kind, g, n_runs))
-        assert found.low is not None
-        assert found.high is not None
-        held += found.low <= 0.5 <= found.high
-    return Rate(held=held, given=trials, trials=trials)
+    return rated(
+        holds(of_runs(_run_effects(kind, g, n_runs) + 0.5, 2.0 * _run_effects(kind, g, n_runs)), 0.5)
+        for _ in range(trials)
+    )
 
 
 class AggregateRates(msgspec.Struct, frozen=True, kw_only=True):
@@ -377,7 +382,7 @@ def aggregate_rates(
     world = World(
         n_runs=(n_runs,), interaction=0.3, run=run, n_entries=len(levels), n_environments=n_environments
     )
-    held: dict[str, list[bool]] = {"iqm": [], "profile": [], "improvement": []}
+    held: dict[str, list[bool | None]] = {"iqm": [], "profile": [], "improvement": []}
     phi = NormalDist().cdf
     above = phi((levels[0] - 0.5 * best) / run)
     better = phi((levels[0] - levels[1]) / (run * math.sqrt(2.0)))
@@ -394,17 +399,14 @@ def aggregate_rates(
                 best=max(float(np.mean(samples[name, env].scores or ())) for name in world.names),
             )
         found, against = aggregates(samples, world.names, scales, resamples=600)
-        for level, one in zip(levels[:-1], found, strict=False):
-            if one.iqm is not None and one.iqm.low is not None and one.iqm.high is not None:
-                held["iqm"].append(one.iqm.low <= level / best <= one.iqm.high)
-        for name, bounded, true in (
-            ("profile", found[0].profile[10], above),
-            ("improvement", against[0].probability, better),
-        ):
-            if bounded.low is not None and bounded.high is not None:
-                held[name].append(bounded.low <= true <= bounded.high)
-    rates = {name: Rate(held=sum(one), given=len(one), trials=max(1, len(one))) for name, one in held.items()}
-    return AggregateRates(**rates)
+        held["iqm"] += [
+            holds(one.iqm, level / best)
+            for level, one in zip(levels[:-1], found, strict=False)
+            if one.iqm is not None
+        ]
+        held["profile"].append(holds(found[0].profile[10], above))
+        held["improvement"].append(holds(against[0].probability, better))
+    return AggregateRates(**{name: rated(outcomes) for name, outcomes in held.items()})
 
 
 def half_width(spread: Spread, n: int) -> float:
@@ -424,12 +426,13 @@ def resolved(n_runs: int, trials: int, *, level: float = 0.05, seed: int = 0) ->
         gap, needed = 1.0, repeats_needed(spread, 1.0, level=level)
         assert needed is not None
         n_runs = needed
-    held = 0
-    for _ in range(trials):
+
+    def trial() -> bool:
         one, other, _ = runs_of("normal", g, n_runs, 32, gap)
         found = difference(one, other)
-        held += found.p is not None and found.p <= level and found.value > 0.0
-    return Rate(held=held, given=trials, trials=trials)
+        return found.p is not None and found.p <= level and found.value > 0.0
+
+    return rated(trial() for _ in range(trials))
 
 
 def optimism_rates(trials: int, *, n_submits: int = 10, seed: int = 0) -> tuple[Rate, Rate]:
@@ -437,11 +440,8 @@ def optimism_rates(trials: int, *, n_submits: int = 10, seed: int = 0) -> tuple[
     how often its interval holds the true one."""
     g = np.random.default_rng(seed)
     true = float(np.random.default_rng(1).normal(0, 1, (200_000, n_submits)).max(axis=1).mean())
-    above = held = 0
-    for _ in range(trials):
-        found = of_runs((g.normal(0, 1, (16, n_submits)).max(axis=1) - g.normal(0, 1, 16)).tolist())
-        assert found.low is not None
-        assert found.high is not None
-        above += found.value > 0.0
-        held += found.low <= true <= found.high
-    return Rate(held=above, given=trials, trials=trials), Rate(held=held, given=trials, trials=trials)
+    found = [
+        of_runs((g.normal(0, 1, (16, n_submits)).max(axis=1) - g.normal(0, 1, 16)).tolist())
+        for _ in range(trials)
+    ]
+    return rated(one.value > 0.0 for one in found), rated(holds(one, true) for one in found)

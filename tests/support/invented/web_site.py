@@ -37,7 +37,6 @@ def site_of(*roots: Path, acting: bool = False, cluster: StatusReply | None = No
         **more,
     )
     if cluster is not None:
-        assert site.cluster is not None
         site.cluster.take(cluster)
     return site
 

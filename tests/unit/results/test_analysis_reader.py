@@ -42,7 +42,6 @@ def test_run_is_read_with_its_submits_and_hidden_scores(tmp_path: Path) -> None:
     assert [submit.val_mean for submit in run.submits] == [-180.0, None, -95.0]
     assert [submit.changed_lines for submit in run.submits] == [None, None, 2]
     assert [submit.label for submit in run.scored] == ["s000", "s002"]
-    assert run.selected is not None
     assert run.selected.index == 2
     assert run.selected.n_failed_episodes == 1
     assert len(run.record.rejected_submits) == 2
@@ -89,7 +88,7 @@ def left_out(runs: Path) -> str:
         ),
     ],
 )
-def test_a_run_that_is_no_finished_one_is_left_out_with_its_reason(
+def test_an_unfinished_run_is_left_out_with_its_reason(
     tmp_path: Path, how: dict[str, Any], reason: str
 ) -> None:
     write_run(tmp_path, VERSIONS, **how)
@@ -244,7 +243,6 @@ def test_a_report_that_is_killed_leaves_nothing_behind(tmp_path: Path) -> None:
     before = semaphores()
     command = [sys.executable, "-c", READS, str(tmp_path)]
     report = subprocess.Popen(command, stdout=subprocess.PIPE, env={**os.environ, **mark})
-    assert report.stdout is not None
     assert report.stdout.readline() == b"1\n"
     assert len(alive()) >= 2  # the report, and at least one of the processes that read for it
     report.kill()

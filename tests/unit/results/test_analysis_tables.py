@@ -283,25 +283,17 @@ def test_many_repeats_are_drawn_as_mean_and_range(tmp_path: Path) -> None:
     assert band.get_datalim(panel.transData).ymax == 9.0
 
 
-def with_names(folder: Path, title: str, family: str) -> None:
-    """Puts a title and a family into the run's record, as a worker told them."""
-    record = json.loads((folder / "run.json").read_text())
-    (folder / "run.json").write_text(json.dumps({**record, "env_title": title, "env_family": family}))
-
-
 def test_foreign_environments_have_their_runs_titles_and_families(tmp_path: Path) -> None:
-    versions = [Version(policy(gain=1.0), (1.0,), 1.0)]
-    for entry in ("A", "B"):
-        with_names(
-            write_run(tmp_path, versions, entry=entry, env="my/glider"), "Glider\x1b[2J\n" + "x" * 99, "score"
-        )
-        with_names(
-            write_run(tmp_path, versions, entry=entry, env="my/kite"),
-            "Kite" if entry == "A" else "Dragon",
-            "air",
-        )
-        with_names(write_run(tmp_path, versions, entry=entry, env="gym/acrobot"), "Not acrobot", "air")
-        with_names(write_run(tmp_path, versions, entry=entry, env="my/easy"), " ACROBOT ", "air")
+    told = [
+        ("my/glider", "Glider\x1b[2J\n" + "x" * 99, "score"),
+        ("my/kite", "", "air"),
+        ("gym/acrobot", "Not acrobot", "air"),
+        ("my/easy", " ACROBOT ", "air"),
+    ]
+    for entry, kite in (("A", "Kite"), ("B", "Dragon")):
+        for env, title, family in told:
+            names = {"env_title": title or kite, "env_family": family}
+            write_run(tmp_path, [Version(policy(gain=1.0), (1.0,), 1.0)], entry=entry, env=env, change=names)
     tables = {table.name: table for table in tables_of(study([tmp_path]))}
     rows = {row["id"]: (row["env"], row["family"]) for row in tables["environments"].rows}
     assert rows["gym/acrobot"] == ("Acrobot", "Gym / Box2D")

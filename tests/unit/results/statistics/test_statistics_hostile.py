@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
 import math
 import re
 import shutil
@@ -61,7 +60,6 @@ def test_missing_cases_leave_only_common_ones_and_their_number_is_reported() -> 
     second = entry("B", run(math.nan, *rising(20)[1:18], math.inf))
     found = pair_of(first, second)
     assert (found.n_cases, found.n_left_out) == (17, 3)
-    assert found.gap is not None
     expected = np.array(rising(20, 1.0)[1:18]) - np.array(rising(20)[1:18])
     assert found.gap.value == pytest.approx(expected.mean())
 
@@ -78,7 +76,6 @@ def test_runs_with_cases_of_their_own_are_compared_as_runs() -> None:
     first = entry("A", *(run(*rising(8, 5.0 + 0.3 * r), case_set=f"a{r}") for r in range(8)))
     second = entry("B", *(run(*rising(8, 0.3 * r), case_set=f"b{r}") for r in range(8)))
     found = pair_of(first, second)
-    assert found.gap is not None
     assert (found.gap.method, found.gap.over, found.n_cases) == ("Welch t", "runs", 0)
     assert (found.verdict, found.compares) == ("first", "agents")
 
@@ -86,7 +83,6 @@ def test_runs_with_cases_of_their_own_are_compared_as_runs() -> None:
 def test_one_run_compares_checkpoints_and_several_compare_agents() -> None:
     one = pair_of(entry("A", run(*rising(32, 3.0))), entry("B", run(*rising(32))))
     assert (one.compares, one.verdict) == ("checkpoints", "first")
-    assert one.gap is not None
     assert one.gap.over == "cases"
     mixed = pair_of(entry("A", *(run(*rising(32, 3.0 + r)) for r in range(4))), entry("B", run(*rising(32))))
     assert mixed.compares == "checkpoints"
@@ -95,13 +91,11 @@ def test_one_run_compares_checkpoints_and_several_compare_agents() -> None:
         entry("R", run(*rising(32)), is_fixed=True),
     )
     assert fixed.compares == "agents"
-    assert fixed.gap is not None
     assert fixed.gap.over == "runs and cases"
 
 
 def test_too_few_cases_and_too_few_runs_are_said() -> None:
     found = pair_of(entry("A", run(2.0, 3.0)), entry("B", run(1.0, 1.5)))
-    assert found.gap is not None
     assert (found.gap.low, found.gap.reason, found.verdict) == (None, TOO_FEW_CASES, "not comparable")
     # Two runs each: no exchange of runs can be rarer than one in three.
     few = pair_of(
@@ -114,34 +108,25 @@ def test_too_few_cases_and_too_few_runs_are_said() -> None:
         entry("B", *(run(*rising(32, 3.0 * r)) for r in range(2))),
     )
     assert noisy.verdict == "not told apart"
-    assert noisy.n_needed is not None
     assert 5 <= noisy.n_needed <= 40
 
 
 def test_identical_returns_have_no_spread_and_no_gap() -> None:
     same = pair_of(entry("A", run(*rising(32))), entry("B", run(*rising(32))))
-    assert same.gap is not None
     assert (same.gap.value, same.gap.low, same.gap.reason) == (0.0, None, "no spread: 32 identical cases")
     assert (same.p, same.verdict) == (None, "not comparable")
     constant = pair_of(
         entry("A", *(run(*[1.0] * 32) for _ in range(3))), entry("B", *(run(*[1.0] * 32) for _ in range(3)))
     )
-    assert constant.gap is not None
     assert (constant.gap.reason, constant.p) == ("no spread: 3 identical repeats", None)
 
 
 def test_returns_of_nought_and_one_are_counted() -> None:
     first, second = [1.0] * 30 + [0.0] * 2, [0.0] * 16 + [1.0] * 16
     found = pair_of(entry("A", run(*first)), entry("B", run(*second)))
-    assert found.gap is not None
     assert found.gap.method == "score"
-    assert found.gap.low is not None
-    assert found.gap.high is not None
     assert -1.0 <= found.gap.low < found.gap.value < found.gap.high <= 1.0
     sure = cell_mean(entry("A", run(*first)))
-    assert sure is not None
-    assert sure.low is not None
-    assert sure.high is not None
     assert 0.0 <= sure.low < sure.value < sure.high <= 1.0
 
 
@@ -174,11 +159,9 @@ def test_scores_alone_have_no_interval_and_do_not_tie() -> None:
 def test_an_aggregate_without_spread_says_so_instead_of_a_zero_width() -> None:
     samples = {("A", "env"): entry("A", *(run(*[1.0] * 8) for _ in range(6)))}
     (found,), _ = aggregates(samples, ["A"], {"env": Scale(random=0.0, best=2.0)})
-    assert found.iqm is not None
     assert (found.iqm.value, found.iqm.low, found.iqm.reason) == (0.5, None, "no spread: 6 identical repeats")
     # The best agent's own mean is the scale, whatever it is.
     (found,), _ = aggregates(samples, ["A"], {"env": Scale(random=0.0, best=1.0)})
-    assert found.iqm is not None
     assert (found.iqm.value, found.iqm.low) == (1.0, None)
 
 
@@ -192,9 +175,6 @@ def test_an_uncertain_scale_widens_the_interval_of_an_iqm() -> None:
     }
     best, random = (float(np.mean(samples[name, "env"].scores or ())) for name in ("B", "R"))
     (a, _), _ = aggregates(samples, ["A", "B"], {"env": Scale(random=random, best=best)})
-    assert a.iqm is not None
-    assert a.iqm.low is not None
-    assert a.iqm.high is not None
     # Standard errors of the ends: about 1.5 and 0.7, of a width of 15.
     assert 0.08 < a.iqm.high - a.iqm.low < 0.4
 
@@ -210,7 +190,6 @@ def test_a_scale_that_may_be_none_gives_no_interval() -> None:
     }
     best, random = (float(np.mean(samples[name, "env"].scores or ())) for name in ("A", "R"))
     (_, b), _ = aggregates(samples, ["A", "B"], {"env": Scale(random=random, best=best)})
-    assert b.iqm is not None
     assert (b.iqm.low, b.iqm.reason) == (None, NO_SCALE)
 
 
@@ -256,7 +235,6 @@ def test_a_verdict_never_contradicts_the_interval_beside_it(world: World, seed: 
     samples = suite_samples(world.returns(generator, world.means(generator)))
     for pair in pairs(samples, world.names, world.environments, resamples=200):
         gap = pair.gap
-        assert gap is not None
         excluded = gap.low is not None and gap.high is not None and (gap.low > 0.0 or gap.high < 0.0)
         assert (pair.p is not None and pair.p <= 0.05) == excluded
         if pair.verdict in ("first", "second"):
@@ -293,7 +271,6 @@ def test_any_numbers_give_finite_intervals_or_a_reason(every: list[list[list[flo
     for one in found:
         assert one.p is None or 0.0 < one.p <= 1.0
         if one.gap is not None and one.gap.low is not None:
-            assert one.gap.high is not None
             assert math.isfinite(one.gap.low)
             assert one.gap.low <= one.gap.value + 1e-6 * abs(one.gap.value)
             assert one.gap.value - 1e-6 * abs(one.gap.value) <= one.gap.high
@@ -306,7 +283,6 @@ def test_any_numbers_give_finite_intervals_or_a_reason(every: list[list[list[flo
 
 def test_matched_keeps_the_order_of_runs_and_refuses_unknown_cases() -> None:
     found = matched([entry("A", run(1.0, 2.0), run(3.0, 4.0)), entry("B", run(5.0, math.nan))])
-    assert found is not None
     assert [matrix.tolist() for matrix in found.returns] == [[[1.0], [3.0]], [[5.0]]]
     assert matched([entry("A", RunReturns(score=1.0))]) is None
     assert matched([]) is None
@@ -359,8 +335,7 @@ def test_report_of_repeats_compares_agents_and_tells_repeats(tmp_path: Path) -> 
 
 def test_an_incomplete_entry_stands_beside_no_complete_one_by_a_mean(tmp_path: Path) -> None:
     for folder in write_suite(tmp_path / "runs", environments=ENVS, repeats=2):
-        record = json.loads((folder / "run.json").read_bytes())
-        if (record["agent"]["entry"], record["env"]) == ("Kestrel", ENVS[2]):
+        if folder.parts[-3:-1] == ("Kestrel", "gym_ant5"):
             shutil.rmtree(folder)
     found = study([tmp_path / "runs"])
     tables = tables_of(found)
@@ -410,13 +385,9 @@ def test_mixed_splits_that_were_allowed_are_not_paired(tmp_path: Path) -> None:
 def test_pairs_with_the_random_reference_are_of_the_same_family(tmp_path: Path) -> None:
     versions = [Version(policy(gain=1.0), (-200.0,), -180.0)]
     for name, shift in (("A", 40.0), ("B", 20.0)):
-        folder = write_run(tmp_path / "runs", versions, entry=name, heldout=rising(32, shift))
-        record = json.loads((folder / "run.json").read_bytes())
-        returns = list(rising(32))
-        record["outcome"]["random_reference"] = {
-            "mean_return": sum(returns) / 32, "std_return": 1.0, "returns": returns, "seeded_by": "case",
-        }  # fmt: skip
-        (folder / "run.json").write_text(json.dumps(record))
+        random = {"mean_return": sum(rising(32)) / 32, "returns": rising(32), "seeded_by": "case"}
+        change = {"outcome": {"random_reference": random}}
+        write_run(tmp_path / "runs", versions, entry=name, heldout=rising(32, shift), change=change)
     found = study([tmp_path / "runs"]).suites[0].statistics
     assert [(one.first, one.second, one.verdict) for one in found.pairs] == [
         ("A", "B", "first"), ("A", "Random policy", "first"), ("B", "Random policy", "first"),
@@ -440,22 +411,13 @@ def test_pairs_with_the_random_reference_are_of_the_same_family(tmp_path: Path) 
 def test_success_is_reported_where_the_return_tells_it(
     tmp_path: Path, env: str, returns: list[float], share: float | None
 ) -> None:
-    write_run(
-        tmp_path / "runs",
-        [Version(policy(gain=1.0), (1.0,), 1.0)],
-        env=env,
-        heldout=returns,
-        random_mean=None,
-    )
-    (one,) = study([tmp_path / "runs"]).suites[0].statistics.generalisation
-    assert one.success == share
-    # What the environment reported comes first.
-    (path,) = (tmp_path / "runs").rglob("run.json")
-    record = json.loads(path.read_text())
-    record["outcome"]["heldout_successes"] = [True, True, True, False]
-    path.write_text(json.dumps(record))
-    (one,) = study([tmp_path / "runs"]).suites[0].statistics.generalisation
-    assert one.success == 0.75
+    for number, (reported, expected) in enumerate([(..., share), ([True, True, True, False], 0.75)]):
+        # What the environment reported comes first.
+        version, change = Version(policy(gain=1.0), (1.0,), 1.0), {"outcome": {"heldout_successes": reported}}
+        runs = tmp_path / str(number)
+        write_run(runs, [version], env=env, heldout=returns, random_mean=None, change=change)
+        (one,) = study([runs]).suites[0].statistics.generalisation
+        assert one.success == expected
 
 
 @pytest.mark.parametrize(
@@ -472,11 +434,8 @@ def test_success_is_reported_where_the_return_tells_it(
 def test_rate_of_repaired_actions_is_reported_where_it_was_recorded(
     tmp_path: Path, repaired: object, rate: float | None
 ) -> None:
-    folder = write_run(tmp_path / "runs", [Version(policy(gain=1.0), (1.0,), 1.0)])
-    record = json.loads((folder / "run.json").read_bytes())
-    if repaired is not None:
-        record["outcome"]["auxiliary"]["transitions"] = repaired
-    (folder / "run.json").write_text(json.dumps(record))
+    change = {"outcome": {"auxiliary": {"transitions": ... if repaired is None else repaired}}}
+    write_run(tmp_path / "runs", [Version(policy(gain=1.0), (1.0,), 1.0)], change=change)
     found = study([tmp_path / "runs"])
     assert found.audit[0].repaired_rate == rate
     assert [row.get("repaired_rate") for row in table_named(tables_of(found), "audit").rows] == [rate]

@@ -137,7 +137,6 @@ def test_repeats_are_the_fewest_whose_interval_is_narrow_enough() -> None:
     spread = Spread(run=1.0, case=0.01, n_cases=32)
     for gap in (0.25, 0.5, 1.0):
         n = repeats_needed(spread, gap)
-        assert n is not None
         assert half_width(spread, n) <= gap < half_width(spread, n - 1)
     assert repeats_needed(spread, 0.19) is None  # the cases alone leave ±0.2
     assert repeats_needed(Spread(run=0.0, case=0.0, n_cases=32), 0.1) == 2

@@ -42,8 +42,6 @@ def test_intervals_over_worlds_cover_the_mean_of_all_worlds() -> None:
         before = [stratum(generator.normal(0.9, 0.2, size=(1, 16))) for _ in range(4)]
         strata = before + [stratum_of(list(each)) for each in worlds]
         found = stratified(strata, [0.25] * 4 + [-0.25] * 4, "worlds, runs, and cases")
-        assert found.low is not None
-        assert found.high is not None
         covered += found.low <= 0.5 <= found.high
     assert 0.94 <= covered / 2000 <= 0.98
 
@@ -51,7 +49,6 @@ def test_intervals_over_worlds_cover_the_mean_of_all_worlds() -> None:
 def written(runs: Path, entry: str, env: str, level: float) -> None:
     """A run whose held-out returns are about `level` on the known scale."""
     scale = anchor(env)
-    assert scale is not None
     generator = random.Random(f"{entry} {env}")
     value = scale.random.mean + level * scale.width
     returns = [value + generator.gauss(0.0, 0.01 * scale.width) for _ in range(16)]
@@ -68,7 +65,6 @@ def test_a_report_pairs_environments_with_their_worlds(tmp_path: Path) -> None:
             for n, world in enumerate(ids(env)):
                 written(runs, entry, world, 0.05 * n if entry == "recites" else level + 0.05 * (n - 1))
     found = study([runs])
-    assert found.worlds is not None
     overall = {one.entry: one for one in found.worlds.paired if one.scope == ""}
     for entry, unchanged, worlds in (("recites", 1.0, 0.05), ("learns", 0.6, 0.6)):
         row = overall[entry]
@@ -76,8 +72,6 @@ def test_a_report_pairs_environments_with_their_worlds(tmp_path: Path) -> None:
         assert row.unchanged.value == pytest.approx(unchanged, abs=0.02)
         assert row.worlds.value == pytest.approx(worlds, abs=0.02)
         low, high = row.difference.low, row.difference.high
-        assert low is not None
-        assert high is not None
         assert low < unchanged - worlds < high
         assert (low > 0.0) == (entry == "recites")
     curve = found.worlds.curves["learns"]
@@ -111,6 +105,5 @@ def test_a_missing_score_in_a_world_leaves_its_environment_out(tmp_path: Path) -
     broken = Version({"policy.py": "import nothing_like_this\n"}, (0.0,), None, "import_error")
     write_run(runs, [broken], entry="learns", env=ids(ENVS[0])[1], exp_id="again")
     found = study([runs], allow_mixed=True)
-    assert found.worlds is not None
     rows = [(one.scope, one.n_environments) for one in found.worlds.paired if one.entry == "learns"]
     assert rows == [(ENVS[1], 1)]
