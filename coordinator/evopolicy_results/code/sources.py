@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import ast
 import hashlib
-import os
-import stat
 from collections import OrderedDict
 from collections.abc import Mapping
+from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
+from evopolicy_common.processes.left_files import left_files
 from evopolicy_common.records.code_metrics import parse
 from evopolicy_common.regular_files import read_regular
 
@@ -50,22 +50,14 @@ def read_python_files(system_dir: Path) -> dict[str, bytes]:
 
     At most `MAX_FILES` files, each at most `MAX_FILE_BYTES`. Raises OSError when the folder cannot be read.
     """
-    found: dict[str, bytes] = {}
     if not system_dir.is_dir():
         raise FileNotFoundError(f"folder {system_dir} not found")
-    for root, folders, names in os.walk(system_dir):
-        folders[:] = sorted(name for name in folders if name != "__pycache__" and not name.startswith("."))
-        for name in sorted(names):
-            path = Path(root, name)
-            if not name.endswith(".py"):
-                continue
-            status = path.lstat()
-            if not stat.S_ISREG(status.st_mode) or status.st_size > MAX_FILE_BYTES:
-                continue
-            found[path.relative_to(system_dir).as_posix()] = read_regular(path)
-            if len(found) >= MAX_FILES:
-                return found
-    return dict(sorted(found.items()))
+    files = left_files(system_dir, enter=lambda name: name != "__pycache__" and not name.startswith("."))
+    sources = (path for path, size in files if path.name.endswith(".py") and size <= MAX_FILE_BYTES)
+    read = {
+        path.relative_to(system_dir).as_posix(): read_regular(path) for path in islice(sources, MAX_FILES)
+    }
+    return dict(sorted(read.items()))
 
 
 class Module(NamedTuple):

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import ast
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 
 import msgspec
 
@@ -89,12 +89,15 @@ class _Walker:
         scope = Scope()
         for node in module.imports:
             self._bind_import(node, scope, module)
-        for statement in tree.body:
-            unit = self._statement_unit(statement, scope, self.names.top_defs)
-            if unit is not None:
-                self.units.append(unit)
-                if not unit.is_function:
-                    self.names.global_names |= unit.stored
+        self.units += self._units_of(tree.body, scope, self.names.top_defs, self.names.global_names)
+
+    def _units_of(
+        self, body: Iterable[ast.stmt], scope: Scope, defs: set[str], stored: set[str]
+    ) -> list[Unit]:
+        """The units of a module's or class's body. Their definitions go to `defs`, other names to `stored`."""
+        units = [unit for one in body if (unit := self._statement_unit(one, scope, defs)) is not None]
+        stored.update(*(unit.stored for unit in units if not unit.is_function))
+        return units
 
     def _bind_import(self, node: ast.Import | ast.ImportFrom, scope: Scope, module: Module) -> None:
         if isinstance(node, ast.Import):
@@ -144,12 +147,8 @@ class _Walker:
         self._add(unit, "ClassDef", _own_name(node.name))
         for part in (*node.decorator_list, *node.bases, *node.keywords):
             self._node(part, unit, 0)
-        for statement in node.body:
-            child = self._statement_unit(statement, scope, self.names.method_defs)
-            if child is not None:
-                unit.children.append(child)
-                if not child.is_function:
-                    self.names.attribute_names |= child.stored
+        names = self.names
+        unit.children = self._units_of(node.body, scope, names.method_defs, names.attribute_names)
         self._class = outer
         return unit
 

@@ -44,8 +44,8 @@ class Plot(msgspec.Struct, frozen=True, kw_only=True):
 
 _PROLOGUE = re.compile(r"^.*?(?=<svg)", re.DOTALL)
 _METADATA = re.compile(r"<metadata>.*?</metadata>\s*", re.DOTALL)
-_SIZE = re.compile(r'(<svg[^>]*?) width="[^"]*"')
-_HEIGHT = re.compile(r'(<svg[^>]*?) height="[^"]*"')
+_TAG = re.compile(r"<svg[^>]*>")
+_SIZE = re.compile(r' (?:width|height)="[^"]*"')
 _IDS = re.compile(r'(\bid="|href="#|url\(#)')
 _THEME = {INK: "var(--ink)", MUTED: "var(--muted)", GRID: "var(--grid)"}
 
@@ -58,7 +58,7 @@ def inline_svg(svg: str, name: str, alt: str) -> str:
     body = _IDS.sub(lambda match: match.group(1) + prefix, body)
     for colour, variable in _THEME.items():
         body = body.replace(colour, variable)
-    body = _HEIGHT.sub(r"\1", _SIZE.sub(r"\1", body, count=1), count=1)
+    body = _TAG.sub(lambda match: _SIZE.sub("", match[0]), body, count=1)
     label = harmless(alt).replace("&", "&amp;").replace('"', "&quot;").replace("<", "&lt;")
     body = body.replace("<svg", f'<svg role="img" aria-label="{label}"', 1)
     return body.replace("'DejaVu Sans'", "system-ui, 'DejaVu Sans'")

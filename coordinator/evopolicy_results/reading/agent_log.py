@@ -90,59 +90,46 @@ class LogReading(msgspec.Struct, frozen=True, kw_only=True):
 def read_agent_log(path: Path, submits: Sequence[Submit]) -> LogReading:
     """Reads a run's log; empty when it is missing. Never raises for damaged content."""
     try:
-        events = (event for value in objects(_lines(path)) for event in _events_of(value))
-        kept = list(itertools.islice(events, MAX_EVENTS))
+        every = (event for value in objects(_lines(path)) for event in _events_of(value))
+        events = list(itertools.islice(every, MAX_EVENTS))
     except OSError:
         return LogReading()
-    return place(kept, submits)
+    groups = _by_results(events, submits)
+    if groups.keys() == {None}:
+        groups = _by_times(events, submits)
+    unplaced = tuple(event.message for event in groups.pop(None, ()) if event.message)
+    return LogReading(
+        by_submit={i: _evidence(own) for i, own in groups.items() if i is not None}, unplaced=unplaced
+    )
 
 
-def place(events: Sequence[LogEvent], submits: Sequence[Submit]) -> LogReading:
-    """Assigns each event to the submit that it precedes."""
-    groups = _by_results(events, [submit.index for submit in submits]) or _by_times(events, submits)
-    if groups is None:
-        return LogReading(unplaced=tuple(event.message for event in events if event.message))
-    placed, rest = groups
-    by_submit = {index: _evidence(several) for index, several in placed.items()}
-    return LogReading(by_submit=by_submit, unplaced=tuple(event.message for event in rest if event.message))
+_Groups = dict[int | None, list[LogEvent]]
+"""Events by the submit that they precede; None: by no known one."""
 
 
-def _by_results(
-    events: Sequence[LogEvent], expected: list[int]
-) -> tuple[dict[int, list[LogEvent]], list[LogEvent]] | None:
-    placed: dict[int, list[LogEvent]] = {}
+def _by_results(events: Sequence[LogEvent], submits: Sequence[Submit]) -> _Groups:
+    groups: _Groups = {}
     pending: list[LogEvent] = []
-    places = {index: place for place, index in enumerate(expected)}
+    places = {submit.index: place for place, submit in enumerate(submits)}
     first_waiting = 0
     for event in events:
         answered = next((index for index in event.answered if places.get(index, -1) >= first_waiting), None)
         if answered is not None:
-            placed[answered] = pending
-            pending = []
+            groups[answered], pending = pending, []
             first_waiting = places[answered] + 1
         pending.append(event)
-    return (placed, pending) if placed else None
+    return {**groups, None: pending}
 
 
-def _by_times(
-    events: Sequence[LogEvent], submits: Sequence[Submit]
-) -> tuple[dict[int, list[LogEvent]], list[LogEvent]] | None:
-    starts = [
-        (started, submit.index) for submit in submits if (started := _instant(submit.started_at)) is not None
-    ]
-    if not starts or not any(event.at is not None for event in events):
-        return None
+def _by_times(events: Sequence[LogEvent], submits: Sequence[Submit]) -> _Groups:
+    starts = [(at, submit.index) for submit in submits if (at := _instant(submit.started_at)) is not None]
     # An event goes to the first submit that starts late enough, so a submit listed after a later start gets none.
-    latest = list(itertools.accumulate((started for started, _ in starts), max))
-    placed: dict[int, list[LogEvent]] = {}
-    rest: list[LogEvent] = []
+    latest = list(itertools.accumulate((at for at, _ in starts), max))
+    groups: _Groups = {}
     for event in events:
         place = len(starts) if event.at is None else bisect.bisect_left(latest, event.at)
-        if place == len(starts):
-            rest.append(event)
-        else:
-            placed.setdefault(starts[place][1], []).append(event)
-    return placed, rest
+        groups.setdefault(starts[place][1] if place < len(starts) else None, []).append(event)
+    return groups
 
 
 def _evidence(events: Sequence[LogEvent]) -> Evidence:

@@ -43,25 +43,18 @@ class Generalisation(msgspec.Struct, frozen=True, kw_only=True):
     it; None if neither does."""
 
 
-class Optimism(msgspec.Struct, frozen=True, kw_only=True):
-    """One entry over its environments: mean of the normalised optimism and its t interval over environments."""
-
-    entry: str
-    mean: Estimate
-    n_environments: int
-
-
 def generalisation(runs: Iterable[Run], scales: Mapping[str, Scale]) -> list[Generalisation]:
     """Every entry on every environment with a completed run, environments in catalogue order."""
     completed = by_cell(run for run in runs if run.score is not None)
     return [_cell(entry, env, several, scales.get(env)) for (env, entry), several in completed.items()]
 
 
-def optimism_of(entry: str, cells: Iterable[Generalisation]) -> Optimism | None:
-    """The entry's optimism; None if no environment has a normalised optimism."""
-    known = [cell.normalised_optimism for cell in cells if cell.entry == entry]
-    values = [value for value in known if value is not None]
-    return Optimism(entry=entry, mean=of_runs(values), n_environments=len(values)) if values else None
+def optimism(entries: Iterable[str], cells: Sequence[Generalisation]) -> dict[str, Estimate]:
+    """By entry, the mean of its normalised optimism with a t interval over environments; without entries that have
+    none."""
+    known = {entry: [cell.normalised_optimism for cell in cells if cell.entry == entry] for entry in entries}
+    values = {entry: [value for value in several if value is not None] for entry, several in known.items()}
+    return {entry: of_runs(several) for entry, several in values.items() if several}
 
 
 def _cell(entry: str, env: str, runs: Sequence[Run], scale: Scale | None) -> Generalisation:

@@ -29,7 +29,7 @@ from evopolicy_results.scoring.normalised import Normalised, normalised, scales_
 from evopolicy_results.scoring.ranking import Leaderboard, leaderboard
 from evopolicy_results.scoring.scores import ScoreTable, score_table
 from evopolicy_results.statistics.aggregates import Aggregate, Improvement, aggregates
-from evopolicy_results.statistics.generalisation import Generalisation, Optimism, generalisation, optimism_of
+from evopolicy_results.statistics.generalisation import Generalisation, generalisation, optimism
 from evopolicy_results.statistics.pairs import Pair, cell_mean, pairs
 from evopolicy_results.statistics.resolution import Resolution, overall, resolutions
 from evopolicy_results.statistics.samples import samples_of
@@ -51,7 +51,8 @@ class SuiteStatistics(msgspec.Struct, frozen=True, kw_only=True):
     aggregates: tuple[Aggregate, ...]
     improvements: tuple[Improvement, ...]
     generalisation: tuple[Generalisation, ...]
-    optimism: tuple[Optimism, ...]
+    optimism: dict[str, Estimate]
+    """By entry, the mean normalised optimism over its environments; absent where there is none."""
 
 
 class Suite(msgspec.Struct, frozen=True, kw_only=True):
@@ -215,7 +216,7 @@ def _suite(name: str, table: ScoreTable, runs: Sequence[Run], resamples: int) ->
             aggregates=tuple(alone),
             improvements=tuple(against),
             generalisation=tuple(general),
-            optimism=tuple(filter(None, (optimism_of(agent, general) for agent in board.agents))),
+            optimism=optimism(board.agents, general),
         ),
     )
 

@@ -267,11 +267,11 @@ def _generalisation(suite: Suite) -> Table:
     rows += [
         {
             "env": "Mean of all",
-            "entry": one.entry,
-            "normalised_optimism": one.mean.value,
-            "optimism_interval": interval_text(one.mean),
+            "entry": entry,
+            "normalised_optimism": mean.value,
+            "optimism_interval": interval_text(mean),
         }
-        for one in suite.statistics.optimism
+        for entry, mean in suite.statistics.optimism.items()
     ]
     return Table(
         name=f"generalisation_{suite.name}",
