@@ -34,7 +34,7 @@ from evopolicy_results.html.pages import (
     run_title,
     trace_page,
 )
-from evopolicy_results.reading.environments import names_in_runs, ordered_environments
+from evopolicy_results.reading.environments import grouped, names_in_runs, ordered_environments
 from evopolicy_results.reading.parallel import ALONE, Processes
 from evopolicy_results.reading.records import Run, path_text
 from evopolicy_results.studies.palette import Look, looks
@@ -76,9 +76,7 @@ def write_report(
     plots: list[Plot] = []
     submits: list[dict[str, Any]] = []
     drawings = drawings_of(study)
-    by_env: dict[str, list[Run]] = {}
-    for run in study.runs if traces else ():
-        by_env.setdefault(run.env, []).append(run)
+    by_env = grouped(study.runs if traces else (), lambda run: run.env)
     pages = [
         partial(_page, run, out, look.get(run.entry), _beside(run, runs, look))
         for runs in by_env.values()

@@ -11,7 +11,7 @@ from statistics import fmean
 import msgspec
 
 from evopolicy_results.behaviour.edits import classify
-from evopolicy_results.reading.environments import by_name
+from evopolicy_results.reading.environments import by_name, grouped
 from evopolicy_results.reading.records import Run, by_cell
 
 PHASES = ("agent_s", "queue_s", "rollout_s", "feedback_s", "finalise_s")
@@ -91,10 +91,7 @@ def _repaired_rate(transitions: object) -> float | None:
 
 def mean_phases(runs: Iterable[Run]) -> dict[str, dict[str, float]]:
     """By entry, the mean wall time of a run in each of `PHASES`, in seconds; without entries that record none."""
-    by_entry: dict[str, list[Run]] = {}
-    for run in runs:
-        if not run.is_published:
-            by_entry.setdefault(run.entry, []).append(run)
+    by_entry = grouped((run for run in runs if not run.is_published), lambda run: run.entry)
     return {
         entry: {
             phase: fmean(getattr(run.record.timing, phase) for run in by_entry[entry]) for phase in PHASES

@@ -24,7 +24,7 @@ from evopolicy_common.messages.environment import Split
 from evopolicy_common.records.fingerprints import comparable
 from evopolicy_common.records.run_record import inputs_digest
 from evopolicy_common.terminal import counted
-from evopolicy_results.reading.environments import ordered_environments, suites_of
+from evopolicy_results.reading.environments import grouped, ordered_environments, suites_of
 from evopolicy_results.reading.records import Run, path_text
 
 
@@ -185,15 +185,12 @@ REMEDIES = {
 
 def mixtures(runs: Iterable[Run]) -> list[Mixture]:
     """Every difference between runs of one suite or environment, and disputed runs; empty for a fair comparison."""
-    by_env: dict[str, list[Run]] = {}
-    for run in runs:
-        by_env.setdefault(run.env, []).append(run)
+    by_env = grouped(runs, lambda run: run.env)
     out: list[Mixture] = []
     for suite, envs in suites_of(by_env).items():
         together = [run for env in envs for run in by_env[env]]
         out += _differences(_BY_SUITE, suite, together)
-        for entry in sorted({run.entry for run in together}):
-            own = [run for run in together if run.entry == entry]
+        for entry, own in sorted(grouped(together, lambda run: run.entry).items()):
             out += _differences(_BY_ENTRY, f"{suite}, {entry}", own)
     for env in ordered_environments(by_env):
         fingerprint = {"fingerprint": _Setting(_fingerprint_beside(by_env[env]))}

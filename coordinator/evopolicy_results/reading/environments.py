@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterable
+from collections.abc import Callable, Collection, Hashable, Iterable
 from functools import cache
+from typing import TypeVar
 
 from evopolicy_common import catalogue
 from evopolicy_common.records.run_record import RunRecord
 from evopolicy_common.terminal import one_line
+
+Item = TypeVar("Item")
+Key = TypeVar("Key", bound=Hashable)
 
 
 def ordered_environments(envs: Iterable[str]) -> list[str]:
@@ -20,6 +24,14 @@ def ordered_environments(envs: Iterable[str]) -> list[str]:
 def by_name(name: str) -> tuple[str, str]:
     """A key that sorts entries in every table and figure."""
     return name.casefold(), name
+
+
+def grouped(items: Iterable[Item], key: Callable[[Item], Key]) -> dict[Key, list[Item]]:
+    """The items by their key, both in order of appearance."""
+    groups: dict[Key, list[Item]] = {}
+    for item in items:
+        groups.setdefault(key(item), []).append(item)
+    return groups
 
 
 names_in_runs: dict[str, set[tuple[str, str]]] = {}
@@ -75,11 +87,10 @@ def family_title(family: str) -> str:
 
 def suites_of(environments: Iterable[str]) -> dict[str, list[str]]:
     """Groups `environments` by suite name (the catalogue's first suite with each); unknown ones are in `other`."""
-    found: dict[str, list[str]] = {}
-    for env in ordered_environments(environments):
-        name = catalogue.suite_of(env).name if env in catalogue.entries() else "other"
-        found.setdefault(name, []).append(env)
-    return found
+    return grouped(
+        ordered_environments(environments),
+        lambda env: catalogue.suite_of(env).name if env in catalogue.entries() else "other",
+    )
 
 
 def suite_size(suite: str) -> int:

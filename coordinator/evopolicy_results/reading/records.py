@@ -16,7 +16,7 @@ import msgspec
 from evopolicy_common.records.rescores import RescoreRecord
 from evopolicy_common.records.run_record import RunRecord
 from evopolicy_results.code.topology import Features
-from evopolicy_results.reading.environments import by_name, ordered_environments
+from evopolicy_results.reading.environments import by_name, grouped, ordered_environments
 from evopolicy_results.reading.published import PUBLISHED
 from evopolicy_results.scan.signals import Signal
 
@@ -174,9 +174,7 @@ def checkpoint_folder(run: Path, folder: str, index: int) -> Path:
 
 def by_cell(runs: Iterable[Run]) -> dict[tuple[str, str], list[Run]]:
     """The runs by (environment, entry): environments in catalogue order, entries by name."""
-    cells: dict[tuple[str, str], list[Run]] = {}
-    for run in runs:
-        cells.setdefault((run.env, run.entry), []).append(run)
+    cells = grouped(runs, lambda run: (run.env, run.entry))
     place = {env: i for i, env in enumerate(ordered_environments(env for env, _ in cells))}
     return {key: cells[key] for key in sorted(cells, key=lambda key: (place[key[0]], by_name(key[1])))}
 

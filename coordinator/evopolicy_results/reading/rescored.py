@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import msgspec
+from msgspec.structs import replace
 
 from evopolicy_common.errors import ConfigError, ProtocolError
 from evopolicy_common.messages.environment import Split
 from evopolicy_common.records.aggregates import mean, std
-from evopolicy_common.records.rescores import RescoreRecord, read_rescore
+from evopolicy_common.records.rescores import Rescored, RescoreRecord, read_rescore
 from evopolicy_common.records.run_record import PolicyFailureRecord, ReferenceScore
 from evopolicy_results.reading.records import Run
 
@@ -22,12 +22,11 @@ def rescored(runs: Sequence[Run], name: str) -> list[Run]:
 
     Raises ConfigError when a run has no such re-score, or one of another run.
     """
-    missing = []
-    found = []
+    missing, out = [], []
     for run in runs:
         best = run.record.outcome.best_submit_index
         if run.score is None or best is None:
-            found.append(run)
+            out.append(run)
             continue
         try:
             record = read_rescore(run.path, name)
@@ -39,35 +38,35 @@ def rescored(runs: Sequence[Run], name: str) -> list[Run]:
             raise ConfigError(
                 f"{run.path}: its re-score {name} is one of another run; remove it and re-score the run"
             )
-        elif record.checkpoint(best) is None or not record.random_returns:
+        elif (played := record.checkpoint(best)) is None or not record.random_returns:
             raise ConfigError(f"{run.path}: its re-score {name} is incomplete; repeat `evopolicy rescore`")
         else:
-            found.append(_replaced(run, record, best))
+            out.append(_replaced(run, record, played))
     if missing:
         more = f" and {len(missing) - _SHOWN} more" if len(missing) > _SHOWN else ""
         raise ConfigError(
             f"no re-score {name} of {', '.join(missing[:_SHOWN])}{more}: play it with `evopolicy rescore RUN… --name"
             f" {name}`, or leave these runs out"
         )
-    return found
+    return out
 
 
-def _replaced(run: Run, record: RescoreRecord, best: int) -> Run:
-    played = record.checkpoint(best)
-    assert played is not None
+def _replaced(run: Run, record: RescoreRecord, played: Rescored) -> Run:
     outcome, versions = run.record.outcome, run.record.versions
     failures = tuple(each for each in outcome.policy_failures if each.split != _HELDOUT)
     failures += tuple(
-        PolicyFailureRecord(split=_HELDOUT, submit_index=best, episode=int(episode), category=category)  # type: ignore[arg-type]
+        PolicyFailureRecord(
+            split=_HELDOUT, submit_index=record.selected, episode=int(episode), category=category
+        )  # type: ignore[arg-type]
         for episode, category in sorted(played.failures.items())
     )
     random = record.random_returns
     reference = ReferenceScore(
         mean_return=mean(random), std_return=std(random), returns=tuple(random), seeded_by="case"
     )
-    replaced = msgspec.structs.replace(
+    replaced = replace(
         run.record,
-        outcome=msgspec.structs.replace(
+        outcome=replace(
             outcome,
             final_score=played.mean,
             heldout_mean_return=played.mean,
@@ -78,13 +77,11 @@ def _replaced(run: Run, record: RescoreRecord, best: int) -> Run:
             policy_failures=failures,
             random_reference=reference,
         ),
-        experiment_dimensions=msgspec.structs.replace(
-            run.record.experiment_dimensions, n_heldout=record.n_cases
-        ),
-        versions=msgspec.structs.replace(
+        experiment_dimensions=replace(run.record.experiment_dimensions, n_heldout=record.n_cases),
+        versions=replace(
             versions,
             cases_hashes={**versions.cases_hashes, _HELDOUT: record.cases_hash},
             data_secret=versions.data_secret and record.cases_secret,
         ),
     )
-    return msgspec.structs.replace(run, record=replaced, rescore=record)
+    return replace(run, record=replaced, rescore=record)

@@ -14,6 +14,7 @@ import msgspec
 
 from evopolicy_common.messages.run_settings import Start
 from evopolicy_common.statistics.resampling import RESAMPLES
+from evopolicy_results.reading.environments import grouped
 from evopolicy_results.reading.records import Run
 from evopolicy_results.statistics.pairs import Pair, pairs
 from evopolicy_results.statistics.samples import Sample, returns_of
@@ -36,23 +37,22 @@ class StartGroup(msgspec.Struct, frozen=True, kw_only=True):
     pairs: tuple[Pair, ...]
 
 
-def grouped(runs: Iterable[Run]) -> dict[tuple[str, int, str], list[Run]]:
+def by_state(runs: Iterable[Run]) -> dict[tuple[str, int, str], list[Run]]:
     """Runs that start from a submit, by its run, index and tree."""
-    by_state: dict[tuple[str, int, str], list[Run]] = {}
-    for run in runs:
-        if (start := run.record.start) is not None:
-            by_state.setdefault((start.run, start.submit_index, start.tree), []).append(run)
-    return by_state
+    started = [(run, run.record.start) for run in runs if run.record.start is not None]
+    groups = grouped(started, lambda one: (one[1].run, one[1].submit_index, one[1].tree))
+    return {state: [run for run, _ in group] for state, group in groups.items()}
 
 
 def start_groups(runs: Sequence[Run], *, resamples: int = RESAMPLES) -> list[StartGroup]:
     """The groups of the started runs among `runs`."""
     names = {run.record.run: f"{run.entry} / {run.record.exp_id}" for run in runs if run.record.run}
     out = []
-    for (parent, _, _), group in grouped(runs).items():
-        by_label: dict[str, list[Run]] = {}
-        for run, label in zip(group, _labels(group), strict=True):
-            by_label.setdefault(label, []).append(run)
+    for (parent, _, _), group in by_state(runs).items():
+        labels = _labels(group)
+        by_label = {
+            each: [run for run, label in zip(group, labels, strict=True) if label == each] for each in labels
+        }
         env, start = group[0].env, group[0].record.start
         assert start is not None
         samples = {

@@ -19,7 +19,7 @@ import numpy as np
 from evopolicy_common.catalogue.anchors import Anchor, anchor
 from evopolicy_common.catalogue.worlds import unchanged
 from evopolicy_common.statistics.intervals import Estimate, Over, Stratum, stratified, stratum, stratum_of
-from evopolicy_results.reading.environments import family_of
+from evopolicy_results.reading.environments import family_of, grouped
 from evopolicy_results.reading.records import Run
 from evopolicy_results.scoring.evolution import Evolution
 from evopolicy_results.scoring.scores import ScoreTable
@@ -71,10 +71,8 @@ class _Cell(msgspec.Struct, frozen=True):
 
 def worlds_of(runs: Sequence[Run], table: ScoreTable, evolutions: Iterable[Evolution]) -> Worlds | None:
     """None unless some entry has scores in an environment and worlds of it."""
-    pairs: dict[str, list[str]] = {}
-    for env in table.environments:
-        if (base := unchanged(env)) != env and anchor(env) is not None:
-            pairs.setdefault(base, []).append(env)
+    altered = (env for env in table.environments if unchanged(env) != env and anchor(env) is not None)
+    pairs = grouped(altered, unchanged)
     samples = samples_of(runs, table) if pairs else {}
     paired: list[Paired] = []
     for entry in table.entries:
@@ -91,10 +89,8 @@ def worlds_of(runs: Sequence[Run], table: ScoreTable, evolutions: Iterable[Evolu
         paired += [_paired(entry, cell.env, [cell]) for cell in cells]
     if not paired:
         return None
-    by_entry: dict[str, list[Evolution]] = {entry: [] for entry in table.agents}
-    for one in evolutions:
-        by_entry[one.entry].append(one)
-    curves = {entry: _curve(several, pairs) for entry, several in by_entry.items()}
+    by_entry = grouped(evolutions, lambda one: one.entry)
+    curves = {entry: _curve(by_entry.get(entry, ()), pairs) for entry in table.agents}
     return Worlds(paired=tuple(paired), curves={entry: curve for entry, curve in curves.items() if curve})
 
 
@@ -132,9 +128,7 @@ def _paired(entry: str, scope: str, cells: Sequence[_Cell]) -> Paired:
 
 def _curve(evolutions: Sequence[Evolution], pairs: dict[str, list[str]]) -> tuple[CurvePoint, ...]:
     """The curve over the environments of which the entry has played all of the report's worlds."""
-    by_env: dict[str, list[Evolution]] = {}
-    for one in evolutions:
-        by_env.setdefault(one.env, []).append(one)
+    by_env = grouped(evolutions, lambda one: one.env)
     whole = {env: worlds for env, worlds in pairs.items() if all(each in by_env for each in (env, *worlds))}
     if not whole:
         return ()

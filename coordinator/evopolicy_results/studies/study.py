@@ -34,7 +34,7 @@ from evopolicy_results.statistics.pairs import Pair, cell_mean, pairs
 from evopolicy_results.statistics.resolution import Resolution, overall, resolutions
 from evopolicy_results.statistics.samples import samples_of
 from evopolicy_results.statistics.standings import Standings, standings
-from evopolicy_results.statistics.starts import VARIED, StartGroup, grouped, start_groups
+from evopolicy_results.statistics.starts import VARIED, StartGroup, by_state, start_groups
 from evopolicy_results.statistics.worlds import Worlds, worlds_of
 
 
@@ -140,7 +140,7 @@ def study_of(
     learn_names(run.record for run in runs)
     whole = [run for run in runs if run.record.start is None]
     mixed = mixtures(whole)
-    for group in grouped(runs).values():
+    for group in by_state(runs).values():
         mixed += [one for one in mixtures(group) if one.what not in VARIED]
     table = score_table(whole)
     if scores is not None:

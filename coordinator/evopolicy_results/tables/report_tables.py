@@ -12,7 +12,7 @@ from evopolicy_common import catalogue
 from evopolicy_results.behaviour import structure
 from evopolicy_results.behaviour.audit import TokenUse
 from evopolicy_results.behaviour.edits import demand_of
-from evopolicy_results.reading.environments import family_of, family_title, suite_size, title_of
+from evopolicy_results.reading.environments import family_of, family_title, grouped, suite_size, title_of
 from evopolicy_results.scoring.normalised import DEMANDS, on_known_scale
 from evopolicy_results.scoring.ranking import CellResult
 from evopolicy_results.statistics.standings import RankEstimate
@@ -74,10 +74,9 @@ def _aggregate(suite: Suite, study: Study) -> Table:
     # Families that do not ship could have the name of another column.
     keys = {each: each if each in catalogue.families() else f"family_{each}" for each in families}
     keys = keys if len(keys) > 1 else {}
-    budgets: dict[str, list[int]] = {}
-    for run in study.runs:
-        if run.env in suite.board.environments:
-            budgets.setdefault(run.entry, []).append(run.budget)
+    here = (run for run in study.runs if run.env in suite.board.environments)
+    by_entry = grouped(here, lambda run: run.entry)
+    budgets = {entry: one_or_all(sorted(run.budget for run in runs)) for entry, runs in by_entry.items()}
     whole = suite_size(suite.name) or len(suite.board.environments)
     standings = suite.statistics.standings
     rows: list[dict[str, Any]] = [
@@ -89,7 +88,7 @@ def _aggregate(suite: Suite, study: Study) -> Table:
             **_uncertainty(standings.of(row.entry)),
             "known": _known_mean(suite, row.entry),
             "rank": row.rank,
-            "budget": None if row.is_reference else one_or_all(sorted(budgets.get(row.entry, []))),
+            "budget": None if row.is_reference else budgets.get(row.entry),
             "wins": row.wins,
             "top2": row.top2,
             "environments": f"{row.n_environments} of {whole}",

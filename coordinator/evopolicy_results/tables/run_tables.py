@@ -15,7 +15,13 @@ from evopolicy_results.behaviour.audit import PHASES, AuditSignals
 from evopolicy_results.behaviour.edits import demand_of
 from evopolicy_results.behaviour.trace import Trace
 from evopolicy_results.reading.agent_log import Evidence
-from evopolicy_results.reading.environments import family_of, family_title, ordered_environments, title_of
+from evopolicy_results.reading.environments import (
+    family_of,
+    family_title,
+    grouped,
+    ordered_environments,
+    title_of,
+)
 from evopolicy_results.reading.records import Run, path_text
 from evopolicy_results.scan.signals import TITLES, Signal
 from evopolicy_results.studies.study import Study
@@ -142,9 +148,7 @@ def _settings(run: Run) -> str:
 
 
 def _environments(study: Study) -> Table:
-    by_env: dict[str, list[Run]] = {}
-    for run in study.runs:
-        by_env.setdefault(run.env, []).append(run)
+    by_env = grouped(study.runs, lambda run: run.env)
 
     def common(value_of: Callable[[Run], Any]) -> Callable[[str], Any]:
         return lambda env: one_or_all(map(value_of, by_env[env]))
