@@ -43,9 +43,11 @@ _LOCAL_ONLY = {
 
 
 def cluster_of(
-    given: ClusterOptions, connect: list[str] | None, file: Path | None, *, local: bool
+    given: ClusterOptions, connect: list[str] | None, file: Path | None, *, local: bool | None = None
 ) -> Cluster:
-    """The cluster that a command plays on. ConfigError for an option that does not go with it."""
+    """The cluster that a command plays on; `local` None: its own unless one is named. ConfigError for an option that
+    does not go with it."""
+    local = not (connect or file) if local is None else local
     packages = list(checked_names(given.policy_package))
     if not local:
         for name, text in _LOCAL_ONLY.items():

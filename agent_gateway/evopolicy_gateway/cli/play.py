@@ -174,11 +174,10 @@ def try_policy(
     with fail_on_our_errors():
         env_id, ids = one_environment(env), cases_of(cases)
         policy = shipped.found(policy_dir, Path.cwd())
-        local = not (connect or credentials_file)
-        if local:
+        if not (connect or credentials_file):
             packages = list(packages_for(policy, cluster.policy_package))
             cluster = msgspec.structs.replace(cluster, policy_package=packages)
-        where = options.cluster_of(cluster, connect, credentials_file, local=local)
+        where = options.cluster_of(cluster, connect, credentials_file)
         where = msgspec.structs.replace(where, unjailed=tier == "none")
         where.check_ids([env_id], "train", ids)
         given: dict[str, Any] = {"sandbox_tier": tier, "limits": limits, "as_json": as_json}
@@ -212,8 +211,7 @@ def play_random(
 
     with fail_on_our_errors():
         chosen = None if cases is None else cases_of(cases)
-        local = not (connect or credentials_file)
-        where = options.cluster_of(cluster, connect, credentials_file, local=local)
+        where = options.cluster_of(cluster, connect, credentials_file)
         env_ids = catalogue.resolve(env)
         where.check_ids(env_ids, split, chosen or ())
         _exit(run_to_end(trials.play_random(env_ids, split, chosen, where, as_json=as_json)))
@@ -285,8 +283,7 @@ def replay(
     with fail_on_our_errors():
         plan = recorded_agent.plan_of(folder_of(run_directory).root, runs, trusted=trust)
         plan.check()
-        local = not (connect or credentials_file)
-        where = options.cluster_of(cluster, connect, credentials_file, local=local)
+        where = options.cluster_of(cluster, connect, credentials_file)
         try:
             run_to_end(plain_runs.play([plan], where, 1, terminal(stderr=True)))
         except KeyboardInterrupt:

@@ -166,7 +166,6 @@ def tasks_in(tasks: Path) -> dict[str, RunFolder]:
 
 
 def _run_of(path: Path) -> RunFolder:
-    """The run of a `task.toml`."""
     try:
         return RunFolder(Path(tomllib.loads(path.read_text("utf-8"))["metadata"]["run"]))
     except (KeyError, TypeError, ValueError) as error:

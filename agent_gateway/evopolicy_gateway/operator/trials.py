@@ -139,7 +139,6 @@ async def play_random(
 
 
 async def _outcomes(operations: Operations, message: Evaluate, console: Terminal) -> list[EpisodeOutcome]:
-    """Returns all outcomes in the requested order."""
     outcomes: list[EpisodeOutcome] = []
     with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
         task = progress.add_task(message.env, total=None)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 
 def _digits(episode_budget: int) -> int:
-    """Number of digits in the names of submits and episodes."""
     return max(3, len(str(episode_budget)))
 
 

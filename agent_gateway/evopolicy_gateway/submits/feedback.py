@@ -225,7 +225,6 @@ class Collector:
             return _NOT_WRITTEN
 
     def _put(self, fetched: list[tuple[EpisodeFeedback, _Fetched]]) -> None:
-        """Writes episodes' folders one after another."""
         for episode, content in fetched:
             much = not isinstance(content, str) and takes_much(content[0])
             with _much if much else contextlib.nullcontext():
@@ -233,7 +232,6 @@ class Collector:
                     self.tree.put_episode(self._name(episode.index), files)
 
     def _name(self, index: int) -> str:
-        """The folder's name of the episode with that request index."""
         return episode_name(self.accepted.first_global_episode + index, self.machine.run.episode_budget)
 
     def _files_of(self, episode: EpisodeFeedback, content: _Fetched) -> dict[str, bytes]:
@@ -261,7 +259,6 @@ class Collector:
         log.error(event, submit=self.accepted.key, index=episode.index, **facts)
 
     def _commit(self, done: SubmitDone) -> bytes:
-        """Commits the folder; returns its summary."""
         errors, request, run = None, self.ticket.request, self.machine.run
         own = run.profile == "own"
         if done.status != "ok":

@@ -119,25 +119,6 @@ def summary_bytes(
 
     Raises ValueError when an ok submit lacks an episode.
     """
-    fields = plain(
-        msgspec.to_builtins(_summary(env, submit_index, done, scores, observations, messages=messages))
-    )
-    if echoed is not None:
-        fields["env_instances"] = list(echoed)
-    if every_key:
-        fields |= dict.fromkeys(("reward_components_mean", "reward_components_per_episode"))
-    return msgspec.json.format(msgspec.json.encode(fields), indent=2) + b"\n"
-
-
-def _summary(
-    env: str,
-    submit_index: int,
-    done: SubmitDone,
-    scores: Sequence[EpisodeScore],
-    observations: ObservationForm,
-    *,
-    messages: bool,
-) -> Summary:
     ok = done.status == "ok"
     # A submit of `end-submit` in which the policy failed is played to its end too.
     played = ok or (done.status == "rollout_timeout" and done.n_kept == done.n_episodes)
@@ -149,7 +130,7 @@ def _summary(
     with_components = played and any(components)
     lengths = tuple(score.length for score in ordered)
     solved = tuple(score.success for score in ordered)
-    return Summary(
+    summary = Summary(
         schema_version=SCHEMA_VERSION,
         submit_index=submit_index,
         env=env,
@@ -176,6 +157,12 @@ def _summary(
         policy_failures=len(_where(ordered, None)) if played else None,
         warning=_warning(ordered, observations, ends=not ok, messages=messages) if played else None,
     )
+    fields = plain(msgspec.to_builtins(summary))
+    if echoed is not None:
+        fields["env_instances"] = list(echoed)
+    if every_key:
+        fields |= dict.fromkeys(("reward_components_mean", "reward_components_per_episode"))
+    return msgspec.json.format(msgspec.json.encode(fields), indent=2) + b"\n"
 
 
 def _warning(

@@ -250,9 +250,9 @@ class TicketMachine:
         return "collect"
 
     def snapshotted(self, snapshot: Snapshot) -> Effect:
-        taken = {"bundle": snapshot.digest, "bundle_error": snapshot.error}
-        taken |= {"kept": snapshot.kept, "tree": snapshot.tree}
-        return msgspec.structs.replace(self._open.request, **taken)
+        digest, error, kept, tree = snapshot.digest, snapshot.error, snapshot.kept, snapshot.tree
+        request = self._open.request
+        return msgspec.structs.replace(request, bundle=digest, bundle_error=error, kept=kept, tree=tree)
 
     def sent(self, reply: messages.SubmitAccepted) -> Effect:
         return open_run.Accepted(key=self._open.request.key, **msgspec.structs.asdict(reply))

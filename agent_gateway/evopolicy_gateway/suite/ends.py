@@ -33,7 +33,6 @@ def _kind(entry: Entry | None) -> str:
 
 
 def _why(run: Plan, entry: Entry | None) -> str:
-    """The reason in one line."""
     if entry is None or entry.state == "pending":
         return f"{run.name}: it was not begun"
     reasons = {

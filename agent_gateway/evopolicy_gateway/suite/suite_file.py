@@ -106,27 +106,23 @@ class SuiteFile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     overrides: tuple[Override, ...] = ()
 
 
-def find(name: str) -> tuple[Path | None, bytes]:
-    """Reads a suite's file by its path or shipped name, such as `core16.toml`. Raises ConfigError when it is missing.
-
-    Returns the path, None for a shipped file, and the bytes.
-    """
+def _found(name: str) -> bytes:
+    """A suite's file by its path or shipped name, such as `core16.toml`. Raises ConfigError when it is missing."""
     path = Path(name)
     if path.is_file():
-        return path, read_given(path, str(path))
+        return read_given(path, str(path))
     shipped = resources.files("evopolicy_gateway.suite") / "shipped"
     there = sorted(entry.name for entry in shipped.iterdir() if entry.name.endswith(".toml"))
     wanted = name if name.endswith(".toml") else f"{name}.toml"
     if wanted in there:
-        return None, (shipped / wanted).read_bytes()
+        return (shipped / wanted).read_bytes()
     raise ConfigError(f"no file and no shipped suite named {name!r}; shipped are {', '.join(there)}")
 
 
 def read(name: str) -> SuiteFile:
     """Reads and validates a suite's file. Raises ConfigError with the problem and its place."""
-    _, data = find(name)
     try:
-        suite = msgspec.toml.decode(data, type=SuiteFile)
+        suite = msgspec.toml.decode(_found(name), type=SuiteFile)
     except (msgspec.DecodeError, UnicodeDecodeError) as error:
         raise ConfigError(f"{name}: {error}") from error
     if not keys.valid_name(suite.name) or len(suite.name) > 40:

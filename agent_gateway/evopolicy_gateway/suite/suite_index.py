@@ -84,7 +84,6 @@ def entry_of(plan: Plan, record: RunRecord, **more: Any) -> Entry:
 
 
 def waiting(plan: Plan) -> Entry:
-    """The index entry of a run that has not started."""
     settings = plan.settings
     return Entry(
         name=plan.name, agent=plan.entry, env=settings.env, repeat=settings.repeat, digest=plan.digest

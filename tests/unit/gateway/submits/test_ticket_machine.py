@@ -232,7 +232,9 @@ ANY = st.lists(st.tuples(st.sampled_from(ACTIONS), st.integers(0, 8)), min_size=
 
 @given(ANY, st.sampled_from(("own", "published")))
 @settings(deadline=None, max_examples=300)
-def test_submits_survive_any_order_of_events(actions: list[tuple[str, int]], profile: str) -> None:
+def test_submits_survive_any_order_of_requests_errors_and_crashes(
+    actions: list[tuple[str, int]], profile: str
+) -> None:
     play(actions, profile)
 
 
