@@ -2,13 +2,30 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
+from evopolicy_common.messages.episode import BlobRef
+from evopolicy_common.messages.gateway import EpisodeFeedback
 from evopolicy_common.messages.operator import RunFinished, SubmitRecord
 from evopolicy_common.messages.run_settings import RunSettings
 from evopolicy_common.messages.worker import Fingerprint
+from evopolicy_gateway.run.plan import Plan
 
 SETTINGS = RunSettings(env="toy/line", entry="evolve", model="none", exp_id="t", budget=8)
+
+
+def plan_in(root: Path, settings: RunSettings = SETTINGS, **more: Any) -> Plan:
+    """The plan of a run below `root`, named after its environment."""
+    usual: dict[str, Any] = {"agent": "evolve", "runs": root, "started_in": root, "wall_limit_s": 60.0}
+    return Plan(name=settings.env, settings=settings, **{**usual, **more})
+
+
+def played_episode(**more: Any) -> EpisodeFeedback:
+    """The result of an episode of one step, without its files."""
+    usual: dict[str, Any] = {"index": 0, "episode_return": 0.0, "length": 1, "failure": None}
+    usual |= {"reward_components": {}, "trajectory": BlobRef(digest="0" * 64, size=1), "video": None}
+    return EpisodeFeedback(**{**usual, "stdout": b"", "stderr": b"", **more})
 
 
 def finished(**fields: Any) -> RunFinished:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from rigs.finished_run import finished
+from rigs.finished_run import finished, plan_in
 
 from evopolicy_common.console import Terminal
 from evopolicy_common.messages.operator import ClaimState
@@ -34,14 +34,8 @@ TIMEOUT_S = 30.0
 HEAD = 'name = "s"\nenvironments = ["toy/line"]\n'
 CODEX = '[[agents]]\nname = "{}"\n[agents.config]\nharness = "codex"\n'
 EVOLVE = '[[agents]]\nname = "{}"\nagent = "evolve"\n'
-TOKENS = {
-    "input_noncached": 100,
-    "cache_read": 20,
-    "cache_creation": 0,
-    "output": 30,
-    "cost": 0.25,
-    "requests": 7,
-}
+TOKENS = {"input_noncached": 100, "cache_read": 20, "cache_creation": 0, "output": 30}
+TOKENS |= {"cost": 0.25, "requests": 7}
 
 
 class Cluster:
@@ -187,17 +181,8 @@ class Direct:
         self.ended: list[str] = []
         self.kinds: list[str] = []
         stage = self
-        self.plans = [
-            Plan(
-                name=env,
-                settings=RunSettings(env=env, entry="a", model="a", exp_id="t"),
-                agent="evolve",
-                runs=root,
-                started_in=root,
-                wall_limit_s=60.0,
-            )
-            for env in ("toy/line", "toy/maze")
-        ]
+        names = {"entry": "a", "model": "a", "exp_id": "t"}
+        self.plans = [plan_in(root, RunSettings(env=env, **names)) for env in ("toy/line", "toy/maze")]
 
         class Play(Lifecycle):
             async def play(self, put_aside: object = None, kind: str = "play") -> RunRecord:

@@ -16,6 +16,7 @@ from typing import Any
 import msgspec
 import pytest
 from commands import agent, record_in, run_dir
+from rigs.finished_run import plan_in
 
 from evopolicy_common.console import Terminal
 from evopolicy_common.messages.run_settings import RunSettings
@@ -53,19 +54,10 @@ def at_once(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def plan_of(root: Path, **more: Any) -> Plan:
-    settings = RunSettings(
-        env="toy/line", entry="a", model="a", exp_id="t", budget=6, n_validation=2, n_heldout=2
-    )
-    started = f"command:python3 {root / 'agent.py'}"
-    return Plan(
-        name="toy/line",
-        settings=settings,
-        agent=started,
-        runs=root / "runs",
-        started_in=root,
-        wall_limit_s=60.0,
-        **more,
-    )
+    names = {"env": "toy/line", "entry": "a", "model": "a", "exp_id": "t"}
+    settings = RunSettings(**names, budget=6, n_validation=2, n_heldout=2)
+    agent_name = f"command:python3 {root / 'agent.py'}"
+    return plan_in(root, settings, agent=agent_name, runs=root / "runs", **more)
 
 
 def played(plan: Plan, operator_file: Path) -> tuple[str, str]:

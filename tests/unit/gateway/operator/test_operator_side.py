@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from invented.policies import Version
 from invented.run_dirs import write_run
-from rigs.finished_run import SETTINGS, finished
+from rigs.finished_run import finished, plan_in
 
 from evopolicy_common.console import Terminal
 from evopolicy_common.errors import ConfigError, ProtocolError
@@ -29,7 +29,6 @@ from evopolicy_gateway.operator.cluster import Cluster
 from evopolicy_gateway.processes import child_messages
 from evopolicy_gateway.processes.child_messages import AgentDoing, Progress
 from evopolicy_gateway.run.options import cases_of, limits_of, one_environment, packages_for
-from evopolicy_gateway.run.plan import Plan
 from evopolicy_gateway.run.record import run_record
 from evopolicy_gateway.run.run_options import ClusterOptions, RunOptions
 from evopolicy_gateway.run.times import Times
@@ -38,23 +37,12 @@ from evopolicy_gateway.run.watch import RunView
 from evopolicy_gateway.run_folder.layout import Staged
 
 
-def plan(tmp_path: Path, **fields: Any) -> Plan:
-    usual: dict[str, Any] = {
-        "settings": SETTINGS,
-        "agent": "evolve",
-        "runs": tmp_path,
-        "started_in": tmp_path,
-        "wall_limit_s": 60.0,
-    }
-    return Plan(**usual | fields)
-
-
 def test_a_missing_cli_is_refused_before_the_run_opens(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(ConfigError, match="no program 'claude' on the PATH; install it with: "):
-        plan(tmp_path, agent="claude-code").claim()
+        plan_in(tmp_path, agent="claude-code").claim()
     assert not list(tmp_path.iterdir())
 
 
@@ -74,13 +62,8 @@ def test_packages_that_somebody_elses_run_names_are_refused_with_its_file(tmp_pa
     assert packages_for(policy, ["scipy"]) == ("scipy",)
 
 
-STAGED = Staged(
-    agents_md_hash="h",
-    initial_policy_hash="i",
-    n_train=64,
-    min_episodes_per_submit=1,
-    max_episodes_per_submit=8,
-)
+COUNTS = {"n_train": 64, "min_episodes_per_submit": 1, "max_episodes_per_submit": 8}
+STAGED = Staged(agents_md_hash="h", initial_policy_hash="i", **COUNTS)
 
 
 def test_a_completed_run_is_recorded_with_all_its_numbers(tmp_path: Path) -> None:
@@ -90,7 +73,7 @@ def test_a_completed_run_is_recorded_with_all_its_numbers(tmp_path: Path) -> Non
     ]
     times = Times(open_s=9.0, in_flight_s=4.0, feedback_s=0.5)
     counted = Transitions(steps=10, action_invalid=3)
-    record = run_record(plan(tmp_path), finished(), STAGED, rejected, times, transitions=counted)
+    record = run_record(plan_in(tmp_path), finished(), STAGED, rejected, times, transitions=counted)
     assert record.outcome.auxiliary["transitions"] == {"steps": 10, "action_invalid": 3}
     assert decode_run_record(encode_run_record(record)) == record
     assert record.outcome.final_score == record.outcome.heldout_mean_return == 2.0
@@ -101,11 +84,8 @@ def test_a_completed_run_is_recorded_with_all_its_numbers(tmp_path: Path) -> Non
     assert record.outcome.random_reference.mean_return == 0.5
     assert (record.agent.turns, record.agent.retries) == (2, 1)
     assert record.agent.settings["effort"] == "high"
-    assert (record.timing.wall_time_seconds, record.timing.agent_s, record.timing.feedback_s) == (
-        12.5,
-        5.0,
-        0.5,
-    )
+    timing = record.timing
+    assert (timing.wall_time_seconds, timing.agent_s, timing.feedback_s) == (12.5, 5.0, 0.5)
     assert [one.message for one in record.rejected_submits] == ["no"]
     assert record.experiment_dimensions.n_heldout == 2
     assert record.versions.fingerprint["numpy"] == "2.4"
@@ -114,14 +94,14 @@ def test_a_completed_run_is_recorded_with_all_its_numbers(tmp_path: Path) -> Non
 
 def test_an_environment_that_does_not_repeat_itself_is_marked_in_the_record(tmp_path: Path) -> None:
     for deterministic in (True, False):
-        record = run_record(plan(tmp_path), finished(deterministic=deterministic), STAGED, [], Times())
+        record = run_record(plan_in(tmp_path), finished(deterministic=deterministic), STAGED, [], Times())
         assert record.versions.env_deterministic is deterministic
 
 
 @pytest.mark.parametrize("status", ["no_ok_submit", "error", "cancelled"])
 def test_a_run_without_a_result_has_no_score(tmp_path: Path, status: str) -> None:
     done = finished(status=status, final_score=None, best_submit_index=None, heldout_returns=(), submits=())
-    outcome = run_record(plan(tmp_path), done, None, [], Times()).outcome
+    outcome = run_record(plan_in(tmp_path), done, None, [], Times()).outcome
     assert outcome.status == status
     assert outcome.final_score == (0.0 if status == "no_ok_submit" else None)
     assert outcome.score is None
@@ -131,16 +111,16 @@ def test_a_run_without_a_result_has_no_score(tmp_path: Path, status: str) -> Non
 
 
 def test_a_runs_folder_is_claimed_once_and_replaced_only_on_demand(tmp_path: Path) -> None:
-    first = plan(tmp_path)
+    first = plan_in(tmp_path)
     first.claim()
     first.folder.run_json.write_text("{}")
     with pytest.raises(ConfigError, match=r"finished run.*--overwrite"):
         first.claim()
-    plan(tmp_path, overwrite=True).claim()
+    plan_in(tmp_path, overwrite=True).claim()
     assert list(first.folder.root.iterdir()) == []
     (first.folder.root / "thesis.tex").write_text("precious")
     with pytest.raises(ConfigError, match="not a run's folder"):
-        plan(tmp_path, overwrite=True).claim()
+        plan_in(tmp_path, overwrite=True).claim()
     assert (first.folder.root / "thesis.tex").exists()
 
 
@@ -148,15 +128,8 @@ def test_limits_are_the_usual_ones_but_for_those_named() -> None:
     limits = limits_of(["act_wall_s=2.5", "memory_bytes=2e9", "submit_wall_s=60"])
     assert limits == ResourceLimits(act_wall_s=2.5, memory_bytes=2_000_000_000, submit_wall_s=60.0)
     assert isinstance(limits.memory_bytes, int)
-    for wrong in (
-        "act_wall_s",
-        "act_wall=1",
-        "act_wall_s=x",
-        "act_wall_s=0",
-        "act_wall_s=-1",
-        "act_wall_s=nan",
-        "cpu_s=inf",
-    ):
+    wrong_ones = ("act_wall_s", "act_wall=1", "cpu_s=inf", *(f"act_wall_s={x}" for x in ("x", 0, -1, "nan")))
+    for wrong in wrong_ones:
         with pytest.raises(ConfigError, match="--limit"):
             limits_of([wrong])
     for name, most in (*LARGEST_LIMITS.items(), ("memory_bytes", LARGEST_LIMIT)):
@@ -176,15 +149,9 @@ def test_wrong_option_values_name_the_option() -> None:
             cases_of(wrong)
     with pytest.raises(ConfigError, match="16 environments"):
         one_environment("core16")
-    choices = [
-        ("policy_scope", "run"),
-        ("observations", "x"),
-        ("finish", "late"),
-        ("step_limit", "9"),
-        ("profile", "p"),
-    ]
-    for field, text in (*choices, ("tier", "docker"), ("video", "on")):
-        option = f"--{field.replace('_', '-')}"
+    choices = "--policy-scope run --observations x --finish late --step-limit 9 --profile p --tier docker --video on"
+    words = choices.split()
+    for option, text in zip(words[::2], words[1::2], strict=True):
         with pytest.raises(typer.BadParameter, match=f"'{text}' is not one of"):
             parse(["evopolicy", "run", "--env", "toy/line", "--agent", "evolve", option, text])
 
@@ -221,14 +188,8 @@ def test_control_lines_come_back_as_they_were_and_nothing_else_does() -> None:
 def test_watchers_on_a_pipe_print_a_line_for_each_news() -> None:
     out = io.StringIO()
     with RunView(Terminal(file=out, width=200)).shown() as watch:
-        progress = Progress(
-            episode_budget=8,
-            remaining_budget=4,
-            n_submits=1,
-            last_submit_id="submit_000",
-            last_status="ok",
-            last_mean=-1.25,
-        )
+        last: dict[str, Any] = {"last_submit_id": "submit_000", "last_status": "ok", "last_mean": -1.25}
+        progress = Progress(episode_budget=8, remaining_budget=4, n_submits=1, **last)
         for _ in range(3):
             watch.progress("toy/line", progress)
         watch.progress("toy/line", msgspec.structs.replace(progress, waits_for="a worker"))
@@ -252,42 +213,22 @@ def test_watchers_on_a_terminal_draw_a_table() -> None:
     console = Terminal(file=out, force_terminal=True, width=160)
     with RunView(console).shown() as watch:
         watch.note("toy/line", "run r-1")
-        watch.progress(
-            "toy/line",
-            Progress(
-                episode_budget=8,
-                remaining_budget=4,
-                n_submits=2,
-                submit_id="submit_001",
-                n_episodes=4,
-                n_done=1,
-            ),
-        )
+        now: dict[str, Any] = {"submit_id": "submit_001", "n_episodes": 4, "n_done": 1}
+        watch.progress("toy/line", Progress(episode_budget=8, remaining_budget=4, n_submits=2, **now))
         watch.phase("toy/line", RunProgress(phase="validation", done=1, total=2))
     text = out.getvalue()
     for needed in ("run r-1", "4/8", "validating 1/2"):
         assert needed in text
 
 
+OPEN = [("open-network", "bwrap"), ("none", "bwrap"), ("bwrap", "none")]
+
+
 @pytest.mark.parametrize(
-    ("jail", "tier", "exposed"),
-    [
-        ("bwrap", "bwrap", False),
-        ("open-network", "bwrap", True),
-        ("none", "bwrap", True),
-        ("bwrap", "none", True),
-    ],
+    ("jail", "tier", "exposed"), [("bwrap", "bwrap", False), *((*each, True) for each in OPEN)]
 )
 def test_agents_without_a_jail_may_read_the_state(
     jail: Any, tier: Any, exposed: bool, tmp_path: Path
 ) -> None:
     settings = RunOptions(agent="evolve", tier=tier).settings("toy/line", "t")
-    plan = Plan(
-        settings=settings,
-        agent="evolve",
-        runs=tmp_path,
-        started_in=tmp_path,
-        wall_limit_s=1.0,
-        jail=JailSettings(mode=jail),
-    )
-    assert _unjailed([plan]) == exposed
+    assert _unjailed([plan_in(tmp_path, settings, jail=JailSettings(mode=jail))]) == exposed

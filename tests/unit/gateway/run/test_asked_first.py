@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from rigs.finished_run import plan_in
 
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.operator import RunCreated
 from evopolicy_common.messages.run_settings import RunSettings
 from evopolicy_common.records.open_run import IntendedRun
 from evopolicy_gateway.run.lifecycle import RunLifecycle
-from evopolicy_gateway.run.plan import Plan
 
 
 class Operations:
@@ -37,8 +37,7 @@ class Operations:
 def ask(folder: Path, operations: Operations, budget: int = 8) -> str:
     """The key of the run that a command opens before it is killed."""
     settings = RunSettings(env="toy/line", entry="a", model="a", exp_id="t", budget=budget)
-    where: dict[str, Any] = {"runs": folder, "started_in": folder, "overwrite": True}
-    plan = Plan(name="toy/line", settings=settings, agent="random", wall_limit_s=60.0, **where)
+    plan = plan_in(folder, settings, overwrite=True)
     plan.folder.root.mkdir(parents=True, exist_ok=True)
     (plan.folder.run_json).write_text("earlier")
 

@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from rigs.finished_run import played_episode
 
 from evopolicy_common.messages.environment import ObservationForm, ObsStorage
-from evopolicy_common.messages.episode import BlobRef, PolicyFailure, ResourceLimits
-from evopolicy_common.messages.gateway import EpisodeFeedback, FeedbackDetail, SubmitDone
+from evopolicy_common.messages.episode import PolicyFailure, ResourceLimits
+from evopolicy_common.messages.gateway import FeedbackDetail, SubmitDone
 from evopolicy_common.records.episodes.rendered import decode, files_of
 from evopolicy_common.records.episodes.trajectory import Recorder
 from evopolicy_common.records.json_text import json_bytes
@@ -36,18 +37,9 @@ def trajectory_files(packed: bytes, storage: ObsStorage | None) -> dict[str, byt
 
 
 def done(n: int, status: Any = "ok", **fields: Any) -> SubmitDone:
-    usual: dict[str, Any] = {
-        "status": status,
-        "n_episodes": n,
-        "env_instances": tuple(range(n)),
-        "first_global_episode": 4,
-        "remaining_budget": 7,
-        "started_at": 100.0,
-        "completed_at": 101.25,
-        "failure": None,
-        "n_kept": n,
-    }
-    return SubmitDone(**usual | fields)
+    usual: dict[str, Any] = {"status": status, "n_episodes": n, "n_kept": n, "failure": None}
+    usual |= {"env_instances": tuple(range(n)), "first_global_episode": 4, "remaining_budget": 7}
+    return SubmitDone(**usual | {"started_at": 100.0, "completed_at": 101.25} | fields)
 
 
 def scores(returns: list[float]) -> list[EpisodeScore]:
@@ -256,17 +248,7 @@ def test_an_action_that_is_no_action_is_written_as_it_was_returned() -> None:
 
 
 def test_streams_are_cut_and_videos_kept() -> None:
-    episode = EpisodeFeedback(
-        index=0,
-        episode_return=0.0,
-        length=1,
-        failure=None,
-        reward_components={},
-        trajectory=BlobRef(digest="0" * 64, size=1),
-        video=None,
-        stdout=b"x" * (MAX_TEXT_BYTES + 5),
-        stderr=b"",
-    )
+    episode = played_episode(stdout=b"x" * (MAX_TEXT_BYTES + 5))
     files = episode_files(episode, packed([np.zeros(1)]), b"mp4", "inline", at=0.0, share=1 << 20)
     assert len(files["stdout.txt"]) == MAX_TEXT_BYTES
     assert files["video.mp4"] == b"mp4"
@@ -279,17 +261,7 @@ SECRET = "the observation was 0.123"
 def shown(detail: FeedbackDetail, storage: ObsStorage) -> dict[str, bytes]:
     """Files of an episode whose policy wrote what it observed wherever it can."""
     failure = PolicyFailure(category="act_error", message=SECRET, traceback=SECRET, step_index=1)
-    episode = EpisodeFeedback(
-        index=0,
-        episode_return=0.0,
-        length=1,
-        failure=failure,
-        reward_components={},
-        trajectory=BlobRef(digest="0" * 64, size=1),
-        video=None,
-        stdout=SECRET.encode(),
-        stderr=SECRET.encode(),
-    )
+    episode = played_episode(failure=failure, stdout=SECRET.encode(), stderr=SECRET.encode())
     observation = np.zeros((4, 5, 3), dtype=np.uint8) if storage == "npz" else np.zeros(1)
     rows = b"" if detail == "scores" else packed([observation])
     return episode_files(episode, rows, b"mp4", storage, at=0.0, share=1 << 20, detail=detail)
@@ -321,12 +293,8 @@ def test_a_level_of_detail_has_its_files_and_hides_the_rest(
 
 
 def test_a_warning_without_messages_still_says_where_the_policy_failed() -> None:
-    failed = EpisodeScore(
-        index=0,
-        episode_return=1.0,
-        length=2,
-        failure=PolicyFailure(category="act_error", message=SECRET, traceback="", step_index=1),
-    )
+    failure = PolicyFailure(category="act_error", message=SECRET, traceback="", step_index=1)
+    failed = EpisodeScore(index=0, episode_return=1.0, length=2, failure=failure)
     text = summary_bytes("toy/line", 0, done(1), [failed], messages=False).decode()
     assert SECRET not in text
     assert "first at step 1, act_error)" in text

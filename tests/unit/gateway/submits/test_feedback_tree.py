@@ -16,9 +16,17 @@ def names(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir())
 
 
-def test_episodes_stream_into_the_partial_folder_and_a_rename_commits_them(tmp_path: Path) -> None:
-    tree = SubmitTree(tmp_path, "submit_000")
-    tree.begin()
+@pytest.fixture
+def tree(tmp_path: Path) -> SubmitTree:
+    """Of submit_000, begun in `tmp_path`."""
+    made = SubmitTree(tmp_path, "submit_000")
+    made.begin()
+    return made
+
+
+def test_episodes_stream_into_the_partial_folder_and_a_rename_commits_them(
+    tree: SubmitTree, tmp_path: Path
+) -> None:
     tree.put_episode("ep_001", {"trajectory.jsonl": b"1\n"})
     assert names(tmp_path) == ["submit_000.partial"]
     assert names(tmp_path / "submit_000.partial" / "episodes") == ["ep_001"]
@@ -27,7 +35,7 @@ def test_episodes_stream_into_the_partial_folder_and_a_rename_commits_them(tmp_p
     assert names(tmp_path / "submit_000") == ["episodes", "summary.json"]
 
 
-def test_the_summary_is_written_last(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_summary_is_written_last(tree: SubmitTree, monkeypatch: pytest.MonkeyPatch) -> None:
     written: list[str] = []
     real = os.open
 
@@ -37,14 +45,14 @@ def test_the_summary_is_written_last(tmp_path: Path, monkeypatch: pytest.MonkeyP
         return real(path, flags, *args, **kwargs)  # type: ignore[arg-type]
 
     monkeypatch.setattr(os, "open", opened)
-    tree = SubmitTree(tmp_path, "submit_000")
-    tree.begin()
     tree.put_episode("ep_000", {"trajectory.jsonl": b"", "stdout.txt": b""})
     tree.commit(b"{}\n", b"why\n")
     assert written == ["trajectory.jsonl", "stdout.txt", "errors.txt", "summary.json"]
 
 
-def test_feedback_is_durable_before_it_has_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_feedback_is_durable_before_it_has_its_name(
+    tree: SubmitTree, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     seen: list[list[str]] = []
 
     def flush(folder: Path) -> None:
@@ -52,16 +60,12 @@ def test_feedback_is_durable_before_it_has_its_name(tmp_path: Path, monkeypatch:
         seen.append(names(folder) + names(folder / "episodes") + names(tmp_path))
 
     monkeypatch.setattr(feedback, "sync_filesystem", flush)
-    tree = SubmitTree(tmp_path, "submit_000")
-    tree.begin()
     tree.put_episode("ep_000", {"trajectory.jsonl": b""})
     tree.commit(b"{}\n", None)
     assert seen == [["episodes", "summary.json", "ep_000", "submit_000.partial"]]
 
 
-def test_beginning_again_forgets_what_was_written(tmp_path: Path) -> None:
-    tree = SubmitTree(tmp_path, "submit_000")
-    tree.begin()
+def test_beginning_again_forgets_what_was_written(tree: SubmitTree, tmp_path: Path) -> None:
     tree.put_episode("ep_000", {"a": b"old"})
     tree.begin()
     tree.put_episode("ep_000", {"a": b"new"})
@@ -78,9 +82,7 @@ def test_a_folder_committed_without_a_journal_entry_is_replaced(tmp_path: Path) 
     assert tree.final.joinpath("summary.json").read_bytes() == b"2"
 
 
-def test_a_dropped_episode_is_gone(tmp_path: Path) -> None:
-    tree = SubmitTree(tmp_path, "submit_000")
-    tree.begin()
+def test_a_dropped_episode_is_gone(tree: SubmitTree) -> None:
     tree.put_episode("ep_000", {"a": b""})
     tree.drop_episode("ep_000")
     tree.drop_episode("ep_001")

@@ -18,10 +18,10 @@ import numpy as np
 import pytest
 import zstandard
 from gateway_double import served
+from rigs.finished_run import played_episode
 
 from evopolicy_common.errors import ProtocolError
 from evopolicy_common.messages.episode import BlobRef, ResourceLimits
-from evopolicy_common.messages.gateway import EpisodeFeedback
 from evopolicy_common.messages.worker import BlobChunk, BlobGet
 from evopolicy_common.records.blobs import digest_of
 from evopolicy_common.records.episodes import npz, rendered, trajectory
@@ -78,17 +78,7 @@ def test_files_of_a_large_episode_are_made_without_its_bytes_in_memory(tmp_path:
     observations = out.getvalue()
     whole = rendered_episode(observations)
     ref = BlobRef(digest=digest_of(whole), size=len(whole))
-    episode = EpisodeFeedback(
-        index=0,
-        episode_return=0.5,
-        length=1,
-        failure=None,
-        reward_components={},
-        trajectory=ref,
-        video=None,
-        stdout=b"",
-        stderr=b"",
-    )
+    episode = played_episode(episode_return=0.5, trajectory=ref)
 
     def work() -> dict[str, bytes]:
         packed = asyncio.run(client_of(whole, tmp_path).fetch(ref))

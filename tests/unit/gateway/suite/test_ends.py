@@ -11,7 +11,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from rigs.finished_run import finished
+from rigs.finished_run import finished, plan_in
 
 from evopolicy_common.console import Terminal
 from evopolicy_common.messages.run_settings import RunSettings
@@ -113,9 +113,8 @@ def test_the_index_keeps_its_bytes(tmp_path: Path) -> None:
 
 def test_a_script_is_told_of_a_run_by_the_same_names(tmp_path: Path) -> None:
     plan, record = one_run(tmp_path)
-    played = PlayedRuns(
-        [plan], Index(suite="", runs={plan.name: entry_of(plan, record)}), {plan.name: record}, set()
-    )
+    index = Index(suite="", runs={plan.name: entry_of(plan, record)})
+    played = PlayedRuns([plan], index, {plan.name: record}, set())
     assert json.loads(msgspec.json.encode(documents(played))) == [
         {
             "env": "toy/line",
@@ -188,15 +187,7 @@ def test_exit_codes_and_report_tell_the_ends(tmp_path: Path, capsys: pytest.Capt
     index = Index(suite="")
     for name, (status, code) in zip("abcde", ends, strict=True):
         settings = RunSettings(env=name, entry="evolve", model="none", exp_id="t")
-        plan = Plan(
-            name=name,
-            settings=settings,
-            agent="evolve",
-            runs=tmp_path,
-            started_in=tmp_path,
-            wall_limit_s=60.0,
-        )
-        plans.append(plan)
+        plans.append(plan_in(tmp_path, settings))
         more = {"agent": "evolve", "env": name, "repeat": 0, "digest": "", "directory": f"evolve/{name}/t"}
         index.runs[name] = Entry(name=name, **more | status)
         assert exit_code(plans, index) == code
