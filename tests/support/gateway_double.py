@@ -504,6 +504,16 @@ class Served(msgspec.Struct, frozen=True):
     pipeline: SubmitPipeline
     http: httpx.AsyncClient
 
+    async def submit(self, env_instances: object, *, wait: bool = True, key: str = "") -> httpx.Response:
+        """Its answer to a submit; `key`: of idempotency."""
+        url = self.urls.submit + ("" if wait else "?wait=false")
+        headers = {"Idempotency-Key": key} if key else {}
+        return await self.http.post(url, json={"env_instances": env_instances}, headers=headers)
+
+    async def info(self) -> dict[str, Any]:
+        found: dict[str, Any] = (await self.http.get(self.urls.info)).json()
+        return found
+
     async def close(self, reason: str = "agent_stopped") -> bool:
         self.gateway.tell(child_messages.CloseRun(reason=reason))
         return await self.task

@@ -24,7 +24,7 @@ def files_below(folder: Path) -> list[str]:
 
 async def test_a_submit_leaves_its_feedback_and_answers_with_the_summary_files_bytes(tmp_path: Path) -> None:
     async with served(tmp_path) as s:
-        answer = await s.http.post(s.urls.submit, json={"env_instances": [3, 0, 3]})
+        answer = await s.submit([3, 0, 3])
         assert answer.status_code == 200
         document = answer.json()
         folder = s.folder.feedback / "submit_000"
@@ -40,14 +40,9 @@ async def test_a_submit_leaves_its_feedback_and_answers_with_the_summary_files_b
         assert summary.std_return == pytest.approx(2**0.5)
         assert summary.remaining_budget == 9
         assert summary.wall_time_seconds > 0.0
-        assert files_below(folder) == sorted(
-            ["summary.json"]
-            + [
-                f"episodes/ep_00{i}/{name}"
-                for i in range(3)
-                for name in ("trajectory.jsonl", "stdout.txt", "stderr.txt")
-            ]
-        )
+        names = ("stderr.txt", "stdout.txt", "trajectory.jsonl")
+        episodes = [f"episodes/ep_00{i}/{name}" for i in range(3) for name in names]
+        assert files_below(folder) == [*episodes, "summary.json"]
         rows = (folder / "episodes/ep_000/trajectory.jsonl").read_text().splitlines()
         assert json.loads(rows[0]) == {
             "t": 0,
@@ -63,17 +58,15 @@ async def test_a_submit_leaves_its_feedback_and_answers_with_the_summary_files_b
 
 async def test_info_tells_the_run_and_the_submit_that_runs(tmp_path: Path) -> None:
     async with served(tmp_path) as s:
-        before = (await s.http.get(s.urls.info)).json()
+        before = await s.info()
         assert before["state"] == {"remaining_budget": 12, "n_submits": 0, "is_finalized": False}
         assert before["env_meta"]["n_env_instances"] == 8
         assert before["env_meta"]["obs_space"]["type"] == "Box"
         assert before["resource_limits"]["rollout_wall_s"] == 600.0
         assert before["submit_in_flight"] is None
         s.double.go.clear()
-        assert (
-            await s.http.post(s.urls.submit + "?wait=false", json={"env_instances": [1, 2]})
-        ).status_code == 202
-        during = (await s.http.get(s.urls.info)).json()
+        assert (await s.submit([1, 2], wait=False)).status_code == 202
+        during = await s.info()
         assert during["state"]["remaining_budget"] == 10
         assert during["submit_in_flight"] == {
             "submit_id": 0,
@@ -89,20 +82,14 @@ async def test_task_is_markdown_with_spaces_bounds_and_scope(tmp_path: Path) -> 
     async with served(tmp_path) as s:
         answer = await s.http.get(s.urls.task)
         assert answer.headers["content-type"].startswith("text/markdown")
-        for needed in (
-            "# A line",
-            "Visible ids: 0 to 7",
-            '"type": "Box"',
-            "Policy scope `episode`",
-            "not seeded",
-        ):
+        for needed in ("# A line", "Visible ids: 0 to 7", '"type": "Box"', "scope `episode`", "not seeded"):
             assert needed in answer.text
 
 
 async def test_an_unwaited_submit_is_asked_for_until_it_is_done(tmp_path: Path) -> None:
     async with served(tmp_path) as s:
         s.double.go.clear()
-        first = await s.http.post(s.urls.submit + "?wait=false", json={"env_instances": "0-2"})
+        first = await s.submit("0-2", wait=False)
         assert first.status_code == 202
         assert first.json()["status"] == "running"
         s.double.go.set()
@@ -116,34 +103,28 @@ async def test_an_unwaited_submit_is_asked_for_until_it_is_done(tmp_path: Path) 
 async def test_a_second_submit_is_a_conflict_that_names_the_first(tmp_path: Path) -> None:
     async with served(tmp_path) as s:
         s.double.go.clear()
-        await s.http.post(s.urls.submit + "?wait=false", json={"env_instances": [0]})
-        second = await s.http.post(s.urls.submit, json={"env_instances": [1]})
+        await s.submit([0], wait=False)
+        second = await s.submit([1])
         assert second.status_code == 409
         assert second.json()["submit_id"] == 0
         assert "submit_000" in second.json()["error"]["message"]
         s.double.go.set()
         await s.pipeline.idle()
-        assert (await s.http.post(s.urls.submit, json={"env_instances": [1]})).json()["submit_id"] == 1
+        assert (await s.submit([1])).json()["submit_id"] == 1
     assert len(s.double.submits) == 2
 
 
 async def test_the_same_key_with_another_body_is_a_conflict(tmp_path: Path) -> None:
     async with served(tmp_path) as s:
-        key = {"Idempotency-Key": "k-1"}
         s.double.go.clear()
-        both = [
-            asyncio.create_task(s.http.post(s.urls.submit, json={"env_instances": [2]}, headers=key))
-            for _ in "ab"
-        ]
+        both = [asyncio.create_task(s.submit([2], key="k-1")) for _ in "ab"]
         await asyncio.sleep(0.1)
         s.double.go.set()
         first, again = [await one for one in both]
         assert first.status_code == again.status_code == 200
         assert first.content == again.content
-        assert (
-            await s.http.post(s.urls.submit, json={"env_instances": [2]}, headers=key)
-        ).content == first.content
-        other = await s.http.post(s.urls.submit, json={"env_instances": [3]}, headers=key)
+        assert (await s.submit([2], key="k-1")).content == first.content
+        other = await s.submit([3], key="k-1")
         assert other.status_code == 409
         assert "another body" in other.json()["error"]["message"]
     assert len(s.double.submits) == 1
@@ -152,7 +133,7 @@ async def test_the_same_key_with_another_body_is_a_conflict(tmp_path: Path) -> N
 async def test_a_client_that_hangs_up_loses_nothing(tmp_path: Path) -> None:
     async with served(tmp_path) as s:
         s.double.go.clear()
-        request = asyncio.create_task(s.http.post(s.urls.submit, json={"env_instances": [0, 1]}))
+        request = asyncio.create_task(s.submit([0, 1]))
         while s.pipeline.machine.in_flight is None:
             await asyncio.sleep(0.01)
         request.cancel()
@@ -182,7 +163,7 @@ async def test_a_rejected_request_costs_no_budget_and_changes_nothing(tmp_path: 
             assert answer.status_code == 400
             assert answer.json()["status"] == status
             assert answer.json()["error"]["message"]
-            state = (await s.http.get(s.urls.info)).json()["state"]
+            state = (await s.info())["state"]
             assert state == {"remaining_budget": 12, "n_submits": 0, "is_finalized": False}
             assert files_below(s.folder.feedback) == []
             assert s.pipeline.machine.n_rejected == number
@@ -205,7 +186,7 @@ async def test_a_body_of_100_megabytes_is_refused_and_the_refusal_is_heard(tmp_p
         chunked = await s.http.post(s.urls.submit, content=unannounced())
         assert chunked.status_code == 400
         assert chunked.json()["status"] == "budget_invalid"
-        assert (await s.http.post(s.urls.submit, json={"env_instances": [0]})).status_code == 200
+        assert (await s.submit([0])).status_code == 200
 
 
 async def test_what_does_not_know_the_token_learns_nothing(tmp_path: Path) -> None:
@@ -214,17 +195,9 @@ async def test_what_does_not_know_the_token_learns_nothing(tmp_path: Path) -> No
         root = f"{parts.scheme}://{parts.netloc}"
         token = parts.path.split("/")[1]
         assert len(bytes.fromhex(token)) * 8 == 128
-        wrong = [
-            f"{root}/",
-            f"{root}/info",
-            f"{root}/{'0' * 32}/info",
-            f"{root}/{token}x/info",
-            f"{root}//info",
-        ]
-        answers = [
-            await s.http.get(url)
-            for url in [*wrong, f"{root}/{token}/nothing", f"{root}/{token}/../etc/passwd"]
-        ]
+        wrong = ["", "info", f"{'0' * 32}/info", f"{token}x/info", "/info"]
+        wrong += [f"{token}/nothing", f"{token}/../etc/passwd"]
+        answers = [await s.http.get(f"{root}/{path}") for path in wrong]
         assert {answer.status_code for answer in answers} == {404}
         assert len({answer.content for answer in answers}) == 1
         assert (await s.http.put(s.urls.submit, content=b"x")).status_code == 405
@@ -250,25 +223,15 @@ async def test_a_verdict_without_a_policy_is_charged_and_told(tmp_path: Path) ->
     cause = PolicyFailure(
         category="import_error", step_index=None, message="No module named 'torch'", traceback="Traceback …\n"
     )
-    double_made: list[Double] = []
-
     double = Double(opened())
     double.failures = {0: cause, 1: cause}
-    double_made.append(double)
     async with served(tmp_path, double) as s:
-        answer = (await s.http.post(s.urls.submit, json={"env_instances": [0, 1]})).json()
+        answer = (await s.submit([0, 1])).json()
         assert answer["status"] == "import_error"
         summary = answer["summary"]
         assert summary["n_episodes"] == 2
         assert summary["remaining_budget"] == 10
-        arrays = (
-            "returns",
-            "mean_return",
-            "episode_lengths",
-            "errors",
-            "timeouts",
-            "max_return",
-        )
+        arrays = ["returns", "mean_return", "episode_lengths", "errors", "timeouts", "max_return"]
         assert all(summary[name] is None for name in arrays)
         assert summary["env_instances"] == [0, 1]
         folder = s.folder.feedback / "submit_000"
@@ -286,7 +249,7 @@ async def test_an_episode_that_failed_has_its_error_file_and_is_listed(tmp_path:
         2: PolicyFailure(category="act_timeout", step_index=0, message="slow", limit=20.0, used=20.1),
     }
     async with served(tmp_path, double) as s:
-        summary = (await s.http.post(s.urls.submit, json={"env_instances": [4, 4, 5]})).json()["summary"]
+        summary = (await s.submit([4, 4, 5])).json()["summary"]
         assert summary["errors"] == [1, 2]
         assert summary["timeouts"] == [2]
         episodes = s.folder.feedback / "submit_000" / "episodes"
@@ -300,7 +263,7 @@ async def test_a_submit_timeout_keeps_the_episodes_before_the_first_unfinished(t
     double = Double(opened())
     double.order = lambda n: [0, 3, 1]
     async with served(tmp_path, double) as s:
-        answer = (await s.http.post(s.urls.submit, json={"env_instances": [0, 1, 2, 3]})).json()
+        answer = (await s.submit([0, 1, 2, 3])).json()
         assert answer["status"] == "rollout_timeout"
         episodes = s.folder.feedback / "submit_000" / "episodes"
         assert sorted(path.name for path in episodes.iterdir()) == ["ep_000", "ep_001"]
@@ -309,9 +272,9 @@ async def test_a_submit_timeout_keeps_the_episodes_before_the_first_unfinished(t
 async def test_the_budget_is_spent_to_the_last_episode_and_then_refused(tmp_path: Path) -> None:
     async with served(tmp_path) as s:
         for _ in range(2):
-            assert (await s.http.post(s.urls.submit, json={"env_instances": "0-5"})).status_code == 200
+            assert (await s.submit("0-5")).status_code == 200
         assert s.pipeline.machine.spent
-        answer = await s.http.post(s.urls.submit, json={"env_instances": [0]})
+        answer = await s.submit([0])
         assert answer.status_code == 409
         assert answer.json()["status"] == "run_closed"
         assert "spent" in answer.json()["error"]["message"]

@@ -22,7 +22,7 @@ from evopolicy_gateway.http import server
 from evopolicy_gateway.submits import pipeline as submits
 from evopolicy_gateway.submits.feedback import SubmitTree
 
-BODY = {"env_instances": [1, 2, 3]}
+IDS = [1, 2, 3]
 
 
 TIMES = ("submit_started_at", "submit_completed_at", "wall_time_seconds")
@@ -44,18 +44,17 @@ async def test_a_restarted_gateway_has_the_same_urls_and_completes_the_feedback(
             urls = s.urls
             rules = (folder.workspace / "AGENTS.md").read_bytes()
             double.go.clear()
-            header = {"Idempotency-Key": "mine"}
-            await s.http.post(s.urls.submit + "?wait=false", json=BODY, headers=header)
+            await s.submit(IDS, wait=False, key="mine")
             (folder.system / "policy.py").write_text("class Policy: 'edited meanwhile'\n")
         assert not (folder.feedback / "submit_000").exists()
         double.go.set()
         async with gateway_on(folder, double) as s:
             assert s.urls == urls
             assert (folder.workspace / "AGENTS.md").read_bytes() == rules
-            again = await s.http.post(s.urls.submit, json=BODY, headers=header)
+            again = await s.submit(IDS, key="mine")
             assert again.status_code == 200
             assert (folder.feedback / "submit_000" / "summary.json").read_bytes() in again.content
-            assert (await s.http.post(s.urls.submit, json=BODY)).json()["submit_id"] == 1
+            assert (await s.submit(IDS)).json()["submit_id"] == 1
     assert [submit.env_instances for submit in double.submits] == [(1, 2, 3), (1, 2, 3)]
     assert double.submits[0].bundle != double.submits[1].bundle
 
@@ -63,7 +62,7 @@ async def test_a_restarted_gateway_has_the_same_urls_and_completes_the_feedback(
 async def test_an_answer_survives_a_restart_and_a_changed_file(tmp_path: Path) -> None:
     async with prepared(tmp_path) as (folder, double):
         async with gateway_on(folder, double) as s:
-            before = await s.http.post(s.urls.submit, json=BODY)
+            before = await s.submit(IDS)
         (folder.feedback / "submit_000" / "summary.json").write_text("{}")
         async with gateway_on(folder, double) as s:
             after = await s.http.get(f"{s.urls.submit}/submit_000")
@@ -74,7 +73,7 @@ async def test_a_submit_waits_for_a_coordinator_that_is_away(tmp_path: Path) -> 
     async with served(tmp_path) as s:
         double = s.double
         double.up = False
-        request = asyncio.create_task(s.http.post(s.urls.submit, json=BODY))
+        request = asyncio.create_task(s.submit(IDS))
         info = await s.http.get(s.urls.info)
         assert info.status_code == 200
         assert info.json()["state"]["n_submits"] == 0
@@ -90,7 +89,7 @@ async def test_a_request_written_down_but_never_sent_is_sent_after_the_restart(t
     async with prepared(tmp_path) as (folder, double):
         async with gateway_on(folder, double) as s:
             double.up = False
-            request = asyncio.create_task(s.http.post(s.urls.submit, json=BODY))
+            request = asyncio.create_task(s.submit(IDS))
             while not folder.journal.read_bytes():
                 await asyncio.sleep(0.01)
         request.cancel()
@@ -114,7 +113,7 @@ async def test_feedback_is_written_once_the_disk_takes_it(tmp_path: Path, monkey
     monkeypatch.setattr(SubmitTree, "put_episode", put_episode)
 
     async with served(tmp_path) as s:
-        assert (await s.http.post(s.urls.submit, json=BODY)).status_code == 200
+        assert (await s.submit(IDS)).status_code == 200
         episodes = s.folder.feedback / "submit_000" / "episodes"
         assert sorted(path.name for path in episodes.iterdir()) == ["ep_000", "ep_001", "ep_002"]
 
@@ -126,16 +125,13 @@ async def test_feedback_tampered_with_while_written_comes_out_whole(tmp_path: Pa
         feedback = s.folder.feedback
         shutil.rmtree(feedback)
         feedback.symlink_to(outside)
-        await s.http.post(s.urls.submit, json=BODY)
+        await s.submit(IDS)
         assert not feedback.is_symlink()
         (feedback / "submit_001").mkdir()
         (feedback / "submit_001" / "forged").write_text("x")
         (feedback / "submit_001.partial").symlink_to(outside)
-        await s.http.post(s.urls.submit, json=BODY)
-        assert sorted(path.name for path in (feedback / "submit_001").iterdir()) == [
-            "episodes",
-            "summary.json",
-        ]
+        await s.submit(IDS)
+        assert {path.name for path in (feedback / "submit_001").iterdir()} == {"episodes", "summary.json"}
     assert list(outside.iterdir()) == []
 
 
@@ -146,7 +142,7 @@ async def test_the_same_results_give_the_same_bytes_whatever_the_order_of_arriva
         double.order = lambda n, order=order: list(order(range(n)) if order is list else order(n))
         (tmp_path / name).mkdir()
         async with served(tmp_path / name, double) as s:
-            await s.http.post(s.urls.submit, json={"env_instances": "0-5"})
+            await s.submit("0-5")
             trees.append(tree_of(s.folder.feedback))
     assert trees[0] == trees[1]
     assert len(trees[0]) == 1 + 6 * 3
@@ -156,7 +152,7 @@ async def test_a_coordinator_that_refuses_for_want_of_disk_is_asked_again(tmp_pa
     async with served(tmp_path) as s:
         double = s.double
         double.world.full = True
-        request = asyncio.create_task(s.http.post(s.urls.submit, json=BODY))
+        request = asyncio.create_task(s.submit(IDS))
         await asyncio.sleep(0.2)
         assert not request.done()
         double.world.full = False
@@ -168,20 +164,20 @@ async def test_a_run_that_the_operator_cancelled_takes_no_more_submits(tmp_path:
         double = s.double
         await double.cancel()
         for _ in range(2):
-            answer = await s.http.post(s.urls.submit, json=BODY)
+            answer = await s.submit(IDS)
             assert answer.status_code == 409
             assert answer.json()["status"] == "cancelled"
             assert "cancelled" in answer.json()["error"]["message"]
             assert double.run_id not in answer.text
         assert s.pipeline.machine.spent
-        assert (await s.http.get(s.urls.info)).json()["state"]["is_finalized"] is True
+        assert (await s.info())["state"]["is_finalized"] is True
 
 
 async def test_closing_finishes_the_submit_in_flight_first(tmp_path: Path) -> None:
     double = Double(opened())
     double.go.clear()
     async with served(tmp_path, double) as s:
-        await s.http.post(s.urls.submit + "?wait=false", json=BODY)
+        await s.submit(IDS, wait=False)
         closing = asyncio.create_task(s.close("wall_limit"))
         await asyncio.sleep(0.1)
         assert double.closed is None
@@ -216,8 +212,7 @@ def test_a_gateway_stopped_in_a_submit_shows_no_error(
         async with prepared(tmp_path) as (folder, double):
             double.go.clear()
             async with gateway_on(folder, double) as s:
-                header = {"Idempotency-Key": "mine"}
-                request = asyncio.create_task(s.http.post(s.urls.submit, json=BODY, headers=header))
+                request = asyncio.create_task(s.submit(IDS, key="mine"))
                 while not double.submits:
                     await asyncio.sleep(0.01)
                 s.gateway.tell(None)
@@ -227,7 +222,7 @@ def test_a_gateway_stopped_in_a_submit_shows_no_error(
                 assert "Idempotency-Key" in answer.json()["error"]["message"]
             double.go.set()
             async with gateway_on(folder, double) as s:
-                assert (await s.http.post(s.urls.submit, json=BODY, headers=header)).status_code == 200
+                assert (await s.submit(IDS, key="mine")).status_code == 200
 
     asyncio.run(main())
     assert [record.message for record in caplog.records if record.exc_info] == []
@@ -237,19 +232,13 @@ async def test_a_gateway_keeps_nothing_of_the_episodes_that_it_has_answered(tmp_
     n, cases = 100, tuple(range(1001, 1201, 2))
 
     budget = 30 * n
-    run = opened(
-        n_env_instances=2000,
-        episode_budget=budget,
-        max_episodes_per_submit=n,
-    )
-    double = Double(run)
-    async with served(tmp_path, double) as s:
+    run = opened(n_env_instances=2000, episode_budget=budget, max_episodes_per_submit=n)
+    async with served(tmp_path, Double(run)) as s:
 
         async def play(submits: int) -> int:
             """Bytes that the gateway's modules hold afterwards."""
             for _ in range(submits):
-                body = {"env_instances": cases}
-                assert (await s.http.post(s.urls.submit, json=body)).status_code == 200
+                assert (await s.submit(cases)).status_code == 200
             gc.collect()
             found = tracemalloc.take_snapshot().statistics("filename")
             return sum(each.size for each in found if "evopolicy_gateway" in each.traceback[0].filename)

@@ -176,7 +176,7 @@ async def test_agent_that_nobody_watches_ends_by_its_operators_word(tmp_path: Pa
     more = {"alone": True, "place": AgentPlace(boot_id=KERNEL)}
     known = prepared(tmp_path, Double(opened(episode_budget=1)))
     async with known as (folder, double), gateway_on(folder, double, **more) as service:
-        await service.http.post(service.urls.submit, json={"env_instances": [1]})
+        await service.submit([1])
         await until(lambda: len(service.waits) > 1)
         assert "evopolicy finish" in service.waits[1]
         assert double.closed is None
@@ -193,10 +193,10 @@ async def test_time_held_by_hidden_episodes_counts_against_no_limit(tmp_path: Pa
     double.go.clear()
     async with served(tmp_path, double) as service:
         assert service.pipeline.machine.held_s == 5.0
-        await service.http.post(service.urls.submit + "?wait=false", json={"env_instances": [1]})
+        await service.submit([1], wait=False)
         double.held_s = 7.5
         await until(lambda: service.pipeline.machine.held_s == 7.5)
-        running = (await service.http.get(service.urls.info)).json()["submit_in_flight"]
+        running = (await service.info())["submit_in_flight"]
         assert running["waits_for"] == "a free slot"
         assert running["held_s"] >= 2.5
         double.go.set()

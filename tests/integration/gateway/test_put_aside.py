@@ -18,7 +18,7 @@ from evopolicy_gateway.run_folder.journal import Journal
 from evopolicy_gateway.run_folder.layout import RunFolder
 from evopolicy_gateway.submits import formatting
 
-BODY = {"env_instances": [1, 2, 3]}
+IDS = [1, 2, 3]
 WHOLE = {"trajectory.jsonl", "stdout.txt", "stderr.txt"}
 
 
@@ -42,7 +42,7 @@ async def test_an_episode_whose_trajectory_cannot_be_written_is_put_aside(
     monkeypatch.setattr(rendered, "MAX_ROWS_BYTES", 5000)
 
     async with served(tmp_path) as s:
-        answer = await s.http.post(s.urls.submit, json=BODY)
+        answer = await s.submit(IDS)
         assert (answer.status_code, answer.json()["status"]) == (200, "ok")
         assert len(answer.json()["summary"]["returns"]) == 3
         assert files_of(s.folder.feedback) == {
@@ -59,7 +59,7 @@ async def test_an_episode_whose_recording_is_gone_is_put_aside(tmp_path: Path) -
     double = Double(opened())
     double.lost = {2}
     async with served(tmp_path, double) as s:
-        assert (await s.http.post(s.urls.submit, json=BODY)).json()["status"] == "ok"
+        assert (await s.submit(IDS)).json()["status"] == "ok"
         assert [line["message"] for line in rows(s.folder.feedback, "ep_001")] == [
             "this episode's trajectory or video is not stored any more; the episode's return counts"
         ]
@@ -104,7 +104,7 @@ async def test_an_episode_that_kills_two_gateways_is_set_aside(tmp_path: Path) -
     async with prepared(tmp_path) as (folder, double):
         async with gateway_on(folder, double) as s:
             double.go.clear()
-            await s.http.post(s.urls.submit + "?wait=false", json={"env_instances": [1, 2, 3, 4]})
+            await s.submit([1, 2, 3, 4], wait=False)
         double.go.set()
         ends = [await child(folder.root) for _ in range(3)]
         assert ends == [-9, -9, 0]
@@ -125,7 +125,7 @@ async def test_an_episode_that_kills_two_gateways_is_set_aside(tmp_path: Path) -
 
 async def ended_by_a_submit(folder: RunFolder, double: Double) -> None:
     async with gateway_on(folder, double) as s:
-        await s.http.post(s.urls.submit + "?wait=false", json=BODY)
+        await s.submit(IDS, wait=False)
         await asyncio.wait([s.task])
 
 
@@ -149,7 +149,7 @@ async def test_a_submit_ending_two_gateways_is_set_aside(
             answer = await s.http.get(f"{s.urls.submit}/submit_000")
             assert (answer.status_code, answer.json()["status"]) == (500, "gateway_failed")
             assert "charged" in answer.json()["error"]["message"]
-            again = await s.http.post(s.urls.submit, json=BODY)
+            again = await s.submit(IDS)
             assert (again.json()["submit_id"], again.json()["status"]) == (1, "ok")
         async with gateway_on(folder, double) as s:
             assert (await s.http.get(f"{s.urls.submit}/submit_000")).status_code == 500

@@ -238,7 +238,7 @@ async def test_an_unawaited_submit_is_answered_soon(tmp_path: Path, monkeypatch:
 
     async with served(tmp_path) as s:
         s.double.up = False
-        answer = await s.http.post(s.urls.submit + "?wait=false", json={"env_instances": [0]})
+        answer = await s.submit([0], wait=False)
         assert answer.status_code == 202
         s.double.up = True
         await s.pipeline.idle()

@@ -133,7 +133,7 @@ def test_large_episodes_are_written_one_by_one(tmp_path: Path, monkeypatch: pyte
     async def main() -> None:
         async with served(tmp_path) as s:
             # Their recordings are not rendered, so nothing is known of their size; those of even cases come as blobs.
-            answer = await s.http.post(s.urls.submit, json={"env_instances": [0, 2, 4, 6]})
+            answer = await s.submit([0, 2, 4, 6])
             assert answer.json()["status"] == "ok"
 
     asyncio.run(main())
