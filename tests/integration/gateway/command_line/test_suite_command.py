@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from commands import Command, command, ended, toy_cluster
+from commands import Command, agent, command, ended, toy_cluster
 from waiting import wait_until
 
 from evopolicy_common.records.run_record import decode_run_record
@@ -74,6 +74,11 @@ def sweep(cwd: Path, *arguments: str) -> AbstractContextManager[Command]:
     return command(cwd, "suite", "t.toml", *arguments)
 
 
+def swept(cwd: Path, *arguments: str, ends: int = 0) -> str:
+    """What that command says until it ends."""
+    return "".join(ended(cwd, "suite", "t.toml", *arguments, ends=ends))
+
+
 def index_in(root: Path) -> dict[str, Any]:
     return dict(json.loads((root / "suite.json").read_text())["runs"])
 
@@ -124,9 +129,7 @@ def test_a_sweep_killed_twice_goes_on_where_it_was(tmp_path: Path) -> None:
 
 def test_a_dry_run_of_a_new_sweep_keeps_no_cluster(tmp_path: Path) -> None:
     write_suite(tmp_path)
-    with sweep(tmp_path, "--local", "--dry-run") as plan:
-        assert plan.wait() == 0, plan.text
-        assert "3 runs: 3 new" in plan.text
+    assert "3 runs: 3 new" in swept(tmp_path, "--local", "--dry-run")
     assert not (tmp_path / "runs" / "t" / ".cluster").exists()
 
 
@@ -139,28 +142,18 @@ def _starts(folder: Path) -> int:
 
 
 def test_a_run_without_a_session_restarts_and_keeps_the_old(tmp_path: Path) -> None:
-    agent = tmp_path / "agent.py"
-    agent.write_text(
-        "import os, json, time, urllib.request\n"
-        "url = os.environ['EVOPOLICYGYM_SUBMIT_URL']\n"
-        "data = json.dumps({'env_instances': [0]}).encode()\n"
-        "urllib.request.urlopen(urllib.request.Request(url, data=data)).read()\n"
-        "time.sleep(3600)\n"
+    own = agent(tmp_path, "submit([0])\ntime.sleep(3600)\n")
+    (tmp_path / "t.toml").write_text(
+        'name = "t"\nenvironments = ["toy/line"]\n[defaults]\nbudget = 2\nvalidation = 1\nheldout = 1\n'
+        f'[[agents]]\nname = "own"\nagent = "{own}"\n'
     )
-    text = (
-        'name = "t"\nenvironments = ["toy/line"]\n[defaults]\nbudget = 1\nvalidation = 1\nheldout = 1\n'
-        f'[[agents]]\nname = "own"\nagent = "command:{sys.executable} {agent}"\n'
-    )
-    (tmp_path / "t.toml").write_text(text.replace("budget = 1", "budget = 2"))
     root = tmp_path / "runs" / "t"
     feedback = root / "own/toy_line/t-0/workspace/feedback/submit_000/summary.json"
     with sweep(tmp_path, "--local") as first:
         wait_until(feedback.exists, lambda: first.text)
         first.kill()
-    agent.write_text(agent.read_text().replace("3600", "0"))
-    with sweep(tmp_path, "--local") as second:
-        assert second.wait() == 0, second.text
-        assert "restarted as a new attempt (its agent keeps no session" in second.text
+    agent(tmp_path, "submit([0])\n")
+    assert "restarted as a new attempt (its agent keeps no session" in swept(tmp_path, "--local")
     record = decode_run_record((root / "own/toy_line/t-0/run.json").read_bytes())
     assert record.attempt == 2
     assert record.outcome.auxiliary["transitions"]["steps"] > 0
@@ -190,63 +183,48 @@ def test_two_hosts_share_a_sweep_and_no_run_is_played_twice(tmp_path: Path, oper
         assert len(index_in(host / "runs" / "t")) == 3
 
 
-def two_hosts(root: Path, agent: Path, flag: Path, *, budget: int) -> list[Path]:
-    """Folders of two hosts with the same sweep of one run, whose agent can see the flag."""
-    hosts = [root / "one", root / "two"]
+def two_hosts(root: Path, code: str, *, budget: int) -> tuple[list[Path], Path]:
+    """Folders of two hosts with the same sweep of one run, and a flag that its agent, with that code, can see."""
+    hosts, flag = [root / "one", root / "two"], root / "seen" / "flag"
+    flag.parent.mkdir()
+    own = agent(root, code)
     for host in hosts:
         host.mkdir()
         (host / "t.toml").write_text(
             f'name = "t"\nenvironments = ["toy/line"]\n[defaults]\nbudget = {budget}\nvalidation = 1\nheldout ='
-            f' 1\n[parallel]\nclaim_ttl_s = 3.0\n[[agents]]\nname = "own"\nagent = "command:{sys.executable} {agent}'
+            f' 1\n[parallel]\nclaim_ttl_s = 3.0\n[[agents]]\nname = "own"\nagent = "{own}'
             f' {flag}"\n[agents.jail]\nread = ["{flag.parent}"]\n'
         )
-    return hosts
+    return hosts, flag
 
 
 def test_a_dead_hosts_runs_are_taken_over_and_return(tmp_path: Path, operator_file: Path) -> None:
-    agent, flag = tmp_path / "agent.py", tmp_path / "seen" / "flag"
-    flag.parent.mkdir()
-    agent.write_text(
-        "import json, os, sys, time, urllib.request\n"
-        "url = os.environ['EVOPOLICYGYM_SUBMIT_URL']\n"
-        "data = json.dumps({'env_instances': [0, 1]}).encode()\n"
-        "urllib.request.urlopen(urllib.request.Request(url, data=data)).read()\n"
-        "while not os.path.exists(sys.argv[1]):\n    time.sleep(0.05)\n"
-    )
-    hosts = two_hosts(tmp_path, agent, flag, budget=4)
+    code = "submit([0, 1])\nwhile not os.path.exists(sys.argv[1]):\n    time.sleep(0.05)\n"
+    hosts, flag = two_hosts(tmp_path, code, budget=4)
     arguments = ("--credentials", str(operator_file))
     with sweep(hosts[0], *arguments) as one:
         feedback = hosts[0] / "runs/t/own/toy_line/t-0/workspace/feedback/submit_000/summary.json"
         wait_until(feedback.exists, lambda: one.text)
         one.kill()
     flag.touch()
-    with sweep(hosts[1], *arguments) as two:
-        assert two.wait() == 0, two.text
-        assert "taken over from" in two.text
+    assert "taken over from" in swept(hosts[1], *arguments)
     (entry,) = index_in(hosts[1] / "runs" / "t").values()
     assert (entry["state"], entry["attempt"]) == ("completed", 2)
-    with sweep(hosts[0], *arguments) as back:
-        assert back.wait() == 0, back.text
+    swept(hosts[0], *arguments)
     (indexed,) = index_in(hosts[0] / "runs" / "t").values()
     assert (indexed["state"], indexed["score"], indexed["directory"]) == ("completed", entry["score"], "")
     assert [*hosts[0].glob("runs/t/*/*/*/run.json")] == []
 
 
 def test_a_host_overtaken_during_a_submit_takes_the_other_result(tmp_path: Path, operator_file: Path) -> None:
-    agent, flag = tmp_path / "agent.py", tmp_path / "seen" / "flag"
-    flag.parent.mkdir()
-    agent.write_text(
-        "import json, os, sys, urllib.request\n"
+    code = (
         "slow = '' if os.path.exists(sys.argv[1]) else 'time.sleep(0.5); '\n"
         "open('system/policy.py', 'w').write(\n"
         "    'import time\\nclass Policy:\\n  def __init__(self, *a): pass\\n  def reset(self, i): pass\\n'\n"
         "    f'  def act(self, obs): {slow}return [0.0]\\n')\n"
-        "url = os.environ['EVOPOLICYGYM_SUBMIT_URL']\n"
-        "data = json.dumps({'env_instances': [0, 1]}).encode()\n"
-        "answer = urllib.request.urlopen(urllib.request.Request(url, data=data)).read()\n"
-        "open('answer.json', 'wb').write(answer)\n"
+        "json.dump(submit([0, 1]), open('answer.json', 'w'))\n"
     )
-    hosts = two_hosts(tmp_path, agent, flag, budget=2)
+    hosts, flag = two_hosts(tmp_path, code, budget=2)
     arguments = ("--credentials", str(operator_file))
     folder = hosts[0] / "runs/t/own/toy_line/t-0"
     with sweep(hosts[0], *arguments) as one:
@@ -276,16 +254,13 @@ def test_a_run_with_a_wrong_key_is_played_again(tmp_path: Path, operator_file: P
     write_suite(tmp_path, claude="bad_key,work")
     arguments = ("--credentials", str(operator_file), "--only", "fake claude/*")
     root = tmp_path / "runs" / "t"
-    with sweep(tmp_path, *arguments) as first:
-        assert first.wait() == 4, first.text
-        assert "401" in first.text
+    assert "401" in swept(tmp_path, *arguments, ends=4)
     (entry,) = index_in(root).values()
     assert entry["state"] == "error"
     assert "before its first submit" in entry["error"]
     # What the fake plays is told by its settings, which make another run of it.
     write_suite(tmp_path, claude="work")
-    with sweep(tmp_path, *arguments, "--changed", "rerun") as second:
-        assert second.wait() == 0, second.text
+    swept(tmp_path, *arguments, "--changed", "rerun")
     (entry,) = index_in(root).values()
     assert (entry["state"], entry["attempt"]) == ("completed", 2)
 
@@ -294,23 +269,17 @@ def test_runs_on_published_cases_stay_where_a_rerun_of_them_is_refused(tmp_path:
     file, root = tmp_path / "t.toml", tmp_path / "runs" / "t"
     write_suite(tmp_path)
     arguments = ("--local", "--only", "evolve/*")
-    with sweep(tmp_path, *arguments) as first:
-        assert first.wait() == 0, first.text
+    swept(tmp_path, *arguments)
     words = ("publish", str(root), "--local", "--state", str(root / ".cluster"), "--out", "r.evp")
     ended(tmp_path, *words)
     run = root / "evolve/toy_line/t-0"
     before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
     file.write_text(file.read_text().replace("budget = 4", "budget = 3"))
-    with sweep(tmp_path, *arguments, "--changed", "rerun") as second:
-        assert second.wait() == 1, second.text
-        assert "are public" in second.text
+    assert "are public" in swept(tmp_path, *arguments, "--changed", "rerun", ends=1)
     assert {path: path.read_bytes() for path in run.rglob("*") if path.is_file()} == before
     assert not (root / ".attempts").exists()
-    with sweep(tmp_path, *arguments) as third:
-        assert third.wait() == 2, third.text
-        assert "budget is 3, was 4" in third.text
-    with sweep(tmp_path, *arguments, "--changed", "keep") as fourth:
-        assert fourth.wait() == 0, fourth.text
+    assert "budget is 3, was 4" in swept(tmp_path, *arguments, ends=2)
+    swept(tmp_path, *arguments, "--changed", "keep")
     options = ["--env", "toy/line", "--agent", "random", "--budget", "3", "--overwrite", "--exp-id", "t-0"]
     options += ["--entry", "evolve", "--runs", str(root), "--state", str(root / ".cluster")]
     with command(tmp_path, "local", *options) as over:
@@ -322,9 +291,8 @@ def test_runs_on_published_cases_stay_where_a_rerun_of_them_is_refused(tmp_path:
 def test_json_events_tell_the_plan_and_the_results(tmp_path: Path, operator_file: Path) -> None:
     write_suite(tmp_path)
     arguments = ("--credentials", str(operator_file), "--only", "evolve/*", "--json")
-    with sweep(tmp_path, *arguments) as running:
-        assert running.wait() == 0, running.text
-        lines = [json.loads(line) for line in running.text.splitlines() if line.startswith("{")]
+    text = swept(tmp_path, *arguments)
+    lines = [json.loads(line) for line in text.splitlines() if line.startswith("{")]
     kinds = [line["event"] for line in lines]
     assert kinds[0] == "planned"
     assert kinds[1] == "started"
@@ -351,10 +319,9 @@ def test_a_higher_cap_continues_the_interrupted_session(tmp_path: Path, operator
     # Whether the second start, which never ends, has come before the cap or not: the next one works.
     (root / "fake codex/toy_line/t-0/workspace/.fake/starts").write_text("[]\n[]\n")
     file.write_text(whole)
-    with sweep(tmp_path, *arguments) as second:
-        assert second.wait() == 0, second.text
-        assert "resumed in its session" in second.text
-        assert "used in all: 2,040 tokens" in second.text
+    text = swept(tmp_path, *arguments)
+    assert "resumed in its session" in text
+    assert "used in all: 2,040 tokens" in text
     (entry,) = index_in(root).values()
     assert (entry["state"], entry["attempt"], entry["tokens"]["output"]) == ("completed", 1, 40)
 
@@ -368,9 +335,7 @@ def test_ctrl_c_leaves_runs_open_and_the_exit_code_tells(tmp_path: Path, operato
         first.process.send_signal(signal.SIGINT)
         assert first.wait() == 130, first.text
         assert first.alive() == []
-    with sweep(tmp_path, *arguments) as second:
-        assert second.wait() == 0, second.text
-        assert "resumed in its session" in second.text
+    assert "resumed in its session" in swept(tmp_path, *arguments)
 
 
 def test_a_changed_file_is_refused_and_a_scoreless_run_reported(tmp_path: Path, operator_file: Path) -> None:
@@ -384,16 +349,12 @@ def test_a_changed_file_is_refused_and_a_scoreless_run_reported(tmp_path: Path, 
     file = tmp_path / "t.toml"
     file.write_text(text)
     arguments = ("--credentials", str(operator_file))
-    with sweep(tmp_path, *arguments) as first:
-        assert first.wait() == 3, first.text
-        assert "feedback takes at most 25.8 KiB" in first.text
+    text = swept(tmp_path, *arguments, ends=3)
+    assert "feedback takes at most 25.8 KiB" in text
     file.write_text(text.replace("budget = 2", "budget = 3"))
-    with sweep(tmp_path, *arguments) as second:
-        assert second.wait() == 2, second.text
-        assert "budget is 3, was 2" in " ".join(second.text.split())
-    with sweep(tmp_path, *arguments, "--changed", "keep") as third:
-        assert third.wait() == 3, third.text
-        assert "1 runs: 1 kept" in third.text
+    text = swept(tmp_path, *arguments, ends=2)
+    assert "budget is 3, was 2" in " ".join(text.split())
+    assert "1 runs: 1 kept" in swept(tmp_path, *arguments, "--changed", "keep", ends=3)
 
 
 def test_a_terminal_shows_a_live_table(tmp_path: Path, operator_file: Path) -> None:
@@ -401,16 +362,11 @@ def test_a_terminal_shows_a_live_table(tmp_path: Path, operator_file: Path) -> N
     main, side = os.openpty()
     fcntl.ioctl(side, termios.TIOCSWINSZ, struct.pack("HHHH", 40, 160, 0, 0))
     arguments = ["suite", "t.toml", "--credentials", str(operator_file), "--only", "fake codex/*"]
+    shown_on = {"TERM": "xterm-256color", "COLUMNS": "160", "LINES": "40"}
     process = subprocess.Popen(
         [sys.executable, "-m", "evopolicy_gateway.cli", *arguments],
         cwd=tmp_path,
-        env={
-            **os.environ,
-            "TERM": "xterm-256color",
-            "COLUMNS": "160",
-            "LINES": "40",
-            "XDG_STATE_HOME": str(tmp_path / "xdg"),
-        },
+        env={**os.environ, **shown_on, "XDG_STATE_HOME": str(tmp_path / "xdg")},
         stdin=side,
         stdout=side,
         stderr=side,
