@@ -10,7 +10,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 import pytest
-from commands import agent, command, ended, record_in, run_dir
+from commands import agent, ended, record_in, run_dir
 
 import evopolicy as evp
 from evopolicy_common.records.run_record import RunRecord
@@ -68,11 +68,6 @@ def record(root: Path) -> RunRecord:
     return record_in(run_dir(root))
 
 
-def finished(root: Path, *arguments: str) -> tuple[int, str, str]:
-    with command(root, *arguments) as running:
-        return running.finish()
-
-
 def test_policies_import_the_runs_packages_and_nothing_beside_them(record: RunRecord) -> None:
     assert record.outcome.status == "completed"
     assert record.outcome.policy_failures == ()
@@ -80,20 +75,16 @@ def test_policies_import_the_runs_packages_and_nothing_beside_them(record: RunRe
 
 
 def test_verify_plays_the_policies_with_their_packages(root: Path) -> None:
-    code, out, err = finished(
+    out, _ = ended(
         root, "verify", str(run_dir(root)), "--local", "--state", "state", "--json", "--slots", "1"
     )
-    assert code == 0, out + err
     report = json.loads(out)
     assert (report["policy_episodes"], report["policy_differences"]) == (2, [])
     assert report["fingerprint_differences"] == []
 
 
 def test_a_rescore_plays_the_checkpoint_with_its_packages(root: Path) -> None:
-    code, out, err = finished(
-        root, "rescore", "runs", "--cases", "2", "--local", "--state", "state", "--slots", "1"
-    )
-    assert code == 0, out + err
+    ended(root, "rescore", "runs", "--cases", "2", "--local", "--state", "state", "--slots", "1")
     (played,) = json.loads((run_dir(root) / "rescore/cases-2.json").read_text())["checkpoints"]
     assert played.get("failures", {}) == {}
 
@@ -101,28 +92,20 @@ def test_a_rescore_plays_the_checkpoint_with_its_packages(root: Path) -> None:
 def test_a_checkpoint_is_tried_with_its_runs_or_the_named_packages(root: Path, record: RunRecord) -> None:
     checkpoint = next((run_dir(root) / "checkpoints").iterdir())
     where = ("--env", "toy/line", "--cases", "0", "--fresh", "--slots", "1")
-    code, out, err = finished(root, "try", str(checkpoint), *where)
-    assert code == 0, out + err
-    code, out, err = finished(root, "try", str(root), *where)
-    assert code == 1, out + err
+    ended(root, "try", str(checkpoint), *where)
+    out, _ = ended(root, "try", str(root), *where, ends=1)
     assert "No module named 'scipy'" in out
-    code, out, err = finished(root, "try", str(root), *where, "--policy-package", "no-such-package")
-    assert code == 2, out + err
+    _, err = ended(root, "try", str(root), *where, "--policy-package", "no-such-package", ends=2)
     assert "package 'no-such-package' is not installed here; install it with" in err
-    code, out, err = finished(root, "random", *where, "--policy-package", "scipy")
-    assert code == 0, out + err
+    ended(root, "random", *where, "--policy-package", "scipy")
 
 
 def test_published_policies_import_what_the_checker_allows_them_by_name(root: Path) -> None:
-    code, out, err = finished(
-        root, "publish", str(run_dir(root)), "--out", "results.evp", "--local", "--state", "state"
-    )
-    assert code == 0, out + err
+    ended(root, "publish", str(run_dir(root)), "--out", "results.evp", "--local", "--state", "state")
 
     def printed(*options: str) -> list[str]:
         asked = ("check", "results.evp", "--policies", "all", "--json", "--slots", "1", *options)
-        code, out, err = finished(root, *asked)
-        assert code == 0, out + err
+        out, _ = ended(root, *asked)
         return [each["text"] for each in json.loads(out)["findings"] if each["kind"] == "policies"]
 
     (refused,) = printed()

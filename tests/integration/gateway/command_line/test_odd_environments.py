@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pytest
-from commands import SMALL, Command
+from commands import SMALL, command, ended
 
 PACKAGE = Path(__file__).parents[3] / "support" / "odd_package"
 POLICY = """
@@ -113,12 +113,9 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def tried(folder: Path, env: str, *options: str) -> tuple[int, str]:
     """Exit code and output of `evopolicy try` with one case."""
-    running = Command(folder, "try", "policy", "--env", env, "--cases", "0", "--fresh", *options)
-    try:
-        code, out, err = running.finish()
-    finally:
-        running.kill_all()
-    return code, " ".join((out + err).split())
+    with command(folder, "try", "policy", "--env", env, "--cases", "0", "--fresh", *options) as running:
+        code = running.wait()
+    return code, " ".join(running.text.split())
 
 
 @pytest.mark.slow
@@ -147,13 +144,9 @@ def test_an_environment_that_is_refused_ends_its_own_run_and_no_other(folder: Pa
         'id = "my/odd"\ngymnasium_id = "odd_envs:Odd-v0"\nkwargs = { does = "crash" }'
     )
     words = ("--env", "odd.toml", "--env", "toy/line", "--agent", "random", "--fresh", *SMALL)
-    running = Command(folder, "local", *words, "--parallel", "2", "--runs", "runs")
-    try:
-        code, out, err = running.finish()
-    finally:
-        running.kill_all()
-    said = " ".join((out + err).split())
-    assert code == 1
+    said = " ".join(
+        "".join(ended(folder, "local", *words, "--parallel", "2", "--runs", "runs", ends=1)).split()
+    )
     assert re.search(
         rf"my/odd: failed: environment my/odd, step 11: it raised ValueError.*{SOURCE}crash_in_step_12", said
     )

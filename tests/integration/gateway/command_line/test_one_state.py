@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 
 import pytest
-from commands import SMALL, Command, agent, command, ended, record_in, run_dir
+from commands import SMALL, agent, command, ended, record_in, run_dir
 from waiting import wait_until
 
 from evopolicy_common.local.cluster import WORKERS_ENDED
@@ -38,14 +38,6 @@ def played(folder: Path, exp_id: str, *arguments: str) -> tuple[dict[str, str], 
     (result,) = json.loads(out)
     versions = record_in(Path(result["run_directory"])).versions
     return {split: versions.cases_hash(split) for split in SPLITS}, err
-
-
-def done(folder: Path, *words: str) -> tuple[int, str, str]:
-    running = Command(folder, *words)
-    try:
-        return running.finish()
-    finally:
-        running.kill_all()
 
 
 def kernels(state: Path) -> tuple[KernelRow, ...]:
@@ -79,13 +71,10 @@ def test_what_a_user_plays_shares_cases_until_a_run_without_a_jail(tmp_path: Pat
     assert before == played(tmp_path, "b")[0]
     # The first run's worker has ended, and nobody waits for it.
     assert len(kernels(state)) == 1
-    code, _, err = done(tmp_path, "report", "runs", "--out", "report", "--no-pages")
-    assert code == 0, err
+    ended(tmp_path, "report", "runs", "--out", "report", "--no-pages")
     fresh, _ = played(tmp_path, "c", "--fresh")
     assert fresh["heldout"] != before["heldout"]
-    code, _, err = done(tmp_path, "report", "runs", "--out", "report", "--no-pages")
-    assert code == 3
-    assert "--fresh" in err
+    assert "--fresh" in ended(tmp_path, "report", "runs", "--out", "report", "--no-pages", ends=3)[1]
     steals = agent(tmp_path, f"STATE = {str(state)!r}\n" + STEAL)
     words = [
         "local",
@@ -100,8 +89,7 @@ def test_what_a_user_plays_shares_cases_until_a_run_without_a_jail(tmp_path: Pat
         "--jail",
         "none",
     ]
-    _, err = ended(tmp_path, *words, *SMALL)
-    assert "note: agents of this run have no full jail" in err
+    assert "note: agents of this run have no full jail" in ended(tmp_path, *words, *SMALL)[1]
     thief = run_dir(tmp_path, exp_id="s")
     versions = record_in(thief).versions
     stolen = json.loads((thief / "workspace" / "system" / "stolen.json").read_text())
@@ -115,9 +103,7 @@ def test_what_a_user_plays_shares_cases_until_a_run_without_a_jail(tmp_path: Pat
         known = {known_hash(bytes.fromhex(text), split, after) for split in SPLITS}
         assert not known & {*before.values(), *after.values()}
     # The first run's cases are gone from the secret, not from the state.
-    code, out, err = done(tmp_path, "verify", str(run_dir(tmp_path, exp_id="a")), "--local")
-    assert code == 0, err
-    assert "identical" in out
+    assert "identical" in ended(tmp_path, "verify", str(run_dir(tmp_path, exp_id="a")), "--local")[0]
 
 
 def known_hash(secret: bytes, split: Split, hashes: dict[str, str]) -> str:
@@ -132,14 +118,12 @@ def test_a_second_command_beside_the_first_is_told_what_to_do(tmp_path: Path) ->
     words = ["local", "--env", "toy/line", "--agent", waits, "--entry", "waits", "--exp-id", "t", *SMALL]
     with command(tmp_path, *words) as running:
         wait_until(lambda: [*(tmp_path / "runs").glob("*/*/t/workspace/here")])
-        code, _, err = done(tmp_path, "random", "--env", "toy/line", "--split", "train", "--cases", "0")
-        assert code == 2
+        _, err = ended(tmp_path, "random", "--env", "toy/line", "--split", "train", "--cases", "0", ends=2)
         assert "--fresh" in err
         assert "--state" in err
         assert not (state / WORKERS_ENDED).exists()
         words = ["random", "--env", "toy/line", "--split", "train", "--cases", "0", "--fresh"]
-        code, out, err = done(tmp_path, *words)
-        assert code == 0, err
+        out, _ = ended(tmp_path, *words)
         assert "the next call has others under the same ids" in out
         assert "played by" not in out
         running.kill()
@@ -150,12 +134,10 @@ def test_a_second_command_beside_the_first_is_told_what_to_do(tmp_path: Path) ->
 
 
 def test_state_and_fresh_do_not_go_together(tmp_path: Path) -> None:
-    code, _, err = done(tmp_path, "random", "--env", "toy/line", "--fresh", "--state", "x")
-    assert code == 2
-    assert "give only one of them" in err
-    code, _, err = done(tmp_path, "run", "--env", "toy/line", "--agent", "random", "--fresh")
-    assert code == 2
-    assert "apply only with --local" in err
+    words = ("random", "--env", "toy/line", "--fresh", "--state", "x")
+    assert "give only one of them" in ended(tmp_path, *words, ends=2)[1]
+    words = ("run", "--env", "toy/line", "--agent", "random", "--fresh")
+    assert "apply only with --local" in ended(tmp_path, *words, ends=2)[1]
 
 
 def test_a_browser_is_that_of_a_cluster_that_the_command_brings_up(tmp_path: Path) -> None:
@@ -164,10 +146,6 @@ def test_a_browser_is_that_of_a_cluster_that_the_command_brings_up(tmp_path: Pat
         ("random", "--env", "toy/line", "--credentials", "x"),
         ("run", "--env", "toy/line", "--agent", "random"),
     ):
-        code, _, err = done(tmp_path, *words, *browser)
-        assert code == 2
-        assert "give it to each evopolicy-worker" in err
+        assert "give it to each evopolicy-worker" in ended(tmp_path, *words, *browser, ends=2)[1]
     words = ("try", "examples", "--env", "toy/line", "--credentials", "x", "--env-timeout", "5")
-    code, _, err = done(tmp_path, *words)
-    assert code == 2
-    assert "give them to each evopolicy-worker" in err
+    assert "give them to each evopolicy-worker" in ended(tmp_path, *words, ends=2)[1]
