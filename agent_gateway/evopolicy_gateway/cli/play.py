@@ -30,7 +30,7 @@ from evopolicy_gateway.run.run_options import ClusterOptions, ListenerOptions, R
 from evopolicy_gateway.run_folder import listener
 from evopolicy_gateway.run_folder.layout import folder_of
 from evopolicy_gateway.suite import runs as plain_runs
-from evopolicy_gateway.suite.ends import exit_code
+from evopolicy_gateway.suite.suite_index import exit_code
 
 app = App()
 

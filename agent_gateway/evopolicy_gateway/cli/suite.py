@@ -41,8 +41,8 @@ from evopolicy_gateway.run_folder.locks import alone
 from evopolicy_gateway.suite import decisions, suite_file, suite_index
 from evopolicy_gateway.suite.claimed import ClaimedSweep, facts_of
 from evopolicy_gateway.suite.decisions import Changed, Decision
-from evopolicy_gateway.suite.ends import exit_code, next_step
 from evopolicy_gateway.suite.suite_file import SuiteFile
+from evopolicy_gateway.suite.suite_index import exit_code, next_step
 from evopolicy_gateway.suite.suite_view import JsonView, SuiteView, results_table
 
 app = App()

@@ -10,13 +10,17 @@ import contextlib
 import os
 import sys
 import threading
+from collections.abc import AsyncIterator
 from typing import Any
 
 import msgspec
 
 from evopolicy_common.errors import DECODE_ERRORS, ProtocolError
+from evopolicy_common.processes import child_process
+from evopolicy_common.processes.child_process import ChildProcess
 from evopolicy_common.records.run_record import AgentInput, AgentLimits, AgentResources
 from evopolicy_gateway.jail.jail import JailOrder
+from evopolicy_gateway.processes import trees as processes
 
 
 class Event(msgspec.Struct, frozen=True, kw_only=True, tag_field="event"):
@@ -287,3 +291,27 @@ class Orders:
             # A child that can no longer read commands ends as if its parent were gone.
             with contextlib.suppress(RuntimeError):  # the loop is closed already
                 loop.call_soon_threadsafe(self._queue.put_nowait, None)
+
+
+async def end_orphans() -> list[int]:
+    """Ends children inherited from dead parents; returns the ids of survivors, which the kernel holds."""
+    async with child_process.starting():
+        return await asyncio.to_thread(processes.end_orphans, frozenset(child_process.live))
+
+
+class Child(ChildProcess):
+    """A running child, started with `talks=True`."""
+
+    async def events(self) -> AsyncIterator[AnyEvent]:
+        """Yields the child's events until it ends."""
+        assert self._process.stdout is not None
+        while data := await self._process.stdout.readline():
+            yield event_of(data)
+
+    async def tell(self, order: Order) -> None:
+        """Sends an order; dropped when the child is gone."""
+        stdin = self._process.stdin
+        assert stdin is not None
+        with contextlib.suppress(BrokenPipeError, ConnectionResetError):
+            stdin.write(line(order))
+            await stdin.drain()

@@ -18,7 +18,6 @@ from evopolicy_common.records.secrets import without_keys
 from evopolicy_common.records.words import in_words
 from evopolicy_common.wire.credentials import Credentials
 from evopolicy_gateway.processes import child_messages as messages
-from evopolicy_gateway.processes import child_rpc
 from evopolicy_gateway.processes.child_messages import Progress, Ready
 from evopolicy_gateway.run import model_relay, record
 from evopolicy_gateway.run.children import GatewayProcess, OpenRun, SupervisedAgent
@@ -114,7 +113,7 @@ class AgentSide:
             for child in (self.agent, relay, self._gateway):
                 if child is not None:
                     await child.end(END_GRACE_S)
-            self.agent.survivors = await child_rpc.end_orphans()
+            self.agent.survivors = await messages.end_orphans()
             self._run.stopwatch.closed()
 
     async def _follow(self) -> None:

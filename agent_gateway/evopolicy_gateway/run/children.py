@@ -18,16 +18,15 @@ from evopolicy_common.wire.credentials import Credentials
 from evopolicy_gateway.harnesses.interface.base import RelayAddress
 from evopolicy_gateway.jail.jail import JailOrder
 from evopolicy_gateway.processes import child_messages as messages
-from evopolicy_gateway.processes import child_rpc
 from evopolicy_gateway.processes.child_messages import (
     AgentEnded,
+    Child,
     CloseRun,
     Order,
     Progress,
     Ready,
     SubmitsSeen,
 )
-from evopolicy_gateway.processes.child_rpc import Child
 from evopolicy_gateway.run.plan import Plan
 from evopolicy_gateway.run.times import Stopwatch
 from evopolicy_gateway.run.watch import View
@@ -251,7 +250,7 @@ class SupervisedAgent(_Kept):
                     ended = event
         await child.ended()
         # Processes left behind by a supervisor that died have become our children.
-        while survivors := await child_rpc.end_orphans():
+        while survivors := await messages.end_orphans():
             if survivors != self.survivors:
                 self.survivors = survivors
                 self.tell_survivors()

@@ -31,8 +31,7 @@ from evopolicy_gateway.http.server import Address
 from evopolicy_gateway.inputs import own_config
 from evopolicy_gateway.jail.view import confined
 from evopolicy_gateway.processes.agent_process import environment_of
-from evopolicy_gateway.processes.child_messages import AgentDoing, ModelBudgetSpent, Ready, StartRelay
-from evopolicy_gateway.processes.child_rpc import Child
+from evopolicy_gateway.processes.child_messages import AgentDoing, Child, ModelBudgetSpent, Ready, StartRelay
 from evopolicy_gateway.relay.service import Order
 from evopolicy_gateway.run import recorded_agent
 from evopolicy_gateway.run.children import OpenRun

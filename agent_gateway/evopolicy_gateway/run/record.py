@@ -49,8 +49,7 @@ from evopolicy_gateway.run.plan import Plan
 from evopolicy_gateway.run.times import Times
 from evopolicy_gateway.run.transitions import Transitions, count_transitions
 from evopolicy_gateway.run_folder.journal import Journal
-from evopolicy_gateway.run_folder.layout import RunFolder, Staged, saved
-from evopolicy_gateway.run_folder.names import submit_id
+from evopolicy_gateway.run_folder.layout import RunFolder, Staged, saved, submit_id
 
 _RESUMABLE = (OSError, StorageError, TransportError, ConfigError)
 """Errors with a remedy, after which `--resume` writes everything."""

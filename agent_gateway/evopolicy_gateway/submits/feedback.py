@@ -29,7 +29,7 @@ from evopolicy_common.records.blobs import fsync_directory, sync_filesystem
 from evopolicy_common.records.open_run import Accepted
 from evopolicy_common.refusals import Refusal
 from evopolicy_gateway.run_folder.journal import AtWork, write_all
-from evopolicy_gateway.run_folder.names import episode_name
+from evopolicy_gateway.run_folder.layout import episode_name
 from evopolicy_gateway.submits import formatting
 from evopolicy_gateway.submits.coordinator_client import HELD_WAIT_S, RESULTS_WAIT_S, CoordinatorClient
 from evopolicy_gateway.submits.episode_files import (

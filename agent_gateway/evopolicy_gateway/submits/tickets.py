@@ -35,7 +35,7 @@ from evopolicy_common.records import open_run
 from evopolicy_common.records.blobs import digest_of
 from evopolicy_common.records.open_run import AnyEntry, Requested
 from evopolicy_common.refusals import RUN_OVER, Refusal
-from evopolicy_gateway.run_folder.names import submit_id
+from evopolicy_gateway.run_folder.layout import submit_id
 from evopolicy_gateway.submits import published_requests
 from evopolicy_gateway.submits.snapshots import Snapshot
 from evopolicy_gateway.submits.submit_request import Bounds, parse

@@ -20,9 +20,8 @@ from evopolicy_gateway.operator.cluster import Cluster, connected
 from evopolicy_gateway.run.plan import Plan
 from evopolicy_gateway.run.watch import RunView
 from evopolicy_gateway.suite.decisions import Decision
-from evopolicy_gateway.suite.ends import next_step
 from evopolicy_gateway.suite.suite_file import Parallel
-from evopolicy_gateway.suite.suite_index import entry_of
+from evopolicy_gateway.suite.suite_index import entry_of, next_step
 from evopolicy_gateway.suite.sweep import Sweep
 
 if TYPE_CHECKING:

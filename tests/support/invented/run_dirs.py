@@ -31,7 +31,7 @@ from evopolicy_common.records.run_record import (
     encode_run_record,
 )
 from evopolicy_common.records.summary import SCHEMA_VERSION, Summary, utc_text
-from evopolicy_gateway.run_folder.names import submit_id
+from evopolicy_gateway.run_folder.layout import submit_id
 from invented.agent_logs import LOGS
 from invented.policies import Version
 

@@ -30,7 +30,7 @@ from evopolicy_gateway.harnesses.interface import base
 from evopolicy_gateway.http import service as http
 from evopolicy_gateway.jail import settings as jail_settings
 from evopolicy_gateway.processes import agent_process
-from evopolicy_gateway.processes.child_rpc import Child
+from evopolicy_gateway.processes.child_messages import Child
 from evopolicy_gateway.run import lifecycle
 from evopolicy_gateway.run.lifecycle import RunLifecycle
 

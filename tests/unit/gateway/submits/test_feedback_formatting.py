@@ -21,7 +21,7 @@ from evopolicy_common.records.episodes.rendered import decode, files_of
 from evopolicy_common.records.episodes.trajectory import Recorder
 from evopolicy_common.records.json_text import json_bytes
 from evopolicy_common.records.summary import decode_summary
-from evopolicy_gateway.run_folder.names import episode_name, submit_id
+from evopolicy_gateway.run_folder.layout import episode_name, submit_id
 from evopolicy_gateway.submits.episode_files import LEFT_OUT_FIRST, episode_files, episode_share, within_share
 from evopolicy_gateway.submits.formatting import (
     MAX_TEXT_BYTES,

@@ -22,10 +22,9 @@ from evopolicy_gateway.run.plan import Plan
 from evopolicy_gateway.run.record import run_record
 from evopolicy_gateway.run.times import Times
 from evopolicy_gateway.suite import suite_index
-from evopolicy_gateway.suite.ends import exit_code
 from evopolicy_gateway.suite.runs import PlayedRuns, documents, report
 from evopolicy_gateway.suite.suite_file import expand, read
-from evopolicy_gateway.suite.suite_index import entry_of
+from evopolicy_gateway.suite.suite_index import entry_of, exit_code
 
 FILE = """
 name = "s"
