@@ -1,7 +1,7 @@
 """Options declared once: a class of options has a field for each, with its type, default, bounds (`msgspec.Meta`) and
 `Option`.
 
-Made from it: options of commands (`cli/option_groups.py`), tables of suite files (`suite/suite_file.py`), keywords of
+Made from it: options of commands (`cli/options.py`), tables of suite files (`suite/suite_file.py`), keywords of
 the package
 `evopolicy`, JSON Schemas, and `docs/reference/options.md`. The docstring below a field is its help; `group` is its
 heading.

@@ -46,7 +46,7 @@ GROUPS = {
         "run": Place(_PLAY, "Play one run on a cluster."),
         "finish": Place(_PLAY, "Close the run of a remote agent."),
         "harbor": Place(
-            "evopolicy_gateway.harbor.command:app",
+            "evopolicy_gateway.harbor.scores:app",
             "Write a Harbor task for each open run of a remote agent, and serve the runs' scores to Harbor's verifiers"
             " until Ctrl-C.",
         ),

@@ -20,7 +20,7 @@ from evopolicy_common.records.run_difference import differences, left_out, short
 from evopolicy_common.terminal import say_json, say_lines
 from evopolicy_gateway import shipped
 from evopolicy_gateway.cli import options
-from evopolicy_gateway.cli.option_groups import Of, Shown, spread
+from evopolicy_gateway.cli.options import Of, Shown, spread
 from evopolicy_gateway.jail.settings import JailSettings
 from evopolicy_gateway.operator.cluster import Cluster
 from evopolicy_gateway.run import recorded_agent

@@ -3,17 +3,20 @@
 Cgroups keep the limits where the agent supervisor may make one. Elsewhere a jailed agent has a number of
 cores, by affinity, and a number of processes, by a resource limit that Linux counts in each user namespace
 since 5.14, though never for root. A limit that no mechanism keeps is recorded as unlimited. No quota keeps
-the size of files: the supervisor measures it, and ends the agent.
+the size of files: the supervisor measures it, and ends the agent. Space counts, not length: a sparse file takes
+little. Each file and folder counts at least `LEAST_BYTES`, since file systems have a bounded number of them.
 """
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import math
 import os
 import re
+import stat
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import msgspec
@@ -21,7 +24,6 @@ import msgspec
 from evopolicy_common.processes import cgroups, proc
 from evopolicy_common.records.run_record import AgentLimits, AgentResources
 from evopolicy_gateway.processes import trees
-from evopolicy_gateway.processes.disk_use import MAX_DEPTH, TooDeepError, used_bytes
 
 _POLL_S = 1.0
 _PAUSE_FACTOR = 50
@@ -142,3 +144,76 @@ def _bind(n_cores: int) -> int:
 def _counts_by_namespace() -> bool:
     release = re.findall(r"\d+", os.uname().release)
     return tuple(map(int, release[:2])) >= _COUNTED_BY_NAMESPACE
+
+
+LEAST_BYTES = 4096
+MAX_DEPTH = 256
+_BLOCK = 512
+_ENTER = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
+
+
+class TooDeepError(Exception):
+    """Folders are nested deeper than `MAX_DEPTH`."""
+
+
+def used_bytes(folders: Iterable[Path], skipped: Path, pids: Iterable[int]) -> int:
+    """Space of all in `folders` without `skipped`, and of deleted files that `pids` have open. Raises
+    TooDeepError."""
+    counted: set[tuple[int, int]] = set()
+    total, devices = 0, set()
+    for folder in folders:
+        with contextlib.suppress(OSError):
+            devices.add(os.stat(folder).st_dev)
+            total += _below(folder, skipped, counted)
+    for pid in pids:
+        with contextlib.suppress(OSError):
+            for name in os.listdir(f"/proc/{pid}/fd"):
+                with contextlib.suppress(OSError):
+                    info = os.stat(f"/proc/{pid}/fd/{name}")
+                    if info.st_nlink == 0 and info.st_dev in devices:
+                        total += _space(info, counted)
+    return total
+
+
+def _below(root: Path, skipped: Path, counted: set[tuple[int, int]]) -> int:
+    """Enters folders by descriptors: a path may be longer than the system takes, or lead elsewhere a moment
+    later."""
+    total = 0
+    stack: list[tuple[int, list[str]]] = []
+    try:
+        stack.append((os.open(root, _ENTER), [""]))
+        while stack:
+            at, names = stack[-1]
+            if not names:
+                os.close(stack.pop()[0])
+                continue
+            name = names.pop()
+            inner: list[str] = []
+            try:
+                folder = os.dup(at) if not name else os.open(name, _ENTER, dir_fd=at)
+            except OSError:
+                continue
+            stack.append((folder, inner))
+            if len(stack) > MAX_DEPTH:
+                raise TooDeepError
+            with contextlib.suppress(OSError), os.scandir(folder) as entries:
+                for entry in entries:
+                    with contextlib.suppress(OSError):
+                        info = entry.stat(follow_symlinks=False)
+                        if len(stack) == 2 and root / entry.name == skipped:
+                            continue
+                        total += _space(info, counted)
+                        if stat.S_ISDIR(info.st_mode):
+                            inner.append(entry.name)
+    finally:
+        for at, _ in stack:
+            os.close(at)
+    return total
+
+
+def _space(info: os.stat_result, counted: set[tuple[int, int]]) -> int:
+    if info.st_nlink != 1 and not stat.S_ISDIR(info.st_mode):
+        if (info.st_dev, info.st_ino) in counted:
+            return 0
+        counted.add((info.st_dev, info.st_ino))
+    return max(LEAST_BYTES, info.st_blocks * _BLOCK)

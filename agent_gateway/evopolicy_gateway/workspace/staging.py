@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import pprint
+from typing import Any
+
+from evopolicy_common.messages.environment import SpaceSchema
 from evopolicy_common.messages.gateway import RunOpened
 from evopolicy_common.records.blobs import digest_of, write_atomically
 from evopolicy_common.records.run_record import PROTOCOL_VERSION
 from evopolicy_gateway.run_folder.layout import RunFolder, Staged, save, saved
 from evopolicy_gateway.workspace.agents_md import NO_URLS, Urls, agents_md
-from evopolicy_gateway.workspace.initial_policy import initial_policy
 
 
 def variables(folder: RunFolder) -> dict[str, str]:
@@ -46,3 +49,74 @@ def stage(folder: RunFolder, run: RunOpened, urls: Urls, text: str = "") -> Stag
     )
     save(folder.staged, staged)
     return staged
+
+
+_SOURCE = '''"""A start that works: every action is the same. Replace it."""
+
+
+class Policy:
+    def __init__(self, obs_space, action_space, env_meta):
+        self.action = {action}
+
+    def reset(self, episode_index):
+        pass
+
+    def act(self, obs):
+        return self.action
+'''
+
+
+def initial_policy(action_space: SpaceSchema) -> str:
+    """Source of a policy for this action space; the same for equal spaces."""
+    action = pprint.pformat(constant_action(action_space), width=90, compact=True, sort_dicts=False)
+    return _SOURCE.replace("{action}", action.replace("\n", "\n" + " " * 22))
+
+
+def constant_action(space: SpaceSchema) -> Any:
+    """One action inside `space`, in plain Python values: zero if it is inside, else the nearest bound.
+
+    Raises ValueError for an unknown kind of space.
+    """
+    kind = space["type"]
+    if kind == "Discrete":
+        return int(space.get("start", 0))
+    if kind == "Box":
+        low, high = space.get("low", space.get("min")), space.get("high", space.get("max"))
+        number = float if str(space["dtype"]).startswith("float") else int
+        return _box(list(space["shape"]), low, high, number)
+    if kind == "Image":
+        lowest, highest = space["value_range"]
+        return _box(list(space["shape"]), lowest, highest, int)
+    if kind == "MultiDiscrete":
+        return _like(space["nvec"], space.get("start", 0))
+    if kind == "MultiBinary":
+        n = space["n"]
+        return _box(n if isinstance(n, list) else [n], 0, 1, int)
+    if kind == "Tuple":
+        return tuple(constant_action(part) for part in space["spaces"])
+    if kind == "Dict":
+        return {key: constant_action(part) for key, part in space["spaces"].items()}
+    if kind == "Text":
+        return str(space.get("characters", "a"))[0] * int(space["min_length"])
+    if kind == "Sequence":
+        return []
+    if kind == "OneOf":
+        return (0, constant_action(space["spaces"][0]))
+    if kind == "Graph":
+        return {"nodes": [constant_action(space["node_space"])], "edges": None, "edge_links": None}
+    raise ValueError(f"no action for a space of type {kind!r}")
+
+
+def _box(shape: list[int], low: Any, high: Any, number: type[int] | type[float]) -> Any:
+    if not shape:
+        return number(min(max(0.0, float(low)), float(high)))
+    lows, highs = (each if isinstance(each, list) else [each] * shape[0] for each in (low, high))
+    return [_box(shape[1:], *bounds, number) for bounds in zip(lows, highs, strict=True)]
+
+
+def _like(nvec: Any, start: Any) -> Any:
+    """The lowest value of each element of a MultiDiscrete space."""
+    if not isinstance(nvec, list):
+        return int(start)
+    starts = start if isinstance(start, list) else [start] * len(nvec)
+    return [_like(part, first) for part, first in zip(nvec, starts, strict=True)]

@@ -21,9 +21,9 @@ from evopolicy_gateway.jail.jail import JailOrder
 from evopolicy_gateway.jail.settings import JailSettings
 from evopolicy_gateway.jail.syscalls import filter_program
 from evopolicy_gateway.jail.view import SHM_BYTES
-from evopolicy_gateway.processes import child_messages, disk_use
+from evopolicy_gateway.processes import child_messages
 from evopolicy_gateway.processes.child_messages import AgentDoing, AgentEnded, AgentUsed
-from evopolicy_gateway.processes.resources import Resources
+from evopolicy_gateway.processes.resources import Resources, used_bytes
 
 needs_cgroups = pytest.mark.skipif(
     not {"cpu", "memory", "pids"} <= cgroups.hierarchies().keys(),
@@ -175,7 +175,7 @@ def test_only_the_agents_own_space_counts_and_each_file_once(tmp_path: Path) -> 
     with (workspace / "sparse").open("wb") as file:
         file.truncate(1 << 40)
     (workspace / "elsewhere").symlink_to("/")
-    used = disk_use.used_bytes([workspace, tmp_path / "missing"], workspace / "feedback", ())
+    used = used_bytes([workspace, tmp_path / "missing"], workspace / "feedback", ())
     assert 1_000_000 < used < 1_100_000
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from evopolicy_common.records.episodes.npz import NpzWriter
-from evopolicy_gateway.submits.stacked import as_published
+from evopolicy_gateway.submits.episode_files import as_published
 
 
 def rows(obs: list[Any]) -> bytes:

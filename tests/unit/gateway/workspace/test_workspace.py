@@ -20,9 +20,8 @@ from evopolicy_gateway.http.info import info_document
 from evopolicy_gateway.http.task import task_markdown
 from evopolicy_gateway.run_folder.layout import RunFolder, run_folder
 from evopolicy_gateway.workspace.agents_md import NO_URLS, PLACEHOLDERS, STANDARD, agents_md, urls_below
-from evopolicy_gateway.workspace.initial_policy import constant_action, initial_policy
 from evopolicy_gateway.workspace.prompts import check_text
-from evopolicy_gateway.workspace.staging import stage
+from evopolicy_gateway.workspace.staging import constant_action, initial_policy, stage
 
 URLS = urls_below("http://127.0.0.1:4711", "ab" * 16)
 

@@ -19,7 +19,7 @@ from evopolicy_common.messages.environment import Case
 from evopolicy_common.records.episodes.trajectory import Recorder, decode
 from evopolicy_gateway.agents import uniform
 from evopolicy_gateway.agents.evolve.evolved.spaces import ActionHead, Features
-from evopolicy_gateway.workspace.initial_policy import constant_action
+from evopolicy_gateway.workspace.staging import constant_action
 from evopolicy_worker.environments import Environment, compile_actions, define, describe, make, registry
 from evopolicy_worker.environments.interface.gymnasium_adapter import GymnasiumFamily
 from evopolicy_worker.environments.interface.opaque import Opaque
