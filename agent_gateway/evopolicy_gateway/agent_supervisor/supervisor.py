@@ -61,10 +61,16 @@ async def keep(order: StartAgent, orders: Orders) -> AgentEnded:
     redact = Redaction.of(secrets_in(environment, config), order.urls).knowing(on_command_line)
     agent_log = AgentLog(Path(order.agent_log), redact)
     clock = AgentClock(order.wall_limit_s)
-    resources = _resources(order)
-    activity = None if order.silence_s is None else Activity(order.silence_s, Path(order.workspace))
+    workspace, folders = Path(order.workspace), [Path(order.workspace)]
+    if order.jail is not None:
+        folders += [Path(order.jail.private, name) for name in ("home", "tmp")]
+    # Binds this process to cores, or makes the agent's cgroup.
+    resources = Resources(order.limits, folders, workspace / "feedback", jailed=order.jail is not None)
+    if words := resources.words():
+        emit(messages.AgentDoing(note=f"agent limits: {words}"))
+    activity = None if order.silence_s is None else Activity(order.silence_s, workspace)
     stage = Stage(
-        workspace=Path(order.workspace),
+        workspace=workspace,
         urls=order.urls,
         environment=environment,
         log=agent_log,
@@ -109,17 +115,6 @@ async def keep(order: StartAgent, orders: Orders) -> AgentEnded:
     if isinstance(ending, EvopolicyError) or reason is not None:
         return AgentEnded(reason=reason or "agent_failed", detail=detail or str(ending))
     raise ending
-
-
-def _resources(order: StartAgent) -> Resources:
-    """Binds this process to cores, or makes the agent's cgroup; tells the operator what its limits are."""
-    workspace, folders = Path(order.workspace), [Path(order.workspace)]
-    if order.jail is not None:
-        folders += [Path(order.jail.private, name) for name in ("home", "tmp")]
-    made = Resources(order.limits, folders, workspace / "feedback", jailed=order.jail is not None)
-    if words := made.words():
-        emit(messages.AgentDoing(note=f"agent limits: {words}"))
-    return made
 
 
 def _stderr_tail(agent_log: AgentLog) -> tuple[str, ...]:

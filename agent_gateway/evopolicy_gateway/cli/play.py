@@ -333,7 +333,7 @@ def _play(plans: list[Plan], where: Cluster, parallel: int, as_json: bool, *, we
 
 
 def _unjailed(plans: list[Plan]) -> bool:
-    """Whether an agent, or a policy that nothing locks in, could read what this user can."""
+    """Whether an agent or a policy could read what this user can."""
     return any(plan.jail.mode != "bwrap" or plan.settings.sandbox_tier == "none" for plan in plans)
 
 

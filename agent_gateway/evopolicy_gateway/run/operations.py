@@ -54,9 +54,8 @@ class Operations(OperatorClient):
 
     async def create(self, wanted: IntendedRun) -> RunCreated:
         """Opens a run; the same key returns the same run. Raises ConfigError for refused settings."""
-        message = CreateRun(
-            token=self._token, key=wanted.key, settings=wanted.settings, replay_key=wanted.replay_key
-        )
+        known = {"key": wanted.key, "replay_key": wanted.replay_key}
+        message = CreateRun(token=self._token, settings=wanted.settings, **known)
         try:
             return await self._once_available("create", message, RunCreated, timeout_s=TIMEOUT_S)
         except RefusedError as error:
@@ -96,9 +95,8 @@ class Operations(OperatorClient):
         result: dict[str, Any] | None = None,
     ) -> ClaimState:
         """Takes, renews, releases (`ttl_s` 0) or settles (`result`) a run of a sweep."""
-        message = Claim(
-            token=self._token, suite=suite, name=name, holder=holder, ttl_s=ttl_s, run=run, result=result
-        )
+        known: dict[str, Any] = {"suite": suite, "name": name, "holder": holder, "ttl_s": ttl_s}
+        message = Claim(token=self._token, **known, run=run, result=result)
         return await self._once_available("claim", message, ClaimState)
 
     async def _once_available(

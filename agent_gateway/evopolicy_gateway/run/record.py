@@ -158,6 +158,10 @@ def run_record(
     suite = catalogue.suite_of(settings.env)
     heldout = finished.heldout_returns
     dimensions = {name: getattr(settings, name) for name in _SAME_DIMENSIONS}
+    spent = {f"{name}_s": finished.wall_s.get(name, 0.0) for name in ("queue", "rollout", "finalise")}
+    spent |= {name: getattr(times, name) for name in ("feedback_s", "held_s", "permit_s")}
+    spent["agent_s"] = max(0.0, times.open_s - times.in_flight_s)
+    spent["wall_time_seconds"] = finished.finished_at - finished.created_at
     return RunRecord(
         model=settings.model,
         env=settings.env,
@@ -186,14 +190,7 @@ def run_record(
         timing=schema.Timing(
             start_time=utc_text(finished.created_at),
             end_time=utc_text(finished.finished_at),
-            wall_time_seconds=round(finished.finished_at - finished.created_at, 3),
-            agent_s=round(max(0.0, times.open_s - times.in_flight_s), 3),
-            queue_s=round(finished.wall_s.get("queue", 0.0), 3),
-            rollout_s=round(finished.wall_s.get("rollout", 0.0), 3),
-            feedback_s=round(times.feedback_s, 3),
-            held_s=round(times.held_s, 3),
-            permit_s=round(times.permit_s, 3),
-            finalise_s=round(finished.wall_s.get("finalise", 0.0), 3),
+            **{name: round(seconds, 3) for name, seconds in spent.items()},
         ),
         outcome=_outcome(finished, code or {}, transitions),
         rejected_submits=tuple(
@@ -325,28 +322,29 @@ def _outcome(
         "nondeterministic_results": finished.nondeterministic_results,
         **({} if transitions is None else {"transitions": msgspec.to_builtins(transitions)}),
     }
+    random = None
+    if reference:
+        known = {"mean_return": mean(reference), "std_return": std(reference), "returns": reference}
+        seeded_by = "case" if finished.reference_by_case else "run"
+        random = schema.ReferenceScore(**known, seeded_by=seeded_by)
+    # As published: a run without an ok submit has the score 0.0.
+    scored: dict[str, Any] = {"final_score": 0.0} if finished.status == "no_ok_submit" else {}
+    if completed:
+        scored = {
+            "final_score": finished.final_score,
+            "best_submit_index": best,
+            "val_scores": {str(index): mean for index, mean in finished.val_scores.items()},
+            "heldout_mean_return": finished.final_score,
+            "heldout_std_return": std(heldout) if heldout else None,
+            "heldout_returns": heldout,
+            "heldout_successes": finished.heldout_successes,
+        }
     return schema.Outcome(
+        **scored,
         status=finished.status,
         error=error,
-        # As published: a run without an ok submit has the score 0.0.
-        final_score=finished.final_score if completed else 0.0 if finished.status == "no_ok_submit" else None,
-        best_submit_index=best,
-        val_scores={str(index): mean for index, mean in finished.val_scores.items()} if completed else None,
-        heldout_mean_return=finished.final_score if completed else None,
-        heldout_std_return=std(heldout) if completed and heldout else None,
-        heldout_returns=heldout if completed else (),
-        heldout_successes=finished.heldout_successes if completed else (),
         quarantined_submits=tuple(sorted(finished.validation_ineligible)),
-        random_reference=(
-            schema.ReferenceScore(
-                mean_return=mean(reference),
-                std_return=std(reference),
-                returns=reference,
-                seeded_by="case" if finished.reference_by_case else "run",
-            )
-            if reference
-            else None
-        ),
+        random_reference=random,
         closed_reason=finished.closed_reason,
         budget_used=finished.budget_used,
         auxiliary=auxiliary,

@@ -128,12 +128,12 @@ class SuiteView(View):
         if kind == "started":
             return "begins" + (f", attempt {details['attempt']}" if details["attempt"] > 1 else "")
         if kind == "finished":
-            if details["state"] == "completed":
+            state, why = details["state"], details["error"]
+            if state == "completed":
                 return f"completed, score {number(details['score'])} (random {number(details['random'])})"
-            if details["state"] == "cancelled":
-                return str(details["error"] or "cancelled")
-            why = f": {details['error']}" if details["error"] else ""
-            return in_words(details["state"]) + why
+            if state == "cancelled":
+                return str(why or state)
+            return in_words(state) + (f": {why}" if why else "")
         if kind == "submit":
             mean = "" if details["mean"] is None else f", mean return {number(details['mean'])}"
             status = in_words(details["status"])
