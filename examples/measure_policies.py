@@ -24,18 +24,13 @@ from typing import Any
 
 import numpy as np
 
-from evopolicy_common.catalogue import entry, suites
+from evopolicy_common.catalogue import entry, policy_folder, suites
 from evopolicy_common.messages.environment import Case
 from evopolicy_results.scoring.paper import heldout_returns
 from evopolicy_worker.environments.interface.base import Environment
 from evopolicy_worker.environments.registry import make
 
 POLICIES = Path(__file__).resolve().parent / "policies"
-
-
-def slug(env_id: str) -> str:
-    """Folder of an environment's policy: `gym/acrobot` is in `gym_acrobot`."""
-    return env_id.replace("/", "_")
 
 
 @contextlib.contextmanager
@@ -88,7 +83,7 @@ def measure(env_id: str, seeds: range, *, show_returns: bool) -> str:
         "action_space": description.action_space,
         "obs_storage": description.obs_storage,
     }
-    with policy_class(POLICIES / slug(env_id)) as new_policy:
+    with policy_class(policy_folder(POLICIES, env_id)) as new_policy:
         episodes = [
             play(
                 environment,
@@ -130,7 +125,7 @@ def main() -> None:
         env_id
         for env_id in suites()["core16"].environments
         if any(fnmatch.fnmatchcase(env_id, pattern) for pattern in arguments.environments)
-        and (POLICIES / slug(env_id) / "policy.py").exists()
+        and (policy_folder(POLICIES, env_id) / "policy.py").exists()
     ]
     if not chosen:
         parser.error(f"no policy for {' '.join(arguments.environments)} in {POLICIES}")

@@ -20,7 +20,7 @@ TOP = Path(__file__).parents[2]
 sys.path[:0] = [str(TOP / "examples"), str(TOP / "tests" / "support")]
 
 import proofs  # noqa: E402
-from measure_policies import play, policy_class, slug  # noqa: E402
+from measure_policies import POLICIES, play, policy_class  # noqa: E402
 
 from evopolicy_common import catalogue  # noqa: E402
 from evopolicy_common.catalogue import anchors, installs  # noqa: E402
@@ -38,7 +38,7 @@ N_CASES = 32
 def policies() -> dict[str, Path]:
     """The folder of each environment's policy, Core16 first."""
     core16 = catalogue.suites()["core16"].environments
-    found = {env_id: TOP / "examples" / "policies" / slug(env_id) for env_id in core16}
+    found = {env_id: catalogue.policy_folder(POLICIES, env_id) for env_id in core16}
     return found | {each.env: each.policy for each in proofs.table()}
 
 

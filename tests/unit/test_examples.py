@@ -15,13 +15,9 @@ POLICIES = Path(__file__).parents[2] / "examples" / "policies"
 CORE16 = catalogue.suites()["core16"].environments
 
 
-def folder(env: str) -> Path:
-    return POLICIES / env.replace("/", "_")
-
-
 @pytest.mark.parametrize("env", CORE16)
 def test_an_example_imports_only_what_the_sandbox_has(env: str) -> None:
-    sources = list(folder(env).rglob("*.py"))
+    sources = list(catalogue.policy_folder(POLICIES, env).rglob("*.py"))
     own = {path.stem for path in sources}
     for path in sources:
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
@@ -35,10 +31,6 @@ def test_an_example_imports_only_what_the_sandbox_has(env: str) -> None:
 
 @pytest.mark.parametrize("env", CORE16)
 def test_an_example_is_a_bundle(env: str) -> None:
-    assert "policy.py" in [file.path for file in bundles.snapshot(folder(env)).files]
-
-
-@pytest.mark.parametrize("name", ["gridmap.py", "errands.py"])
-def test_modules_that_several_bundles_carry_are_the_same(name: str) -> None:
-    # A bundle must be whole, so these are copies: a change to one is a change to all.
-    assert len({path.read_bytes() for path in POLICIES.glob(f"*/{name}")}) == 1
+    assert "policy.py" in [
+        file.path for file in bundles.snapshot(catalogue.policy_folder(POLICIES, env)).files
+    ]

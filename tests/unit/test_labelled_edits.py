@@ -55,17 +55,18 @@ def test_every_edit_is_of_the_type_that_its_name_says(written: Path, env: str) -
     assert {label[3:] for label in found} == {"first", "synthesis", "parametric", "retest", "rollback"}
 
 
-def test_a_folder_without_the_environment_is_played_itself(tmp_path: Path) -> None:
-    (tmp_path / "gym_acrobot").mkdir()
-    assert folder_for(tmp_path, "gym/acrobot") == tmp_path / "gym_acrobot"
-    assert folder_for(tmp_path, "gym/racing") == tmp_path
-    for name in ("my_env:Glider-v0", "my_env_Glider-v0"):  # the second is preferred
-        (tmp_path / name).mkdir()
-        assert folder_for(tmp_path, "my_env:Glider-v0") == tmp_path / name
-
-
-def test_a_world_is_played_by_the_policies_of_the_unchanged_environment(tmp_path: Path) -> None:
-    (tmp_path / "gym_acrobot").mkdir()
-    assert folder_for(tmp_path, "gym/acrobot@w2") == tmp_path / "gym_acrobot"
-    (tmp_path / "gym_acrobot@w2").mkdir()
-    assert folder_for(tmp_path, "gym/acrobot@w2") == tmp_path / "gym_acrobot@w2"
+@pytest.mark.parametrize(
+    ("env", "names"),
+    [
+        ("gym/racing", ["", "gym_racing"]),
+        ("my_env:Glider-v0", ["", "my_env:Glider-v0", "my_env_Glider-v0"]),
+        ("gym/acrobot@w2", ["", "gym_acrobot", "gym_acrobot@w2"]),
+        ("gymnasium/MiniGrid-Empty-v0", ["", "gymnasium_MiniGrid", "gymnasium_MiniGrid-Empty-v0"]),
+    ],
+)
+def test_an_environment_is_played_by_the_policies_in_its_nearest_folder(
+    env: str, names: list[str], tmp_path: Path
+) -> None:
+    for name in names:  # each is preferred to the ones before it
+        (tmp_path / name).mkdir(exist_ok=True)
+        assert folder_for(tmp_path, env) == tmp_path / name

@@ -4,7 +4,8 @@ Run as `python -m evopolicy_gateway.agents.replay DIR` in the workspace, with th
 a folder with a `policy.py` (such as a run's `checkpoints/submit_NNN/`), or with a `system/` that has one (such as a
 workspace). DIR is either a policy, or its subfolders are policies, which are submitted in sorted order. If DIR has a
 folder named like the environment, with `_` for `/` and `:`, that folder is used instead: so one DIR serves many
-environments, such as `examples/policies`. A world without a folder of its own has that of the unchanged environment.
+environments, such as `examples/policies`. A world without a folder has that of the unchanged environment, and an
+environment without one that of its family, such as `gymnasium_MiniGrid`.
 """
 
 from __future__ import annotations
@@ -32,13 +33,11 @@ def policies_in(folder: Path) -> list[Path]:
 
 
 def folder_for(folder: Path, env: str) -> Path:
-    """The subfolder of `folder` for this environment, or else for the one that it alters, or else `folder` itself."""
-    unchanged = re.sub("@w[0-9]+$", "", env)
-    named = (
-        folder / name
-        for each in (env, unchanged)
-        for name in (re.sub("[/:]", "_", each), each.replace("/", "_"))
-    )
+    """The subfolder of `folder` for this environment, or else for the one that it alters, or else for their family
+    (the name up to the first hyphen), or else `folder` itself."""
+    each = (env, re.sub("@w[0-9]+$", "", env))
+    names = [name for one in each for name in (re.sub("[/:]", "_", one), one.replace("/", "_"))]
+    named = (folder / name for name in (*names, names[0].partition("-")[0]))
     return next((own for own in named if own.is_dir()), folder)
 
 

@@ -123,6 +123,13 @@ def folder_name(env_id: str) -> str:
     return re.sub("[/:]", "_", env_id)
 
 
+def policy_folder(policies: Path, env_id: str) -> Path:
+    """The folder of an environment's policy in `policies`: named as it, or as its family (before the first hyphen)."""
+    name = folder_name(env_id)
+    family = policies / name.partition("-")[0]
+    return family if family.is_dir() and not (policies / name).is_dir() else policies / name
+
+
 def earlier_folder_name(env_id: str) -> str:
     """As `folder_name` in earlier versions, whose folders are read too: with the colon of `module:Id`."""
     return env_id.replace("/", "_")

@@ -101,7 +101,7 @@ async def _accept(env_ids: list[str], policies: Path, journal: _Journal, slots: 
 
                 async def work() -> None:
                     for env in env_ids:
-                        await _environment(env, policies / catalogue.folder_name(env), journal, player)
+                        await _environment(env, catalogue.policy_folder(policies, env), journal, player)
 
                 await unless_failed(asyncio.create_task(work()), cluster.failed)
     say(f"{counted(len(env_ids), 'environment')} in {time.monotonic() - began:.0f} s")

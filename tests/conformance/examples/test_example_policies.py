@@ -36,12 +36,13 @@ async def play(slot: Slot, env: str) -> float:
         job_id=f"example {env}",
         env=env,
         bundle="0" * 64,
+        env_meta={"env": env},
         episodes=tuple(
             EpisodeSpec(index=i, episode_index=i, case=Case(seed=31_000 + i), policy_seed=bytes([i] * 16))
             for i in range(N_CASES)
         ),
     )
-    outcomes = await slot.play(job, POLICIES / env.replace("/", "_"), lambda done, steps: None)
+    outcomes = await slot.play(job, catalogue.policy_folder(POLICIES, env), lambda done, steps: None)
     assert [outcome.failure for outcome in outcomes] == [None] * N_CASES, env
     return sum(outcome.episode_return for outcome in outcomes) / N_CASES
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from evopolicy_common.catalogue import policy_folder
 from evopolicy_common.messages.environment import Case
 from evopolicy_common.records.policies.bundles import Bundle, snapshot, unpack
 from evopolicy_common.worlds.rules import PARAMETERS, Rules
@@ -32,7 +33,7 @@ def loaded(bundle: Bundle, folder: Path, monkeypatch: pytest.MonkeyPatch) -> Any
 def test_a_transformed_policy_earns_what_the_policy_earns(
     env: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    bundle = snapshot(POLICIES / env.replace("/", "_"))
+    bundle = snapshot(policy_folder(POLICIES, env))
     base, world = environments.make(env), environments.make(f"{env}@w1")
     spaces = base.description.obs_space, base.description.action_space
     every = ((f"{n:032x}-{n}") for n in range(64))
@@ -43,7 +44,7 @@ def test_a_transformed_policy_earns_what_the_policy_earns(
         if key:
             played, found = world, transformed(bundle, Rules(key, *spaces, base.parameters))
         policy = loaded(found, tmp_path / (key or "unchanged"), monkeypatch)(
-            *spaces, {"max_episode_steps": base.description.max_episode_steps}
+            *spaces, {"env": env, "max_episode_steps": base.description.max_episode_steps}
         )
         policy.reset(0)
         obs = played.reset(Case(seed=7, options={"world": key} if key else None))

@@ -1,7 +1,7 @@
 """Errands in a MiniGrid world where one thing at a time can be carried: fetch, open, put down out of the way.
 
 Each function returns a plan, (poses to pass, what to do at the last of them), or None when the errand cannot
-be done from what is known. The same file serves the policies that fetch a ball from behind a locked door.
+be done from what is known.
 """
 
 from gridmap import DOOR, DROP, EMPTY, LEFT, LOCKED, PICK_UP, STEP, trace

@@ -2,7 +2,7 @@
 
 The agent sees a 7 x 7 window that turns with it and never its position, so the map counts positions from the
 start: a `forward` has moved exactly when the cell ahead could be entered. Cells are numbered row by row in
-one flat list; a pose is a (cell, direction). The same file serves all MiniGrid policies.
+one flat list; a pose is a (cell, direction).
 """
 
 import heapq
