@@ -73,7 +73,7 @@ paper-worker:
 demo: $(CORE)
 	@$(BIN)/evopolicy demo
 
-# More processes than cores, since many tests wait for timers and other processes. One by one: make test ARGS="-n 0"
+# More processes than cores, since many tests wait for timers and other processes. One by one: make test PROCESSES=0
 PROCESSES := $$(( $$(nproc) + 9 ))
 
 # ARGS that name files play those, of whatever layer.
@@ -91,9 +91,7 @@ test-system test-families test-long: HOST = --all-tests
 test test-system test-families test-long: export PYTHONDONTWRITEBYTECODE :=
 test test-system test-families test-long: install
 	@bash deploy/setup-host.sh $(HOST)
-# In a fresh checkout one process compiles the tests, not each of them at the same time.
-	@test -e tests/unit/__pycache__ || $(BIN)/python -m pytest -q --collect-only -m "$(LAYERS)" >/dev/null 2>&1 || true
-	@short="$$(mktemp -d /tmp/evp-XXXXXX)"; $(BIN)/python -m pytest -n $(PROCESSES) --dist loadfile --no-loadscope-reorder --basetemp="$$short/t" \
+	@short="$$(mktemp -d /tmp/evp-XXXXXX)"; $(BIN)/python -m pytest --processes $(PROCESSES) --basetemp="$$short/t" \
 	$(if $(findstring tests/,$(ARGS)),,-m "$(LAYERS)") $(ARGS); status=$$?; \
 	if [ $$status = 0 ]; then rm -rf "$$short"; else echo "the failed tests' files are in $$short"; fi; exit $$status
 
@@ -133,7 +131,7 @@ bench-replay: install
 bench-peers: install
 	@PYTHONPATH=tests/bench:tests/support $(BIN)/python tests/bench/peers_bench.py $(ARGS)
 
-# Episodes per second through coordinator and Zenoh, beside Dask's no-op tasks.
+# Episodes per second through coordinator and Zenoh.
 bench-throughput: install
 	@PYTHONPATH=tests/support $(BIN)/python tests/bench/throughput.py $(ARGS)
 

@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import asyncio
-import functools
 import gc
 import inspect
 import os
 import re
-import shutil
 import signal
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import hypothesis
 import pytest
+from parallel import Parallel
 
 if TYPE_CHECKING:
     from forked import Forks
@@ -41,21 +40,20 @@ _ONE_BY_ONE = tuple(
 """Their tests share nothing and take minutes together: each is played where there is room."""
 
 
-@pytest.hookimpl(optionalhook=True)
-def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
-    """As `--dist loadfile` has it, but for the tests of `_ONE_BY_ONE`."""
-    if config.getvalue("dist") != "loadfile":
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtestloop(session: pytest.Session) -> bool | None:
+    """Plays files beside each other where `--processes` asks for it."""
+    processes = session.config.getoption("processes")
+    if not processes or session.testsfailed or session.config.option.collectonly:
         return None
-    from xdist.scheduler import LoadFileScheduling
-
-    class ByFile(LoadFileScheduling):
-        def _split_scope(self, nodeid: str) -> str:
-            return nodeid if nodeid.startswith(_ONE_BY_ONE) else super()._split_scope(nodeid)
-
-    return ByFile(config, log)
+    Parallel(session, lambda item: item if item.nodeid.startswith(_ONE_BY_ONE) else item.path).play(processes)
+    return True
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption(
+        "--processes", type=int, default=0, help="play files in this many processes; 0: in this one"
+    )
     parser.addoption(
         "--fault-seeds",
         type=int,
@@ -79,31 +77,20 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
     return True if is_test and left_out(collection_path.read_bytes()) else None
 
 
-def _beside_others(config: pytest.Config) -> bool:
-    """Whether this is one of xdist's processes."""
-    return hasattr(config, "workerinput")
-
-
-@functools.cache
-def _in(path: Path, names: tuple[str, ...]) -> bool:
-    """Whether it is one of these files, or in one of these folders. Every process asks for each file of thousands of
-    tests."""
-    return f"{path}/".startswith(tuple(f"{Path(__file__).parent}/{name}/" for name in names))
-
-
 @pytest.hookimpl(tryfirst=True)  # before -m selects by marker
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Puts files with slow tests first, unit tests last, others in the order of their paths.
 
-    With `--dist loadfile --no-loadscope-reorder` processes take files in this order, so that they end at about the same
-    time. By itself xdist begins with the files of most tests, and the longest tests, alone in their files, come last.
-    There unit tests, which compute, stand among the others, which wait for processes and clusters.
+    Processes take files in this order, so that they end at about the same time. There unit tests, which compute, stand
+    among the others, which wait for processes and clusters.
     """
     files = list(dict.fromkeys(item.path for item in items))
     slow = {item.path for item in items if item.get_closest_marker("slow") is not None}
-    unit = {path for path in files if _in(path, ("unit",))}
+    unit = {path for path in files if path.is_relative_to(Path(__file__).parent / "unit")}
     # Where the files of a kind begin and end.
-    spans = ((0.0, 0.0), (1.0, 1.7), (1.0, 2.0)) if _beside_others(config) else ((0, 0), (1, 1), (2, 2))
+    spans = (
+        ((0.0, 0.0), (1.0, 1.7), (1.0, 2.0)) if config.getoption("processes") else ((0, 0), (1, 1), (2, 2))
+    )
     place: dict[Path, float] = {}
     for (begin, end), kind in zip(spans, (slow, {*files} - slow - unit, unit - slow), strict=True):
         ordered = [path for path in files if path in kind]
@@ -138,6 +125,12 @@ def forked() -> Iterator[Forks]:
     forks.close()
 
 
+@pytest.fixture
+def one_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Commands that would compute in a process for each core do so in this one, which has imported everything."""
+    monkeypatch.setattr(os, "cpu_count", lambda: 1)
+
+
 @pytest.fixture(scope="session")
 def slots(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Slots]:
     """Shared by all tests of a process: each slot has to be healthy after what another test or attack did to it."""
@@ -148,16 +141,18 @@ def slots(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Slots]:
     found.close()
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _state_of_its_own() -> Iterator[None]:
+    """Local commands share one state per user: not the developer's, and another for each process of tests."""
+    with tempfile.TemporaryDirectory(prefix="evp-state-", ignore_cleanup_errors=True) as folder:
+        os.environ["XDG_STATE_HOME"] = folder
+        yield
+
+
 def pytest_configure(config: pytest.Config) -> None:
-    # Local commands share one state per user: not the developer's, and another for each process of tests.
-    os.environ["XDG_STATE_HOME"] = tempfile.mkdtemp(prefix="evp-state-")
     # A shell ignores Ctrl-C for what it starts in the background, and children inherit that: tests that press it could
     # not be run there.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     # How long an example takes says how busy the machine is.
     hypothesis.settings.register_profile("patient", deadline=None)
     hypothesis.settings.load_profile("patient")
-
-
-def pytest_unconfigure(config: pytest.Config) -> None:
-    shutil.rmtree(os.environ["XDG_STATE_HOME"], ignore_errors=True)
