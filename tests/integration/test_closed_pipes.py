@@ -53,6 +53,7 @@ def test_every_program_ends_quietly_when_nobody_reads_it(name: str) -> None:
     assert closed(name, "--help") == (READER_GONE, "")
 
 
+@pytest.mark.system
 def test_results_that_nobody_reads_end_their_commands_quietly(tmp_path: Path) -> None:
     for command in (
         "evopolicy-coordinator certs init --state state --host there",
@@ -67,6 +68,7 @@ def test_results_that_nobody_reads_end_their_commands_quietly(tmp_path: Path) ->
         assert closed(*command.split(), cwd=tmp_path) == (READER_GONE, ""), command
 
 
+@pytest.mark.system
 def test_a_run_that_nobody_watches_any_more_ends_as_with_ctrl_c(tmp_path: Path) -> None:
     """It is cancelled; its cluster, gateway and agent end with it."""
     run = ["evopolicy", "local", "--env", "toy/line", "--agent", "evolve", "--exp-id", "t", *SMALL]

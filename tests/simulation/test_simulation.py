@@ -1,4 +1,7 @@
-"""The simulation in CI: a thousand seeds of the production core under faults, and bugs planted in the core."""
+"""The simulation: seeds of the production core under faults, and bugs planted in the core.
+
+`make test` plays 200 seeds, `make test-system` 800 more.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,8 @@ from simulate import play, replay_command
 
 pytestmark = pytest.mark.slow
 
-SEEDS = 1000
+SEEDS, OFTEN = 1000, 200
+"""All, and those of `make test`."""
 SEEDS_PER_BUG = 500
 NOTICED_BY = {
     "count late limit verdicts": 332,
@@ -21,7 +25,7 @@ NOTICED_BY = {
     "lease to a poll that was given up unread": 150,
     "leave runs unpinned when a worker is taken back": 15,
     "take a liveliness hint for the truth": 14,
-    "expire leases after the loop stood still": 121,
+    "expire leases after the loop stood still": 150,
     "adopt a job that is leased elsewhere": 60,
     "forget to tell a worker to stop": 13,
     "leave a lost worker's leases with it": 26,
@@ -34,7 +38,7 @@ NOTICED_BY = {
     "take all kernels for free after a restart": 107,
     "throw the dice of a stopped episode again at once": 68,
     "play train episodes beside hidden ones": 12,
-    "forget the hidden jobs that train jobs wait behind": 25,
+    "forget the hidden jobs that train jobs wait behind": 51,
     "never preempt": 8,
     "end others' permits when a gateway names another kernel of their machine": 9,
     "end permits when a worker names another kernel of their machine": 19,
@@ -46,7 +50,10 @@ NOTICED_BY = {
 """Seeds to try first for bugs that few seeds detect. After a change of the core other seeds may: then all are tried."""
 
 
-@pytest.mark.parametrize("first", range(0, SEEDS, 100))
+@pytest.mark.parametrize(
+    "first",
+    [pytest.param(each, marks=[pytest.mark.system] * (each >= OFTEN)) for each in range(0, SEEDS, 100)],
+)
 def test_every_seed_ends_as_it_does_without_faults(first: int) -> None:
     for seed in range(first, first + 100):
         try:

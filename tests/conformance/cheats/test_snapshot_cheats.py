@@ -36,7 +36,11 @@ class Swapped:
         self.verdicts: list[tuple[str, str]] = [tuple(each) for each in json.loads(report)]
 
 
-@pytest.fixture(scope="module", params=[(), ("--jail", "none")], ids=["jailed", "unjailed"])
+@pytest.fixture(
+    scope="module",
+    params=[(), pytest.param(("--jail", "none"), marks=pytest.mark.system)],
+    ids=["jailed", "unjailed"],
+)
 def swapped(request: pytest.FixtureRequest, cheated: Cheated) -> Swapped:
     return Swapped(cheated, *request.param)
 

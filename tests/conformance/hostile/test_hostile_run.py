@@ -17,6 +17,8 @@ import pytest
 from breakers import BREAKERS, PATIENT
 from slots import HONEST
 
+pytestmark = pytest.mark.system
+
 PLAYED = [attack for attack in BREAKERS if attack.limits == PATIENT]
 SOURCES = {attack.name: attack.source for attack in PLAYED}
 VERDICTS = {attack.name: attack.verdict for attack in PLAYED}

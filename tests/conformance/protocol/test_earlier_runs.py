@@ -42,6 +42,7 @@ def test_an_earlier_run_is_read_with_all_its_numbers() -> None:
     assert run.record.artifacts.logs_agent == "logs/agent.jsonl"
 
 
+@pytest.mark.usefixtures("one_process")
 def test_an_earlier_run_is_reported(tmp_path: Path) -> None:
     result = CliRunner().invoke(report, [str(EARLIER / "run"), "--out", str(tmp_path / "report")])
     assert result.exit_code == 0, result.output
@@ -51,6 +52,7 @@ def test_an_earlier_run_is_reported(tmp_path: Path) -> None:
     assert "not_told" not in found["tables"]
 
 
+@pytest.mark.system
 def test_an_earlier_run_is_verified(tmp_path: Path) -> None:
     """Every recorded episode and every checkpoint's policy is played again."""
     run = tmp_path / "run"
@@ -64,6 +66,7 @@ def test_an_earlier_run_is_verified(tmp_path: Path) -> None:
     assert (document["episodes"], document["policy_episodes"], document["policy_differences"]) == (7, 7, [])
 
 
+@pytest.mark.system
 def test_an_earlier_run_is_the_same_run_as_one_of_today(now: Path) -> None:
     found = differences(EARLIER / "run", now)
     # Where the agent's program lies, and what it was made with, are of the two machines.
@@ -76,6 +79,7 @@ def test_an_earlier_run_is_the_same_run_as_one_of_today(now: Path) -> None:
     assert [line for line in found if not line.startswith((*other, "trees/", "run.json: trees"))] == []
 
 
+@pytest.mark.system
 def test_an_earlier_run_differs_where_its_outcome_does(now: Path, tmp_path: Path) -> None:
     changed = tmp_path / "run"
     shutil.copytree(EARLIER / "run", changed)

@@ -20,6 +20,8 @@ from evopolicy_results.reading.reader import read_or_explain, read_run
 from evopolicy_results.reading.records import LeftOut
 from evopolicy_results.verify.source import read_run as read_for_verify
 
+pytestmark = pytest.mark.usefixtures("one_process")
+
 
 def test_the_fixture_is_what_the_published_checker_passes(tmp_path: Path) -> None:
     assert check_run(write_published_run(tmp_path)) == []

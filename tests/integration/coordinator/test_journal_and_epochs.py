@@ -27,6 +27,8 @@ from evopolicy_common.wire.transport import connect
 from evopolicy_coordinator.storage.backup import back_up
 from evopolicy_results.publish.signatures import signed_by
 
+pytestmark = pytest.mark.system
+
 
 def command(*args: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(

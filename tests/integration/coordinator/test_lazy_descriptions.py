@@ -21,6 +21,8 @@ from evopolicy_common.messages.worker import Fingerprint
 from evopolicy_common.wire import transport
 from evopolicy_common.wire.operator_client import OperatorClient
 
+pytestmark = [pytest.mark.system, pytest.mark.slow, pytest.mark.timeout(400)]
+
 
 class Cluster:
     """A coordinator that trusts nobody, and a worker."""
@@ -96,8 +98,6 @@ def cluster(tmp_path: Path) -> Iterator[Cluster]:
     found.coordinator.stop()
 
 
-@pytest.mark.slow
-@pytest.mark.timeout(400)
 def test_an_awaited_environment_is_described_and_kept_for_later_starts(cluster: Cluster) -> None:
     ids = {
         each

@@ -13,6 +13,8 @@ from typing import Any
 import pytest
 from commands import agent, evopolicy, words
 
+pytestmark = pytest.mark.system
+
 POLICY = """
 import time
 

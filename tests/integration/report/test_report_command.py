@@ -30,6 +30,9 @@ MP4 = bytes.fromhex("000000206674797069736f6d0000020069736f6d69736f32617663316d7
 """The first box of a video file: enough to be copied and linked."""
 
 
+pytestmark = pytest.mark.usefixtures("one_process")
+
+
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("runs")

@@ -9,6 +9,8 @@ import pytest
 from commands import command, record_in, run_dir
 from stages.cli_stage import FAKES
 
+pytestmark = pytest.mark.system
+
 
 def test_an_agent_behind_the_protocol_plays_a_whole_run_in_its_jail(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch

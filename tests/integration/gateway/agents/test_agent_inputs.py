@@ -39,6 +39,7 @@ key = ""
     )
 
 
+@pytest.mark.system
 def test_an_agent_reads_its_skill_and_cannot_change_it(tmp_path: Path) -> None:
     with ModelApi([Step(command=LOOK), Step(command=SUBMIT), Step(text="done")]) as api:
         agent_file(tmp_path, api.base_url)

@@ -138,6 +138,7 @@ def test_an_odd_environment_is_played_or_refused_with_its_sentence(folder: Path,
     assert "Traceback" not in said
 
 
+@pytest.mark.system
 @pytest.mark.slow
 def test_an_environment_that_is_refused_ends_its_own_run_and_no_other(folder: Path) -> None:
     (folder / "odd.toml").write_text(
@@ -155,6 +156,7 @@ def test_an_environment_that_is_refused_ends_its_own_run_and_no_other(folder: Pa
     assert '"status":"completed"' in good.read_text().replace(" ", "")
 
 
+@pytest.mark.system
 @pytest.mark.slow
 def test_python_callers_get_the_refusal_as_an_exception(folder: Path) -> None:
     code = """

@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import pytest
 from commands import Plays, agent, command, ended, ran_on, record_in, run_arguments, run_dir
 from waiting import wait_until
 
@@ -175,6 +176,7 @@ def test_replay_submits_the_policies_in_order_with_even_shares(operator_file: Pa
     assert [summary.env_instances for summary in summaries] == [(0, 1, 2), (0, 1)]
 
 
+@pytest.mark.system
 def test_a_run_of_that_name_is_refused_and_replaced_only_on_demand(ran: Plays) -> None:
     file = ran("", ends=3).folder / "run.json"
     before = file.read_bytes()
@@ -186,6 +188,7 @@ def test_a_run_of_that_name_is_refused_and_replaced_only_on_demand(ran: Plays) -
     assert file.read_bytes() != before
 
 
+@pytest.mark.system
 def test_a_run_that_is_played_is_nobody_elses_to_replace(operator_file: Path, tmp_path: Path) -> None:
     code = "submit([0])\nopen('here', 'w')\nwhile not os.path.exists('go'): time.sleep(0.05)\nsubmit([1])\n"
     arguments = run_arguments(operator_file, agent(tmp_path, code))
@@ -226,6 +229,7 @@ def test_an_agent_failing_after_its_submits_has_its_own_exit_code(ran: Plays) ->
     assert played.record.outcome.status == "completed"
 
 
+@pytest.mark.system
 def test_other_texts_and_less_feedback_are_recorded(ran: Plays, operator_file: Path, tmp_path: Path) -> None:
     code = """
 for line in sys.stdin:

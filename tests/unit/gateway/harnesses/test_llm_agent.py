@@ -20,6 +20,8 @@ pytestmark = pytest.mark.slow
 
 Protocol = Literal["openai", "anthropic"]
 PROTOCOLS: list[Protocol] = ["openai", "anthropic"]
+MOSTLY_ONE = ["openai", pytest.param("anthropic", marks=pytest.mark.system)]
+"""For what the agent does alike with both."""
 SUBMIT = (
     "echo '# better' >> system/policy.py; curl -s --noproxy '*' -X POST"
     " -d '{\"env_instances\": [0, 1]}' $EVOPOLICYGYM_SUBMIT_URL"
@@ -67,7 +69,7 @@ def test_a_model_edits_submits_and_is_prompted_again_in_its_session(
     assert "first" in str(api.requests[2])
 
 
-@pytest.mark.parametrize("protocol", PROTOCOLS)
+@pytest.mark.parametrize("protocol", MOSTLY_ONE)
 def test_neither_its_commands_nor_its_log_have_the_key(tmp_path: Path, protocol: Protocol) -> None:
     found, api = played(tmp_path, protocol, [Step(command="env"), Step(text="done")], reprompts=0)
     assert "EVOPOLICYGYM_SUBMIT_URL" in str(api.requests[1])
@@ -75,7 +77,7 @@ def test_neither_its_commands_nor_its_log_have_the_key(tmp_path: Path, protocol:
     assert KEY not in found.text
 
 
-@pytest.mark.parametrize("protocol", PROTOCOLS)
+@pytest.mark.parametrize("protocol", MOSTLY_ONE)
 def test_a_busy_provider_is_asked_again_within_the_turn(tmp_path: Path, protocol: Protocol) -> None:
     script = [Step(status=503, text="overloaded"), Step(command=SUBMIT), Step(command=SUBMIT)]
     found, _ = played(tmp_path, protocol, [*script, Step(text="done")])
@@ -83,7 +85,7 @@ def test_a_busy_provider_is_asked_again_within_the_turn(tmp_path: Path, protocol
     assert (found.ending.reason, found.ending.retries) == ("agent_stopped", 0), found.ending.detail
 
 
-@pytest.mark.parametrize("protocol", PROTOCOLS)
+@pytest.mark.parametrize("protocol", MOSTLY_ONE)
 def test_a_wrong_key_ends_the_run_with_the_providers_words(tmp_path: Path, protocol: Protocol) -> None:
     found, _ = played(tmp_path, protocol, [Step(status=401, text="no such key")] * 9)
     assert found.ending is not None
@@ -125,7 +127,7 @@ def test_a_session_that_failed_before_its_first_answer_begins_anew(tmp_path: Pat
     assert [prompt["message"][:14] for prompt in found.prompts] == ["Read AGENTS.md"] * 2
 
 
-@pytest.mark.parametrize("protocol", PROTOCOLS)
+@pytest.mark.parametrize("protocol", MOSTLY_ONE)
 def test_a_conversation_beyond_the_models_context_goes_on_without_old_outputs(
     tmp_path: Path, protocol: Protocol
 ) -> None:
