@@ -17,39 +17,23 @@ from evopolicy_common.records.policies.bundles import BundleFile
 SECRET = b"the hidden seeds"
 
 
-class BundleAttack(msgspec.Struct, frozen=True, kw_only=True):
+class BundleAttack(msgspec.Struct, frozen=True):
     """A folder `system/` with something in it that is no file of the policy's."""
 
     name: str
-    spoil: Callable[[Path, Path], None]
-    """Given `system/`, and a file outside that holds the secret."""
-    verdict: str
     words: str
     """In the verdict's message."""
+    spoil: Callable[[Path, Path], object]
+    """Given `system/`, and a file outside that holds the secret."""
     harm: Callable[[Path], bool] | None = None
     """Whether somebody who copies and reads such a folder without looking is harmed; None where to see it is not
     safe."""
-
-
-def _link(system: Path, secret: Path) -> None:
-    (system / "data").symlink_to(secret)
-
-
-def _folder_link(system: Path, secret: Path) -> None:
-    (system / "data").symlink_to(secret.parent)
+    verdict: str = "import_error"
 
 
 def _policy_link(system: Path, secret: Path) -> None:
     (system / "policy.py").unlink()
     (system / "policy.py").symlink_to(secret)
-
-
-def _hard_link(system: Path, secret: Path) -> None:
-    os.link(secret, system / "data")
-
-
-def _pipe(system: Path, secret: Path) -> None:
-    os.mkfifo(system / "data")
 
 
 def _device(system: Path, secret: Path) -> None:
@@ -63,10 +47,6 @@ def _device(system: Path, secret: Path) -> None:
 def _thousands(system: Path, secret: Path) -> None:
     for k in range(bundles.MAX_FILES):
         (system / f"{k}").touch()
-
-
-def _deep(system: Path, secret: Path) -> None:
-    (system / "/".join("d" * 40)).mkdir(parents=True)
 
 
 def _huge(system: Path, secret: Path) -> None:
@@ -100,63 +80,45 @@ def _waits_for_ever(system: Path) -> bool:
 
 BUNDLES = (
     BundleAttack(
-        name="a bundle with a symbolic link to a file outside",
-        spoil=_link,
-        verdict="import_error",
-        words="data is a symbolic link",
-        harm=_tells_the_secret,
+        "a bundle with a symbolic link to a file outside",
+        "data is a symbolic link",
+        lambda system, secret: (system / "data").symlink_to(secret),
+        _tells_the_secret,
     ),
     BundleAttack(
-        name="a bundle with a symbolic link to a folder outside",
-        spoil=_folder_link,
-        verdict="import_error",
-        words="data is a symbolic link",
-        harm=_tells_the_secret,
+        "a bundle with a symbolic link to a folder outside",
+        "data is a symbolic link",
+        lambda system, secret: (system / "data").symlink_to(secret.parent),
+        _tells_the_secret,
     ),
     BundleAttack(
-        name="a symbolic link in place of policy.py",
-        spoil=_policy_link,
+        "a symbolic link in place of policy.py",
+        "symbolic link",
+        _policy_link,
+        _tells_the_secret,
         verdict="missing_policy",
-        words="symbolic link",
-        harm=_tells_the_secret,
     ),
     BundleAttack(
-        name="a bundle with a hard link to a file outside",
-        spoil=_hard_link,
-        verdict="import_error",
-        words="data",
-        harm=_tells_the_secret,
+        "a bundle with a hard link to a file outside",
+        "data",
+        lambda system, secret: os.link(secret, system / "data"),
+        _tells_the_secret,
     ),
     BundleAttack(
-        name="a bundle with a named pipe without a writer",
-        spoil=_pipe,
-        verdict="import_error",
-        words="named pipe",
-        harm=_waits_for_ever,
+        "a bundle with a named pipe without a writer",
+        "named pipe",
+        lambda system, secret: os.mkfifo(system / "data"),
+        _waits_for_ever,
     ),
+    BundleAttack("a bundle with a device file", "data is a", _device),
+    BundleAttack("a bundle of thousands of files", "2000", _thousands, _copies_thousands),
     BundleAttack(
-        name="a bundle with a device file", spoil=_device, verdict="import_error", words="data is a"
+        "a bundle of folders nested 40 deep",
+        "deep",
+        lambda system, secret: (system / "/".join("d" * 40)).mkdir(parents=True),
+        _copies_every_depth,
     ),
-    BundleAttack(
-        name="a bundle of thousands of files",
-        spoil=_thousands,
-        verdict="import_error",
-        words="2000",
-        harm=_copies_thousands,
-    ),
-    BundleAttack(
-        name="a bundle of folders nested 40 deep",
-        spoil=_deep,
-        verdict="import_error",
-        words="deep",
-        harm=_copies_every_depth,
-    ),
-    BundleAttack(
-        name="a bundle with a sparse file of a terabyte",
-        spoil=_huge,
-        verdict="import_error",
-        words="1,099,511,627,776",
-    ),
+    BundleAttack("a bundle with a sparse file of a terabyte", "1,099,511,627,776", _huge),
 )
 PATHS = ("../evil", "a/../../evil", "/tmp/evopolicy-evil", "..")
 
