@@ -1,4 +1,4 @@
-"""Options as settings, control lines, `run.json` from a finished run, what watchers print."""
+"""Options as settings, control lines, `run.json` from a finished run, what watchers print, paths of policies."""
 
 from __future__ import annotations
 
@@ -26,6 +26,7 @@ from evopolicy_common.records.run_record import decode_run_record, encode_run_re
 from evopolicy_gateway.cli.play import _unjailed
 from evopolicy_gateway.jail.settings import JailSettings
 from evopolicy_gateway.operator.cluster import Cluster
+from evopolicy_gateway.operator.trials import policy_bundle
 from evopolicy_gateway.processes import child_messages
 from evopolicy_gateway.processes.child_messages import AgentDoing, Progress
 from evopolicy_gateway.run.options import cases_of, limits_of, one_environment, packages_for
@@ -232,3 +233,17 @@ def test_agents_without_a_jail_may_read_the_state(
 ) -> None:
     settings = RunOptions(agent="evolve", tier=tier).settings("toy/line", "t")
     assert _unjailed([plan_in(tmp_path, settings, jail=JailSettings(mode=jail))]) == exposed
+
+
+@pytest.mark.parametrize(
+    ("name", "problem"),
+    [("empty", "holds no policy.py"), ("policy.py", "is a file"), ("absent", "there is no folder")],
+)
+def test_a_path_without_a_policy_is_refused_with_the_remedy(tmp_path: Path, name: str, problem: str) -> None:
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "policy.py").touch()
+    with pytest.raises(ConfigError) as refused:
+        policy_bundle(tmp_path / name)
+    assert problem in str(refused.value)
+    assert str(tmp_path / name) in str(refused.value)
+    assert "name a folder with policy.py in it" in str(refused.value)

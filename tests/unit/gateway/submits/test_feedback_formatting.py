@@ -211,15 +211,6 @@ def packed(observations: list[Any], actions: list[Any] | None = None, form: Any 
     return recorder.finish()
 
 
-def test_rows_observations_and_steps_agree_for_pictures() -> None:
-    frames = [np.full((4, 5, 3), t, dtype=np.uint8) for t in range(3)]
-    files = trajectory_files(packed(frames), "npz")
-    rows = [json.loads(line) for line in files["trajectory.jsonl"].splitlines()]
-    assert [row["obs"] for row in rows] == [None] * 3
-    stored = np.load(io.BytesIO(files["observations.npz"]), allow_pickle=False)
-    np.testing.assert_array_equal(stored["observations"], np.stack(frames))
-
-
 def test_dicts_with_pictures_are_stored_by_part() -> None:
     observations = [
         {"view": np.full((2, 2), t, dtype=np.uint8), "text": f"go {t}", "pair": (t, np.array([0.5 * t]))}

@@ -1,4 +1,4 @@
-"""The gateway's journal."""
+"""The gateway's journal and the small files of a run's folder, also damaged ones."""
 
 from __future__ import annotations
 
@@ -9,9 +9,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from evopolicy_common.errors import StorageError
-from evopolicy_common.records.open_run import Accepted, AnyEntry, Closed, Rejected, Requested, Settled
+from evopolicy_common.errors import ConfigError, StorageError
+from evopolicy_common.records.open_run import (
+    Accepted,
+    AnyEntry,
+    Closed,
+    OpenedRun,
+    Rejected,
+    Requested,
+    Settled,
+)
 from evopolicy_gateway.run_folder.journal import Journal
+from evopolicy_gateway.run_folder.layout import RunFolder, save, saved
 
 REQUESTED = Requested(
     key="k", client_key=None, body_digest="d", env_instances=(1, 2), bundle="b" * 64, bundle_error=None
@@ -95,3 +104,14 @@ def test_a_line_that_the_disk_refuses_is_cut_off(tmp_path: Path, monkeypatch: py
     journal.append(ENTRIES[2])
     journal.close()
     assert entries_in(tmp_path / "j") == [REQUESTED, ENTRIES[2]]
+
+
+def test_a_file_that_a_disk_has_damaged_is_reported(tmp_path: Path) -> None:
+    folder = RunFolder(tmp_path)
+    folder.state.mkdir()
+    save(folder.opened_run, OpenedRun(run="r-1"))
+    assert saved(folder.opened_run, OpenedRun).run == "r-1"
+    for damaged in (b"", b"{", b"\xff", b"[" * 100_000, b'{"run": 1}'):
+        folder.opened_run.write_bytes(damaged)
+        with pytest.raises(ConfigError, match=f"{folder.opened_run} is damaged.*--overwrite"):
+            saved(folder.opened_run, OpenedRun)

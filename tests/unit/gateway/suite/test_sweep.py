@@ -1,16 +1,17 @@
-"""A sweep's own rules: limits, pauses, caps, and what was used."""
+"""A sweep's own rules: limits, pauses, caps, and what was used; the runs of `evopolicy local` and `run`."""
 
 from __future__ import annotations
 
 import asyncio
 from pathlib import Path
 
+import msgspec
 import pytest
-from stages.sweep_stage import CODEX, EVOLVE, TIMEOUT_S, TOKENS, Stage, Staged, entry_of, until
+from stages.sweep_stage import CODEX, EVOLVE, TIMEOUT_S, TOKENS, Direct, Stage, Staged, entry_of, until
 
-from evopolicy_common.errors import StorageError
+from evopolicy_common.errors import ConfigError, EvopolicyError, StorageError
 from evopolicy_common.records.suite_folder import PAUSED, Index
-from evopolicy_gateway.suite import suite_index, sweep
+from evopolicy_gateway.suite import runs, suite_index, sweep
 
 
 def test_limits_per_machine_agent_and_provider_hold(staged: Staged) -> None:
@@ -235,3 +236,52 @@ def test_runs_go_on_while_the_disk_refuses_the_index(staged: Staged, monkeypatch
     assert len(refused) == 3
     assert {entry.state for entry in index.runs.values()} == {"completed"}
     assert len([line for line in stage.events if "suite.json is not up to date" in line]) == 1
+
+
+def test_a_failing_run_stops_no_other_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    direct = Direct(tmp_path, monkeypatch)
+
+    async def act(name: str) -> None:
+        if name == "toy/line":
+            raise EvopolicyError("the gateway cannot serve")
+
+    direct.act = act
+    failed, completed = runs.documents(direct.play())
+    assert (failed["status"], failed["error"]) == ("error", "the gateway cannot serve")
+    assert (completed["status"], completed["final_score"]) == ("completed", 1.0)
+    assert direct.output.getvalue() == "toy/line: failed: the gateway cannot serve\n"
+    assert not list(tmp_path.glob("**/suite.json"))
+
+
+def test_a_wrong_option_of_all_runs_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    direct = Direct(tmp_path, monkeypatch)
+    wrong = {"toy/line"}
+
+    async def act(name: str) -> None:
+        if name in wrong:
+            raise ConfigError(f"{name} has too few cases")
+
+    direct.act = act
+    documents = runs.documents(direct.play())
+    assert [one["wrong_option"] for one in documents] == [True, False]
+    wrong.add("toy/maze")
+    with pytest.raises(ConfigError, match="toy/line has too few cases"):
+        direct.play()
+    assert direct.output.getvalue() == ""
+
+
+def test_a_commands_own_runs_continue_when_resumed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    direct = Direct(tmp_path, monkeypatch)
+    direct.plans[1] = msgspec.structs.replace(direct.plans[1], resume=True)
+
+    async def act(name: str) -> None:
+        await until(lambda: len(direct.kinds) == 2)
+        if name == "toy/line":
+            raise KeyboardInterrupt
+        await asyncio.Event().wait()
+
+    direct.act = act
+    with pytest.raises(KeyboardInterrupt):
+        direct.play(parallel=2)
+    assert direct.kinds == ["play", "go_on"]
+    assert direct.ended == ["toy/line", "toy/maze"]
