@@ -20,6 +20,7 @@ from coordinator_harness import (
     FINGERPRINT,
     LINE,
     Coordinator,
+    OperatorClient,
     bundle_of,
     comparable,
     gateway_of,
@@ -27,11 +28,13 @@ from coordinator_harness import (
     play,
     run,
 )
+from typer import Typer
 from typer.testing import CliRunner
 
 from evopolicy_common.errors import PartFailedError, SandboxError, SlotDiedError, WorkerError
 from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome, Job, Tier
+from evopolicy_common.messages.status import WorkerStatus
 from evopolicy_common.records.blobs import digest_of
 from evopolicy_common.wire import codec
 from evopolicy_common.wire.requests import Requester
@@ -39,7 +42,7 @@ from evopolicy_common.wire.transport import connect
 from evopolicy_coordinator.cli.envs import app as envs_app
 from evopolicy_coordinator.cli.status import status_app, workers_app
 from evopolicy_worker import capabilities, outbox, supervisor
-from evopolicy_worker.capabilities import Capabilities, Describe, Probe
+from evopolicy_worker.capabilities import Capabilities
 from evopolicy_worker.slot_protocol.begun import HandedBack
 from evopolicy_worker.supervisor import Options, Supervisor
 
@@ -126,14 +129,9 @@ async def supervising(
     grace_s: float = 5.0,
     dress: Callable[[EpisodeOutcome], EpisodeOutcome] = large,
     kind: type[ScriptedSlot] = ScriptedSlot,
-    tiers: tuple[Tier, ...] = ("bwrap",),
-    missing: dict[Tier, str] | None = None,
-    probe: Probe | None = None,
-    failed: dict[str, str] | None = None,
-    describe: Describe | None = None,
+    able: Capabilities | None = None,
 ) -> AsyncIterator[Supervisor]:
-    """A supervisor that works in the background and is drained at the end. `failed`: in place of the environment that
-    works."""
+    """A supervisor that works in the background and is drained at the end. `able`: else every job can be played."""
     options = Options(
         name=name,
         slots=slots,
@@ -143,25 +141,14 @@ async def supervising(
         scratch=scratch / name,
         grace_s=grace_s,
     )
-    works = Capabilities(
-        tiers,
-        () if failed else (LINE,),
-        missing_tiers=missing,
-        failed_environments=failed,
-        probe=probe,
-        describe=describe,
-    )
-
-    def make_slot(index: int, tier: Tier) -> ScriptedSlot:
-        return kind(script, dress)
-
+    able = able or Capabilities(("bwrap",), (LINE,))
     async with connect(coordinator.credentials("worker")) as link:
-        found = Supervisor(link, options, works, make_slot)
-        task = asyncio.create_task(found.run())
+        worker = Supervisor(link, options, able, lambda index, tier: kind(script, dress))
+        task = asyncio.create_task(worker.run())
         try:
-            yield found
+            yield worker
         finally:
-            found.drain()
+            worker.drain()
             await asyncio.wait_for(task, 30)
 
 
@@ -188,6 +175,24 @@ async def test_a_whole_run_goes_through_the_supervisor(coordinator: Coordinator,
         assert 30 <= worker.jobs_done <= 33
 
 
+async def until_told(operator: OperatorClient, reason: str, told: Callable[[WorkerStatus], bool]) -> str:
+    """Why the run waits, once that contains `reason` and the only worker is shown as `told` wants."""
+    async with asyncio.timeout(30):
+        while True:
+            status = await operator.status()
+            waits = [run.waits_for for run in status.runs if reason in run.waits_for]
+            if waits and told(status.workers[0]):
+                return waits[0]
+            await asyncio.sleep(0.05)
+
+
+async def shown_by(coordinator: Coordinator, app: Typer, *arguments: str) -> str:
+    """The output of a command for operators, on one line."""
+    arguments += ("--credentials", coordinator.ready["credentials"]["operator"])
+    shown = await asyncio.to_thread(CliRunner().invoke, app, arguments)
+    return shown.stdout.replace("\n", " ")
+
+
 async def test_an_environment_that_failed_is_told_and_tried_again(
     coordinator: Coordinator, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -201,25 +206,14 @@ async def test_an_environment_that_failed_is_told_and_tried_again(
         return ((LINE,), {}) if works.is_set() else ((), {"toy/line": again})
 
     failed = {"toy/line": "step 3: it raised KeyError"}
-    async with (
-        supervising(coordinator, tmp_path, failed=failed, describe=describe),
-        operator_of(coordinator) as operator,
-    ):
+    able = Capabilities(("bwrap",), (), failed_environments=failed, describe=describe)
+    async with supervising(coordinator, tmp_path, able=able), operator_of(coordinator) as operator:
         played = asyncio.create_task(whole_run(coordinator, "waits"))
-        async with asyncio.timeout(30):
-            await tried.wait()
-            while True:
-                status = await operator.status()
-                waits = [run.waits_for for run in status.runs if again in run.waits_for]
-                if waits and status.workers[0].failed_environments == {"toy/line": again}:
-                    break
-                await asyncio.sleep(0.05)
-        assert f"it failed on w-1: {again}" in waits[0]
-        file = coordinator.ready["credentials"]["operator"]
+        await tried.wait()
+        waits = await until_told(operator, again, lambda w: w.failed_environments == {"toy/line": again})
+        assert f"it failed on w-1: {again}" in waits
         for app, *arguments in ((status_app,), (workers_app, "list"), (envs_app,)):
-            arguments += ["--credentials", file]
-            shown = await asyncio.to_thread(CliRunner().invoke, app, arguments)
-            assert again in shown.stdout.replace("\n", " ")
+            assert again in await shown_by(coordinator, app, *arguments)
         works.set()
         assert (await played)["status"] == "completed"
         (worker,) = (await operator.status()).workers
@@ -237,29 +231,17 @@ async def test_a_tier_that_failed_once_is_told_and_tried_again(
         if not works.is_set():
             raise SandboxError(f"{tier}: still no namespaces")
 
-    missing: dict[Tier, str] = {"bwrap": "no namespaces"}
-    async with (
-        supervising(coordinator, tmp_path, tiers=("landlock",), missing=missing, probe=probe),
-        operator_of(coordinator) as operator,
-    ):
+    able = Capabilities(("landlock",), (LINE,), missing_tiers={"bwrap": "no namespaces"}, probe=probe)
+    again = "bwrap: still no namespaces"
+    async with supervising(coordinator, tmp_path, able=able), operator_of(coordinator) as operator:
         played = asyncio.create_task(whole_run(coordinator, "waits"))
-        async with asyncio.timeout(30):
-            await probed.wait()
-            while True:
-                status = await operator.status()
-                waits = [run.waits_for for run in status.runs if "tier bwrap" in run.waits_for]
-                if waits and status.workers[0].missing_tiers == {"bwrap": "bwrap: still no namespaces"}:
-                    break
-                await asyncio.sleep(0.05)
-        assert status.workers[0].tiers == ("landlock",)
-        file = coordinator.ready["credentials"]["operator"]
+        await probed.wait()
+        waits = await until_told(
+            operator, "tier bwrap", lambda w: (w.tiers, w.missing_tiers) == (("landlock",), {"bwrap": again})
+        )
         for app, *arguments in ((status_app,), (workers_app, "list")):
-            arguments += ["--credentials", file]
-            shown = await asyncio.to_thread(CliRunner().invoke, app, arguments)
-            assert "w-1 has no sandbox tier bwrap: bwrap: still no namespaces" in shown.stdout.replace(
-                "\n", " "
-            )
-        assert "does not work on w-1: bwrap: still no namespaces" in waits[0]
+            assert f"w-1 has no sandbox tier bwrap: {again}" in await shown_by(coordinator, app, *arguments)
+        assert f"does not work on w-1: {again}" in waits
         works.set()
         assert (await played)["status"] == "completed"
         (worker,) = (await operator.status()).workers
@@ -495,6 +477,14 @@ async def test_a_worker_whose_coordinator_is_away_ends_all_the_same(
     await asyncio.gather(run_task, return_exceptions=True)
 
 
+async def hang(slot: ScriptedSlot, go_on: asyncio.Event) -> None:
+    """Until the slot is stopped or may `go_on`."""
+    waits = [asyncio.create_task(event.wait()) for event in (slot.stopped, go_on)]
+    await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
+    for wait in waits:
+        wait.cancel()
+
+
 async def test_a_silent_coordinator_stops_hidden_episodes_only(
     coordinator: Coordinator, tmp_path: Path
 ) -> None:
@@ -503,14 +493,9 @@ async def test_a_silent_coordinator_stops_hidden_episodes_only(
     go_on = asyncio.Event()
 
     async def hang_once(slot: ScriptedSlot, job: Job) -> None:
-        if go_on.is_set():
-            return
-        if "/validation/" in job.job_id or "/random/" in job.job_id:
+        if not go_on.is_set() and ("/validation/" in job.job_id or "/random/" in job.job_id):
             playing.set()
-            waits = [asyncio.create_task(event.wait()) for event in (slot.stopped, go_on)]
-            await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
-            for wait in waits:
-                wait.cancel()
+            await hang(slot, go_on)
             if slot.stopped.is_set():
                 stopped.append(job.job_id)
 
@@ -548,10 +533,7 @@ async def test_a_waiting_submit_stops_hidden_episodes_that_would_never_end(
     async def hang_while_hidden(slot: ScriptedSlot, job: Job) -> None:
         if job.record == "actions" and not go_on.is_set():
             hanging.set()
-            waits = [asyncio.create_task(event.wait()) for event in (slot.stopped, go_on)]
-            await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
-            for wait in waits:
-                wait.cancel()
+            await hang(slot, go_on)
             if not go_on.is_set():
                 stopped.append(job.job_id)
                 raise SandboxError("cancelled")
