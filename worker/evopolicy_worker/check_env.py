@@ -243,8 +243,16 @@ def _job(description: EnvironmentDescription, tier: Tier, steps: int) -> Job:
         "max_episode_steps": description.max_episode_steps,
     }
     spec = EpisodeSpec(index=0, episode_index=0, case=Case(seed=SEEDS[0]), policy_seed=bytes(16))
-    plan = {"job_id": "check", "env": description.env, "bundle": "check", "render": True}
-    return Job(**plan, episodes=(spec,), env_meta=meta, tier=tier, max_steps=steps)
+    return Job(
+        job_id="check",
+        env=description.env,
+        bundle="check",
+        episodes=(spec,),
+        env_meta=meta,
+        tier=tier,
+        render=True,
+        max_steps=steps,
+    )
 
 
 def _next(answers: IO[bytes], env_id: str) -> CheckResult:

@@ -3,6 +3,7 @@ undefended."""
 
 from __future__ import annotations
 
+import asyncio
 import base64
 import json
 import os
@@ -92,12 +93,14 @@ def serve(listener: socket.socket) -> None:
             connection.sendall(b"hello")
 
 
-def probe(slots: Slots, name: str, parameters: dict[str, Any], **options: Any) -> EpisodeOutcome:
+def probing(name: str, parameters: Any, source: str = PROBE) -> dict[str, str | bytes]:
+    """The files of a policy that tries an attack of the corpus."""
     attack = (POLICIES / f"{name}.py").read_text()
-    options = {"limits": PATIENT} | options
-    return slots.play(
-        {"policy.py": PROBE, "attack.py": attack, "target.json": json.dumps(parameters)}, **options
-    )
+    return {"policy.py": source, "attack.py": attack, "target.json": json.dumps(parameters)}
+
+
+def probe(slots: Slots, name: str, parameters: dict[str, Any], **options: Any) -> EpisodeOutcome:
+    return slots.play(probing(name, parameters), **{"limits": PATIENT} | options)
 
 
 def attempts(outcome: EpisodeOutcome) -> dict[str, list[str]]:
@@ -248,12 +251,8 @@ def test_the_cases_seed_is_nowhere_in_the_policys_process(slots: Slots) -> None:
     assert found == {"held": ["in an object", "in random's state", "in numpy's state"], "THROUGH": []}
     # The search does find what is there: the same policy, given the number.
     source = PROBE.replace("import attack", f"import attack\nGIVEN = [{SEED}]")
-    files: dict[str, str | bytes] = {
-        "policy.py": source,
-        "attack.py": (POLICIES / "find_seed.py").read_text(),
-        "target.json": json.dumps(parameters),
-    }
-    assert attempts(slots.play(files, seed=SEED))["THROUGH"] == ["in an object"]
+    found = attempts(slots.play(probing("find_seed", parameters, source), seed=SEED))
+    assert found["THROUGH"] == ["in an object"]
 
 
 def test_train_and_hidden_episodes_look_the_same_to_a_policy(slots: Slots) -> None:
@@ -264,25 +263,30 @@ def test_train_and_hidden_episodes_look_the_same_to_a_policy(slots: Slots) -> No
     assert len(train) > 1000
 
 
+def printed(slots: Slots, name: str, parameters: Any, **options: Any) -> bytes:
+    """The output of a policy of the corpus that is no probe, and that nothing prevents."""
+    files: dict[str, str | bytes] = {
+        "policy.py": (POLICIES / f"{name}.py").read_text(),
+        "target.json": json.dumps(parameters),
+    }
+    outcome = slots.play(files, limits=PATIENT, **options)
+    assert outcome.failure is None, outcome.failure
+    return outcome.stdout
+
+
 @pytest.mark.parametrize("tier", ["bwrap", "none"])
 def test_names_that_a_policy_looked_for_tell_a_later_one_nothing(slots: Slots, tier: str) -> None:
     bits, tag = [random.getrandbits(1) for _ in range(400)], f"{random.getrandbits(64):x}"
-    source = (POLICIES / "names.py").read_text()
 
-    def play(slot: Any, **parameters: Any) -> EpisodeOutcome:
-        files: dict[str, str | bytes] = {
-            "policy.py": source,
-            "target.json": json.dumps({"tag": tag, **parameters}),
-        }
-        outcome = slots.play(files, slot=slot, tier=tier, limits=PATIENT)
-        assert outcome.failure is None, outcome.failure
-        return outcome
+    def play(slot: Any, **parameters: Any) -> bytes:
+        return printed(slots, "names", {"tag": tag, **parameters}, slot=slot, tier=tier)
 
     play(slots.slot(tier), role="tell", bits=bits)  # type: ignore[arg-type]
     # Undefended one folder is enough: there are many.
     walk = "/" if tier == "bwrap" else os.path.dirname(os.__file__)
-    output = play(second_slot(slots, tier), role="listen", n=len(bits), walk=walk).stdout
-    heard, machines_folders = json.loads(output)
+    heard, machines_folders = json.loads(
+        play(second_slot(slots, tier), role="listen", n=len(bits), walk=walk)
+    )
     agreeing = sum(one == bool(other) for one, other in zip(heard, bits, strict=True))
     # Guessing gets half of them, give or take ten.
     assert (agreeing > 300) == (tier == "none"), agreeing
@@ -294,32 +298,21 @@ def unpacked(text: str) -> bytes:
 
 
 def test_a_policy_finds_nothing_in_memory_of_the_policies_before_it(slots: Slots) -> None:
-    slot = slots.new("bwrap")
-    slots.run(slot.start())
-
-    def look(pages: list[int]) -> tuple[bytes, dict[str, bytes]]:
-        files: dict[str, str | bytes] = {
-            "policy.py": (POLICIES / "own_memory.py").read_text(),
-            "target.json": json.dumps(pages),
-        }
-        outcome = slots.play(files, slot=slot, limits=PATIENT)
-        assert outcome.failure is None, outcome.failure
-        digests, shown = json.loads(outcome.stdout)
+    def read(slot: Any, pages: list[int]) -> tuple[bytes, dict[str, bytes]]:
+        digests, shown = json.loads(printed(slots, "own_memory", pages, slot=slot))
         return unpacked(digests), {page: unpacked(content) for page, content in shown.items()}
 
-    try:
-        first, _ = look([])
+    with slots.running() as slot:
+        first, _ = read(slot, [])
         differing: set[int] = set()
         for status in (3, 77):
             slots.play(misbehaving(act=f"time.sleep(0.05); os._exit({status})"), slot=slot, limits=PATIENT)
-            digests, _ = look([])
+            digests, _ = read(slot, [])
             assert len(digests) == len(first) > 1000, "its memory has another size"
             differing |= {
                 k for k, (one, other) in enumerate(zip(first, digests, strict=True)) if one != other
             }
-        shown = [look(sorted(differing))[1] for _ in range(3)]
-    finally:
-        slots.run(slot.close())
+        shown = [read(slot, sorted(differing))[1] for _ in range(3)]
     words = 0
     for page in shown[0]:
         contents = [one[page] for one in shown]
@@ -375,13 +368,11 @@ def test_policies_in_parallel_slots_cannot_talk(slots: Slots, way: str) -> None:
     heard = {}
     for tier in ("bwrap", "none"):
         pair = [slots.slot(tier), second_slot(slots, tier)]
-        attack = (POLICIES / "talk.py").read_text()
         plays = []
         for slot, role in zip(pair, ("tell", "listen"), strict=True):
-            parameters = json.dumps({"role": role, "way": way})
-            folder = slots.bundle({"policy.py": PROBE, "attack.py": attack, "target.json": parameters})
+            folder = slots.bundle(probing("talk", {"role": role, "way": way}))
             plays.append(slot.play(make_job(tier=tier, limits=PATIENT), folder, lambda episodes, steps: None))
-        (_,), (listener,) = slots.run(both(plays[0], plays[1]))
+        (_,), (listener,) = slots.run(both(*plays))
         heard[tier] = attempts(listener)["THROUGH"] != []
     assert heard == {"bwrap": False, "none": True}
 
@@ -395,10 +386,8 @@ def second_slot(slots: Slots, tier: str) -> Any:
     return found[tier]
 
 
-async def both(one: Any, two: Any) -> Any:
-    import asyncio
-
-    return await asyncio.gather(one, two)
+async def both(*plays: Any) -> Any:
+    return await asyncio.gather(*plays)
 
 
 def test_the_documented_table_is_the_corpus() -> None:
@@ -417,11 +406,9 @@ def test_a_bundle_of_thousands_of_files_is_played(slots: Slots) -> None:
     "decoy", ["policy/__init__.py", f"policy{EXTENSION_SUFFIXES[0]}", f"policy{EXTENSION_SUFFIXES[-1]}"]
 )
 def test_policy_py_is_played_whatever_else_has_its_name(slots: Slots, decoy: str) -> None:
-    helper = "import policy\nprint(policy.__file__[-9:], policy.MINE)"
-    source = f"MINE = 1\nimport helper\n{HONEST}"
     files: dict[str, str | bytes] = {
-        "policy.py": source,
-        "helper.py": helper,
+        "policy.py": f"MINE = 1\nimport helper\n{HONEST}",
+        "helper.py": "import policy\nprint(policy.__file__[-9:], policy.MINE)",
         decoy: "print('a decoy is played')",
     }
     outcome = slots.play(files)

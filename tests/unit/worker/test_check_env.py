@@ -137,34 +137,33 @@ def _command_line(process: Path) -> bytes:
         return b""
 
 
-def test_an_environment_may_wait_for_the_processor_as_long_as_it_must(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    now, used = [0.0], [0.0]
-    monkeypatch.setattr(conformance, "_processor_s", lambda pid: used[0])
-    monkeypatch.setattr(time, "monotonic", lambda: now[0])
-    limit = conformance._Limit(1)
-    # A tenth of a processor, for almost an hour.
-    for _ in range(299):
-        now[0] += 10.0
-        used[0] += 1.0
-        assert limit.passed() == ""
-    used[0] += 2.0
-    assert "processor time" in limit.passed()
-
-
-def test_an_environment_that_only_polls_ends_within_an_hour(monkeypatch: pytest.MonkeyPatch) -> None:
-    now, used = [0.0], [0.0]
-    monkeypatch.setattr(conformance, "_processor_s", lambda pid: used[0])
-    monkeypatch.setattr(time, "monotonic", lambda: now[0])
-    limit = conformance._Limit(1)
-    for _ in range(3600):
-        now[0] += 1.0
+@pytest.mark.parametrize(
+    ("turns", "passes_s", "uses_s", "then", "told"),
+    [
+        # A tenth of a processor, for almost an hour.
+        (299, 10.0, 1.0, (0.0, 2.0), "processor time"),
         # As much as `while True: time.sleep(0.01)` uses.
-        used[0] += 0.01
+        (3600, 1.0, 0.01, (1.0, 0.0), "not done within 3600 s"),
+    ],
+    ids=["waits for the processor", "only polls"],
+)
+def test_an_environment_has_an_hour_of_which_waiting_costs_little(
+    monkeypatch: pytest.MonkeyPatch,
+    turns: int,
+    passes_s: float,
+    uses_s: float,
+    then: tuple[float, float],
+    told: str,
+) -> None:
+    now = used = 0.0
+    monkeypatch.setattr(conformance, "_processor_s", lambda pid: used)
+    monkeypatch.setattr(time, "monotonic", lambda: now)
+    limit = conformance._Limit(1)
+    for _ in range(turns):
+        now, used = now + passes_s, used + uses_s
         assert limit.passed() == ""
-    now[0] += 1.0
-    assert "not done within 3600 s" in limit.passed()
+    now, used = now + then[0], used + then[1]
+    assert told in limit.passed()
 
 
 def test_a_killed_check_leaves_no_environment() -> None:

@@ -147,9 +147,9 @@ class Player:
                 films += film_of
                 progress.episodes_done += 1
                 if failure is not None and _verdict_of_submit(job, job.episodes[k], failure):
-                    none = {"episode_return": 0.0, "length": 0, "terminated": False, "truncated": False}
+                    none: dict[str, Any] = {"length": 0, "terminated": False, "truncated": False}
                     others = (
-                        EpisodeOutcome(index=each.index, **none, failure=failure)
+                        EpisodeOutcome(index=each.index, episode_return=0.0, **none, failure=failure)
                         for each in job.episodes[k + 1 :]
                     )
                     finished = (messages.Finished(outcome=_brief(each, _share(job))) for each in others)

@@ -46,9 +46,11 @@ def scratch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     folder.mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(folder))
     monkeypatch.setattr(chromium, "START_S", 2.0)
-    monkeypatch.setattr(page, "_shared", None)
+    page.shared().lose()
+    page.shared.cache_clear()
     yield folder
     monkeypatch.undo()
+    page.shared.cache_clear()
     chromium.program.cache_clear()
 
 

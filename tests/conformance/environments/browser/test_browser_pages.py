@@ -32,6 +32,24 @@ def address(folder: Path, script: str, *, body: str = "", name: str = "attack.ht
     return Address(root=folder, path=name, width=500, height=320)
 
 
+def guarded(browser: Page, folder: Path, script: str = "window.here = 1", *, body: str = "") -> str:
+    """The address of a document with this script, opened in a page that may not be left."""
+    browser.open(address(folder, script, body=body), "1")
+    browser.run("__evopolicy.clock.guarded = true")
+    return str(browser.run("location.href"))
+
+
+def pages_of(browser: Page) -> list[str]:
+    """Addresses of all windows of the page's context."""
+    targets = browser.browser.devtools.call("Target.getTargets", timeout_s=5.0)["targetInfos"]
+    return [
+        one["url"]
+        for one in targets
+        if one["type"] in ("page", "service_worker", "shared_worker")
+        and one["browserContextId"] == browser._context
+    ]
+
+
 class Listener:
     """A server of this machine that notes who asks it."""
 
@@ -190,14 +208,8 @@ def test_there_is_one_window_and_nobody_to_ask(browser: Page, tmp_path: Path) ->
       window.answers = [alert("stop"), confirm("go on?"), prompt("who?"), window.open("about:blank"), print()];
       window.onbeforeunload = () => "stay";
     """
-    browser.open(
-        address(
-            tmp_path,
-            script,
-            body='<a id="new" href="attack.html" target="_blank" style="font-size:60px">new</a>',
-        ),
-        "1",
-    )
+    body = '<a id="new" href="attack.html" target="_blank" style="font-size:60px">new</a>'
+    browser.open(address(tmp_path, script, body=body), "1")
     assert browser.run("window.answers") == [None, False, None, None, None]
     browser.mouse(
         ("mouseMoved", 30, 40, "left", 0),
@@ -205,9 +217,7 @@ def test_there_is_one_window_and_nobody_to_ask(browser: Page, tmp_path: Path) ->
         ("mouseReleased", 30, 40, "left", 1),
     )
     browser.run("new Promise((done) => done())")
-    targets = browser.browser.devtools.call("Target.getTargets", timeout_s=5.0)["targetInfos"]
-    pages = [one for one in targets if one["type"] == "page" and one["browserContextId"] == browser._context]
-    assert len(pages) == 1
+    assert len(pages_of(browser)) == 1
 
 
 @pytest.mark.parametrize(
@@ -222,23 +232,11 @@ def test_there_is_one_window_and_nobody_to_ask(browser: Page, tmp_path: Path) ->
 )
 def test_a_page_cannot_be_left_and_says_so(browser: Page, tmp_path: Path, script: str) -> None:
     body = '<form action="attack.html"><input name="a"></form><a href="attack.html?b">b</a>'
-    browser.open(address(tmp_path, "window.here = 1", body=body), "1")
-    browser.run("__evopolicy.clock.guarded = true")
+    guarded(browser, tmp_path, body=body)
     browser.run(f"(() => {{ {script} }})()")
     browser.run("__evopolicy.advance(200)")
     assert browser.run("window.here") == 1
     assert browser.run("__evopolicy.clock.left") != ""
-
-
-def pages_of(browser: Page) -> list[str]:
-    """Addresses of all windows of the page's context."""
-    targets = browser.browser.devtools.call("Target.getTargets", timeout_s=5.0)["targetInfos"]
-    return [
-        one["url"]
-        for one in targets
-        if one["type"] in ("page", "service_worker", "shared_worker")
-        and one["browserContextId"] == browser._context
-    ]
 
 
 @pytest.mark.parametrize(
@@ -256,9 +254,7 @@ def pages_of(browser: Page) -> list[str]:
 )
 def test_no_click_on_a_link_leads_elsewhere_or_saves_a_file(browser: Page, tmp_path: Path, link: str) -> None:
     body = f'<a {link} style="display:block; width:200px; height:100px">there</a>'
-    browser.open(address(tmp_path, "window.here = 1", body=body), "1")
-    browser.run("__evopolicy.clock.guarded = true")
-    where = browser.run("location.href")
+    where = guarded(browser, tmp_path, body=body)
     for button, modifiers in (("left", 0), ("left", CONTROL), ("left", SHIFT), ("left", ALT), ("middle", 0)):
         for kind in ("mouseMoved", "mousePressed", "mouseReleased"):
             browser.mouse((kind, 60, 50, button, 1), modifiers=modifiers)
@@ -271,9 +267,7 @@ def test_no_click_on_a_link_leads_elsewhere_or_saves_a_file(browser: Page, tmp_p
 
 
 def test_keys_of_a_browser_s_own_do_nothing(browser: Page, tmp_path: Path) -> None:
-    browser.open(address(tmp_path, "window.here = 1"), "1")
-    browser.run("__evopolicy.clock.guarded = true")
-    where = browser.run("location.href")
+    where = guarded(browser, tmp_path)
     for name in ("Control+t", "Control+n", "Control+Shift+n", "Control+o", "Control+s", "Control+p", "Control+u",
                  "Control+w", "Control+r", "Control+l", "Control+Shift+i", "Alt+ArrowLeft", "F5", "F11", "F12"):  # fmt: skip  # noqa: E501
         found = combined(name)
@@ -304,9 +298,7 @@ def test_no_frame_opens_a_window_or_leaves_a_worker(browser: Page, tmp_path: Pat
       document.body.append(form);
       HTMLFormElement.prototype.requestSubmit.call(form);
     """
-    browser.open(address(tmp_path, ""), "1")
-    browser.run("__evopolicy.clock.guarded = true")
-    where = browser.run("location.href")
+    where = guarded(browser, tmp_path, "")
     browser.run(f"(() => {{ {script} }})()")
     browser.run("__evopolicy.advance(200)")
     time.sleep(0.2)
@@ -315,8 +307,7 @@ def test_no_frame_opens_a_window_or_leaves_a_worker(browser: Page, tmp_path: Pat
 
 
 def test_a_place_within_a_page_is_no_leaving(browser: Page, tmp_path: Path) -> None:
-    browser.open(address(tmp_path, "window.here = 1", body='<a id="a" href="#there">a</a>'), "1")
-    browser.run("__evopolicy.clock.guarded = true")
+    guarded(browser, tmp_path, body='<a id="a" href="#there">a</a>')
     browser.run("document.links[0].click()")
     browser.run("history.pushState(null, '', '?x')")
     assert browser.run("[location.hash, window.here, __evopolicy.clock.left]") == ["", 1, ""]

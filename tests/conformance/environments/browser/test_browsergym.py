@@ -259,28 +259,17 @@ def test_every_call_can_be_made(warm: Warm) -> None:
     environment = warm("browsergym/miniwob.enter-text")
     obs = environment.reset(Case(seed=1))
     field = bid(nodes(obs, "textbox")[0])
-    values = {
-        "bid": field,
-        "from_bid": field,
-        "to_bid": field,
-        "key": "a",
-        "key_comb": "Control+a",
-        "value": "b",
-        "text": "c",
-    }
+    values = {"key": "a", "key_comb": "Control+a", "value": "b", "text": "c"}
+    values |= dict.fromkeys(("bid", "from_bid", "to_bid"), field)
     skipped = {"report_infeasible", "select_option", "check", "uncheck"}
-    for name, arguments in SIGNATURES.items():
-        if name not in skipped:
-            given = {
-                each: values.get(each, 50)
-                for each, parameter in arguments.items()
-                if each in values or not isinstance(parameter[0], str)
-            }
-            given = {each: value for each, value in given.items() if each not in ("button", "modifiers")}
-            step = environment.step(
-                f"{name}({', '.join(f'{key}={value!r}' for key, value in given.items())})"
-            )
-            assert step.obs["last_action_error"] == "", name
+    for name in SIGNATURES.keys() - skipped:
+        given = [
+            f"{each}={values.get(each, 50)!r}"
+            for each, parameter in SIGNATURES[name].items()
+            if each in values or (each not in ("button", "modifiers") and not isinstance(parameter[0], str))
+        ]
+        step = environment.step(f"{name}({', '.join(given)})")
+        assert step.obs["last_action_error"] == "", name
     step = environment.step("report_infeasible('no')")
     assert (step.reward, step.terminated) == (0.0, True)
 

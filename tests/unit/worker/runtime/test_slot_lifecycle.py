@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 from slots import HONEST, STUCK, Slots, begun, family, make_job, pid_of, runs
+from waiting import wait_until
 
 from evopolicy_common.errors import SandboxError, SlotDiedError, WorkerError
 from evopolicy_common.messages.episode import EpisodeOutcome
@@ -53,13 +54,8 @@ def test_progress_is_reported_while_a_job_runs(slots: Slots) -> None:
     reports: list[tuple[int, int]] = []
     policy = HONEST.replace("return [", "import time; time.sleep(0.01); return [")
     slot = slots.slot()
-    slots.run(
-        slot.play(
-            make_job(n=2, policy_scope="submit"),
-            slots.bundle(policy),
-            lambda *progress: reports.append(progress),
-        )
-    )
+    job = make_job(n=2, policy_scope="submit")
+    slots.run(slot.play(job, slots.bundle(policy), lambda *progress: reports.append(progress)))
     assert reports == sorted(reports)
     assert any(0 < steps < 120 for _, steps in reports)
     assert any(done == 1 for done, _ in reports)
@@ -93,12 +89,7 @@ def test_a_closed_slot_leaves_no_process_and_no_file(slots: Slots) -> None:
     assert len(members) > 3
     slots.run(slot.close())
     slots.run(slot.close())
-    for _ in range(200):
-        left = [pid for pid in members if runs(pid)]
-        if not left:
-            break
-        slots.run(asyncio.sleep(0.02))
-    assert not left
+    wait_until(lambda: not any(map(runs, members)))
     assert not slot._scratch.exists()
 
 
@@ -130,14 +121,11 @@ def test_a_start_that_is_cancelled_leaves_neither_half_of_bubblewrap(
 
     slots.run(cancelled())
     second = int(pid_file.read_text())
-    for _ in range(200):
-        if not runs(second):
-            break
-        slots.run(asyncio.sleep(0.02))
-    still_runs = runs(second)
-    if still_runs:
+    try:
+        wait_until(lambda: not runs(second))
+    except AssertionError:
         os.kill(second, signal.SIGKILL)
-    assert not still_runs
+        raise
 
 
 def test_without_an_own_file_system_the_policys_folder_is_removed(slots: Slots) -> None:

@@ -200,7 +200,7 @@ class Page:
         number of clicks. `modifiers`: the keys held meanwhile. A press on a scrollbar is left out, unless `resting`,
         where there is none."""
         # Whole pixels, as the page is told: from parts of one the browser selects other characters from time to time.
-        events = tuple((kind, math.floor(x), math.floor(y), *rest) for kind, x, y, *rest in events)
+        events = tuple((kind, math.floor(x), math.floor(y), button, n) for kind, x, y, button, n in events)
         pressed = dict.fromkeys((x, y) for kind, x, y, _, _ in events if kind == PRESS and not resting)
         # Asked before the first event: to wait for a mouse that moves is to wait for the next frame.
         bars = [place for place in pressed if self.run("__evopolicy.bar({}, {})".format(*place))]

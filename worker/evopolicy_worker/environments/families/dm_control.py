@@ -137,8 +137,8 @@ class _Task(Adapted):
             model = self._physics.model.ptr
             # Without a graphics card, shadows take most of a frame's time.
             model.vis.quality.shadowsize = 0
-            camera, size = 0 if model.ncam else None, {"width": _WIDTH, "height": _HEIGHT}
-            self._renderer = MujocoRenderer(model, self._physics.data.ptr, **size, camera_id=camera)
+            camera, data = 0 if model.ncam else None, self._physics.data.ptr
+            self._renderer = MujocoRenderer(model, data, width=_WIDTH, height=_HEIGHT, camera_id=camera)
         return self._renderer.render("rgb_array")
 
     def close(self) -> None:

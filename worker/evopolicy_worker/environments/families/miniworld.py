@@ -71,7 +71,7 @@ class MiniWorldFamily(GymnasiumFamily):
         _root().switch_to()
         # The window for people takes sixty megabytes even when it is not shown.
         width, height = _PICTURE_FOR_PEOPLE if render else (1, 1)
-        mode = {
+        mode: dict[str, Any] = {
             "render_mode": "rgb_array" if render else None,
             "window_width": width,
             "window_height": height,
