@@ -127,15 +127,15 @@ def test_parts_of_an_observation_are_arrays_of_their_own_over_many_blocks(
 
 
 def test_an_archive_is_whole_and_the_same_every_time() -> None:
-    def file() -> bytes:
+    def archive() -> bytes:
         writer = NpzWriter()
         for t in range(30):
             writer.add("a/b", np.full((1, 9, 9), t, dtype=np.int16))
             writer.add("text", [f"ä{t}"])
         return writer.finish()
 
-    assert file() == file()
-    assert zipfile.ZipFile(io.BytesIO(file())).testzip() is None
+    assert archive() == archive()
+    assert zipfile.ZipFile(io.BytesIO(archive())).testzip() is None
 
 
 @given(st.binary(max_size=50), st.binary(max_size=300))
@@ -172,25 +172,6 @@ def row(t: int, reward: str = "0.5") -> bytes:
     )
 
 
-@pytest.mark.parametrize(
-    "rows",
-    [
-        row(0) + row(2) + row(1),
-        row(0) + row(1) + row(1),
-        row(1) + row(2) + row(3),
-        row(0) + row(1) + row(2, "5e-1x"),
-        row(0) + row(1) + row(2, '"0.5"'),
-        row(0) + row(1) + row(2, "null"),
-        row(0) + row(1) + row(2) + b"{}\n",
-        row(0) + row(1) + b"\n",
-    ],
-)
-def test_rows_that_are_not_the_declared_steps_are_refused(rows: bytes) -> None:
-    file = {"name": ROWS, "size": len(rows), "packed": "zstd"}
-    with pytest.raises(ProtocolError):
-        checked_files(container([(file, zstandard.ZstdCompressor().compress(rows))]), 3, 1.5)
-
-
 @given(st.integers(0, 400), st.binary(min_size=1, max_size=3))
 def test_damaged_bytes_are_an_error_of_the_protocol(at: int, wrong: bytes) -> None:
     whole = episode()
@@ -205,27 +186,46 @@ def test_damaged_bytes_are_an_error_of_the_protocol(at: int, wrong: bytes) -> No
             pass
 
 
-def container(files: list[tuple[dict[str, Any], bytes]], n: int = 3) -> bytes:
-    header = {"observations": "arrays", "n": n, "files": [header_entry for header_entry, _ in files]}
-    parts = [msgspec.msgpack.encode(header), recorded(Recorder("actions"), [(None, 0, 0.5)] * n)]
+File = tuple[dict[str, Any], bytes]
+
+
+def file(data: bytes, name: str = ROWS, packed: str = "as it is", size: int | None = None) -> File:
+    """A file of a container, which may claim another size."""
+    claimed = len(data) if size is None else size
+    data = zstandard.ZstdCompressor().compress(data) if packed == "zstd" else data
+    return {"name": name, "size": claimed, "packed": packed}, data
+
+
+def container(*files: File) -> bytes:
+    """An episode of three steps with these files."""
+    header = {"observations": "arrays", "n": 3, "files": [entry for entry, _ in files]}
+    parts = [msgspec.msgpack.encode(header), recorded(Recorder("actions"), [(None, 0, 0.5)] * 3)]
     parts += [data for _, data in files]
     return rendered.MAGIC + b"".join(len(part).to_bytes(4, "little") + part for part in parts)
 
 
-@pytest.mark.parametrize("size", [10, 1 << 40, -1, 1 << 27])
-def test_a_bomb_is_refused_before_it_is_unpacked(size: int) -> None:
-    bomb = zstandard.ZstdCompressor().compress(bytes(64 << 20))
+@pytest.mark.parametrize(
+    "files",
+    [
+        # Not the declared steps.
+        [file(row(0) + row(2) + row(1), packed="zstd")],
+        [file(row(0) + row(1) + row(1), packed="zstd")],
+        [file(row(1) + row(2) + row(3), packed="zstd")],
+        [file(row(0) + row(1) + row(2, "5e-1x"), packed="zstd")],
+        [file(row(0) + row(1) + row(2, '"0.5"'), packed="zstd")],
+        [file(row(0) + row(1) + row(2, "null"), packed="zstd")],
+        [file(row(0) + row(1) + row(2) + b"{}\n", packed="zstd")],
+        [file(row(0) + row(1) + b"\n", packed="zstd")],
+        # Bombs, which are not unpacked.
+        *([file(bytes(16 << 20), packed="zstd", size=size)] for size in (10, 1 << 40, -1, 1 << 27)),
+        # Not the files of feedback.
+        [file(b"x", "../policy.py")],
+        [file(b"x"), file(b"x")],
+    ],
+)
+def test_a_container_of_other_files_is_refused(files: list[File]) -> None:
     with pytest.raises(ProtocolError):
-        checked_files(container([({"name": ROWS, "size": size, "packed": "zstd"}, bomb)]), 3, 1.5)
-
-
-def test_only_feedback_files_come_out_of_a_container() -> None:
-    file = {"name": "../policy.py", "size": 1, "packed": "as it is"}
-    with pytest.raises(ProtocolError):
-        checked_files(container([(file, b"x")]), 3, 1.5)
-    twice = ({"name": ROWS, "size": 1, "packed": "as it is"}, b"x")
-    with pytest.raises(ProtocolError):
-        checked_files(container([twice, twice]), 3, 1.5)
+        checked_files(container(*files), 3, 1.5)
 
 
 def test_an_archive_that_unpacks_to_more_than_an_episode_is_refused() -> None:
@@ -236,18 +236,10 @@ def test_an_archive_that_unpacks_to_more_than_an_episode_is_refused() -> None:
     data = out.getvalue()
     member = (1000).to_bytes(4, "little")
     lying = data.replace(member, (0xFFFFFFFF).to_bytes(4, "little"))
-    rows = zstandard.ZstdCompressor().compress(decode(episode()).files[ROWS])
-    size = len(decode(episode()).files[ROWS])
-    files = [({"name": ROWS, "size": size, "packed": "zstd"}, rows)]
-    assert OBSERVATIONS in checked_files(
-        container([*files, ({"name": OBSERVATIONS, "size": len(data), "packed": "as it is"}, data)]), 3, 1.5
-    )
+    rows = file(decode(episode()).files[ROWS], packed="zstd")
+    assert OBSERVATIONS in checked_files(container(rows, file(data, OBSERVATIONS)), 3, 1.5)
     with pytest.raises(ProtocolError):
-        checked_files(
-            container([*files, ({"name": OBSERVATIONS, "size": len(lying), "packed": "as it is"}, lying)]),
-            3,
-            1.5,
-        )
+        checked_files(container(rows, file(lying, OBSERVATIONS)), 3, 1.5)
 
 
 @pytest.mark.parametrize("storage", ["inline", "npz"])

@@ -63,6 +63,16 @@ async def stopped(
     return await asyncio.wait_for(task, 60)
 
 
+def begin(slots: Slots, slot: Slot, job: Job, source: str, steps: int, episodes: int = 0) -> Job:
+    """The job as it goes on after a stop."""
+    assert slots.run(stopped(slots, slot, job, source, steps, episodes)) == ()
+    return going_on(job, slot)
+
+
+def end(slots: Slots, slot: Slot, job: Job, source: str) -> tuple[EpisodeOutcome, ...]:
+    return slots.run(slot.play(job, slots.bundle(source), lambda *progress: None))
+
+
 def actions(outcome: EpisodeOutcome) -> list[float]:
     return [float(row.action[0]) for row in rows(outcome)]
 
@@ -74,10 +84,9 @@ def test_a_policy_that_uses_the_clock_draws_once_despite_stops(slots: Slots, tie
     thrown: list[list[float]] = []
     for _ in range(4):
         # A stop that comes before what stands is played again takes nothing away from it.
-        assert slots.run(stopped(slots, slot, job, SLOW, 12)) == ()
-        job = going_on(job, slot)
+        job = begin(slots, slot, job, SLOW, 12)
         thrown.append(prefix(job))
-    (outcome,) = slots.run(slot.play(job, slots.bundle(SLOW), lambda *progress: None))
+    (outcome,) = end(slots, slot, job, SLOW)
     assert outcome.failure is None
     assert len(thrown[0]) >= 12
     for shorter, longer in itertools.pairwise([*thrown, actions(outcome)]):
@@ -120,14 +129,12 @@ def test_a_failure_stands_and_so_do_the_episodes_before_it(slots: Slots) -> None
     fails = f"if self.e == 1 and self.n == 5 and time.time() < {until}: raise ValueError('unlucky')"
     source = SLOW.replace("time.sleep", f"{fails}\n        time.sleep")
     slot = slots.slot()
-    job = hidden(n=3, policy_scope="submit")
-    assert slots.run(stopped(slots, slot, job, source, 70, episodes=1)) == ()
-    job = going_on(job, slot)
+    job = begin(slots, slot, hidden(n=3, policy_scope="submit"), source, 70, episodes=1)
     known = begun.unpack(job)
     assert known[0].failure is not None
     # Now it would not fail any more.
     lucky = source.replace(str(until), "0")
-    outcomes = slots.run(slot.play(job, slots.bundle(lucky), lambda *progress: None))
+    outcomes = end(slots, slot, job, lucky)
     assert outcomes[0].failure is not None
     assert (outcomes[0].failure.category, outcomes[0].failure.step_index) == ("act_error", 4)
     assert actions(outcomes[0])[:4] == prefix(job, 0)
@@ -137,12 +144,10 @@ def test_a_failure_stands_and_so_do_the_episodes_before_it(slots: Slots) -> None
 
 def test_a_policy_that_fails_while_its_actions_are_played_again_keeps_them(slots: Slots) -> None:
     slot = slots.slot()
-    job = hidden()
-    assert slots.run(stopped(slots, slot, job, SLOW, 10)) == ()
-    job = going_on(job, slot)
+    job = begin(slots, slot, hidden(), SLOW, 10)
     stands = prefix(job)
     fails = SLOW.replace("self.n += 1", "raise ValueError('I know what comes')")
-    (outcome,) = slots.run(slot.play(job, slots.bundle(fails), lambda *progress: None))
+    (outcome,) = end(slots, slot, job, fails)
     assert outcome.failure is not None
     assert actions(outcome)[: len(stands)] == stands
     # What follows are the random actions of any policy that fails.
@@ -154,9 +159,8 @@ def test_a_policy_that_fails_while_its_actions_are_played_again_keeps_them(slots
 def test_an_honest_policy_comes_to_the_same_when_it_is_stopped(slots: Slots) -> None:
     source = HONEST.replace("return [", "import time; time.sleep(0.03); return [")
     slot = slots.slot()
-    job = hidden()
-    assert slots.run(stopped(slots, slot, job, source, 10)) == ()
-    (outcome,) = slots.run(slot.play(going_on(job, slot), slots.bundle(source), lambda *progress: None))
+    job = begin(slots, slot, hidden(), source, 10)
+    (outcome,) = end(slots, slot, job, source)
     (whole,) = slots.play_all(HONEST, record="actions", limits=PATIENT)
     assert outcome.trajectory == whole.trajectory
     assert outcome.episode_return == whole.episode_return
@@ -183,7 +187,7 @@ def test_a_failure_by_a_limit_is_reported_as_one(slots: Slots) -> None:
     source = CLOCKED.replace("AHEAD", "time.sleep(9.0 if self.e == 1 and self.n == 3 else 0.03)")
     slot = slots.slot()
     job = hidden(n=2, policy_scope="submit", limits=limits)
-    assert slots.run(stopped(slots, slot, job, source, 65, episodes=1)) == ()
+    begin(slots, slot, job, source, 65, episodes=1)
     back = slot.begun
     assert back is not None
     assert back.limit_verdict
@@ -193,13 +197,8 @@ def test_the_file_of_an_episode_holds_actions_of_any_form_and_length(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     log, episode = begun.Log(tmp_path), begun.Begun([begun.Returned(3, 3)])
-    values = [
-        np.arange(3, dtype=np.int8),
-        {"a": (np.float32(0.5), "x")},
-        "\ud800",
-        2**70,
-        *[[0.1] * 999] * 99,
-    ]
+    odd = [np.arange(3, dtype=np.int8), {"a": (np.float32(0.5), "x")}, "\ud800", 2**70]
+    values = [*odd, *[[0.1] * 999] * 99]
     log.begins("job", 2, episode)
     for value in values:
         episode.take(begun.Returned(value, value))
@@ -227,14 +226,9 @@ def test_the_file_of_an_episode_holds_actions_of_any_form_and_length(
 
 @pytest.mark.parametrize(
     "data",
-    [
-        b"\xc1 none of it",
-        begun_by(b"no recording"),
-        begun_by(b""),
-        begun_by(b"", b"\xc1"),
-    ],
+    [b"\xc1 none of it", begun_by(b"no recording"), begun_by(b""), begun_by(b"", b"\xc1")],
 )
 def test_what_cannot_be_read_is_begun_anew(slots: Slots, data: bytes) -> None:
     job = hidden(begun=BlobRef(digest=digest_of(data), size=len(data), inline=data))
-    (outcome,) = slots.run(slots.slot().play(job, slots.bundle(HONEST), lambda *progress: None))
+    (outcome,) = end(slots, slots.slot(), job, HONEST)
     assert outcome.failure is None

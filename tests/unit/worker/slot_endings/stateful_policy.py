@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import asyncio
+import os
+import signal
+from collections.abc import Callable
 from pathlib import Path
 
 import msgspec
-from slots import QUICK
+from slots import QUICK, Slots, begun, family, pid_of
 
 from evopolicy_common.messages.episode import EpisodeOutcome
 from evopolicy_worker.slots.slot import Slot
@@ -56,6 +59,21 @@ async def in_its_pause(slot: Slot, pid: int) -> None:
         await asyncio.sleep(0.05)
         now = used()
         same, before = (same + 1 if now == before else 0), now
+
+
+async def struck(
+    slot: Slot, slots: Slots, strike: Callable[[list[int]], object], source: str = "", **options: object
+) -> tuple[EpisodeOutcome, ...]:
+    """The outcomes of a job whose slot's processes are struck in its policy's pause."""
+    task = await begun(slot, slots, source or stateful(), **{"limits": PATIENT, **options})
+    pids = family(pid_of(slot))
+    await in_its_pause(slot, pids[-1])
+    strike(pids)
+    return await asyncio.wait_for(task, 100)
+
+
+def kill_policy(pids: list[int]) -> None:
+    os.kill(pids[-1], signal.SIGKILL)
 
 
 def place_of_env(pids: list[int]) -> int:

@@ -2,16 +2,10 @@
 
 from __future__ import annotations
 
-import asyncio
-import os
-import signal
-
 import msgspec
 import pytest
-from slots import HONEST, QUICK, Slots, acting, begun, family, pid_of, rows
-from stateful_policy import PATIENT, in_its_pause
-
-from evopolicy_common.messages.episode import EpisodeOutcome
+from slots import HONEST, QUICK, Slots, acting, pid_of, rows
+from stateful_policy import kill_policy, struck
 
 SELF_MADE = {
     "abort": "os.abort()",
@@ -130,16 +124,7 @@ def test_what_a_policy_had_returned_stands_when_it_is_started_again(slots: Slots
     luck = "luck = (time.time_ns() // 1000 % 1_000_000) / 1e6; print(luck, flush=True); return [luck]"
     source = CLOCKED.replace("return [(time.time_ns() % 1000) / 1000]", luck)
     source = source.replace("WAY", "time.sleep(3)").replace("AT", "31")
-    slot = slots.slot()
-
-    async def work() -> tuple[EpisodeOutcome, ...]:
-        task = await begun(slot, slots, source, limits=PATIENT)
-        pid = family(pid_of(slot))[-1]
-        await in_its_pause(slot, pid)
-        os.kill(pid, signal.SIGKILL)
-        return await asyncio.wait_for(task, 60)
-
-    (outcome,) = slots.run(work())
+    (outcome,) = slots.run(struck(slots.slot(), slots, kill_policy, source))
     assert outcome.failure is None
     # What it says it threw is the second throw; what it played is the first.
     assert rows(outcome)[0].action != [float(outcome.stdout)]

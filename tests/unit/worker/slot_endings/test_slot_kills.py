@@ -10,31 +10,12 @@ import signal
 
 import pytest
 from slots import HONEST, Slots, begun, category_of, family, make_job, misbehaving, pid_of, rows
-from stateful_policy import PATIENT, essence, in_its_pause, place_of_env, stateful
+from stateful_policy import PATIENT, essence, in_its_pause, kill_policy, place_of_env, stateful, struck
 
 from evopolicy_common.errors import BrokenEnvironmentError, SandboxError, SlotDiedError, WorkerError
 from evopolicy_common.messages.episode import EpisodeOutcome, Tier
-from evopolicy_worker.slots.slot import Slot
 
 pytestmark = pytest.mark.slow
-
-
-def played(
-    slots: Slots, slot: Slot, signals: list[int], pause_s: float = 5.0, **options: object
-) -> EpisodeOutcome:
-    """One episode in which the policy's process gets these signals in its pause."""
-
-    async def work() -> tuple[EpisodeOutcome, ...]:
-        task = await begun(slot, slots, stateful(pause_s), limits=PATIENT, **options)
-        pid = family(pid_of(slot))[-1]
-        await in_its_pause(slot, pid)
-        for number in signals:
-            os.kill(pid, number)
-            await asyncio.sleep(0.1)
-        return await asyncio.wait_for(task, 100)
-
-    (outcome,) = slots.run(work())
-    return outcome
 
 
 @pytest.mark.parametrize("tier", ["bwrap", "landlock"])
@@ -42,7 +23,7 @@ def test_a_policy_killed_from_outside_restarts_unnoticed(slots: Slots, tier: str
     slot = slots.slot(tier)  # type: ignore[arg-type]
     undisturbed = slots.play(stateful(0.0), tier=tier, limits=PATIENT)
     slot._stderr.clear()
-    disturbed = played(slots, slot, [signal.SIGKILL], tier=tier)
+    (disturbed,) = slots.run(struck(slot, slots, kill_policy, tier=tier))
     assert undisturbed.failure is None
     assert essence(disturbed) == essence(undisturbed)
     assert any("a policy is started again" in line for line in slot._stderr)
@@ -54,31 +35,25 @@ def test_a_batch_systems_sigterm_to_every_process_ends_nothing(slots: Slots, tie
     slot = slots.slot(tier)  # type: ignore[arg-type]
     slot._stderr.clear()
 
-    async def work() -> tuple[EpisodeOutcome, ...]:
-        task = await begun(slot, slots, stateful(2.0), tier=tier, limits=PATIENT)
-        pids = family(pid_of(slot))
-        await in_its_pause(slot, pids[-1])
+    def strike(pids: list[int]) -> None:
         for pid in pids:
             os.kill(pid, signal.SIGTERM)
-        return await asyncio.wait_for(task, 100)
 
-    (disturbed,) = slots.run(work())
+    (disturbed,) = slots.run(struck(slot, slots, strike, stateful(2.0), tier=tier))
     assert disturbed.failure is None
     assert essence(disturbed) == essence(undisturbed)
     assert not any("started again" in line for line in slot._stderr)
 
 
 def test_where_a_policy_may_signal_itself_a_kill_is_its_own(slots: Slots) -> None:
-    outcome = played(slots, slots.slot("none"), [signal.SIGKILL], tier="none")
+    (outcome,) = slots.run(struck(slots.slot("none"), slots, kill_policy, tier="none"))
     assert category_of(outcome) == "killed"
     assert outcome.length == 60
 
 
-def test_a_killed_policy_of_several_episodes_is_played_elsewhere(
-    slots: Slots,
-) -> None:
+def test_a_killed_policy_of_several_episodes_is_played_elsewhere(slots: Slots) -> None:
     with pytest.raises(SandboxError, match="SIGKILL, and neither the policy nor a limit can have done that"):
-        played(slots, slots.slot(), [signal.SIGKILL], n=1, policy_scope="submit")
+        slots.run(struck(slots.slot(), slots, kill_policy, policy_scope="submit"))
     assert slots.play(HONEST).failure is None
 
 
@@ -112,15 +87,11 @@ def after(
     `place`: in the slot's family, counted from the environment's process.
     """
 
-    async def work(slot: Slot) -> tuple[EpisodeOutcome, ...]:
-        task = await begun(slot, slots, source or stateful(), limits=PATIENT, tier=tier, **options)
-        pids = family(pid_of(slot))
-        await in_its_pause(slot, pids[-1])
+    def strike(pids: list[int]) -> None:
         os.kill(pids[place_of_env(pids) + place], number)
-        return await asyncio.wait_for(task, 100)
 
     with slots.running(slots.new(tier)) as slot:
-        return list(slots.run(work(slot)))
+        return list(slots.run(struck(slot, slots, strike, source, tier=tier, **options)))
 
 
 # Its two bubblewraps, the two parents of the zygote's as root, the zygote; the policy is the last.
@@ -192,9 +163,7 @@ def test_an_episode_under_kills_and_stops_of_anything_is_the_same_episode(slots:
         assert essence(outcome) == essence(undisturbed)
 
 
-def test_an_idle_sandboxs_end_costs_one_retry(
-    slots: Slots,
-) -> None:
+def test_an_idle_sandboxs_end_costs_one_retry(slots: Slots) -> None:
     with slots.running() as slot:
         pids = family(pid_of(slot))
         os.kill(pids[place_of_env(pids) + 1], signal.SIGKILL)

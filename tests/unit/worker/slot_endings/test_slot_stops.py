@@ -13,7 +13,7 @@ import msgspec
 import pytest
 from machines.cgroups import limited, starved
 from slots import HONEST, QUICK, Slots, acting, begun, category_of, family, misbehaving, pid_of
-from stateful_policy import PATIENT, essence, in_its_pause, place_of_env, stateful
+from stateful_policy import PATIENT, essence, place_of_env, stateful, struck
 
 from evopolicy_common.errors import SlotDiedError
 from evopolicy_common.messages.episode import EpisodeOutcome
@@ -104,9 +104,7 @@ COMPUTES = acting(
 )
 
 
-def test_no_wall_limit_counts_time_without_a_processor(
-    slots: Slots,
-) -> None:
+def test_no_wall_limit_counts_time_without_a_processor(slots: Slots) -> None:
     slot = slots.slot()
     # Long enough to be moved in, well within what an answer may take.
     source = COMPUTES.replace("PAUSE", "1.5").replace("OTHERS", "pass").replace("MINE", "0.02")
@@ -155,17 +153,9 @@ def test_a_policy_killed_for_its_own_memory_has_failed(
     slots: Slots, eaten: int, limit: int, category: str | None
 ) -> None:
     slot = slots.slot()
-
-    async def work() -> tuple[EpisodeOutcome, ...]:
-        task = await begun(slot, slots, eats(eaten), limits=PATIENT)
-        pid = family(pid_of(slot))[-1]
-        await in_its_pause(slot, pid)
-        group.add(pid)
-        return await asyncio.wait_for(task, 60)
-
     slot._stderr.clear()
     with limited(limit) as group:
-        (outcome,) = slots.run(work())
+        (outcome,) = slots.run(struck(slot, slots, lambda pids: group.add(pids[-1]), eats(eaten)))
     assert category_of(outcome) == category
     if outcome.failure is not None:
         assert outcome.failure.limit == PATIENT.memory_bytes
