@@ -161,12 +161,8 @@ def test_an_idle_episode_is_truncated_at_the_stated_limit(env_id: str, action: A
 @pytest.mark.parametrize("env_id", IDS)
 def test_random_actions_are_those_of_the_gymnasium_space(env_id: str, warm: Warm) -> None:
     if env_id.startswith("toy/"):
-        schema = warm(env_id).description.action_space
-        assert (
-            warm(env_id).action_codec.repair(warm(env_id).action_codec.sample(np.random.default_rng(0)))[1]
-            is False
-        )
-        assert schema["type"] in ("Box", "Discrete")
+        codec = warm(env_id).action_codec
+        assert codec.repair(codec.sample(np.random.default_rng(0)))[1] is False
         return
     import gymnasium
 

@@ -90,13 +90,8 @@ def test_rows_pass_visibility_on_as_the_librarys_mask_does() -> None:
         grid = Grid(7, 7)
         for x in range(7):
             for y in range(7):
-                thing = rng.integers(6)
-                if thing == 0:
-                    grid.set(x, y, Wall())
-                elif thing == 1:
-                    grid.set(x, y, Door("red", is_open=bool(rng.integers(2))))
-                elif thing == 2:
-                    grid.set(x, y, Ball())
+                things = (Wall(), Door("red", is_open=bool(rng.integers(2))), Ball(), None, None, None)
+                grid.set(x, y, things[rng.integers(6)])
         cells: list[list[Any]] = [[grid.get(x, y) for x in range(7)] for y in range(7)]
         mask = grid.process_vis((3, 6))
         seen = 1 << 3
