@@ -25,12 +25,12 @@ from evopolicy_common.processes import proc
 from evopolicy_worker.sandbox.zygote import Child
 
 TICK_S = 0.1
-"""How often limits are looked at while a policy works, seconds; sooner when one is near."""
+"""How often limits are checked while a policy works, seconds; sooner when one is near."""
 _SHORTEST_TICK_S = 0.005
 _SLOW_S = 0.05
-"""How long a policy owes an answer before it is looked at whether it runs."""
+"""How long a policy owes an answer before the monitor checks whether it runs."""
 LATE_S = 0.5
-"""A look that comes so much later than planned means that this process was not let run, seconds."""
+"""A check that comes so much later than planned means that this process was not let run, seconds."""
 STOPPED_S = 10.0
 """Seconds after which a policy that was stopped from outside is ended and restarted."""
 STOPPED = ("T", "t")
@@ -97,14 +97,14 @@ class Watch:
         self.stopped = False
         """Whether it was ended because it stood stopped."""
         self._held = held
-        self._looked = self._next = time.monotonic()
-        # Excused seconds: in the episode; in the answer that was owed at the last look, and its start; separately, the
+        self._checked = self._next = time.monotonic()
+        # Excused seconds: in the episode; in the answer that was owed at the last check, and its start; separately, the
         # waits for a processor, which the kernel counts.
         self._excused_s = self._in_episode_s = 0.0
         self._answer = self._answer_excused_s = self._in_answer_s = 0.0
         self._episode_waited = 0.0
         self._answer_waited: float | None = None
-        # How long it has been stopped, and waiting, up to the last look.
+        # How long it has been stopped, and waiting, up to the last check.
         self._stood_s = self._waiting_s = self._cpu_s = 0.0
         self._cpu_clock = proc.clock(child.host_pid) if child.host_pid else 0
         self._count_threads = count_threads
@@ -130,7 +130,7 @@ class Watch:
         self.stderr.drain(self.child.stderr)
 
     def judge(self, now: float) -> float:
-        """Ends the policy if it passed a limit; seconds until it is worth looking again."""
+        """Ends the policy if it passed a limit; seconds until it is worth checking again."""
         self._excuse(now)
         pause_s = self._judge(now)
         self._next = now + pause_s
@@ -147,7 +147,7 @@ class Watch:
         limits = self.limits
         running, in_episode = self._used(since, now)
         if running >= self.answer_limit_s or in_episode >= limits.episode_wall_s:
-            # Answers of late may have waited, too, and it was not looked.
+            # The last answers may have waited, too, while nothing was checked.
             self._count_waits(self.cpu_s())
             running, in_episode = self._used(since, now)
         remaining_answer_s = self.answer_limit_s - running
@@ -174,15 +174,15 @@ class Watch:
         return max(_SHORTEST_TICK_S, min(TICK_S, remaining_answer_s, remaining_episode_s))
 
     def _excuse(self, now: float) -> None:
-        """Count the time from the last look on in which the policy was not let run."""
-        since, looked, self._looked = self.since, self._looked, now
+        """Count the time from the last check on in which the policy was not let run."""
+        since, last, self._checked = self.since, self._checked, now
         if self._answer != since:
             self._answer, self._answer_waited = since, None
             self._answer_excused_s = self._stood_s = self._waiting_s = self._in_answer_s = 0.0
-        owed_s = now - max(since, looked) if since else 0.0
+        owed_s = now - max(since, last) if since else 0.0
         if now - self._next > LATE_S:
             # The episode loop stood still, too, whether or not it has its answer by now.
-            self._excused_s += now - looked
+            self._excused_s += now - last
             self._answer_excused_s += owed_s
         elif owed_s and now - since > _SLOW_S:
             cpu_s, stat = self.cpu_s(), proc.stat(self.child.host_pid)

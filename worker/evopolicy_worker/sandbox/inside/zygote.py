@@ -203,9 +203,9 @@ def heap_can_grow() -> bool:
     libc.sbrk.restype = libc.mmap.restype = ctypes.c_void_p
     end, size = ctypes.c_void_p(libc.sbrk(ctypes.c_long(0))), ctypes.c_size_t(HEAP_ROOM)
     # Not by `sbrk`: taking it back could take what the C library has allocated meanwhile.
-    room = libc.mmap(end, size, 3, 0x22 | MAP_FIXED_NOREPLACE, -1, ctypes.c_long(0))
-    libc.munmap(ctypes.c_void_p(room), size)
-    return bool(room == end.value)
+    mapped = libc.mmap(end, size, 3, 0x22 | MAP_FIXED_NOREPLACE, -1, ctypes.c_long(0))
+    libc.munmap(ctypes.c_void_p(mapped), size)
+    return bool(mapped == end.value)
 
 
 def zygote(control: int, namespaces: bool, then: Callable[[int], None]) -> NoReturn:
@@ -221,10 +221,10 @@ def zygote(control: int, namespaces: bool, then: Callable[[int], None]) -> NoRet
     """
     page = unshared_page()
     how, usage = ctypes.c_void_p(page), ctypes.c_void_p(page + SIGINFO_BYTES)
-    asked, room = ctypes.create_string_buffer(2), ctypes.create_string_buffer(24)
+    asked, fds = ctypes.create_string_buffer(2), ctypes.create_string_buffer(24)
     pieces = (ctypes.c_size_t * 2)(ctypes.addressof(asked), len(asked))
-    # struct msghdr: no name, one piece, room for two descriptors, flags
-    message = (ctypes.c_size_t * 7)(0, 0, ctypes.addressof(pieces), 1, ctypes.addressof(room), len(room), 0)
+    # struct msghdr: no name, one piece, two descriptors, flags
+    message = (ctypes.c_size_t * 7)(0, 0, ctypes.addressof(pieces), 1, ctypes.addressof(fds), len(fds), 0)
     calls = ctypes.PyDLL(None)
     myself = os.pidfd_open(os.getpid())
     # The lowest numbers that are free, which descriptors that arrive get.
