@@ -1,4 +1,4 @@
-"""The replay client of the commands on finished runs: requests, outcomes with progress, and the workers' versions."""
+"""The replay client of the commands on finished runs: requests, outcomes with progress, workers' versions."""
 
 from __future__ import annotations
 
@@ -84,9 +84,9 @@ class Evaluations:
         tier: Tier = "bwrap",
         limits: ResourceLimits | None = None,
     ) -> AsyncIterator[tuple[int, EpisodeOutcome | None]]:
-        """Plays some of a list's episodes again, by recorded `actions` (trajectories, one for each index) or with the
-        policy of `bundle`. Yields each index with its outcome as it arrives, then those that have none. `run`: the
-        coordinator's id, for the policies' random seeds."""
+        """Plays some of a list's episodes again, by recorded `actions` (trajectories, one for each index) or
+        with the policy of `bundle`. Yields each index with its outcome as it arrives, then those that have none.
+        `run`: the coordinator's id, for the policies' random seeds."""
         for data in actions:
             await self.ask.upload(digest_of(data), data)
         if bundle is not None:
@@ -157,8 +157,8 @@ def unlike(then: Mapping[str, str], here: Mapping[str, str]) -> list[str]:
 
 
 def sample(sizes: Sequence[int], n: int, seed: int) -> list[tuple[int, tuple[int, ...]]]:
-    """Draws `n` episodes from lists of these sizes without replacement (all if there are fewer): the number of each
-    list that has some, and their indexes in it."""
+    """Draws `n` episodes from lists of these sizes without replacement (all if there are fewer): the number
+    of each list that has some, and their indexes in it."""
     everything = [(k, index) for k, size in enumerate(sizes) for index in range(size)]
     chosen: dict[int, list[int]] = {}
     for k, index in sorted(random.Random(seed).sample(everything, min(n, len(everything)))):

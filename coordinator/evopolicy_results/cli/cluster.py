@@ -104,7 +104,7 @@ class Where(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Playing:
-    """Evaluations of a command, with a bar of episodes on a terminal. Elsewhere it prints only why episodes wait."""
+    """Evaluations of a command, with a bar on a terminal. Elsewhere it prints only why episodes wait."""
 
     def __init__(
         self, link: transport.Link, cluster: LocalCluster | None, progress: Progress, title: str

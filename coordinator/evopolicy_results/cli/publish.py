@@ -37,7 +37,6 @@ from evopolicy_results.publish.archive import Archive
 from evopolicy_results.publish.collect import Published, Publisher, find_runs, needles_of_this_machine
 from evopolicy_results.publish.contents import Countersignature, Listed
 from evopolicy_results.publish.findings import KINDS, Checked
-from evopolicy_results.publish.policies import play_policies
 from evopolicy_results.publish.scan import scan_published
 
 FAILED, NOT_REPLAYED = 1, 3
@@ -186,7 +185,9 @@ def check(
             fail("--policy-package goes with --policies")
         noted = [_noted(each) for each in head or ()]
         drawn = random.SystemRandom().randrange(2**32) if seed is None else seed
-        play_them = functools.partial(play_policies, packages=frozenset(checked_names(policy_package)))
+        play_them = functools.partial(
+            replays.play_policies, packages=frozenset(checked_names(policy_package))
+        )
         try:
             with Archive(file) as archive:
                 checked = rules.check(archive, identity or "", noted)

@@ -55,7 +55,8 @@ def rescore(
     data: Annotated[
         Path | None,
         typer.Option(
-            help="Take the held-out cases of this folder of split files instead; with --cases, the first ones."
+            help="Take the held-out cases of this folder of split files instead; with --cases, the first"
+            " ones."
         ),
     ] = None,
     all_checkpoints: Annotated[

@@ -100,8 +100,8 @@ def verify(
             if not knows_run:
                 notes.append(
                     "this coordinator has no record of the run: actions are those of the feedback files, hidden"
-                    " episodes are not checked, policies get other seeds than they had, and edits that agree with"
-                    " each other are found only where a train episode that is played again shows them"
+                    " episodes are not checked, policies get other seeds than they had, and edits that agree"
+                    " with each other are found only where a train episode that is played again shows them"
                 )
             total = sum(len(indexes) * (1 + (policy and one.split == "train")) for one, indexes in chosen)
             playing.update(total=total)

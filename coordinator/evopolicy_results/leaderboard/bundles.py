@@ -1,4 +1,5 @@
-"""Reads published results for a leaderboard: checks each file and unpacks its runs into run directories for the report.
+"""Reads published results for a leaderboard: checks each file, unpacks its runs into run directories, and
+groups files that are one comparison.
 
 Rules that this module owns:
 - A file is untrusted. Its check comes first, and nothing is unpacked of a file that fails.
@@ -28,6 +29,7 @@ from evopolicy_results.publish.archive import Archive
 from evopolicy_results.publish.contents import Episode
 from evopolicy_results.publish.findings import Checked, PublishedRun
 from evopolicy_results.publish.scan import scan_published
+from evopolicy_results.reading.comparability import mixtures
 from evopolicy_results.reading.reader import load_runs
 from evopolicy_results.reading.records import LeftOut, Run
 
@@ -45,8 +47,8 @@ class LabRun(msgspec.Struct, frozen=True, kw_only=True):
     published: str
     """The coordinator's id."""
     episodes: tuple[tuple[Episode, tuple[float, ...]], ...]
-    """Held-out episodes of the selected checkpoint, each with the sum of its rewards so far at up to `_POINTS` steps;
-    without sums where the recording was withheld."""
+    """Held-out episodes of the selected checkpoint, each with the sum of its rewards so far at `_POINTS` steps
+    at most; without sums where the recording was withheld."""
     unrecorded: bool = False
     """Some of its episodes have no recording, so that no replay can contradict their returns."""
 
@@ -279,3 +281,52 @@ def _short(text: str) -> str:
 def _sha256(path: Path) -> str:
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+class Board(msgspec.Struct, kw_only=True):
+    """Bundles whose runs are one comparison."""
+
+    bundles: list[LabBundle]
+    apart: list[str] = []
+    """How its runs differ from those of the first board; empty for the first board."""
+    mixed: bool = False
+    """A single bundle whose own runs are no one comparison."""
+    unrecorded: bool = False
+    """Its runs have episodes without a recording."""
+
+    @property
+    def runs(self) -> list[Run]:
+        return [each.run for bundle in self.bundles for each in bundle.runs]
+
+
+def boards(bundles: Sequence[LabBundle]) -> list[Board]:
+    """The boards, the one with most runs first. A bundle joins the first board that it is comparable with. Its runs
+    with episodes that have no recording stand on boards of their own, after the others."""
+    found: list[Board] = []
+    parts = [
+        (unrecorded, msgspec.structs.replace(bundle, runs=runs))
+        for bundle in bundles
+        for unrecorded in (False, True)
+        if not bundle.refused and (runs := [one for one in bundle.runs if one.unrecorded == unrecorded])
+    ]
+    for unrecorded, bundle in sorted(parts, key=lambda part: (-len(part[1].runs), part[1].file)):
+        own = [each.run for each in bundle.runs]
+        if mixtures(own):
+            found.append(Board(bundles=[bundle], mixed=True, unrecorded=unrecorded))
+            continue
+        alike = [board for board in found if not board.mixed and board.unrecorded == unrecorded]
+        home = next((board for board in alike if not mixtures([*board.runs, *own])), None)
+        if home is None:
+            found.append(Board(bundles=[bundle], unrecorded=unrecorded))
+        else:
+            home.bundles.append(bundle)
+    found.sort(key=lambda board: (board.unrecorded, board.mixed, -len(board.runs)))
+    for board in found:
+        if board.unrecorded:
+            board.apart.append(
+                "some of their episodes have no recording, so that no replay can contradict the returns"
+            )
+        if board is not found[0]:
+            whole = board.runs if board.mixed else [*found[0].runs, *board.runs]
+            board.apart += [str(one) for one in mixtures(whole)]
+    return found

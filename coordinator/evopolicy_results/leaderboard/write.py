@@ -22,8 +22,7 @@ from markupsafe import Markup
 from evopolicy_common.errors import ConfigError
 from evopolicy_results.html import notice, section
 from evopolicy_results.html.pages import page, table_view
-from evopolicy_results.leaderboard.bundles import LabBundle, LabRun
-from evopolicy_results.leaderboard.compare import Board, boards
+from evopolicy_results.leaderboard.bundles import Board, LabBundle, LabRun, boards
 from evopolicy_results.publish.findings import KINDS
 from evopolicy_results.reading.environments import title_of
 from evopolicy_results.report import slug, write_report
@@ -213,13 +212,13 @@ def _board(board: Board, study: Study, number: int, folder: str) -> dict[str, An
 
 
 _FILES = (
-    "Each column after Left out is a check. ok: shown. open: this check cannot decide, or was not made. FAILED:"
-    " the file contradicts itself, or another file of its signer. Left out: runs that the same coordinator opened"
-    " for the same entries and that are not in the file."
+    "Each column after Left out is a check. ok: shown. open: this check cannot decide, or was not made."
+    " FAILED: the file contradicts itself, or another file of its signer. Left out: runs that the same"
+    " coordinator opened for the same entries and that are not in the file."
 )
 _RUNS = (
-    "Each run's page shows its submits, sources and their differences. Its recorded episodes are the held-out episodes"
-    " of the selected checkpoint."
+    "Each run's page shows its submits, sources and their differences. Its recorded episodes are the held-out"
+    " episodes of the selected checkpoint."
 )
 _REFUSED = "No run of these files is in a board."
 _RUN_COLUMNS = "Entry;Environment;Repeat;Held-out mean;Run;Episodes;File;Signed by"
@@ -303,8 +302,9 @@ def _checking(bundles: Sequence[LabBundle]) -> dict[str, Any]:
     texts = [
         "Take each signer's key from a place that you know to be theirs, not from this page.",
         (
-            "No check shows that recorded actions came from the policy, that a publisher did not start over with a new"
-            " journal (unless you have an earlier head of it), or what a publisher states about jails and machines."
+            "No check shows that recorded actions came from the policy, that a publisher did not start over"
+            " with a new journal (unless you have an earlier head of it), or what a publisher states about jails"
+            " and machines."
         ),
     ]
     return section("check", "Check it yourself", texts=texts, code="\n".join(lines))
@@ -318,7 +318,8 @@ def _notices(bundles: Sequence[LabBundle]) -> list[dict[str, Any]]:
     differ = len({each for bundle in shown for each in bundle.processors}) > 1
     found = (
         (
-            f"{len(unknown)} of {len(shown)} files are self-signed: nobody named their signer's key to this site.",
+            f"{len(unknown)} of {len(shown)} files are self-signed: nobody named their signer's key to this"
+            " site.",
             unknown,
         ),
         (
@@ -327,8 +328,8 @@ def _notices(bundles: Sequence[LabBundle]) -> list[dict[str, Any]]:
             not_replayed,
         ),
         (
-            "The runs were played on processors with different features, which can change numbers in their last"
-            " digits.",
+            "The runs were played on processors with different features, which can change numbers in their"
+            " last digits.",
             processors * differ,
         ),
     )

@@ -28,7 +28,8 @@ _END = struct.Struct("<4sHHHHIIH")
 _ENTRY = struct.Struct("<4sHHHHHHIIIHHHHHII")
 _Entry = namedtuple(
     "_Entry",
-    "mark made needs flags method time date crc packed length n_name n_extra n_comment part internal mode offset",
+    "mark made needs flags method time date crc packed length n_name n_extra n_comment part internal mode"
+    " offset",
 )
 _LOCAL = struct.Struct("<4sHHHHHIIIHH")
 _FILE_MODE = 0o100644

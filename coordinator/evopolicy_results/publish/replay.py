@@ -1,4 +1,4 @@
-"""Plays recorded actions of published results again, on a cluster of this machine's own.
+"""Plays recorded actions of published results again, or their policies, on a cluster of this machine's own.
 
 Rules that this module owns:
 - Nothing of the file is executed, and no limit of it is taken over: actions are data, the environments are the
@@ -6,6 +6,10 @@ Rules that this module owns:
 - The splits are those of the opening, which the commitment fixes. A run whose environment is not installed, or in other
   versions than the run tells, is not played: other versions give other numbers. Nor is one whose environment does not
   repeat episodes according to this machine; the file's own statement does not count.
+- A policy is untrusted code: it runs in the worker's sandbox, with default limits, like any agent's. It gets
+  the published arguments (`env_meta`, episode indexes) and other random seeds than in the run, which are secret.
+  Only policies that declare `deterministic = True` are played. One that fails here, or failed in the run, shows
+  nothing: limits and machines differ.
 - The packages that a run's policies import are those that its `run.json` names, and only if the operator names them
   too: names in the file alone make nothing of this machine visible or imported.
 """
@@ -23,11 +27,14 @@ import numpy as np
 from evopolicy_common import catalogue
 from evopolicy_common.errors import BrokenEnvironmentError, ConfigError, EvopolicyError, ProtocolError
 from evopolicy_common.local.cluster import local_cluster
+from evopolicy_common.messages.episode import EpisodeOutcome
 from evopolicy_common.messages.operator import DescribeEnvironment
 from evopolicy_common.processes.packages import packages_in
 from evopolicy_common.processes.scratch import scratch_folder
 from evopolicy_common.records.episodes import compare
 from evopolicy_common.records.episodes.trajectory import Trajectory
+from evopolicy_common.records.policies.bundles import Bundle
+from evopolicy_common.records.policies.declarations import declares_deterministic
 from evopolicy_common.records.splits import FILE_STEMS, SPLITS, SplitFile, cases_hash
 from evopolicy_common.wire import credentials, transport
 from evopolicy_results.evaluations import Cases, Evaluations, sample, unlike
@@ -74,8 +81,8 @@ async def replay(files: Files, checked: Checked, share: float, seed: int, slots:
                 alike = False
                 if other_cpu and rounding:
                     fault += (
-                        f", {LAST_PLACES} units in the last place at most: this machine's processor has other features"
-                        " than the run's"
+                        f", {LAST_PLACES} units in the last place at most: this machine's processor has other"
+                        " features than the run's"
                     )
                 elif other_cpu:
                     fault += "; other features of the processor do not explain this"
@@ -120,6 +127,109 @@ async def _play(evaluations: Evaluations, files: Files, part: Chosen) -> tuple[i
     return len(recorded), faults
 
 
+async def play_policies(
+    files: Files,
+    checked: Checked,
+    share: float,
+    seed: int,
+    slots: int,
+    tell: Tell,
+    packages: Collection[str] = (),
+) -> None:
+    """Plays a share of the episodes of deterministic policies, drawn by `seed`, and adds the findings to `checked`.
+
+    `packages`: those that policies may import besides numpy, where their run names it."""
+    checked.findings = [each for each in checked.findings if each.kind != "policies"]
+    declared: dict[tuple[str, int], Bundle] = {}
+    chosen: list[Chosen] = []
+    drawn = draw(checked.runs, share, seed)
+    for run in checked.runs:
+        found = {
+            (run.folder, index): bundle
+            for index, bundle in run.bundles(files)
+            if declares_deterministic({file.path: file.data for file in bundle.files})
+        }
+        declared |= found
+        others = sum(submit.bundle is not None for submit in run.result.submits) - len(found)
+        if others:
+            text = f"{others} policies do not declare themselves deterministic, or were withheld: not played"
+            checked.add("policies", "open", text, run.opening.run)
+        own = [each for each in drawn if (each.run.folder, each.group.submit_index) in found]
+        if found and not own:
+            text = "no episode of its deterministic policies was drawn"
+            checked.add("policies", "open", text, run.opening.run)
+        if run.opening.settings.policy_scope == "submit":
+            # One policy plays the whole list, of which no part can be played alone.
+            own = [
+                msgspec.structs.replace(each, indexes=tuple(range(len(each.cases.env_instances))))
+                for each in own
+            ]
+        chosen += own
+
+    async def play_run(
+        evaluations: Evaluations, run: PublishedRun, parts: Sequence[Chosen], other_cpu: bool
+    ) -> None:
+        same = unknown = 0
+        differ: list[str] = []
+        for part in parts:
+            settings, group = run.opening.settings, part.group
+            recordings = dict(enumerate(run.recordings(files, group.name)))
+            if not recordings:
+                unknown += len(part.indexes)
+                continue
+            async for index, outcome in evaluations.replayed(
+                part.cases,
+                part.indexes,
+                env=settings.env,
+                conditions=settings,
+                bundle=declared[run.folder, group.submit_index],
+                # As in the run: train recordings have the policy's actions, hidden ones the played ones.
+                record="full" if group.split == "train" else "actions",
+            ):
+                data, failed = recordings.get(index), group.episodes[index].failure
+                if data is None or failed or outcome is None or outcome.failure is not None:
+                    unknown += 1
+                elif (fault := await _difference(evaluations, recording_of(data), outcome)) is None:
+                    same += 1
+                else:
+                    text = "the policy declares itself deterministic and gave other actions"
+                    differ.append(f"{group.name}, episode {index}: {text}: {fault}")
+        name = run.opening.run
+        for text in differ:
+            if other_cpu:
+                text += (
+                    "; this machine's processor has other features than the run's, which can change numbers"
+                )
+            checked.add("policies", "open" if other_cpu else "failed", text, name)
+        if unknown:
+            text = "their policy failed here or in the run, or they have no recording"
+            checked.add("policies", "open", f"{unknown} episodes show nothing: {text}", name)
+        if same and not differ:
+            text = f"{same} episodes of policies that declare themselves deterministic: the same actions"
+            checked.add("policies", "ok", text, name)
+
+    await play_runs("policies", chosen, checked, slots, tell, play_run, packages)
+
+
+async def _difference(evaluations: Evaluations, recorded: Trajectory, outcome: EpisodeOutcome) -> str | None:
+    if outcome.trajectory is None:
+        return "no recording came"
+    again = await evaluations.recording(outcome)
+    for step in range(min(recorded.n, again.n)):
+        if not compare.same(_plain(recorded.actions[step]), _plain(again.actions[step])):
+            return f"at step {step}"
+    return None if recorded.n == again.n else f"{recorded.n} and {again.n} steps"
+
+
+def _plain(action: object) -> object:
+    """An action with its numbers as arrays, the form in which publication may have put them."""
+    if isinstance(action, dict):
+        return {name: _plain(value) for name, value in action.items()}
+    if isinstance(action, list | tuple):
+        return [_plain(value) for value in action]
+    return np.asarray(action) if isinstance(action, np.generic | bool | int | float) else action
+
+
 async def play_runs(
     kind: str,
     chosen: Sequence[Chosen],
@@ -130,7 +240,7 @@ async def play_runs(
     packages: Collection[str] | None = None,
 ) -> None:
     """Plays runs on as many clusters, one after another, as their cases and packages ask for. Adds to `checked` those
-    that cannot be played. `packages`: those that the runs' policies may import; None where no policy is played."""
+    that cannot be played. `packages`: those that the policies may import; None where no policy is played."""
     by_run: dict[str, list[Chosen]] = {}
     layers: list[tuple[tuple[str, ...], dict[str, str], list[PublishedRun]]] = []
     for each in chosen:
@@ -269,7 +379,7 @@ def rounded(recorded: Trajectory, again: Trajectory) -> bool:
 
 
 def share_of(option: str, text: str | None) -> float | None:
-    """`5%` or `all` as a share, 0 to 1; None for none. ConfigError, which names the option, for anything else."""
+    """`5%` or `all` as a share, 0 to 1; None for none. ConfigError, with the option, for anything else."""
     if text is None:
         return None
     with contextlib.suppress(ValueError):

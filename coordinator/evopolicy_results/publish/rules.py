@@ -82,11 +82,14 @@ def _manifest(files: Files, identity: str, checked: Checked) -> Manifest | None:
     fault = ""
     if (manifest.format, manifest.version) != (contents.FORMAT, contents.VERSION):
         fault = (
-            f"{manifest.format[:40]!r} version {manifest.version}; this program reads {contents.FORMAT!r} version"
-            f" {contents.VERSION}"
+            f"{manifest.format[:40]!r} version {manifest.version}; this program reads {contents.FORMAT!r}"
+            f" version {contents.VERSION}"
         )
     elif data != contents.document(manifest) or manifest.canary != CANARY:
-        fault = "the manifest is not written as the software writes it: a field is added or doubled, or another canary"
+        fault = (
+            "the manifest is not written as the software writes it: a field is added or doubled, or another"
+            " canary"
+        )
     if fault:
         checked.add("format", "failed", fault)
         return None

@@ -217,7 +217,8 @@ def _budget(run: PublishedRun, history: History) -> Iterator[str]:
         if any(not 0 <= case < len(opening.train) for case in submit.env_instances):
             yield f"submit {submit.submit_index} plays a case that is not one of train"
     if used != result.budget_used or used > opening.budget:
-        yield f"its submits take {used} episodes, {result.budget_used} are told, {opening.budget} were granted"
+        told, granted = result.budget_used, opening.budget
+        yield f"its submits take {used} episodes, {told} are told, {granted} were granted"
 
 
 def _selection(run: PublishedRun, history: History) -> Iterator[str]:

@@ -112,8 +112,8 @@ def read_finished(folders: Sequence[Path]) -> tuple[list[Finished], list[str], l
 
 
 async def rescore(run: Finished, wanted: Wanted, evaluations: Evaluations) -> Written:
-    """Plays the missing episodes of one run and writes its file. Raises ConfigError for runs, cases or versions that do
-    not fit."""
+    """Plays the missing episodes of one run and writes its file. Raises ConfigError for runs, cases or versions
+    that do not fit."""
     try:
         return await _rescore(run, wanted, evaluations)
     except RefusedError as error:

@@ -1,6 +1,9 @@
 """Signals in Python files: network and simulator imports, numbers of the environment's dynamics, and tables keyed by
 observation hashes or cases.
 
+Only three environments have a list of numbers. Code without a loop is not searched for them: controllers use
+the same.
+
 A table keyed by observations or cases is memory of single episodes. Two forms are found:
 - a lookup (`table[key]`, `.get(key)`) whose key is a hash or the bytes of a value (`hash`, `hashlib`, `crc32`,
   `tobytes`);
@@ -11,15 +14,15 @@ Digests of at least `_HEX` hexadecimal digits as keys of a literal count too.
 from __future__ import annotations
 
 import ast
+import math
 import re
-from collections.abc import Iterator, Mapping, Sequence, Set
+from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from functools import lru_cache
 
 import msgspec
 
 from evopolicy_common.simulators import SIMULATORS
 from evopolicy_results.code.sources import MAX_FILE_BYTES, parsed
-from evopolicy_results.scan.constants import dynamics_constants
 from evopolicy_results.scan.signals import Kind, Signal, signal
 
 _NETWORK = re.compile("socket|urllib|http|requests|httpx|aiohttp|ftplib|smtplib|websockets?|paramiko")
@@ -32,6 +35,13 @@ _HEX = re.compile(r"[0-9a-fA-F]{16,}")
 _FEWEST_KEYS = 4
 _FEWEST_STEPS = 8
 """Number of values in a sequence from which it counts as the actions of an episode."""
+DYNAMICS: dict[str, tuple[tuple[float, ...], int]] = {
+    "gym/acrobot": ((4 * math.pi, 9 * math.pi, 9.8, 0.2, 0.5), 4),
+    "gym/continuouscar": ((0.0015, 0.0025, 0.07, 0.45, 1.2, 0.6), 4),
+    "gymnasium/parking-v0": ((1 / 15, 0.2, 0.12, 0.3, 0.02, 2.5), 4),
+}
+"""An environment's numbers, and how many of them together are no coincidence."""
+_TOLERANCE = 1e-3
 
 
 def code_signals(index: int, files: Mapping[str, bytes], env: str = "") -> Iterator[Signal]:
@@ -162,3 +172,35 @@ def _is_episodes(value: ast.expr) -> bool:
         members = value.values if isinstance(value, ast.Dict) else value.elts
     long = (isinstance(each, ast.List | ast.Tuple) and len(each.elts) >= _FEWEST_STEPS for each in members)
     return sum(long) >= 2
+
+
+def dynamics_constants(nodes: Iterable[ast.AST], env: str) -> dict[float, ast.expr]:
+    """The numbers of `env`'s dynamics in a module with their first places; empty for too few of them."""
+    numbers, enough = DYNAMICS.get(env, ((), 0))
+    found: dict[float, ast.expr] = {}
+    loops = 0
+    for node in nodes if numbers else ():
+        loops += isinstance(node, ast.For | ast.While | ast.comprehension)
+        if isinstance(node, ast.expr) and (value := _value(node)) is not None:
+            for number in numbers:
+                if math.isclose(abs(value), number, rel_tol=_TOLERANCE):
+                    found.setdefault(number, node)
+    return found if loops and len(found) >= enough else {}
+
+
+def _value(node: ast.expr) -> float | None:
+    """The value of a number, of a product with pi such as `4 * np.pi`, or of a quotient of two numbers."""
+    if not isinstance(node, ast.BinOp):
+        return _float(node)
+    left, right = _float(node.left), _float(node.right)
+    if left is not None and isinstance(node.op, ast.Mult):
+        name = getattr(node.right, "attr", getattr(node.right, "id", ""))
+        return left * math.pi if name == "pi" else None
+    return left / right if left is not None and right and isinstance(node.op, ast.Div) else None
+
+
+def _float(node: ast.expr) -> float | None:
+    # An agent may have written an integer that no float can hold.
+    if isinstance(node, ast.Constant) and isinstance(node.value, float | int) and abs(node.value) < 1e6:
+        return float(node.value)
+    return None

@@ -78,13 +78,6 @@ class Leaderboard(msgspec.Struct, frozen=True, kw_only=True):
         found = [row.entry for row in self.standings if not row.is_reference]
         return sorted(found, key=lambda entry: (entry.casefold(), entry))
 
-    def marks(self, env: str) -> dict[str, int]:
-        """Entry to 1 for the best and 2 for the second-best of `env`; ties share a mark, others are absent."""
-        ranks = {
-            entry: cell.rank for (entry, e), cell in self.cells.items() if e == env and cell.mean is not None
-        }
-        return {entry: rank for entry, rank in ranks.items() if rank is not None and rank <= 2}
-
 
 def competition_ranks(values: Mapping[str, float | None]) -> dict[str, int]:
     """Descending ranks from 1; equal values share the better rank, None ranks below every number."""

@@ -14,8 +14,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import evopolicy_gateway.agents
-from evopolicy_results.scan.code import code_signals
-from evopolicy_results.scan.constants import DYNAMICS
+from evopolicy_results.scan.code import DYNAMICS, code_signals
 
 HERE = Path(__file__).parent
 EXAMPLES = HERE.parents[2] / "examples" / "policies"

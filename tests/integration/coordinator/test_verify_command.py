@@ -69,7 +69,7 @@ class Played:
     def verify(
         self, run: Path, *options: str, code: int, where: tuple[str, ...] | None = None
     ) -> dict[str, Any]:
-        """The report on the cluster, or on one of its own that `where` describes; what it said if there is none."""
+        """The report, on the cluster or one of its own that `where` describes; else what it said."""
         where = ("--credentials", self.operator) if where is None else where
         done = evopolicy(self.root, "verify", str(run), "--json", *where, *options, code=code)
         report: dict[str, Any] = json.loads(done.stdout) if done.stdout else {"said": done.stderr}

@@ -21,8 +21,7 @@ from evopolicy_common.records.episodes.trajectory import Recorder, decode
 from evopolicy_common.records.policies import bundles
 from evopolicy_common.records.policies.bundles import BundleFile
 from evopolicy_coordinator.pki import identity
-from evopolicy_results.leaderboard.bundles import LabBundle, read_bundles
-from evopolicy_results.leaderboard.compare import boards
+from evopolicy_results.leaderboard.bundles import LabBundle, boards, read_bundles
 from evopolicy_results.publish import contents, rules
 from evopolicy_results.publish.archive import Archive
 from evopolicy_results.publish.findings import Checked
