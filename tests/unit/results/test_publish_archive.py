@@ -9,7 +9,6 @@ import stat
 import struct
 import tempfile
 import zipfile
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -20,49 +19,31 @@ from evopolicy_common.errors import ProtocolError
 from evopolicy_results.publish.archive import Archive, Writer
 
 
-def plain(name: str, mode: int = 0o100644) -> zipfile.ZipInfo:
+def plain(name: str, mode: int = 0o100644, extra: bytes = b"") -> zipfile.ZipInfo:
     info = zipfile.ZipInfo(name)
     info.create_system = 3
     info.external_attr = mode << 16
+    info.extra = extra
     return info
 
 
-def zipped(fill: Callable[[zipfile.ZipFile], None], compression: int = zipfile.ZIP_STORED) -> bytes:
+def zipped(
+    *infos: zipfile.ZipInfo, data: bytes = b"{}", comment: bytes = b"", compression: int = zipfile.ZIP_STORED
+) -> bytes:
     buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w", compression) as archive:
-        fill(archive)
+    with zipfile.ZipFile(buffer, "w") as archive:
+        archive.comment = comment
+        for info in infos:
+            archive.writestr(info, data, compression)
     return buffer.getvalue()
 
 
 def named(*names: str) -> bytes:
-    def fill(archive: zipfile.ZipFile) -> None:
-        for name in names:
-            archive.writestr(plain(name), b"{}")
-
-    return zipped(fill)
+    return zipped(*map(plain, names))
 
 
-def commented() -> bytes:
-    def fill(archive: zipfile.ZipFile) -> None:
-        archive.writestr(plain("a"), b"x")
-        archive.comment = b"hello"
-
-    return zipped(fill)
-
-
-def with_extra() -> bytes:
-    info = plain("a")
-    info.extra = struct.pack("<HH", 0x7075, 0)
-    return zipped(lambda archive: archive.writestr(info, b"x"))
-
-
-def bomb() -> bytes:
-    info = plain("runs/0000/run.json")
-    return zipped(lambda archive: archive.writestr(info, b"0" * (8 << 20), zipfile.ZIP_DEFLATED))
-
-
-def link() -> bytes:
-    return zipped(lambda archive: archive.writestr(plain("a", stat.S_IFLNK | 0o777), b"/etc/passwd"))
+BOMB = zipped(plain("runs/0000/run.json"), data=b"0" * (8 << 20), compression=zipfile.ZIP_DEFLATED)
+LINK = zipped(plain("a", stat.S_IFLNK | 0o777), data=b"/etc/passwd")
 
 
 def claims(n: int) -> bytes:
@@ -72,16 +53,8 @@ def claims(n: int) -> bytes:
     return bytes(data)
 
 
-def million() -> bytes:
-    """As many files as can be told of, with a list to match, and more behind it."""
-    size = 0xFFFFFFF0
-    return struct.pack("<4sHHHHIIH", b"PK\5\6", 0, 0, 0xFFFF, 0xFFFF, size, 0, 0)
-
-
-def header_of_another() -> bytes:
-    data = bytearray(named("abc"))
-    data[30:33] = b"xyz"
-    return bytes(data)
+MILLION = struct.pack("<4sHHHHIIH", b"PK\5\6", 0, 0, 0xFFFF, 0xFFFF, 0xFFFFFFF0, 0, 0)
+"""As many files as can be told of, with a list to match, and more behind it."""
 
 
 def overlapping() -> bytes:
@@ -94,9 +67,9 @@ def overlapping() -> bytes:
 HOSTILE: dict[str, tuple[bytes, str]] = {
     "empty": (b"", "too short"),
     "text": (b"hello world, this is no archive at all", "no whole file"),
-    "zip bomb": (bomb(), "compressed"),
-    "link": (link(), "link"),
-    "folder": (zipped(lambda archive: archive.writestr(plain("a/", 0o40755), b"")), "not the name"),
+    "zip bomb": (BOMB, "compressed"),
+    "link": (LINK, "link"),
+    "folder": (zipped(plain("a/", 0o40755), data=b""), "not the name"),
     "absolute path": (named("/etc/passwd"), "not the name"),
     "parent path": (named("runs/../../x"), "not the name"),
     "hidden name": (named(".ssh/config"), "not the name"),
@@ -105,12 +78,12 @@ HOSTILE: dict[str, tuple[bytes, str]] = {
     "letters of another alphabet": (named("результат"), "not the name"),
     "long name": (named("a" * 500), "not where it should be|not the name"),
     "duplicate": (named("a", "b").replace(b"b{}", b"a{}").replace(b"bPK", b"aPK"), "twice|headers differ"),
-    "comment": (commented(), "no whole file"),
-    "extra field": (with_extra(), "extras|not where"),
+    "comment": (zipped(plain("a"), comment=b"hello"), "no whole file"),
+    "extra field": (zipped(plain("a", extra=struct.pack("<HH", 0x7075, 0))), "extras|not where"),
     "more files than there are": (claims(60_000), "cut off"),
     "too many files": (claims(65_400), "65,000 are allowed"),
-    "a million files": (million(), "65,000 are allowed"),
-    "two headers": (header_of_another(), "headers differ"),
+    "a million files": (MILLION, "65,000 are allowed"),
+    "two headers": (named("abc").replace(b"abc", b"xyz", 1), "headers differ"),
     "overlap": (overlapping(), "overlaps"),
     "bytes before": (b"MZ" + named("a"), "not where it should be"),
     "bytes between": (named("a")[:31] + b"", "no whole file|too short"),
