@@ -15,11 +15,13 @@ from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
 from evopolicy_common.errors import ProtocolError
 from evopolicy_common.records import journal
 from evopolicy_common.records.aggregates import mean, std
+from evopolicy_common.records.episodes.trajectory import Recorder, decode
 from evopolicy_common.records.run_record import decode_run_record
 from evopolicy_coordinator.pki import identity
 from evopolicy_results.publish import card as cards
 from evopolicy_results.publish import contents, descriptions
 from evopolicy_results.publish.archive import Archive, Writer
+from evopolicy_results.publish.run_rules import return_of
 
 ENV = "toy/line"
 CONSTANT = """
@@ -98,6 +100,24 @@ class Forger:
     def text(self, name: str, before: bytes, after: bytes) -> None:
         assert before in self.files[name]
         self.files[name] = self.files[name].replace(before, after, 1)
+
+    def rerecord(self, group: str, change: Callable[[Any], tuple[Any, float]], n: int = 1) -> None:
+        """Other actions and rewards, as `change` makes them of each step, in the first `n` recordings."""
+        name = f"runs/0000/actions/{group}"
+        recordings = contents.unpack_recordings(self.files[name])
+        for place, data in enumerate(recordings[:n]):
+            assert data is not None
+            recorder = Recorder("actions")
+            for row in decode(data).rows():
+                action, reward = change(row)
+                recorder.append(None, action, reward, row.terminated, row.truncated, {})
+            recordings[place] = recorder.finish()
+        self.files[name] = contents.pack_recordings(recordings)
+
+    def returns(self, group: str) -> list[float]:
+        """What the rewards of a group's recordings come to."""
+        recordings = contents.unpack_recordings(self.files[f"runs/0000/actions/{group}"])
+        return [return_of(decode(data)) for data in recordings if data is not None]
 
     def entries(self, change: Callable[[list[bytes]], list[bytes]]) -> None:
         """Changes the journal, and what `run.json` tells of it, as its owner could who begins another."""

@@ -13,7 +13,6 @@ import msgspec
 import pytest
 from publications import Forger, Held, Results, spelt
 
-from evopolicy_common.records.episodes.trajectory import Recorder, decode
 from evopolicy_common.records.run_record import RunRecord
 from evopolicy_results.publish import contents, fields, rules
 from evopolicy_results.publish.findings import Checked
@@ -171,13 +170,7 @@ def test_changed_policies_salts_and_rewards_are_found(results: Results) -> None:
 
 def test_changed_actions_are_listed_as_what_replay_alone_compares(results: Results) -> None:
     forger = Forger(results.files)
-    name = "runs/0000/actions/heldout-001"
-    recordings = contents.unpack_recordings(forger.files[name])
-    assert recordings[0] is not None
-    recorder = Recorder("actions")
-    for row in decode(recordings[0]).rows():
-        recorder.append(None, row.action + 1, row.reward, row.terminated, row.truncated, {})
-    forger.files[name] = contents.pack_recordings([recorder.finish(), *recordings[1:]])
+    forger.rerecord("heldout-001", lambda row: (row.action + 1, row.reward))
     forger.sign(results.root / "st")
     found = checked(results, forger)
     assert not found.failed

@@ -19,13 +19,13 @@ from typing import Any
 import msgspec
 import pytest
 from commands import evopolicy, words
+from edits import put
 from publications import CONSTANT, Forger, Held, Results, spelt
 
 from evopolicy_common.records import journal
-from evopolicy_common.records.episodes.trajectory import Recorder, decode
 from evopolicy_common.records.policies import bundles
 from evopolicy_common.records.policies.bundles import BundleFile
-from evopolicy_results.publish import contents, rules, run_rules
+from evopolicy_results.publish import contents, rules
 from evopolicy_results.publish import replay as replays
 from evopolicy_results.publish.findings import KINDS, Finding
 
@@ -36,35 +36,6 @@ RUN, RESULT, OPENING, EPISODES, SALT = (
     f"runs/0000/{name}"
     for name in (contents.RUN, contents.RESULT, contents.OPENING, contents.EPISODES, contents.SALT)
 )
-
-
-def put(*path: str | int, value: Any) -> Callable[[Any], None]:
-    """Sets a part of a document."""
-
-    def change(document: Any) -> None:
-        for step in path[:-1]:
-            document = document[step]
-        assert document[path[-1]] != value
-        document[path[-1]] = value
-
-    return change
-
-
-def rerecorded(
-    forger: Forger,
-    group: str = "heldout-001",
-    reward: float = 100.0,
-    change: Callable[[float], float] | None = None,
-) -> None:
-    """Other rewards in a recording: `reward`, or what `change` makes of them."""
-    name = f"runs/0000/actions/{group}"
-    recordings = contents.unpack_recordings(forger.files[name])
-    assert recordings[0] is not None
-    recorder = Recorder("actions")
-    for row in decode(recordings[0]).rows():
-        new = reward if change is None else change(row.reward)
-        recorder.append(None, row.action, new, row.terminated, row.truncated, {})
-    forger.files[name] = contents.pack_recordings([recorder.finish(), *recordings[1:]])
 
 
 def swap_policy(forger: Forger) -> None:
@@ -152,7 +123,7 @@ SIGNED_ANEW: dict[str, tuple[Edit, str, str]] = {
     "a replay, by its journal": (lambda f: f.entries(replay_entry), "commitment", "is a replay of run r-1"),
     "another place in the journal": (lambda f: f.json(RUN, put("committed", "opened_head", value="00" * 32)), "record", "another commitment or head"),
     "no place in the journal": (lambda f: f.json(RUN, put("committed", value=None)), "record", "another commitment or head"),
-    "recorded rewards edited": (rerecorded, "recordings", "rewards come to"),
+    "recorded rewards edited": (lambda f: f.rerecord("heldout-001", lambda row: (row.action, 100.0)), "recordings", "rewards come to"),
     "a recording left out": (lambda f: f.files.__setitem__("runs/0000/actions/train-000", contents.pack_recordings([])), "recordings", "0 recordings"),
     "a recording that is none": (lambda f: f.files.__setitem__("runs/0000/actions/train-000", contents.pack_recordings([b"evotraj1", b"x"])), "recordings", "not a trajectory"),
     "a run's first entry cut off": (lambda f: f.entries(lambda lines: lines[1:]), "journal", "without being open"),
@@ -367,10 +338,8 @@ def test_an_edited_processor_excuses_differences_of_last_places_alone(results: R
     )
     for change, code, text in edits:
         forger = Forger(results.files)
-        rerecorded(forger, change=change)
-        recording = contents.unpack_recordings(forger.files["runs/0000/actions/heldout-001"])[0]
-        assert recording is not None
-        value = run_rules.return_of(decode(recording))
+        forger.rerecord("heldout-001", lambda row, change=change: (row.action, change(row.reward)))
+        value = forger.returns("heldout-001")[0]
         forger.begin_anew(lambda result: result.pop("record") and None)
         forger.begin_anew(raised(lambda old, value=value: [value, *old[1:]]))  # type: ignore[misc]
         forger.json(RUN, put("versions", "fingerprint", "cpu", value="another"))

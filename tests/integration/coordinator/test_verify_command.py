@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 from commands import agent, evopolicy, process, words
+from edits import edited
 
 pytestmark = pytest.mark.system
 
@@ -148,11 +149,10 @@ def test_numbers_that_no_episode_shows_are_compared_with_the_coordinators(
 ) -> None:
     """A raised score with everything that follows from it, and a summary with fewer returns than episodes."""
     run = Path(shutil.copytree(played.run("gym/acrobot"), tmp_path / "run"))
-    record = json.loads((run / "run.json").read_text())
-    outcome = record["outcome"]
-    outcome |= {"final_score": -1.0, "heldout_mean_return": -1.0, "heldout_returns": [-1.0, -1.0]}
-    outcome["heldout_std_return"] = 0.0
-    (run / "run.json").write_text(json.dumps(record))
+    with edited(run / "run.json") as record:
+        outcome = record["outcome"]
+        outcome |= {"final_score": -1.0, "heldout_mean_return": -1.0, "heldout_returns": [-1.0, -1.0]}
+        outcome["heldout_std_return"] = 0.0
     path = run / "workspace" / "feedback" / "submit_000" / "summary.json"
     path.chmod(0o644)
     path.write_text(json.dumps(json.loads(path.read_text()) | {"returns": [-1.0]}))
@@ -166,10 +166,9 @@ def test_without_the_coordinator_a_tampered_action_shows_in_its_results(
     played: Played, tmp_path: Path
 ) -> None:
     run = tampered(played.run("toy/line"), tmp_path / "run", 0, action=[0.9])
-    record = json.loads((run / "run.json").read_text())
-    record["run"] = "r-unknown"
-    record["versions"]["fingerprint"] |= {"numpy": "1.0", "definition": "of another text"}
-    (run / "run.json").write_text(json.dumps(record))
+    with edited(run / "run.json") as record:
+        record["run"] = "r-unknown"
+        record["versions"]["fingerprint"] |= {"numpy": "1.0", "definition": "of another text"}
     report = played.verify(run, code=1)
     assert {found["episode"] for found in report["differences"]} == {"submit 0, ep_000"}
     assert report["from_files"] == report["episodes"] == 3

@@ -17,7 +17,6 @@ from publications import AGENT, ENV, Forger, read
 from evopolicy_common.records import journal
 from evopolicy_common.records.aggregates import mean
 from evopolicy_common.records.code_metrics import TREND, code_metrics
-from evopolicy_common.records.episodes.trajectory import Recorder, decode
 from evopolicy_common.records.policies import bundles
 from evopolicy_common.records.policies.bundles import BundleFile
 from evopolicy_coordinator.pki import identity
@@ -26,7 +25,6 @@ from evopolicy_results.publish import contents, rules
 from evopolicy_results.publish.archive import Archive
 from evopolicy_results.publish.findings import Checked
 from evopolicy_results.publish.replay import replay
-from evopolicy_results.publish.run_rules import return_of
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(900)]
 PAGE = Path(__file__).parents[3] / "docs/how-to/publish.md"
@@ -59,16 +57,8 @@ def another_processor(forger: Forger) -> None:
 
 
 def raised_rewards(forger: Forger) -> None:
-    recordings = contents.unpack_recordings(forger.files[HELDOUT])
-    new = []
-    for data in recordings:
-        recorder = Recorder("actions")
-        assert data is not None
-        for row in decode(data).rows():
-            recorder.append(None, row.action, row.reward + 1.0, row.terminated, row.truncated, {})
-        new.append(recorder.finish())
-    forger.files[HELDOUT] = contents.pack_recordings(list(new))
-    raised(forger, lambda old: [return_of(decode(data)) for data in new])
+    forger.rerecord("heldout-001", lambda row: (row.action, row.reward + 1.0), n=3)
+    raised(forger, lambda old: forger.returns("heldout-001"))
 
     def told(result: dict[str, Any]) -> None:
         result["record"]["versions.fingerprint"]["cpu"] = "x86_64 SSE2"

@@ -3,7 +3,6 @@ result."""
 
 from __future__ import annotations
 
-import json
 import math
 import shutil
 from collections.abc import Callable
@@ -12,6 +11,7 @@ from typing import Any
 
 import msgspec
 import pytest
+from edits import edited, put
 from invented.policies import Version, policy
 from invented.run_dirs import write_run
 
@@ -39,18 +39,11 @@ class Copy:
         self.root = root
 
     def edit(self, name: str, change: Callable[[Any], object]) -> None:
-        document = json.loads((self.root / name).read_bytes())
-        change(document)
-        (self.root / name).write_text(json.dumps(document))
+        with edited(self.root / name) as document:
+            change(document)
 
     def put(self, name: str, *path: str | int, value: Any) -> None:
-        def change(document: Any) -> None:
-            for step in path[:-1]:
-                document = document[step]
-            assert document[path[-1]] != value
-            document[path[-1]] = value
-
-        self.edit(name, change)
+        self.edit(name, put(*path, value=value))
 
 
 @pytest.fixture(scope="module")
