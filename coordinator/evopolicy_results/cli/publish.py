@@ -206,16 +206,9 @@ def check(
         except OSError as error:
             raise ConfigError(f"{file}: {error.strerror or error}") from error
     if as_json:
-        result = {
-            "file": str(file),
-            "ok": not checked.failed,
-            "signer": checked.signer,
-            "findings": checked.findings,
-            "claims": checked.claims,
-            "covered": checked.covered,
-            "listing": checked.listing,
-            "removed": checked.removed,
-        }
+        shown = ("signer", "findings", "claims", "covered", "listing", "removed")
+        found = {name: getattr(checked, name) for name in shown}
+        result = {"file": str(file), "ok": not checked.failed, **found}
         say_json(result)
     else:
         _print(checked)

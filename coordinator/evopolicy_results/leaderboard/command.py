@@ -99,21 +99,10 @@ def leaderboard(
             raise ConfigError(f"{error.filename}: {error.strerror}") from error
         shown = [bundle for bundle in bundles if not bundle.refused]
         index = write_site(bundles, out, title=title, tell=lambda text: say(one_line(text), err=True))
-        summary = {
-            "index": str(index),
-            "files": [
-                {
-                    "file": one.file,
-                    "signer": one.signer,
-                    "lab": one.lab,
-                    "runs": len(one.runs),
-                    "refused": one.refused,
-                }
-                for one in bundles
-            ],
-        }
+        told = ("file", "signer", "lab", "runs", "refused")
+        found = [{name: getattr(one, name) for name in told} | {"runs": len(one.runs)} for one in bundles]
     if as_json:
-        say_json(summary)
+        say_json({"index": str(index), "files": found})
     else:
         for one in bundles:
             if one.refused:

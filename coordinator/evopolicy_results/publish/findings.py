@@ -3,7 +3,7 @@ documents."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, Literal, NamedTuple, Protocol, TypeVar
 
 import msgspec
@@ -155,6 +155,15 @@ class Checked(msgspec.Struct, kw_only=True):
 
     def add(self, kind: str, state: State, text: str, run: str = "") -> None:
         self.findings.append(Finding(kind=kind, state=state, text=text, run=run))
+
+    def conclude(self, kind: str, faults: Sequence[str], ok: str, run: str = "", left: str = "") -> None:
+        """Adds the faults as failed; without any, that all is `ok`, or is open as `left` says."""
+        for text in faults:
+            self.add(kind, "failed", text, run)
+        if left:
+            self.add(kind, "open", left, run)
+        elif not faults:
+            self.add(kind, "ok", ok, run)
 
 
 class Fault(NamedTuple):

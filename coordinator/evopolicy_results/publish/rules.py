@@ -10,7 +10,7 @@ Rules that this module owns:
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 from evopolicy_common.errors import ProtocolError
 from evopolicy_common.records import journal
@@ -39,7 +39,8 @@ def check(files: Files, identity: str = "", heads: Sequence[str | Countersignatu
     _names(files, manifest, checked)
     damaged, digests = _digests(files, manifest, checked)
     entries = _journal(files, manifest, checked)
-    _order(entries, heads, checked)
+    for state, text in _order(entries, heads, checked.signer):
+        checked.add("order", state, text)
     _removed(files, checked)
     folders = sorted({"/".join(name.split("/")[:2]) for name in files.names if name.startswith("runs/")})
     if len(folders) > contents.MAX_RUNS:
@@ -150,10 +151,7 @@ def _digests(files: Files, manifest: Manifest, checked: Checked) -> tuple[set[st
             damaged.add(name)
     bad += [f"{name} is missing" for name in sorted(expected - files.names)]
     bad += [f"{name} was added" for name in sorted(files.names - expected)]
-    for text in bad:
-        checked.add("digests", "failed", text)
-    if not bad:
-        checked.add("digests", "ok", counted(len(wanted), "file"))
+    checked.conclude("digests", bad, counted(len(wanted), "file"))
     return damaged, wanted
 
 
@@ -171,43 +169,34 @@ def _journal(files: Files, manifest: Manifest, checked: Checked) -> History:
     fault = _history_fault(entries)
     if (len(lines), head) != (manifest.journal_entries, manifest.journal_head):
         fault = f"its {len(lines)} entries come to the head {head}, which is not the signed one"
-    text = fault or f"{len(lines)} entries, head {head}"
-    checked.add("journal", "failed" if fault else "ok", text)
+    checked.conclude("journal", [fault] if fault else [], f"{len(lines)} entries, head {head}")
     return History(entries, heads)
 
 
-def _order(history: History, noted: Sequence[str | Countersignature], checked: Checked) -> None:
+def _order(
+    history: History, noted: Sequence[str | Countersignature], signer: str
+) -> Iterator[tuple[State, str]]:
     """Whether the journal had the heads that were noted elsewhere."""
     if not noted:
-        text = (
-            "the journal is its owner's, who could have deleted it and begun another: compare its head with one that"
-            " was noted elsewhere in time (--head)"
-        )
-        checked.add("order", "open", text)
+        text = "the journal is its owner's, who could have deleted it and begun another: compare its head with one"
+        yield "open", f"{text} that was noted elsewhere in time (--head)"
     for each in noted:
         head, by = each, "that you gave"
         if isinstance(each, Countersignature):
             head, by = each.head, f"countersigned by {each.key} at {utc_text(each.at)} by its clock"
             if not signed_by(each.key, each.signature, contents.head_digest(each.head, each.at), HEAD):
-                checked.add("order", "failed", f"not a countersignature by {each.key}")
+                yield "failed", f"not a countersignature by {each.key}"
                 continue
-            if each.key == checked.signer:
-                checked.add(
-                    "order", "open", "countersigned with the signer's own key, which shows nothing more"
-                )
+            if each.key == signer:
+                yield "open", "countersigned with the signer's own key, which shows nothing more"
                 continue
-        try:
-            number = history.heads.index(str(head))
-        except ValueError:
-            text = f"the journal never had the head {head}, {by}: it was changed, or begun anew"
-            checked.add("order", "failed", text)
+        if head not in history.heads:
+            yield "failed", f"the journal never had the head {head}, {by}: it was changed, or begun anew"
             continue
+        number = history.heads.index(str(head))
         later = sum(isinstance(entry, Opened) for entry in history.entries[number + 1 :])
-        checked.add(
-            "order",
-            "ok",
-            f"the journal had entry {number} with the head {by}; {counted(later, 'run')} opened after it",
-        )
+        opened = counted(later, "run")
+        yield "ok", f"the journal had entry {number} with the head {by}; {opened} opened after it"
 
 
 def _history_fault(entries: Sequence[journal.Entry]) -> str | None:
@@ -268,15 +257,9 @@ def _descriptions(files: Files, manifest: Manifest, digests: Mapping[str, str], 
         licence=card.licence,
         claimed=card.licences,
     )
-    wrong = [
-        name
-        for name, made in descriptions.files(cards.matching(own, card), digests).items()
-        if made != data[name]
-    ]
-    for name in wrong:
-        checked.add("card", "failed", f"{name} is not what follows from the runs")
-    if not wrong:
-        checked.add("card", "ok", KINDS["card"])
+    made = descriptions.files(cards.matching(own, card), digests)
+    wrong = [f"{name} is not what follows from the runs" for name in made if made[name] != data[name]]
+    checked.conclude("card", wrong, KINDS["card"])
 
 
 def _claims(checked: Checked) -> None:

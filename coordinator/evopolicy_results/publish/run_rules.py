@@ -314,14 +314,13 @@ def _recordings(files: Files, run: PublishedRun, damaged: set[str], checked: Che
                 checked.claim(f"{run.folder}/{contents.EPISODES}", (f"{place}.{field}" for field in claimed))
             elif fault := recording_fault(episode, data):
                 faults.append(f"{group.name}, episode {episode.index}: {fault}")
-    for text in faults:
-        checked.add("recordings", "failed", text, name)
     checked.recorded[name] = recorded
+    left = ""
     if missing := checked.unrecorded(name):
-        text = f"only {', '.join(missing)} episodes have a recording: the other returns rest on the publisher's word"
-        checked.add("recordings", "open", text, name)
-    elif not faults:
-        checked.add("recordings", "ok", counted(sum(n for n, _ in recorded.values()), "episode"), name)
+        left = f"only {', '.join(missing)} episodes have a recording: the other returns rest on the publisher's word"
+    checked.conclude(
+        "recordings", faults, counted(sum(n for n, _ in recorded.values()), "episode"), name, left
+    )
 
 
 def recording_fault(episode: contents.Episode, data: bytes) -> str | None:
@@ -373,12 +372,8 @@ def _checkpoints(files: Files, run: PublishedRun, damaged: set[str], checked: Ch
         except (BundleError, ProtocolError) as error:
             text = f"submit {submit.submit_index}: another policy than the one that was submitted: {error}"
             faults.append(text)
-    for text in faults:
-        checked.add("checkpoints", "failed", text, name)
-    if withheld:
-        checked.add("checkpoints", "open", f"{withheld} policies were withheld", name)
-    elif not faults:
-        checked.add("checkpoints", "ok", f"{len(policies)} policies", name)
+    left = f"{withheld} policies were withheld" if withheld else ""
+    checked.conclude("checkpoints", faults, f"{len(policies)} policies", name, left)
     for text in _metrics(run, policies, checked):
         checked.add("record", "failed", text, name)
 

@@ -25,12 +25,12 @@ def scan_published(files: Files, checked: Checked) -> None:
         except ProtocolError as error:
             checked.add("signals", "open", f"not searched: {error}", name)
             continue
-        for each in found[:_SHOWN]:
-            text = f"{TITLES[each.kind]}: {each.path}: {each.reason}: {each.quote}"
+        signals = [f"{TITLES[each.kind]}: {each.path}: {each.reason}: {each.quote}" for each in found]
+        if len(signals) > _SHOWN:
+            signals[_SHOWN:] = [f"{len(signals) - _SHOWN} more signals"]
+        for text in signals:
             checked.add("signals", "open", text, name)
-        if len(found) > _SHOWN:
-            checked.add("signals", "open", f"{len(found) - _SHOWN} more signals", name)
-        if not found:
+        if not signals:
             checked.add("signals", "ok", "no signal", name)
 
 
