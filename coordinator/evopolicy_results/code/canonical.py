@@ -59,11 +59,13 @@ def stable_hash(parts: list[str]) -> str:
 def canonical(units: list[Unit], names: Names) -> str:
     """One hash of the units: equal for equal structure, independent of the bundle's names and order."""
     every: list[Unit] = []
-    queue = list(reversed(units))
-    while queue:
-        unit = queue.pop()
-        every.append(unit)
-        queue.extend(reversed(unit.children))
+
+    def collect(some: list[Unit]) -> None:
+        for unit in some:
+            every.append(unit)
+            collect(unit.children)
+
+    collect(units)
     resolved = [_resolve(unit, names) for unit in every]
     place = {id(unit): i for i, unit in enumerate(every)}
     texts = [_numbered(tokens, {}, {}) for tokens in resolved]

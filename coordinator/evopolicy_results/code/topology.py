@@ -16,6 +16,7 @@ from __future__ import annotations
 import ast
 import re
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 
 import msgspec
 
@@ -50,12 +51,10 @@ def describe(modules: Mapping[str, Module]) -> tuple[str, Features]:
     walker = _Walker(set(modules))
     opaque: list[str] = []
     for module in modules.values():
-        if module.nodes:
-            try:
+        with suppress(RecursionError):
+            if module.nodes:
                 walker.module(module)
                 continue
-            except RecursionError:
-                pass
         opaque.append(stable_hash([module.path, module.source.hex()]))
     features = Features(
         functions=walker.functions,

@@ -2,12 +2,9 @@
 confinement, and whether hidden episodes and agents shared a kernel. Results that an audit disputes must not be mixed
 with others.
 
-These must agree over all runs of a suite: budget, scope, observation form, simulation rule, finish rule, detail of
-the feedback, text of `AGENTS.md`, failed episodes, hidden evaluation, profile, jail, hidden isolation, hidden cases,
-and the limits of agents with a model. The prompts must agree over the runs
-of one entry. These must agree over the runs of one environment, since environments differ
-in them anyway: splits (by hash), library fingerprint, environment version, bounds of a submit, a policy's limits,
-step limit, and videos in feedback. Runs with hidden cases of their own differ in these splits by design.
+Settings of `_BY_SUITE` must agree over all runs of a suite, those of `_BY_ENTRY` over the runs of one entry, and those
+of `_BY_ENVIRONMENT` and the library fingerprint over the runs of one environment, since environments differ in them
+anyway. Runs with hidden cases of their own differ in these splits by design.
 """
 
 from __future__ import annotations

@@ -174,11 +174,9 @@ def read_run(folder: Path) -> Run:
             raise UnreadableRunError("run.json says completed, and has no final_score")
         if outcome.best_submit_index is None:
             raise UnreadableRunError("run.json says completed, and has no best_submit_index")
-    submits = _read_submits(folder, record)
-    selected = next((submit for submit in submits if submit.index == outcome.best_submit_index), None)
-    if outcome.status == "completed" and selected is None:
+    run = Run(path=folder, record=record, submits=_read_submits(folder, record))
+    if outcome.status == "completed" and run.selected is None:
         raise UnreadableRunError(f"the selected submit {outcome.best_submit_index} has no files")
-    run = Run(path=folder, record=record, submits=submits)
     run = replace(run, signals=_signals(run))
     try:
         check_plausible({"run.json": run.record, "submits": run.submits})
@@ -316,9 +314,5 @@ def describe_files(files: Files) -> tuple[Files, Source | None]:
 
 def count_changed_lines(before: Files, after: Files) -> int:
     """Lines removed plus lines added between two source bundles, file by file; a renamed file counts twice."""
-    changed = 0
-    for path in sorted({*before, *after}):
-        old, new = before.get(path, b""), after.get(path, b"")
-        if old != new:
-            changed += n_changed(old.splitlines(), new.splitlines())
-    return changed
+    pairs = [(before.get(path, b""), after.get(path, b"")) for path in {*before, *after}]
+    return sum(n_changed(old.splitlines(), new.splitlines()) for old, new in pairs if old != new)

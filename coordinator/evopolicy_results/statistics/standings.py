@@ -130,15 +130,14 @@ def _drawn_scores(
     for number, env in enumerate(environments):
         means = np.empty_like(total)
         for i, entry in enumerate(entries):
-            sample = samples[entry, env]
-            drawn = _drawn_mean(sample, i, number, resamples)
-            if sample.scores is None:  # a run without an ok submit has the worst rank in every resample
+            sample, scores = samples[entry, env], samples[entry, env].scores
+            if scores is None:  # a run without an ok submit has the worst rank in every resample
                 means[i] = -math.inf
-            elif drawn is None:
-                spread.discard(entry)
-                means[i] = np.mean(sample.scores)
-            else:
+            elif (drawn := _drawn_mean(sample, scores, i, number, resamples)) is not None:
                 means[i] = drawn
+            else:
+                spread.discard(entry)
+                means[i] = np.mean(scores)
         above = np.zeros_like(means)
         for row in means:
             above += row > means
@@ -146,13 +145,13 @@ def _drawn_scores(
     return total / len(environments), spread
 
 
-def _drawn_mean(sample: Sample, entry: int, env: int, resamples: int) -> Floats | None:
-    """Resampled means; None if the sample shows no spread, or has no mean."""
-    if sample.scores is None:
-        return None
+def _drawn_mean(
+    sample: Sample, known: Sequence[float], entry: int, env: int, resamples: int
+) -> Floats | None:
+    """Resampled means; None if the sample shows no spread."""
     common = matched([sample])
     seed = 1000 + 97 * entry + 10_007 * env
-    scores, returns = np.array(sample.scores), np.zeros((1, 1))
+    scores, returns = np.array(known), np.zeros((1, 1))
     if common is not None:
         returns = common.returns[0]
         scores = returns.mean(axis=1)
