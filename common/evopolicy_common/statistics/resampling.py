@@ -21,9 +21,9 @@ def weights(n: int, n_drawn: int, resamples: int, seed: int) -> Floats:
     """(resamples, n): multinomial counts of `n_drawn` draws with replacement from `n`; rows sum to `n_drawn`.
     Read-only."""
     drawn = np.random.default_rng([seed, n, n_drawn]).multinomial(n_drawn, np.full(n, 1.0 / n), resamples)
-    found: Floats = drawn.astype(np.float64)
-    found.setflags(write=False)
-    return found
+    counts: Floats = drawn.astype(np.float64)
+    counts.setflags(write=False)
+    return counts
 
 
 @lru_cache(maxsize=8)
@@ -34,10 +34,10 @@ def t_weights(n: int, draws: int, seed: int) -> Floats:
     if n == 1:
         return np.zeros((draws, 1))
     generator = np.random.default_rng([13, seed, n])
-    found: Floats = generator.normal(size=(draws, n))
-    found /= np.sqrt(n * generator.chisquare(n - 1, size=(draws, 1)))
-    found.setflags(write=False)
-    return found
+    drawn: Floats = generator.normal(size=(draws, n))
+    drawn /= np.sqrt(n * generator.chisquare(n - 1, size=(draws, 1)))
+    drawn.setflags(write=False)
+    return drawn
 
 
 @lru_cache(maxsize=4)

@@ -55,8 +55,8 @@ class UnreadableRunError(Exception):
 
 def find_run_dirs(paths: Iterable[Path]) -> tuple[list[Path], list[LeftOut]]:
     """As `run_folders`; paths without a run directory are returned with the reason."""
-    found, without = run_folders(paths)
-    return found, [
+    folders, without = run_folders(paths)
+    return folders, [
         LeftOut(
             path=path,
             reason=f"this is {text}"

@@ -133,8 +133,8 @@ def label_test(first: Sequence[float], second: Sequence[float], n_random: int = 
     observed = float(_welch(own, pooled, n_first, n_second)[0])
     reached = 0
     for start in range(0, len(patterns), _CHUNK):
-        found = _welch(patterns[start : start + _CHUNK], pooled, n_first, n_second)
-        reached += int((found >= observed * (1.0 - _CLOSE)).sum())
+        t = _welch(patterns[start : start + _CHUNK], pooled, n_first, n_second)
+        reached += int((t >= observed * (1.0 - _CLOSE)).sum())
     return reached / len(patterns) if exact else (reached + 1.0) / (len(patterns) + 1.0)
 
 

@@ -78,13 +78,10 @@ def test_damaged_run_is_read_or_left_out_and_never_a_crash(
     records = [path for path in files if path.suffix == ".json"]
     sources_and_logs = [path for path in files if path.suffix in (".py", ".jsonl")]
     for _ in range(rng.randint(1, 3)):
-        match rng.randrange(3):
-            case 0:
-                damage_value(rng.choice(records), rng)
-            case 1:
-                damage_bytes(rng.choice(records), rng)
-            case _:
-                damage_bytes(rng.choice(sources_and_logs), rng)
+        damage, damaged = rng.choice(
+            [(damage_value, records), (damage_bytes, records), (damage_bytes, sources_and_logs)]
+        )
+        damage(rng.choice(damaged), rng)
     loaded = load_runs([folder / "runs"])
     assert "Agent B" in {run.entry for run in loaded.runs}
     assert len(loaded.runs) + len(loaded.left_out) == 2
@@ -119,13 +116,7 @@ def damage_bytes(path: Path, rng: random.Random) -> None:
 
 def places(document: Any) -> Iterator[tuple[Any, Any]]:
     """Every (container, key or index) of a JSON document."""
-    keys = (
-        document.keys()
-        if isinstance(document, dict)
-        else range(len(document))
-        if isinstance(document, list)
-        else ()
-    )
-    for key in list(keys):
-        yield document, key
-        yield from places(document[key])
+    if isinstance(document, dict | list):
+        for key in list(document) if isinstance(document, dict) else range(len(document)):
+            yield document, key
+            yield from places(document[key])

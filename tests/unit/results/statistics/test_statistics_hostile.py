@@ -55,6 +55,11 @@ def rising(n: int, shift: float = 0.0) -> tuple[float, ...]:
     return tuple(float(i) + shift + 0.1 * math.sin(7.0 * i + shift) for i in range(n))
 
 
+def repeated(name: str, n: int, shift: float, step: float = 1.0) -> Sample:
+    """An entry of n runs, each `step` above the one before."""
+    return entry(name, *(run(*rising(32, shift + step * r)) for r in range(n)))
+
+
 def test_missing_cases_leave_only_common_ones_and_their_number_is_reported() -> None:
     first = entry("A", run(*rising(20, 1.0)))
     second = entry("B", run(math.nan, *rising(20)[1:18], math.inf))
@@ -81,53 +86,41 @@ def test_runs_with_cases_of_their_own_are_compared_as_runs() -> None:
 
 
 def test_one_run_compares_checkpoints_and_several_compare_agents() -> None:
-    one = pair_of(entry("A", run(*rising(32, 3.0))), entry("B", run(*rising(32))))
-    assert (one.compares, one.verdict) == ("checkpoints", "first")
-    assert one.gap.over == "cases"
-    mixed = pair_of(entry("A", *(run(*rising(32, 3.0 + r)) for r in range(4))), entry("B", run(*rising(32))))
-    assert mixed.compares == "checkpoints"
-    fixed = pair_of(
-        entry("A", *(run(*rising(32, 3.0 + r)) for r in range(4))),
-        entry("R", run(*rising(32)), is_fixed=True),
-    )
-    assert fixed.compares == "agents"
-    assert fixed.gap.over == "runs and cases"
+    single = entry("B", run(*rising(32)))
+    one = pair_of(entry("A", run(*rising(32, 3.0))), single)
+    assert (one.compares, one.verdict, one.gap.over) == ("checkpoints", "first", "cases")
+    assert pair_of(repeated("A", 4, 3.0), single).compares == "checkpoints"
+    fixed = pair_of(repeated("A", 4, 3.0), entry("R", run(*rising(32)), is_fixed=True))
+    assert (fixed.compares, fixed.gap.over) == ("agents", "runs and cases")
 
 
 def test_too_few_cases_and_too_few_runs_are_said() -> None:
     found = pair_of(entry("A", run(2.0, 3.0)), entry("B", run(1.0, 1.5)))
     assert (found.gap.low, found.gap.reason, found.verdict) == (None, TOO_FEW_CASES, "not comparable")
     # Two runs each: no exchange of runs can be rarer than one in three.
-    few = pair_of(
-        entry("A", *(run(*rising(32, 50.0 + r)) for r in range(2))),
-        entry("B", *(run(*rising(32, 0.1 * r)) for r in range(2))),
-    )
+    few = pair_of(repeated("A", 2, 50.0), repeated("B", 2, 0.0, 0.1))
     assert (few.verdict, few.p_these_cases) == ("first", pytest.approx(1 / 3))
-    noisy = pair_of(
-        entry("A", *(run(*rising(32, 2.0 + 3.0 * r)) for r in range(2))),
-        entry("B", *(run(*rising(32, 3.0 * r)) for r in range(2))),
-    )
+    noisy = pair_of(repeated("A", 2, 2.0, 3.0), repeated("B", 2, 0.0, 3.0))
     assert noisy.verdict == "not told apart"
     assert 5 <= noisy.n_needed <= 40
 
 
 def test_identical_returns_have_no_spread_and_no_gap() -> None:
-    same = pair_of(entry("A", run(*rising(32))), entry("B", run(*rising(32))))
+    same = pair_of(repeated("A", 1, 0.0), repeated("B", 1, 0.0))
     assert (same.gap.value, same.gap.low, same.gap.reason) == (0.0, None, "no spread: 32 identical cases")
     assert (same.p, same.verdict) == (None, "not comparable")
-    constant = pair_of(
-        entry("A", *(run(*[1.0] * 32) for _ in range(3))), entry("B", *(run(*[1.0] * 32) for _ in range(3)))
-    )
-    assert (constant.gap.reason, constant.p) == ("no spread: 3 identical repeats", None)
+    constant = [entry(name, *[run(*[1.0] * 32)] * 3) for name in ("A", "B")]
+    found = pair_of(*constant)
+    assert (found.gap.reason, found.p) == ("no spread: 3 identical repeats", None)
 
 
 def test_returns_of_nought_and_one_are_counted() -> None:
     first, second = [1.0] * 30 + [0.0] * 2, [0.0] * 16 + [1.0] * 16
-    found = pair_of(entry("A", run(*first)), entry("B", run(*second)))
-    assert found.gap.method == "score"
-    assert -1.0 <= found.gap.low < found.gap.value < found.gap.high <= 1.0
-    sure = cell_mean(entry("A", run(*first)))
-    assert 0.0 <= sure.low < sure.value < sure.high <= 1.0
+    gap = pair_of(entry("A", run(*first)), entry("B", run(*second))).gap
+    assert gap.method == "score"
+    assert -1.0 <= gap.low < gap.value < gap.high <= 1.0
+    mean = cell_mean(entry("A", run(*first)))
+    assert 0.0 <= mean.low < mean.value < mean.high <= 1.0
 
 
 def test_a_run_without_an_ok_submit_has_no_gap_and_stays_last() -> None:
@@ -373,21 +366,22 @@ def test_the_papers_own_table_has_scores_only_and_says_so() -> None:
     assert msgspec.json.encode(shown.rows)
 
 
+VERSIONS = [Version(policy(gain=1.0), (-200.0,), -180.0)]
+
+
 def test_mixed_splits_that_were_allowed_are_not_paired(tmp_path: Path) -> None:
-    versions = [Version(policy(gain=1.0), (-200.0,), -180.0)]
     for name, split in (("A", "split-1"), ("B", "split-2")):
-        write_run(tmp_path / "runs", versions, entry=name, split=split, heldout=rising(32))
+        write_run(tmp_path / "runs", VERSIONS, entry=name, split=split, heldout=rising(32))
     found = study([tmp_path / "runs"], allow_mixed=True)
     (pair,) = [one for one in found.suites[0].statistics.pairs if one.second == "B"]
     assert pair.reason == NO_COMMON_CASES
 
 
 def test_pairs_with_the_random_reference_are_of_the_same_family(tmp_path: Path) -> None:
-    versions = [Version(policy(gain=1.0), (-200.0,), -180.0)]
     for name, shift in (("A", 40.0), ("B", 20.0)):
         random = {"mean_return": sum(rising(32)) / 32, "returns": rising(32), "seeded_by": "case"}
         change = {"outcome": {"random_reference": random}}
-        write_run(tmp_path / "runs", versions, entry=name, heldout=rising(32, shift), change=change)
+        write_run(tmp_path / "runs", VERSIONS, entry=name, heldout=rising(32, shift), change=change)
     found = study([tmp_path / "runs"]).suites[0].statistics
     assert [(one.first, one.second, one.verdict) for one in found.pairs] == [
         ("A", "B", "first"), ("A", "Random policy", "first"), ("B", "Random policy", "first"),
@@ -413,9 +407,9 @@ def test_success_is_reported_where_the_return_tells_it(
 ) -> None:
     for number, (reported, expected) in enumerate([(..., share), ([True, True, True, False], 0.75)]):
         # What the environment reported comes first.
-        version, change = Version(policy(gain=1.0), (1.0,), 1.0), {"outcome": {"heldout_successes": reported}}
+        change = {"outcome": {"heldout_successes": reported}}
         runs = tmp_path / str(number)
-        write_run(runs, [version], env=env, heldout=returns, random_mean=None, change=change)
+        write_run(runs, VERSIONS, env=env, heldout=returns, random_mean=None, change=change)
         (one,) = study([runs]).suites[0].statistics.generalisation
         assert one.success == expected
 
@@ -435,7 +429,7 @@ def test_rate_of_repaired_actions_is_reported_where_it_was_recorded(
     tmp_path: Path, repaired: object, rate: float | None
 ) -> None:
     change = {"outcome": {"auxiliary": {"transitions": ... if repaired is None else repaired}}}
-    write_run(tmp_path / "runs", [Version(policy(gain=1.0), (1.0,), 1.0)], change=change)
+    write_run(tmp_path / "runs", VERSIONS, change=change)
     found = study([tmp_path / "runs"])
     assert found.audit[0].repaired_rate == rate
     assert [row.get("repaired_rate") for row in table_named(tables_of(found), "audit").rows] == [rate]
