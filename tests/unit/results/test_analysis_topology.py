@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import pytest
 
 from evopolicy_results.code.sources import reachable_modules, source_digest
@@ -53,9 +55,80 @@ MOVED = {
 }
 
 
-def swap(old: str, new: str, source: str = BASE) -> dict[str, bytes]:
-    assert old in source
-    return {"policy.py": source.replace(old, new).encode()}
+RICH = """import numpy as xp
+from dataclasses import dataclass, field
+
+
+@dataclass
+class Memory:
+    cells: dict = field(default_factory=dict)
+    size: int = 7
+
+
+class Planner(Memory):
+    WEIGHTS = (0.1, 0.2, 0.3)
+
+    def __init__(self, depth=3, *, width=2):
+        super().__init__()
+        self.depth = depth
+        self.width = width
+
+    def plan(self, grid, goal):
+        def cost(a, b=1.0):
+            return abs(a - goal) * b
+
+        best = min((cost(c, b=2.0) for c in grid), default=0)
+        try:
+            order = sorted(grid, key=lambda cell: cost(cell))
+        except ValueError as error:
+            print(error)
+            order = []
+        match len(order):
+            case 0:
+                return 0
+            case n if n > 3:
+                return n
+        while (step := best - 1) > 0:
+            best = step
+        return best
+
+
+LIMIT = [1, 2, 3]
+
+
+class Policy:
+    def __init__(self, obs_space, action_space, env_meta):
+        self.planner = Planner(depth=4, width=1)
+        self.old = xp.zeros(3, dtype=xp.float32)
+        self.new = None
+
+    def reset(self, episode_index):
+        global COUNT
+        COUNT = 0
+
+    def act(self, obs):
+        self.old, self.new = self.new, obs
+        x = self.planner.plan(LIMIT, obs[0])
+        return x if x else -1
+"""
+"""Most of the language: nested functions, classes that inherit, patterns, globals."""
+HELPER, _, REST = RICH.partition("LIMIT = [")
+
+
+def policy_with(imported: str) -> bytes:
+    """The rest of RICH, with the classes before it imported."""
+    return f"import numpy as xp\n{imported}\n\nLIMIT = [{REST}".encode()
+
+
+def swap(*texts: str, source: str = BASE) -> dict[str, bytes]:
+    """`source` with every second text in place of the one before it."""
+    for old, new in zip(texts[::2], texts[1::2], strict=True):
+        assert old in source, old
+        source = source.replace(old, new)
+    return {"policy.py": source.encode()}
+
+
+rich = partial(swap, source=RICH)
 
 
 def describe_files(files: dict[str, bytes]) -> tuple[str, str, Features]:
@@ -76,7 +149,7 @@ BYTES_ONLY = {
     "an attribute renamed": swap("kp", "proportional"),
     "a function renamed": swap("wrap", "principal_angle"),
     "a global renamed": swap("GAIN", "STRENGTH"),
-    "a parameter renamed": swap("here", "place", BASE.replace('["here"]', '["h"]')),
+    "a parameter renamed": swap("here", "place", source=BASE.replace('["here"]', '["h"]')),
     "type hints": swap("def wrap(angle):", "def wrap(angle: float) -> float:"),
     "a hint on a variable": swap("        error = ", "        error: float = "),
     "functions reordered": {
@@ -99,6 +172,49 @@ BYTES_ONLY = {
         "policy.py": BASE.replace("import math\n", "from math import pi\n").replace("math.pi", "pi").encode()
     },
     "an unused import": swap("import math\n", "import math\nimport random\n"),
+}
+
+PARAMETRIC = {
+    "a class renamed": rich("Planner", "Searcher"),
+    "a base class renamed": rich("Memory", "Store"),
+    "a method renamed": rich(".plan(", ".search(", "def plan", "def search"),
+    "an import's alias renamed": rich("numpy as xp", "numpy as np", "xp.", "np."),
+    "an import without its alias": rich("import numpy as xp", "import numpy", "xp.", "numpy."),
+    "a keyword parameter renamed with its calls": rich("depth", "levels"),
+    "a nested function renamed": rich("cost", "price"),
+    "a nested default": rich("b=1.0", "b=1.5"),
+    "a comprehension's variable renamed": rich("cost(c, b=2.0) for c in", "cost(z, b=2.0) for z in"),
+    "a lambda's parameter renamed": rich("lambda cell: cost(cell)", "lambda q: cost(q)"),
+    "an exception's name": rich("error", "problem"),
+    "a pattern's constant": rich("case 0", "case 5"),
+    "a pattern's capture renamed": rich("case n if n > 3", "case k if k > 3", "return n\n", "return k\n"),
+    "an assignment expression renamed": rich("step", "after"),
+    "a declared global renamed": rich("COUNT", "CALLS"),
+    "the values of a list": rich("[1, 2, 3]", "[9, -8, 7.5]"),
+    "the values of a class variable": rich("(0.1, 0.2, 0.3)", "(1, 2, 3)"),
+    "a field's default": rich("size: int = 7", "size: int = 8"),
+    "a number written otherwise": rich("0.1", "1e-1"),
+    "two attributes that trade names": rich(
+        "self.old", "self.tmp", "self.new", "self.old", "self.tmp", "self.new"
+    ),
+    "a returned constant's sign": rich("else -1", "else 1"),
+    "classes moved to a module": {
+        "policy.py": policy_with("from brain import Planner"),
+        "brain.py": HELPER.encode(),
+    },
+    "classes moved to a package": {
+        "policy.py": policy_with("from lib.brain import Planner"),
+        "lib/__init__.py": b"",
+        "lib/brain.py": HELPER.encode(),
+    },
+    "two statements on a line": rich("= depth\n        self.width", "= depth; self.width"),
+    "needless parentheses": rich("abs(a - goal) * b", "(abs((a) - goal)) * (b)"),
+    "line ends": rich("\n", "\r\n"),
+    "tabs": rich("    ", "\t"),
+    "a field's hint": rich("cells: dict =", 'cells: "dict[int, int]" ='),
+    "a method's hints": rich("def act(self, obs):", "def act(self, obs: xp.ndarray) -> int:"),
+    "a needless pass": rich("self.width = width", "self.width = width\n        pass"),
+    "an import for hints": rich("from dataclasses", "from typing import Any\nfrom dataclasses"),
 }
 
 STRUCTURE = {
@@ -132,19 +248,40 @@ STRUCTURE = {
 }
 
 
-@pytest.mark.parametrize("edit", sorted(BYTES_ONLY))
+SYNTHESIS = {
+    "a library's constant": rich("float32", "float64"),
+    "a field removed": rich("    size: int = 7\n", ""),
+    "a comparison": rich("> 0:", ">= 0:"),
+    "an argument dropped": rich(", width=1", ""),
+    "a base class dropped": rich("Planner(Memory)", "Planner"),
+    "another attribute in one place": rich("if x else -1", "if self.old else -1"),
+    "an index for a key": rich("obs[0]", 'obs["a"]'),
+    "a longer list": rich("[1, 2, 3]", "[1, 2, 3, 4]"),
+    "a flag for nothing": rich("self.new = None", "self.new = True"),
+    "an expression for a constant": rich("depth=4", "depth=2 + 2"),
+    "operands traded": rich("abs(a - goal)", "abs(goal - a)"),
+    "a condition negated": rich("if x else", "if not x else"),
+    "a pattern without its guard": rich("case n if n > 3", "case n"),
+    "a new handler": rich("except ValueError as error", "except (ValueError, TypeError) as error"),
+    "a nested function lifted to a call": rich("cost(cell))", "abs(cell))"),
+}
+
+
+@pytest.mark.parametrize("edit", [*BYTES_ONLY, *PARAMETRIC])
 def test_edit_that_is_no_structure_keeps_the_topology(edit: str) -> None:
     before = BASE.replace('["here"]', '["h"]') if edit == "a parameter renamed" else BASE
+    before = before if edit in BYTES_ONLY else RICH
     digest, topology, _ = describe_files({"policy.py": before.encode()})
-    new_digest, new_topology, _ = describe_files(BYTES_ONLY[edit])
+    new_digest, new_topology, _ = describe_files((BYTES_ONLY | PARAMETRIC)[edit])
     assert new_digest != digest
     assert new_topology == topology
 
 
-@pytest.mark.parametrize("edit", sorted(STRUCTURE))
+@pytest.mark.parametrize("edit", [*STRUCTURE, *SYNTHESIS])
 def test_edit_of_structure_changes_the_topology(edit: str) -> None:
-    _, topology, _ = describe_files({"policy.py": BASE.encode()})
-    _, new_topology, _ = describe_files(STRUCTURE[edit])
+    before = BASE if edit in STRUCTURE else RICH
+    _, topology, _ = describe_files({"policy.py": before.encode()})
+    _, new_topology, _ = describe_files((STRUCTURE | SYNTHESIS)[edit])
     assert new_topology != topology
 
 
