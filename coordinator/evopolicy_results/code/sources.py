@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import ast
 import hashlib
-from collections import OrderedDict
 from collections.abc import Mapping
 from itertools import islice
 from pathlib import Path
@@ -26,7 +25,7 @@ MAX_FILES = 400
 
 _MAX_KEPT_BYTES = 1 << 20
 """Sources whose trees are kept: a tree takes about a hundred times the memory."""
-_kept: OrderedDict[bytes, tuple[ast.AST, ...]] = OrderedDict()
+_kept: dict[bytes, tuple[ast.AST, ...]] = {}
 
 
 def parsed(source: bytes) -> tuple[ast.AST, ...]:
@@ -40,7 +39,7 @@ def parsed(source: bytes) -> tuple[ast.AST, ...]:
         nodes = () if tree is None else tuple(ast.walk(tree))
     _kept[source] = nodes
     while sum(map(len, _kept)) > _MAX_KEPT_BYTES:
-        _kept.popitem(last=False)
+        del _kept[next(iter(_kept))]
     return nodes
 
 

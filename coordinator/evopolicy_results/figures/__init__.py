@@ -31,12 +31,9 @@ _OF_STUDY = (
     "policies.wall_time",
 )
 
-Drawing = partial[Plot | None]
-"""Draws one figure; None if it has no data. Can be sent to another process."""
 
-
-def drawings_of(study: Study) -> list[Drawing]:
-    """The figures that matplotlib draws, in order."""
+def drawings_of(study: Study) -> list[partial[Plot | None]]:
+    """The figures that matplotlib draws, in order; None for one without data. They can be sent to other processes."""
     look = looks(study.entries, study.reference)
     sent = msgspec.structs.replace(study, runs=(), audit=())  # figures need no more
     return [

@@ -9,8 +9,8 @@ scores. Policies are parsed, never run. Runs of the published software are read 
 from __future__ import annotations
 
 import math
-from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -201,18 +201,16 @@ def _signals(run: Run) -> tuple[Signal, ...]:
 
 def _read_record(folder: Path) -> RunRecord:
     try:
-        data = read_regular(folder / RUN_JSON)
-        value = published.decode(data)
-        record = (
-            published.read_record(folder, value) if published.is_published(value) else decode_run_record(data)
-        )
-        check_places(folder, record.artifacts)
+        with _naming(RUN_JSON):
+            data = read_regular(folder / RUN_JSON)
+            value = published.decode(data)
+            ours = not published.is_published(value)
+            record = decode_run_record(data) if ours else published.read_record(folder, value)
+            check_places(folder, record.artifacts)
     except FileNotFoundError as error:
         raise UnreadableRunError("unfinished: run.json is missing") from error
     except OSError as error:
         raise UnreadableRunError(f"run.json: {error.strerror}") from error
-    except ProtocolError as error:
-        raise UnreadableRunError(f"run.json: {error}") from error
     return record
 
 
@@ -232,11 +230,13 @@ def _read_submits(folder: Path, record: RunRecord) -> tuple[Submit, ...]:
                 raise UnreadableRunError(
                     f"{place.relative_to(folder)} is a link; put the folder itself in its place"
                 )
-        summary = _read_summary(shown, record)
-        try:
+        summary: Summary | PublishedSummary | None = None
+        if (path := shown / "summary.json").is_file():
+            with _naming(f"{shown.name}/summary.json"):
+                ours = record.record_version != PUBLISHED
+                summary = decode_summary(read_regular(path)) if ours else published.read_summary(path)
+        with _naming(checkpoint.relative_to(folder)):
             meta = read_meta(checkpoint, budget)
-        except ProtocolError as error:
-            raise UnreadableRunError(f"{checkpoint.relative_to(folder)}: {error}") from error
         if summary is not None:
             status: str = summary.status
             n_episodes, mean = summary.n_episodes, summary.mean_return
@@ -274,19 +274,16 @@ def _read_submits(folder: Path, record: RunRecord) -> tuple[Submit, ...]:
     return tuple(submits)
 
 
-def _read_summary(folder: Path, record: RunRecord) -> Summary | PublishedSummary | None:
-    path = folder / "summary.json"
-    if not path.is_file():
-        return None
+@contextmanager
+def _naming(file: object) -> Iterator[None]:
+    """A damaged file's error names it."""
     try:
-        if record.record_version == PUBLISHED:
-            return published.read_summary(path)
-        return decode_summary(read_regular(path))
+        yield
     except ProtocolError as error:
-        raise UnreadableRunError(f"{folder.name}/summary.json: {error}") from error
+        raise UnreadableRunError(f"{file}: {error}") from error
 
 
-_described: OrderedDict[str, Source] = OrderedDict()
+_described: dict[str, Source] = {}
 _MAX_DESCRIBED = 4096
 
 
@@ -308,7 +305,7 @@ def describe_files(files: Files) -> tuple[Files, Source | None]:
             digest=digest, topology=topology, features=features, files=tuple(sorted(reached))
         )
         if len(_described) > _MAX_DESCRIBED:
-            _described.popitem(last=False)
+            del _described[next(iter(_described))]
     return reached, known
 
 

@@ -59,8 +59,8 @@ def optimism(entries: Iterable[str], cells: Sequence[Generalisation]) -> dict[st
 
 def _cell(entry: str, env: str, runs: Sequence[Run], scale: Scale | None) -> Generalisation:
     heldout = fmean(run.score for run in runs if run.score is not None)
-    train = _mean([run.selected.mean_return if run.selected is not None else None for run in runs])
-    validation = _mean([run.selected.val_mean if run.selected is not None else None for run in runs])
+    train = mean_of_all([run.selected.mean_return if run.selected is not None else None for run in runs])
+    validation = mean_of_all([run.selected.val_mean if run.selected is not None else None for run in runs])
     optimism = None if validation is None else validation - heldout
     width = None if scale is None else scale.best - scale.random
     return Generalisation(
@@ -76,7 +76,8 @@ def _cell(entry: str, env: str, runs: Sequence[Run], scale: Scale | None) -> Gen
     )
 
 
-def _mean(values: Sequence[float | None]) -> float | None:
+def mean_of_all(values: Sequence[float | None]) -> float | None:
+    """None unless all are known."""
     known = [value for value in values if value is not None]
     return fmean(known) if known and len(known) == len(values) else None
 

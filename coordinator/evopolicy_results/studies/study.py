@@ -115,9 +115,7 @@ class Study(msgspec.Struct, frozen=True, kw_only=True):
     @property
     def reference(self) -> str | None:
         """The entry of the uniform-random reference; None when it is missing."""
-        return next(
-            (suite.table.reference for suite in self.suites if suite.table.reference is not None), None
-        )
+        return next(filter(None, (suite.table.reference for suite in self.suites)), None)
 
 
 def study_of(

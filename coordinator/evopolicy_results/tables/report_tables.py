@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from statistics import fmean
 from typing import Any
 
 from msgspec.structs import replace
@@ -15,6 +14,7 @@ from evopolicy_results.behaviour.edits import demand_of
 from evopolicy_results.reading.environments import family_of, family_title, grouped, suite_size, title_of
 from evopolicy_results.scoring.normalised import DEMANDS, on_known_scale
 from evopolicy_results.scoring.ranking import CellResult
+from evopolicy_results.statistics.generalisation import mean_of_all
 from evopolicy_results.statistics.standings import RankEstimate
 from evopolicy_results.studies.study import Study, Suite
 from evopolicy_results.tables.run_tables import (
@@ -265,9 +265,7 @@ def _normalised(suite: Suite) -> Table:
 def _known_mean(suite: Suite, entry: str) -> float | None:
     """Mean over the suite's environments; None unless all have a scale and a score."""
     cells = [suite.board.cells.get((entry, env)) for env in suite.board.environments]
-    values = [None if cell is None else on_known_scale(cell.mean, cell.env) for cell in cells]
-    known = [value for value in values if value is not None]
-    return fmean(known) if known and len(known) == len(values) else None
+    return mean_of_all([None if cell is None else on_known_scale(cell.mean, cell.env) for cell in cells])
 
 
 def _worlds(study: Study) -> Table:

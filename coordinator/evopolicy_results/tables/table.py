@@ -121,9 +121,7 @@ def to_csv(table: Table) -> str:
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow([csv_cell(column.key) for column in table.columns])  # may be names of agents
-    for row in table.rows:
-        values = [row.get(column.key) for column in table.columns]
-        writer.writerow([csv_cell(value) for value in values])
+    writer.writerows([csv_cell(row.get(column.key)) for column in table.columns] for row in table.rows)
     return out.getvalue()
 
 
