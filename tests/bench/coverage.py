@@ -60,8 +60,7 @@ RUNS = (2, 3, 5, 10, 16)
 
 def _gaps(world: World) -> Measure:
     def measured(trials: int) -> Sequence[Rate | float]:
-        found = false_gaps(world, trials)
-        return float(trials), found.raw, found.holm, found.ties
+        return float(trials), *false_gaps(world, trials)
 
     return measured
 
@@ -69,7 +68,7 @@ def _gaps(world: World) -> Measure:
 def _ranks(world: World) -> Measure:
     def measured(trials: int) -> Sequence[Rate | float]:
         found = rank_rates(world, trials)
-        apart = math.nan if math.isnan(found.pairs_apart) else round(100.0 * found.pairs_apart)
+        apart = round(100.0 * found.pairs_apart.share) if found.pairs_apart.given else math.nan
         return found.score, found.rank, found.false_gap, apart
 
     return measured

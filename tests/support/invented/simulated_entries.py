@@ -7,6 +7,7 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from statistics import NormalDist
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -251,7 +252,7 @@ def rank_scores(means: Floats) -> Floats:
     return found
 
 
-class FalseGaps(msgspec.Struct, frozen=True, kw_only=True):
+class FalseGaps(NamedTuple):
     """Of simulated suites of equal entries."""
 
     raw: Rate
@@ -264,20 +265,17 @@ class FalseGaps(msgspec.Struct, frozen=True, kw_only=True):
 
 def false_gaps(world: World, trials: int, *, seed: int = 0) -> FalseGaps:
     g = np.random.default_rng(seed)
-    raw = tests = wrong = split = 0
+    raw: list[bool] = []
+    wrong: list[bool] = []
+    split: list[bool] = []
     for _ in range(trials):
         samples = suite_samples(world.returns(g, world.means(g)))
         found = pairs(samples, world.names, world.environments, resamples=1000)
-        known = [pair.p for pair in found if pair.p is not None]
-        raw, tests = raw + sum(p <= 0.05 for p in known), tests + len(known)
-        wrong += any(pair.verdict in ("first", "second") for pair in found)
-        board = standings(samples, observed_scores(world, samples), world.environments, resamples=800)
-        split += any(not set(one.ties) & set(other.ties) for one in board.rows for other in board.rows)
-    return FalseGaps(
-        raw=Rate(held=raw, given=tests, trials=tests),
-        holm=Rate(held=wrong, given=trials, trials=trials),
-        ties=Rate(held=split, given=trials, trials=trials),
-    )
+        raw += [pair.p <= 0.05 for pair in found if pair.p is not None]
+        wrong.append(any(pair.verdict in ("first", "second") for pair in found))
+        rows = standings(samples, observed_scores(world, samples), world.environments, resamples=800).rows
+        split.append(any(not set(one.ties) & set(other.ties) for one in rows for other in rows))
+    return FalseGaps(rated(raw), rated(wrong), rated(split))
 
 
 def observed_scores(world: World, samples: Mapping[tuple[str, str], Sample]) -> dict[str, float]:
@@ -286,7 +284,7 @@ def observed_scores(world: World, samples: Mapping[tuple[str, str], Sample]) -> 
     return dict(zip(world.names, rank_scores(np.array(means)).tolist(), strict=True))
 
 
-class RankRates(msgspec.Struct, frozen=True, kw_only=True):
+class RankRates(NamedTuple):
     """Of simulated suites."""
 
     score: Rate
@@ -295,19 +293,18 @@ class RankRates(msgspec.Struct, frozen=True, kw_only=True):
     """Suites in which every entry's rank interval holds its rank by that average score."""
     false_gap: Rate
     """Suites in which some pair is told apart the wrong way round, or although its average scores are equal."""
-    pairs_apart: float
-    """Share of the pairs with unequal average scores that are told apart."""
+    pairs_apart: Rate
+    """Pairs with unequal average scores that are told apart."""
 
 
 def rank_rates(world: World, trials: int, *, seed: int = 0) -> RankRates:
     g = np.random.default_rng(seed)
     n_runs, n_cases = world.n_runs[0], world.n_cases
-    held = ranks_held = false_gaps = apart = unequal = 0
+    noise = (1.0 / n_runs + world.interaction**2) / n_cases + world.run**2 / n_runs * (n_runs > 1)
+    outcomes: tuple[list[bool], ...] = ([], [], [], [])
+    held, ranks_held, wrong, apart = outcomes
     for _ in range(trials):
         means = world.means(g)
-        noise = (1.0 / n_runs + world.interaction**2) / n_cases + (
-            world.run**2 / n_runs if n_runs > 1 else 0.0
-        )
         average = np.full(world.n_entries, 0.5)
         if world.spread:
             drawn = means + g.normal(0, math.sqrt(noise), (2000, *means.shape))
@@ -318,26 +315,20 @@ def rank_rates(world: World, trials: int, *, seed: int = 0) -> RankRates:
         true = dict(zip(world.names, average.tolist(), strict=True))
         rows = {row.entry: row for row in found.rows}
         assert set(rows) == set(true)
-        all_ranks = True
+        ranks = []
         for name, row in rows.items():
-            held += row.score_low - 1e-9 <= true[name] <= row.score_high + 1e-9
+            held.append(row.score_low - 1e-9 <= true[name] <= row.score_high + 1e-9)
             rank = 1 + sum(other > true[name] + 1e-12 for other in true.values())
             worst = len(true) - sum(other < true[name] - 1e-12 for other in true.values())
-            all_ranks = all_ranks and row.rank_low <= worst and rank <= row.rank_high
-        ranks_held += all_ranks
-        wrong = False
-        for one, other in itertools.permutations(world.names, 2):
-            distinguished = not set(rows[one].ties) & set(rows[other].ties) and scores[one] > scores[other]
-            unequal += true[one] > true[other]
-            apart += distinguished and true[one] > true[other]
-            wrong = wrong or (distinguished and true[one] <= true[other])
-        false_gaps += wrong
-    return RankRates(
-        score=Rate(held=held, given=trials * world.n_entries, trials=trials * world.n_entries),
-        rank=Rate(held=ranks_held, given=trials, trials=trials),
-        false_gap=Rate(held=false_gaps, given=trials, trials=trials),
-        pairs_apart=apart / unequal if unequal else math.nan,
-    )
+            ranks.append(row.rank_low <= worst and rank <= row.rank_high)
+        ranks_held.append(all(ranks))
+        told = {
+            (one, other): not set(rows[one].ties) & set(rows[other].ties) and scores[one] > scores[other]
+            for one, other in itertools.permutations(world.names, 2)
+        }
+        apart += [is_told for (one, other), is_told in told.items() if true[one] > true[other]]
+        wrong.append(any(is_told and true[one] <= true[other] for (one, other), is_told in told.items()))
+    return RankRates(*map(rated, outcomes))
 
 
 def mean_coverage(n_runs: int, shape: str, trials: int, *, seed: int = 0) -> Rate:
@@ -362,7 +353,7 @@ def welch_coverage(kind: str, n_runs: int, trials: int, *, seed: int = 0) -> Rat
     )
 
 
-class AggregateRates(msgspec.Struct, frozen=True, kw_only=True):
+class AggregateRates(NamedTuple):
     """Coverage of the true values with infinitely many runs and cases, on the true scale."""
 
     iqm: Rate
