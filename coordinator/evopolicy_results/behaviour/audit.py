@@ -1,6 +1,6 @@
 """Audit signals and token accounting of each run (paper, appendix: audit signals, token and cost accounting).
 
-These are diagnostics: no score depends on them. A run of the published software has no record of some of them.
+These are diagnostics: no score depends on them. Runs of the published software record only some of them.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ def _repaired_rate(transitions: object) -> float | None:
 
 
 def mean_phases(runs: Iterable[Run]) -> dict[str, dict[str, float]]:
-    """By entry, the mean wall time of a run in each of `PHASES`, in seconds; without entries that record none."""
+    """By entry, the mean wall time of a run by phase, in seconds; without entries that record none."""
     by_entry = grouped((run for run in runs if not run.is_published), lambda run: run.entry)
     return {
         entry: {

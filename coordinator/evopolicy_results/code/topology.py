@@ -93,7 +93,7 @@ class _Walker:
     def _units_of(
         self, body: Iterable[ast.stmt], scope: Scope, defs: set[str], stored: set[str]
     ) -> list[Unit]:
-        """The units of a module's or class's body. Their definitions go to `defs`, other names to `stored`."""
+        """The units of a body. Their definitions go to `defs`, other names to `stored`."""
         units = [unit for one in body if (unit := self._statement_unit(one, scope, defs)) is not None]
         stored.update(*(unit.stored for unit in units if not unit.is_function))
         return units

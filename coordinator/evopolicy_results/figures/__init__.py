@@ -33,7 +33,7 @@ _OF_STUDY = (
 
 
 def drawings_of(study: Study) -> list[partial[Plot | None]]:
-    """The figures that matplotlib draws, in order; None for one without data. They can be sent to other processes."""
+    """The figures that matplotlib draws, in order; None for one without data. Processes can send them."""
     look = looks(study.entries, study.reference)
     sent = msgspec.structs.replace(study, runs=(), audit=())  # figures need no more
     return [

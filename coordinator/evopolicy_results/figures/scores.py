@@ -154,7 +154,7 @@ def _mean_curve(panel: Axes, curves: Sequence[Evolution], look: Look) -> None:
 
 
 def performance_profiles(suite: Suite, study: Study, looks: Mapping[str, Look]) -> Plot | None:
-    """One curve per agent, the share of its runs above each normalised score, with its pointwise 95 % band."""
+    """By agent, the share of its runs above each normalised score, with a pointwise 95 % band."""
     aggregates = suite.statistics.aggregates
     if not aggregates:
         return None
@@ -244,7 +244,7 @@ def normalised_performance(suite: Suite, study: Study, looks: Mapping[str, Look]
 
 
 def worlds(study: Study, looks: Mapping[str, Look]) -> Plot | None:
-    """Left: each entry's mean in unchanged environments and in worlds. Right: its best so far over episodes."""
+    """Left: each entry's means, unchanged and in worlds. Right: its best so far over episodes."""
     if study.worlds is None:
         return None
     overall = {one.entry: one for one in reversed(study.worlds.paired)}  # an entry's first row is its widest

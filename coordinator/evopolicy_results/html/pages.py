@@ -1,4 +1,4 @@
-"""The report's pages as text: their contents and wording. Markup is in `templates/`; `report` writes the files."""
+"""The report's pages as text: contents and wording. Markup is in `templates/`; `report` writes the files."""
 
 from __future__ import annotations
 
@@ -72,8 +72,8 @@ class _Section(NamedTuple):
     text: str = ""
     figures: str = ""
     tables: str = ""
-    """Names of figures and of tables. `name_*` has one for each suite, `name_+` one for each suite whose environments
-    are averaged. All names between two semicolons are of the first suite, then of the next."""
+    """Names of figures and of tables. `name_*` has one for each suite, `name_+` one for each suite with means
+    over environments. All names between two semicolons are of the first suite, then of the next."""
 
 
 _SECTIONS = (
@@ -135,7 +135,7 @@ def index_page(
     trace_links: Mapping[str, str],
     replay_links: Mapping[str, str],
 ) -> str:
-    """`index.html`: every section with content, and what was left out. Without a `title` it names the suites."""
+    """`index.html`: every section with content. Without a `title` it names the suites."""
     n_envs = len({env for suite in study.suites for env in suite.table.environments})
     folded = ("pairs_", "generalisation_", "cells_")[: 3 if n_envs >= _RANKS_FROM else 2]
     views = {
@@ -262,7 +262,7 @@ def _notices(study: Study) -> list[dict[str, Any]]:
 
 
 def table_view(table: Table, pages: Mapping[str, str] = {}) -> dict[str, Any]:
-    """The table for a page, without columns that have no value in any row. `pages` of runs, by the run's name."""
+    """The table for a page, without columns of no values. `pages`: those of runs, by their names."""
     columns = [
         c for c in table.columns if not table.rows or any(row.get(c.key) is not None for row in table.rows)
     ]
@@ -369,7 +369,8 @@ def _outcome(row: TraceRow, by_index: Mapping[int, Submit]) -> str:
     submit = row.submit
     if submit.status != "ok":
         return f"{in_words(submit.status)}: no working policy"
-    before = None if row.transition is None else by_index.get(row.transition.previous)  # type: ignore[arg-type]
+    previous = None if row.transition is None else row.transition.previous
+    before = None if previous is None else by_index[previous]
     parts = []
     for words, field in (("visible mean", "mean_return"), ("validation mean", "val_mean")):
         value, earlier = getattr(submit, field), getattr(before, field, None)
@@ -381,7 +382,7 @@ def _outcome(row: TraceRow, by_index: Mapping[int, Submit]) -> str:
 
 
 def _checkpoints(trace: Trace) -> dict[str, dict[str, Any]]:
-    """By label, each submit's checkpoint: the first with the same files, and what changed since the one before."""
+    """By label: the first checkpoint with the same files, and what changed since the one before."""
     out: dict[str, dict[str, Any]] = {}
     previous: dict[str, str] | None = None
     labels: dict[str, str] = {}
