@@ -38,10 +38,10 @@ def rank_scores(suite: Suite, study: Study, looks: Mapping[str, Look]) -> Plot |
         for panel, family in zip(axes[0], panels, strict=True):
             panel.set_title(suite.title if not family else family_title(family))
             for place, row in enumerate(standings):
-                end = value = row.families.get(family) if family else row.score
+                value = row.families.get(family) if family else row.score
                 if value is None:
                     continue
-                look = looks[row.entry]
+                look, end = looks[row.entry], value
                 panel.hlines(place, 0.0, value, color=look.colour, linewidth=2.2, alpha=0.55)
                 panel.plot(value, place, look.marker, color=look.colour, markersize=6.5)
                 if not family and (estimate := estimates.of(row.entry)) is not None:

@@ -73,8 +73,8 @@ def name_rows(panel: Axes, names: Sequence[str]) -> None:
 
 def write_beside(panel: Axes, x: float, y: float, text: str, points: int, size: float = 8) -> None:
     """Writes `text` in that font size, so many points to the right of a place."""
-    offset = {"xytext": (points, 0), "textcoords": "offset points"}
-    panel.annotate(text, (x, y), **offset, va="center", fontsize=size)
+    offset = (points, 0)
+    panel.annotate(text, (x, y), xytext=offset, textcoords="offset points", va="center", fontsize=size)
 
 
 def handles_of(entries: Iterable[str], looks: Mapping[str, Look]) -> list[Line2D]:

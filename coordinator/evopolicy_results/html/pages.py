@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache
 from importlib.resources import files
-from itertools import zip_longest
 from typing import Any, NamedTuple
 
 from jinja2 import DictLoader, Environment, StrictUndefined
@@ -288,7 +287,9 @@ def table_view(table: Table, pages: Mapping[str, str] = {}) -> dict[str, Any]:
                 _cell(column, row.get(column.key), table.marks.get((number, column.key), 0), pages.get(run))
                 for column in columns
             ]
-            for number, (row, run) in enumerate(zip_longest(table.rows, table.runs, fillvalue=""))
+            for number, (row, run) in enumerate(
+                zip(table.rows, table.runs or [""] * len(table.rows), strict=True)
+            )
         ],
     }
 

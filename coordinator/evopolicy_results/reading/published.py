@@ -124,11 +124,13 @@ def read_record(folder: Path, record: dict[str, Any]) -> RunRecord:
                 Outcome,
             ),
             artifacts=msgspec.convert(artifacts, Artifacts),
-            versions=Versions(
-                harness=str(versions.get("harness", UNKNOWN)),
-                env=str(versions.get("env", UNKNOWN)),
-                data_secret=False,
-                **{name: str(versions.get(name, "")) for name in _HASHES},
+            versions=msgspec.convert(
+                {
+                    **{name: str(versions.get(name, UNKNOWN)) for name in ("harness", "env")},
+                    **{name: str(versions.get(name, "")) for name in _HASHES},
+                    "data_secret": False,
+                },
+                Versions,
             ),
         )
     except (msgspec.ValidationError, TypeError) as error:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 from msgspec.structs import replace
 
@@ -54,11 +55,12 @@ def rescored(runs: Sequence[Run], name: str) -> list[Run]:
 def _replaced(run: Run, record: RescoreRecord, played: Rescored) -> Run:
     outcome, versions = run.record.outcome, run.record.versions
     failures = tuple(each for each in outcome.policy_failures if each.split != _HELDOUT)
+    categories: dict[str, Any] = {**played.failures}
     failures += tuple(
         PolicyFailureRecord(
-            split=_HELDOUT, submit_index=record.selected, episode=int(episode), category=category
-        )  # type: ignore[arg-type]
-        for episode, category in sorted(played.failures.items())
+            split=_HELDOUT, submit_index=record.selected, episode=int(case), category=category
+        )
+        for case, category in sorted(categories.items())
     )
     random = record.random_returns
     reference = ReferenceScore(

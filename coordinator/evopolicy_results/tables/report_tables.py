@@ -13,7 +13,7 @@ from evopolicy_results.behaviour.audit import TokenUse
 from evopolicy_results.behaviour.edits import demand_of
 from evopolicy_results.reading.environments import family_of, family_title, grouped, suite_size, title_of
 from evopolicy_results.scoring.normalised import DEMANDS, on_known_scale
-from evopolicy_results.scoring.ranking import CellResult
+from evopolicy_results.scoring.ranking import CellResult, Incomplete, Standing
 from evopolicy_results.statistics.generalisation import mean_of_all
 from evopolicy_results.statistics.standings import RankEstimate
 from evopolicy_results.studies.study import Study, Suite
@@ -171,7 +171,8 @@ def _incomplete(suite: Suite) -> Table:
 def _heldout(suite: Suite) -> Table:
     rows: list[dict[str, Any]] = []
     marks: dict[tuple[int, str], int] = {}
-    for i, standing in enumerate([*suite.board.standings, *suite.board.incomplete]):
+    standings: list[Standing | Incomplete] = [*suite.board.standings, *suite.board.incomplete]
+    for i, standing in enumerate(standings):
         row: dict[str, Any] = {"entry": standing.entry, "harness": standing.harness}
         for env in suite.board.environments:
             if (cell := suite.board.cells.get((standing.entry, env))) is not None:
