@@ -145,10 +145,7 @@ def _evidence(events: Sequence[LogEvent]) -> Evidence:
 def _lines(path: Path) -> Iterator[bytes]:
     remaining = MAX_LOG_BYTES
     with open_regular(path) as stream:
-        while remaining > 0:
-            line = stream.readline(remaining)
-            if not line:
-                return
+        while line := stream.readline(remaining):
             remaining -= len(line)
             yield line
 

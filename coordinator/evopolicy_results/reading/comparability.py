@@ -65,9 +65,7 @@ def _named(mixtures: Sequence[Mixture]) -> Iterator[str]:
             continue
         for value, folders in islice(mixture.folders.items(), _MOST_NAMED):
             more = len(folders) - _MOST_NAMED
-            yield f"    {value}: {', '.join(folders[:_MOST_NAMED])}" + (
-                f" and {more} more" if more > 0 else ""
-            )
+            yield f"    {value}: {', '.join(folders[:_MOST_NAMED])}" + f" and {more} more" * (more > 0)
         if (more := len(mixture.folders) - _MOST_NAMED) > 0:
             yield f"    and {more} more values"
 

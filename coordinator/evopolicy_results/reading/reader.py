@@ -150,11 +150,9 @@ def read_or_explain(folder: Path) -> Run | LeftOut:
     """The run in `folder`, or the reason why it is left out."""
     try:
         return read_run(folder)
-    except UnreadableRunError as error:
-        return LeftOut(path=folder, reason=str(error))
-    except Exception as error:
-        # The other runs are read regardless of an agent's leftovers.
-        return LeftOut(path=folder, reason=f"{type(error).__name__}: {error}"[:_MAX_REASON_CHARS])
+    except Exception as error:  # the other runs are read regardless of an agent's leftovers
+        kind = "" if isinstance(error, UnreadableRunError) else f"{type(error).__name__}: "
+        return LeftOut(path=folder, reason=f"{kind}{error}"[:_MAX_REASON_CHARS])
 
 
 def read_run(folder: Path) -> Run:
