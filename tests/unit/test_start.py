@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import typer
 
-from evopolicy_gateway.cli.main import PLACES, app
+from evopolicy_gateway.cli.main import HELPS, app
 
 LARGE = {
     *(
@@ -87,12 +87,12 @@ def test_commands_are_found_by_the_table_alone() -> None:
     assert project.get("entry-points", {}).keys() <= {"inspect_ai"}
 
 
-@pytest.mark.parametrize("name", PLACES)
+@pytest.mark.parametrize("name", HELPS)
 def test_the_help_of_evopolicy_describes_a_command_as_its_own_help_does(name: str) -> None:
     front = typer.main.get_command(app)
     command = front.commands[name]  # type: ignore[attr-defined]
     assert command.name == name
-    assert PLACES[name].help == command.get_short_help_str(1000)
+    assert HELPS[name] == command.get_short_help_str(1000)
 
 
 CTRL_C = """

@@ -9,143 +9,102 @@ from __future__ import annotations
 import importlib
 import sys
 from collections.abc import Iterator, Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import typer
 
 from evopolicy_common.cli.frame import App, Group, Version, run_app
 from evopolicy_gateway.processes import trees as processes
 
-
-class Place(NamedTuple):
-    """Module and help text of a command."""
-
-    app: str
-    """`module:name` of a `typer.Typer`, which holds the command or is it."""
-    help: str
-    """First sentence of its own help."""
-    extra: str | None = None
-    """Extra to name where a module is missing; None for that of the module."""
-
-
-_PLAY = "evopolicy_gateway.cli.play:app"
-_COORDINATOR = "evopolicy_coordinator.cli"
-_RESULTS = "evopolicy_results.cli"
-
+_MODULES = {
+    "evopolicy_gateway.cli.play:app": "demo replay try random local run finish diff",
+    "evopolicy_gateway.harbor.scores:app": "harbor",
+    "evopolicy_gateway.cli.suite:app": "suite",
+    "evopolicy_results.cli.report:app": "report",
+    "evopolicy_results.cli.verify:app": "verify",
+    "evopolicy_results.cli.rescore:app": "rescore",
+    "evopolicy._exports.command:app": "export",
+    "evopolicy_results.cli.publish:app": "publish",
+    "evopolicy_results.cli.publish:check_app": "check",
+    "evopolicy_results.leaderboard.command:app": "leaderboard",
+    "evopolicy_coordinator.cli.status:status_app": "status",
+    "evopolicy_coordinator.cli.web:app": "web",
+    "evopolicy_coordinator.cli.status:workers_app": "workers",
+    "evopolicy_coordinator.cli.status:runs_app": "runs",
+    "evopolicy_coordinator.cli.envs:app": "envs",
+    "evopolicy_coordinator.cli.gc:disk_app": "disk",
+    "evopolicy_coordinator.cli.gc:gc_app": "gc",
+    "evopolicy_worker.sandbox.doctor_command:app": "doctor",
+    "evopolicy_gateway.cli.files:app": "files texts schema",
+    "evopolicy_coordinator.cli.data:app": "data",
+}
+"""Each `module:name` of a `typer.Typer`, which holds the named commands or is one."""
+_EXTRAS = {"web": "coordinator"}
+"""Extras to name where a command lacks a module, if not that of the module."""
 GROUPS = {
     "Play": {
-        "demo": Place(
-            _PLAY, "Play one run on this machine: the agent evolve on gym/continuouscar, 32 episodes."
-        ),
-        "replay": Place(
-            _PLAY, "Play a recorded run again: the same agent, with its model's answers from the record."
-        ),
-        "try": Place(_PLAY, "Play a policy on train cases, without a run or an agent."),
-        "random": Place(_PLAY, "Play uniform random actions on a split, as a reference for scores."),
-        "local": Place(_PLAY, "Play runs on this machine."),
-        "run": Place(_PLAY, "Play one run on a cluster."),
-        "finish": Place(_PLAY, "Close the run of a remote agent."),
-        "harbor": Place(
-            "evopolicy_gateway.harbor.scores:app",
-            "Write a Harbor task for each open run of a remote agent, and serve the runs' scores to Harbor's verifiers"
-            " until Ctrl-C.",
-        ),
-        "suite": Place("evopolicy_gateway.cli.suite:app", "Play a sweep: agents × environments × repeats."),
+        "demo": "Play one run on this machine: the agent evolve on gym/continuouscar, 32 episodes.",
+        "replay": "Play a recorded run again: the same agent, with its model's answers from the record.",
+        "try": "Play a policy on train cases, without a run or an agent.",
+        "random": "Play uniform random actions on a split, as a reference for scores.",
+        "local": "Play runs on this machine.",
+        "run": "Play one run on a cluster.",
+        "finish": "Close the run of a remote agent.",
+        "harbor": "Write a Harbor task for each open run of a remote agent, and serve the runs' scores"
+        " to Harbor's verifiers until Ctrl-C.",
+        "suite": "Play a sweep: agents × environments × repeats.",
     },
     "Results": {
-        "report": Place(
-            f"{_RESULTS}.report:app",
-            "Write a report on finished runs: leaderboard, figures and diagnostics.",
-        ),
-        "diff": Place(
-            _PLAY,
-            "Compare two run directories, except for times, logs and other values that differ between equal runs.",
-        ),
-        "verify": Place(
-            f"{_RESULTS}.verify:app",
-            "Replay a run's recorded actions, and compare rewards, observations and returns bit for bit.",
-        ),
-        "rescore": Place(
-            f"{_RESULTS}.rescore:app",
-            "Play checkpoints of finished runs on further hidden cases, for tighter intervals.",
-        ),
-        "export": Place(
-            "evopolicy._exports.command:app",
-            "Export runs to tables, experiment trackers, trajectory datasets and agents' logs.",
-        ),
-        "publish": Place(
-            f"{_RESULTS}.publish:app",
-            "Write finished runs into one signed file that anyone can check, and make their cases public.",
-        ),
-        "check": Place(f"{_RESULTS}.publish:check_app", "Check published results."),
-        "leaderboard": Place(
-            "evopolicy_results.leaderboard.command:app",
-            "Write a leaderboard of several labs' published results as a static site.",
-        ),
+        "report": "Write a report on finished runs: leaderboard, figures and diagnostics.",
+        "diff": "Compare two run directories, except for times, logs and other values that differ"
+        " between equal runs.",
+        "verify": "Replay a run's recorded actions, and compare rewards, observations and returns bit"
+        " for bit.",
+        "rescore": "Play checkpoints of finished runs on further hidden cases, for tighter intervals.",
+        "export": "Export runs to tables, experiment trackers, trajectory datasets and agents' logs.",
+        "publish": "Write finished runs into one signed file that anyone can check, and make their cases"
+        " public.",
+        "check": "Check published results.",
+        "leaderboard": "Write a leaderboard of several labs' published results as a static site.",
     },
     "Cluster": {
-        "status": Place(
-            f"{_COORDINATOR}.status:status_app", "Show workers, runs, and the reasons why runs wait."
-        ),
-        "web": Place(
-            f"{_COORDINATOR}.web:app", "Show sweeps, runs and the cluster in a browser, live.", "coordinator"
-        ),
-        "workers": Place(f"{_COORDINATOR}.status:workers_app", "List, drain, pause and resume workers."),
-        "runs": Place(f"{_COORDINATOR}.status:runs_app", "List, cancel and repin runs."),
-        "envs": Place(
-            f"{_COORDINATOR}.envs:app",
-            "List the environments that the cluster's workers offer, their definitions, and whether runs may use them.",
-        ),
-        "disk": Place(
-            f"{_COORDINATOR}.gc:disk_app",
-            "Show the disk space of stored runs by environment, and whether a planned sweep fits.",
-        ),
-        "gc": Place(
-            f"{_COORDINATOR}.gc:gc_app",
-            "Delete stored episodes and bundles of runs that finished long ago, and unreferenced blobs.",
-        ),
+        "status": "Show workers, runs, and the reasons why runs wait.",
+        "web": "Show sweeps, runs and the cluster in a browser, live.",
+        "workers": "List, drain, pause and resume workers.",
+        "runs": "List, cancel and repin runs.",
+        "envs": "List the environments that the cluster's workers offer, their definitions, and"
+        " whether runs may use them.",
+        "disk": "Show the disk space of stored runs by environment, and whether a planned sweep fits.",
+        "gc": "Delete stored episodes and bundles of runs that finished long ago, and unreferenced blobs.",
     },
     "Setup and files": {
-        "doctor": Place(
-            "evopolicy_worker.sandbox.doctor_command:app",
-            "Check this machine, and print the remedy for each missing part.",
-        ),
-        "files": Place(
-            "evopolicy_gateway.cli.files:app",
-            "List or copy the examples, deployment files and pages that come with evopolicy.",
-        ),
-        "texts": Place(
-            "evopolicy_gateway.cli.files:app",
-            "Print the standard texts for agents, as templates for --agents-md and --prompts.",
-        ),
-        "schema": Place(
-            "evopolicy_gateway.cli.files:app", "Print the JSON Schema of one of evopolicy's files."
-        ),
-        "data": Place(
-            f"{_COORDINATOR}.data:app",
-            "Make and check the split files of environments (hidden cases: keep them from agents).",
-        ),
+        "doctor": "Check this machine, and print the remedy for each missing part.",
+        "files": "List or copy the examples, deployment files and pages that come with evopolicy.",
+        "texts": "Print the standard texts for agents, as templates for --agents-md and --prompts.",
+        "schema": "Print the JSON Schema of one of evopolicy's files.",
+        "data": "Make and check the split files of environments (hidden cases: keep them from agents).",
     },
 }
-"""All commands, by the headings of the help."""
-PLACES = {name: place for places in GROUPS.values() for name, place in places.items()}
+"""All commands by the headings of the help, each with the first sentence of its own help."""
+HELPS = {name: text for helps in GROUPS.values() for name, text in helps.items()}
+_PLACES = {name: place for place, names in _MODULES.items() for name in names.split()}
 
 
 class _Commands(Mapping[str, Any]):
     """The commands by name, each imported on first use."""
 
     def __getitem__(self, name: str) -> Any:
-        module, _, app = PLACES[name].app.partition(":")
+        module, _, app = _PLACES[name].partition(":")
         command: Any = typer.main.get_command(getattr(importlib.import_module(module), app))
         command = getattr(command, "commands", {}).get(name, command)
         command.name = name
         return command
 
     def __iter__(self) -> Iterator[str]:
-        return iter(PLACES)
+        return iter(HELPS)
 
     def __len__(self) -> int:
-        return len(PLACES)
+        return len(HELPS)
 
 
 class _TopLevel(Group):
@@ -154,7 +113,7 @@ class _TopLevel(Group):
         self.commands = _Commands()  # type: ignore[assignment]  # nobody adds to it
 
     def list_commands(self, ctx: Any) -> list[str]:
-        return list(PLACES)
+        return list(HELPS)
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
         try:
@@ -167,10 +126,7 @@ class _TopLevel(Group):
             raise
 
     def command_groups(self, ctx: Any) -> dict[str, list[tuple[str, str]]]:
-        return {
-            heading: [(name, place.help) for name, place in places.items()]
-            for heading, places in GROUPS.items()
-        }
+        return {heading: list(helps.items()) for heading, helps in GROUPS.items()}
 
 
 app = App(cls=_TopLevel, no_args_is_help=True, add_completion=True)
@@ -189,5 +145,5 @@ def evopolicy(_: Version = False) -> None:
 def main() -> None:
     """The program."""
     processes.become_subreaper()
-    command = PLACES.get(next((word for word in sys.argv[1:] if not word.startswith("-")), ""))
-    run_app(app, command and command.extra)
+    command = next((word for word in sys.argv[1:] if not word.startswith("-")), "")
+    run_app(app, _EXTRAS.get(command))
