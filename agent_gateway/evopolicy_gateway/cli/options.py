@@ -24,6 +24,25 @@ from evopolicy_gateway.run.run_options import ClusterOptions
 
 RUN, CLUSTER = "Run", ClusterOptions.group
 
+Env = Annotated[
+    str, typer.Option(help="Suite id, such as gym/acrobot.", show_default=False, rich_help_panel=RUN)
+]
+Envs = Annotated[
+    list[str],
+    typer.Option(
+        help="Suite (core16), suite id, glob (gymnasium/MiniGrid-*), environment file or module:Id; may be repeated.",
+        show_default=False,
+        rich_help_panel=RUN,
+    ),
+]
+Local = Annotated[
+    bool,
+    typer.Option(
+        "--local",
+        help="Start a coordinator and a worker on this machine, as `evopolicy local` does.",
+        rich_help_panel=CLUSTER,
+    ),
+]
 Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON; progress goes to stderr.")]
 Web = Annotated[
     bool,

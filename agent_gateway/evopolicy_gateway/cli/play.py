@@ -33,26 +33,17 @@ from evopolicy_gateway.suite import runs as plain_runs
 from evopolicy_gateway.suite.suite_index import exit_code
 
 app = App()
+_UNAUDITED = Shown(without=("audit", "hidden_isolation", "env_timeout", "env_memory"))
 
 
 @app.command(epilog="Example: evopolicy run --env gym/acrobot --agent evolve --credentials operator-me")
 @spread
 def run(
     *,
-    env: Annotated[
-        str,
-        typer.Option(help="Suite id, such as gym/acrobot.", show_default=False, rich_help_panel=options.RUN),
-    ],
+    env: options.Env,
     connect: Connect = None,
     credentials_file: CredentialsFile = None,
-    local: Annotated[
-        bool,
-        typer.Option(
-            "--local",
-            help="Start a coordinator and a worker on this machine, as `evopolicy local` does.",
-            rich_help_panel=options.CLUSTER,
-        ),
-    ] = False,
+    local: options.Local = False,
     given: RunOptions,
     jail: JailSettings,
     served: ListenerOptions,
@@ -88,16 +79,7 @@ def run(
 @spread
 def local(
     *,
-    env: Annotated[
-        list[str],
-        typer.Option(
-            help=(
-                "Suite (core16), suite id, glob (gymnasium/MiniGrid-*), environment file or module:Id; may be repeated."
-            ),
-            show_default=False,
-            rich_help_panel=options.RUN,
-        ),
-    ],
+    env: options.Envs,
     given: RunOptions,
     jail: JailSettings,
     parallel: Annotated[
@@ -145,7 +127,7 @@ def demo(
 def try_policy(
     *,
     policy_dir: Annotated[Path, typer.Argument(help="Folder with a policy.py.", show_default=False)],
-    env: Annotated[str, typer.Option(help="Suite id, such as gym/acrobot.", show_default=False)],
+    env: options.Env,
     cases: Annotated[
         str,
         typer.Option(
@@ -188,19 +170,12 @@ def try_policy(
 @spread
 def play_random(
     *,
-    env: Annotated[
-        list[str],
-        typer.Option(
-            help="Suite, suite id, glob, environment file or module:Id; may be repeated.", show_default=False
-        ),
-    ],
+    env: options.Envs,
     split: Annotated[Split, typer.Option(help="Cases to play.")] = "heldout",
     cases: Annotated[str | None, typer.Option(help="Ids and ranges in the split; default: all.")] = None,
     connect: Connect = None,
     credentials_file: CredentialsFile = None,
-    cluster: Annotated[
-        ClusterOptions, Shown(without=("audit", "hidden_isolation", "env_timeout", "env_memory"))
-    ],
+    cluster: Annotated[ClusterOptions, _UNAUDITED],
     as_json: options.Json = False,
 ) -> None:
     """Play uniform random actions on a split, as a reference for scores.
@@ -271,9 +246,7 @@ def replay(
     ] = False,
     connect: Connect = None,
     credentials_file: CredentialsFile = None,
-    cluster: Annotated[
-        ClusterOptions, Shown(without=("audit", "hidden_isolation", "env_timeout", "env_memory"))
-    ],
+    cluster: Annotated[ClusterOptions, _UNAUDITED],
 ) -> None:
     """Play a recorded run again: the same agent, with its model's answers from the record.
 

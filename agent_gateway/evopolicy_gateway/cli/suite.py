@@ -63,14 +63,7 @@ def suite(
     ],
     connect: Connect = None,
     credentials_file: CredentialsFile = None,
-    local: Annotated[
-        bool,
-        typer.Option(
-            "--local",
-            help="Start a coordinator and a worker on this machine for the sweep.",
-            rich_help_panel=options.CLUSTER,
-        ),
-    ] = False,
+    local: options.Local = False,
     runs: Annotated[Path | None, typer.Option(help="The sweep's folder; default: runs/NAME.")] = None,
     only: Annotated[
         list[str] | None,
