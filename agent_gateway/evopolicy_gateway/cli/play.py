@@ -163,7 +163,7 @@ def try_policy(
         where = msgspec.structs.replace(where, unjailed=tier == "none")
         where.check_ids([env_id], "train", ids)
         given: dict[str, Any] = {"sandbox_tier": tier, "limits": limits, "as_json": as_json}
-        _exit(run_to_end(trials.try_policy(env_id, policy, ids, out, where, **given)))
+        raise typer.Exit(run_to_end(trials.try_policy(env_id, policy, ids, out, where, **given)))
 
 
 @app.command("random", epilog="Example: evopolicy random --env gym/acrobot --split heldout")
@@ -189,7 +189,7 @@ def play_random(
         where = options.cluster_of(cluster, connect, credentials_file)
         env_ids = catalogue.resolve(env)
         where.check_ids(env_ids, split, chosen or ())
-        _exit(run_to_end(trials.play_random(env_ids, split, chosen, where, as_json=as_json)))
+        raise typer.Exit(run_to_end(trials.play_random(env_ids, split, chosen, where, as_json=as_json)))
 
 
 def _tell_left_out(wanted: bool) -> None:
@@ -263,7 +263,7 @@ def replay(
             fail("interrupted", 130)
         found = recorded_agent.outcome(run_directory, plan)
     say_lines(found.splitlines() if found else ["identical"])
-    _exit(1 if found else 0)
+    raise typer.Exit(1 if found else 0)
 
 
 @app.command(epilog="Example: evopolicy finish runs/their-agent/gym_acrobot/20260115-093000")
@@ -302,14 +302,9 @@ def _play(plans: list[Plan], where: Cluster, parallel: int, as_json: bool, *, we
         say_json(plain_runs.documents(played))
     else:
         plain_runs.report(played, plans[0].runs, console)
-    _exit(exit_code(plans, played.index))
+    raise typer.Exit(exit_code(plans, played.index))
 
 
 def _unjailed(plans: list[Plan]) -> bool:
     """Whether an agent or a policy could read what this user can."""
     return any(plan.jail.mode != "bwrap" or plan.settings.sandbox_tier == "none" for plan in plans)
-
-
-def _exit(code: int) -> None:
-    if code:
-        raise typer.Exit(code)

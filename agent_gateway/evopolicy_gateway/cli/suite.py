@@ -116,8 +116,7 @@ def suite(
             code = run_to_end(_suite(wanted, expanded, root, where, changed, dry_run, as_json))
         except KeyboardInterrupt:
             fail("interrupted; repeat the command to continue the sweep", 130)
-    if code:
-        raise typer.Exit(code)
+    raise typer.Exit(code)
 
 
 async def _suite(

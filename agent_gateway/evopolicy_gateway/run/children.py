@@ -35,10 +35,6 @@ from evopolicy_gateway.run_folder.listener import TOKEN_VARIABLE, place_notice
 from evopolicy_gateway.workspace import staging as workspace
 
 
-class RunError(EvopolicyError):
-    """The run could not be played to its end; its folder and the message tell how far it came."""
-
-
 class OpenRun(msgspec.Struct, frozen=True, kw_only=True):
     """One open run."""
 
@@ -112,7 +108,7 @@ class GatewayProcess(_Kept):
         return self._close is not None or self.closed.is_set()
 
     async def keep(self) -> None:
-        """Runs the gateway until it has closed the run. Raises RunError when it cannot serve."""
+        """Runs the gateway until it has closed the run. Raises EvopolicyError when it cannot serve."""
         run, log = self._run, self._run.folder.harness_log
         quick_deaths = 0
         while not self.closed.is_set():
@@ -127,7 +123,7 @@ class GatewayProcess(_Kept):
             quick_deaths = quick_deaths + 1 if time.monotonic() - started < _QUICK_DEATH_S else 0
             if code == _USAGE_ERROR or quick_deaths > _MAX_QUICK_DEATHS:
                 words = child_process.last_words(log)
-                raise RunError(f"the gateway cannot serve (exit status {code}): {words}; see {log}")
+                raise EvopolicyError(f"the gateway cannot serve (exit status {code}): {words}; see {log}")
             run.note(f"the gateway ended with status {code}; starting it again")
             await asyncio.sleep(0.1 * 2**quick_deaths)
 
