@@ -105,7 +105,7 @@ def make_app(pipeline: SubmitPipeline, token: str, bearer: str = "") -> ASGIApp:
         exception_handlers={
             HTTPException: _http_error,
             RequestError: _request_error,
-            ClientDisconnect: _gone,
+            ClientDisconnect: lambda request, error: Response(status_code=400),
             Exception: _our_error,
         },
     )
@@ -206,10 +206,6 @@ async def _http_error(request: Request, error: Exception) -> Response:
     response = _json(error.status_code, {"error": {"message": message}})
     response.headers.update(error.headers or {})
     return response
-
-
-async def _gone(request: Request, error: Exception) -> Response:
-    return Response(status_code=400)
 
 
 async def _our_error(request: Request, error: Exception) -> Response:

@@ -78,7 +78,8 @@ class Way:
         self.words = [*_PATIENT, jail[0], "--args", str(self._files[0])]
         self._files.append(_readable(filter_program(fixed_cores=fixed_cores)))
         self.words += ["--seccomp", str(self._files[1])]
-        self.words += ["--", _base_python(), "-I", "-S", ENTRY]
+        python = os.path.realpath(getattr(sys, "_base_executable", sys.executable))
+        self.words += ["--", python, "-I", "-S", ENTRY]
         if proxy is None:
             self.words += ["-", "-"]
         else:
@@ -222,7 +223,3 @@ class Jail:
 def _port(url: str) -> int:
     parts = urlsplit(url)
     return parts.port or (HTTPS if parts.scheme == "https" else 80)
-
-
-def _base_python() -> str:
-    return os.path.realpath(getattr(sys, "_base_executable", sys.executable))

@@ -79,7 +79,8 @@ class View(msgspec.Struct, frozen=True, kw_only=True):
         command += ["--dir", "/var", "--symlink", "../tmp", "/var/tmp"]
         command += ["--bind", str(self.private / "home"), self.home]
         paths = (*self.needs.paths, *self.read, *self.write)
-        inside = [path for path in paths if self._is_hidden(path)]
+        real = {path: Path(os.path.realpath(path)) for path in paths}
+        inside = [path for path in paths if any(map(real[path].is_relative_to, self.hidden))]
         outside = [path for path in paths if path not in inside]
         command += self._binds(outside)
         for path, target in self.needs.links.items():
@@ -151,10 +152,6 @@ class View(msgspec.Struct, frozen=True, kw_only=True):
                 if secret.is_relative_to(real):
                     covered[os.path.join(folder, secret.relative_to(real))] = None
         return [word for path in covered for word in _covered(path)]
-
-    def _is_hidden(self, path: str) -> bool:
-        real = Path(os.path.realpath(path))
-        return any(real.is_relative_to(secret) for secret in self.hidden)
 
 
 def _bubblewrap() -> list[str]:

@@ -62,7 +62,9 @@ class Resources:
             self.fixed_cores = True
         self.own_pids: int | None = None
         """Resource limit for the programs themselves."""
-        if asked.pids and "pids" not in by and jailed and os.getuid() and _counts_by_namespace():
+        release = tuple(map(int, re.findall(r"\d+", os.uname().release)[:2]))
+        counted = release >= _COUNTED_BY_NAMESPACE and os.getuid() != 0
+        if asked.pids and "pids" not in by and jailed and counted:
             limits, by["pids"] = msgspec.structs.replace(limits, pids=asked.pids), "rlimit"
             self.own_pids = asked.pids
         self._now = AgentResources(limits=limits, kept_by=by)
@@ -139,11 +141,6 @@ def _bind(n_cores: int) -> int:
     chosen = (cores[first:] + cores[:first])[:n_cores]
     os.sched_setaffinity(0, chosen)
     return len(chosen)
-
-
-def _counts_by_namespace() -> bool:
-    release = re.findall(r"\d+", os.uname().release)
-    return tuple(map(int, release[:2])) >= _COUNTED_BY_NAMESPACE
 
 
 LEAST_BYTES = 4096

@@ -138,8 +138,7 @@ class GatewayProcess(_Kept):
             case messages.Waits():
                 run.watch.held(run.plan.name, event.waits_for)
             case Ready():
-                run.stopwatch.permit_reported(event.permit_s)
-                run.stopwatch.held_reported(event.held_s)
+                run.stopwatch.held_reported(event.held_s, event.permit_s)
                 if not self._served.done():
                     for text in (*event.notes, *_place_notes(run, event)):
                         run.note(text)

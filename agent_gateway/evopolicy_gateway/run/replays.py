@@ -32,7 +32,9 @@ async def fetch(root: Path, finished: RunFinished, operations: Operations) -> tu
             continue
         path = f"{FOLDER}/heldout_{outcome.index:03d}/video.mp4"
         target = root / path
-        if not await asyncio.to_thread(_has, target, outcome.video.digest):
+        if not (
+            target.is_file() and digest_of(await asyncio.to_thread(target.read_bytes)) == outcome.video.digest
+        ):
             try:
                 data = await operations.fetch(outcome.video)
             except RefusedError:
@@ -44,7 +46,3 @@ async def fetch(root: Path, finished: RunFinished, operations: Operations) -> tu
             Replay(path=path, split="heldout", episode=outcome.index, submit_index=index, **known)
         )
     return tuple(sorted(recordings, key=lambda replay: replay.episode))
-
-
-def _has(path: Path, digest: str) -> bool:
-    return path.is_file() and digest_of(path.read_bytes()) == digest

@@ -93,14 +93,13 @@ class Stopwatch:
         if process == "agent":
             self.keep()
 
-    def held_reported(self, seconds: float) -> float:
-        """Sets the run's `held_s` as counted by the coordinator; returns the stored value, which never decreases."""
-        self._base = msgspec.structs.replace(self._base, held_s=max(self._base.held_s, seconds))
-        return self._base.held_s
-
-    def permit_reported(self, seconds: float) -> None:
-        """Adds time spent waiting for a permit, seconds."""
-        self._base = msgspec.structs.replace(self._base, permit_s=self._base.permit_s + seconds)
+    def held_reported(self, held_s: float, permit_s: float = 0.0) -> float:
+        """Sets the run's `held_s` as counted by the coordinator, and adds time spent waiting for a permit; returns the
+        stored `held_s`, which never decreases."""
+        base = self._base
+        held_s, permit_s = max(base.held_s, held_s), base.permit_s + permit_s
+        self._base = msgspec.structs.replace(base, held_s=held_s, permit_s=permit_s)
+        return held_s
 
     def keep(self) -> None:
         """Saves the times. Ignores a disk error, since other, more important writes report it."""

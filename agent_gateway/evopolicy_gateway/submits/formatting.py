@@ -128,6 +128,8 @@ def summary_bytes(
     returns = tuple(score.episode_return for score in ordered)
     components = tuple(score.reward_components for score in ordered)
     with_components = played and any(components)
+    names = list(dict.fromkeys(name for parts in components for name in parts))
+    means = {name: mean([parts.get(name, 0.0) for parts in components]) for name in names}
     lengths = tuple(score.length for score in ordered)
     solved = tuple(score.success for score in ordered)
     summary = Summary(
@@ -151,7 +153,7 @@ def summary_bytes(
         mean_episode_length=mean(lengths) if played else None,
         timeouts=_where(ordered, TIME_LIMITS) if played else None,
         errors=_where(ordered, None) if played else None,
-        reward_components_mean=_component_means(components) if with_components else None,
+        reward_components_mean=means if with_components else None,
         reward_components_per_episode=components if with_components else None,
         successes=solved if played and None not in solved and solved else None,
         policy_failures=len(_where(ordered, None)) if played else None,
@@ -196,11 +198,6 @@ def _where(scores: Sequence[EpisodeScore], categories: frozenset[str] | None) ->
         for score in scores
         if score.failure is not None and (categories is None or score.failure.category in categories)
     )
-
-
-def _component_means(components: Sequence[dict[str, float]]) -> dict[str, float]:
-    names = list(dict.fromkeys(name for parts in components for name in parts))
-    return {name: mean([parts.get(name, 0.0) for parts in components]) for name in names}
 
 
 def _fitting(line: dict[str, Any]) -> bytes:

@@ -69,7 +69,13 @@ def parse(body: bytes, bounds: Bounds) -> tuple[int, ...]:
         ids = ids_in(wanted, bounds)
     else:
         _budget(f"{_FIELD} is {_kind(wanted)}; send a list of train ids or a text of ranges: {_FORM}")
-    _check_count(len(ids), bounds)
+    if bounds.remaining_budget < bounds.min_episodes:
+        _budget(
+            f"{bounds.remaining_budget} episodes remain and a submit needs at least {bounds.min_episodes}:"
+            " the budget is spent, no more submits are taken"
+        )
+    if not bounds.least <= len(ids) <= bounds.most:
+        _refuse_count(len(ids), bounds)
     return ids
 
 
@@ -119,16 +125,6 @@ def _check_id(number: int, where: str, bounds: Bounds) -> None:
     if not 0 <= number < bounds.n_env_instances:
         value = "" if str(number) in where else f" is {number}, which"
         _instance(f"{where}{value} is outside the train ids 0 to {bounds.n_env_instances - 1}")
-
-
-def _check_count(n: int, bounds: Bounds) -> None:
-    if bounds.remaining_budget < bounds.min_episodes:
-        _budget(
-            f"{bounds.remaining_budget} episodes remain and a submit needs at least {bounds.min_episodes}:"
-            " the budget is spent, no more submits are taken"
-        )
-    if not bounds.least <= n <= bounds.most:
-        _refuse_count(n, bounds)
 
 
 def _refuse_count(n: int, bounds: Bounds) -> NoReturn:

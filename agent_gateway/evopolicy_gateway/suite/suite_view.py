@@ -35,10 +35,6 @@ _STYLES = ("bold", "red", "dim", "dim", "")
 """Styles of rows by `_order`: running, failed, on another host, waiting, ended."""
 
 
-def _ignore(_: str, __: AgentDoing) -> None:
-    pass
-
-
 class SuiteView(View):
     """The view of a sweep's runs: a table with the running ones and the last ended ones."""
 
@@ -48,7 +44,7 @@ class SuiteView(View):
     def __init__(self, names: list[str], parallel: int, console: Terminal | None = None) -> None:
         super().__init__(console)
         self.rows = {name: Row() for name in names}
-        self.on_doing: Callable[[str, AgentDoing], None] = _ignore
+        self.on_doing: Callable[[str, AgentDoing], object] = lambda run, doing: None
         self._parallel = parallel
 
     # Reports of the sweep.

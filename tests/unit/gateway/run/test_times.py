@@ -42,10 +42,10 @@ def test_what_processes_tell_adds_up_over_their_deaths_and_over_commands(tmp_pat
 def test_time_waited_for_hidden_episodes_is_a_figure_of_its_own(tmp_path: Path) -> None:
     path = tmp_path / "times.json"
     first = Stopwatch(path)
-    first.permit_reported(2.0)
+    first.held_reported(0.0, 2.0)
     assert first.held_reported(3.0) == 3.0
     # Both are told by each gateway: of the whole run the one, of its own wait the other.
-    first.permit_reported(1.0)
+    first.held_reported(0.0, 1.0)
     assert first.held_reported(2.0) == 3.0
     first.keep()
     assert Stopwatch(path).times == Times(held_s=3.0, permit_s=3.0)
