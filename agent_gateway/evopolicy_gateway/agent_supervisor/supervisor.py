@@ -111,15 +111,13 @@ async def keep(order: StartAgent, orders: Orders) -> AgentEnded:
         if ending.reason != "agent_failed":
             return ending
         why = "; ".join(filter(None, (ending.detail, resources.reached())))
-        return msgspec.structs.replace(ending, detail=why, stderr_tail=_stderr_tail(agent_log))
+        # By now the log's redaction knows more than at the start.
+        lines = [agent_log.redact(line.encode()).decode("utf-8", "replace") for line in agent_log.last_errors]
+        tail = tuple(filter(None, lines))[-_LINES_SHOWN:]
+        return msgspec.structs.replace(ending, detail=why, stderr_tail=tail)
     if isinstance(ending, EvopolicyError) or reason is not None:
         return AgentEnded(reason=reason or "agent_failed", detail=detail or str(ending))
     raise ending
-
-
-def _stderr_tail(agent_log: AgentLog) -> tuple[str, ...]:
-    lines = [agent_log.redact(line.encode()).decode("utf-8", "replace") for line in agent_log.last_errors]
-    return tuple(line for line in lines if line)[-_LINES_SHOWN:]
 
 
 async def _play(
@@ -145,7 +143,7 @@ async def _play(
         jail = Jail(
             order.jail,
             inputs=kept.shown(harness.skills_at),
-            more_programs=kept.commands,
+            more_programs=[(server.command,) for server in kept.servers.values()],
             # With the relay it needs neither the provider's hosts nor the variables with the key.
             harness="" if relayed else harness.name,
             command=harness.command,

@@ -70,7 +70,7 @@ def run(
             check_installed(LOCAL)
         where = options.cluster_of(cluster, connect, credentials_file, local=local)
         held = jail.of_remote_agent() if given.agent == listener.AGENT else jail
-        agent_host = served.host_of(given.agent)
+        agent_host = listener.agent_host_of(given.agent, served.agent_host)
         plans = _plans(given, [one_environment(env)], agent_host, jail=held, listener=served.listener())
         _play(plans, msgspec.structs.replace(where, patient=given.resume and not local), 1, as_json, web=web)
 

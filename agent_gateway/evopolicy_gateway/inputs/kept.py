@@ -42,11 +42,6 @@ class Kept(msgspec.Struct, frozen=True, kw_only=True):
     def __bool__(self) -> bool:
         return bool(self.skills or self.servers)
 
-    @property
-    def commands(self) -> list[tuple[str, ...]]:
-        """The servers' command lines, whose programs the jail shows."""
-        return [(server.command,) for server in self.servers.values()]
-
     def shown(self, skills_at: str) -> list[tuple[str, str]]:
         """Each copy with its place in the jail; `skills_at`: folder in which the agent looks for skills."""
         if self.folder is None or not self:

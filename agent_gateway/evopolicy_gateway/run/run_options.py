@@ -25,7 +25,7 @@ from evopolicy_gateway.run import starts, texts
 from evopolicy_gateway.run.options import default_exp_id, limits_of
 from evopolicy_gateway.run.plan import WALL_S, Plan
 from evopolicy_gateway.run.texts import Texts
-from evopolicy_gateway.run_folder.listener import Listener, agent_host_of, listener_of
+from evopolicy_gateway.run_folder.listener import Listener, listener_of
 
 Seconds = Annotated[float, Meta(ge=1.0)]
 OF_ONE_RUN = Option(suite=None)
@@ -272,10 +272,6 @@ class ListenerOptions(msgspec.Struct, frozen=True, kw_only=True):
     """Boot id of the agent's machine (there: cat /proc/sys/kernel/random/boot_id): no hidden episode is played on it
     while the agent is alive. elsewhere: you vouch that the agent is on no machine of the cluster. Default: the agent
     may be on any machine, so no hidden episode is played before it has ended."""
-
-    def host_of(self, agent: str) -> str:
-        """`RunSettings.agent_host`. ConfigError for what names no kernel, or an agent that is started here."""
-        return "" if self.agent_host is None else agent_host_of(agent, self.agent_host)
 
     def listener(self) -> Listener | None:
         """None without `--http`. ConfigError naming the option that is wrong."""

@@ -86,8 +86,11 @@ def check_agent(agent: str, listener: Listener | None) -> None:
         raise ConfigError("--http applies only with --agent remote; a local agent is served on loopback")
 
 
-def agent_host_of(agent: str, named: str) -> str:
-    """Parses `--agent-host`: a kernel's boot id or `ELSEWHERE`. Raises ConfigError for anything else."""
+def agent_host_of(agent: str, named: str | None) -> str:
+    """Parses `--agent-host`: a kernel's boot id or `ELSEWHERE`; empty for None. Raises ConfigError for anything else,
+    and for an agent that is started here."""
+    if named is None:
+        return ""
     if agent != AGENT:
         raise ConfigError("--agent-host applies only with --agent remote; a local agent is on this machine")
     return _boot_id(named, ELSEWHERE, " when it is on no machine of the cluster")
