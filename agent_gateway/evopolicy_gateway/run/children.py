@@ -18,15 +18,7 @@ from evopolicy_common.wire.credentials import Credentials
 from evopolicy_gateway.harnesses.interface.base import RelayAddress
 from evopolicy_gateway.jail.jail import JailOrder
 from evopolicy_gateway.processes import child_messages as messages
-from evopolicy_gateway.processes.child_messages import (
-    AgentEnded,
-    Child,
-    CloseRun,
-    Order,
-    Progress,
-    Ready,
-    SubmitsSeen,
-)
+from evopolicy_gateway.processes.child_messages import AgentEnded, Child, Progress, Ready
 from evopolicy_gateway.run.plan import Plan
 from evopolicy_gateway.run.times import Stopwatch
 from evopolicy_gateway.run.watch import View
@@ -65,7 +57,7 @@ class _Kept:
         self._run = run
         self._child: Child | None = None
 
-    async def tell(self, order: Order) -> None:
+    async def tell(self, order: messages.Order) -> None:
         """Sends an order to the present process, if there is one."""
         if self._child is not None:
             await self._child.tell(order)
@@ -100,7 +92,7 @@ class GatewayProcess(_Kept):
         """Set when the coordinator has closed the run."""
         if closed:
             self.closed.set()
-        self._close: CloseRun | None = None
+        self._close: messages.CloseRun | None = None
 
     @property
     def is_closing(self) -> bool:
@@ -127,7 +119,7 @@ class GatewayProcess(_Kept):
             run.note(f"the gateway ended with status {code}; starting it again")
             await asyncio.sleep(0.1 * 2**quick_deaths)
 
-    async def close(self, order: CloseRun) -> None:
+    async def close(self, order: messages.CloseRun) -> None:
         """Has the run closed, by this gateway or the next one."""
         self._close = order
         await self.tell(order)
@@ -180,7 +172,7 @@ class SupervisedAgent(_Kept):
         self._credentials = gateway
         self.survivors: list[int] = []
         """Process ids of the agent that survive being killed."""
-        self._submits = SubmitsSeen(asked=0, running=False)
+        self._submits = messages.SubmitsSeen(asked=0, running=False)
         """As last reported by the gateway."""
         self._held_before = 0.0
         """`held_s` of the run when the supervisor was started."""
@@ -206,7 +198,7 @@ class SupervisedAgent(_Kept):
         """Gives time for which submits waited for hidden episodes back to the agent's clock; `held_s` of the run."""
         await self.tell(messages.HeldTime(seconds=held_s - self._held_before))
 
-    async def note_submits(self, submits: SubmitsSeen) -> None:
+    async def note_submits(self, submits: messages.SubmitsSeen) -> None:
         self._submits = submits
         await self.tell(submits)
 

@@ -10,17 +10,8 @@ from typing import Any, TypeVar
 
 from evopolicy_common.errors import ConfigError, EvopolicyError, RefusedError
 from evopolicy_common.logs import structlog
+from evopolicy_common.messages import operator as messages
 from evopolicy_common.messages.episode import EpisodeOutcome
-from evopolicy_common.messages.operator import (
-    Claim,
-    ClaimState,
-    CreateRun,
-    Evaluate,
-    Rescore,
-    RunCreated,
-    RunProgress,
-    WaitRun,
-)
 from evopolicy_common.messages.worker import Message
 from evopolicy_common.processes.notices import notify_if_slow
 from evopolicy_common.records.open_run import IntendedRun, OpenedRun
@@ -52,24 +43,23 @@ class Operations(OperatorClient):
         if self._opened is not None:
             self._opened(run, locks)
 
-    async def create(self, wanted: IntendedRun) -> RunCreated:
+    async def create(self, wanted: IntendedRun) -> messages.RunCreated:
         """Opens a run; the same key returns the same run. Raises ConfigError for refused settings."""
         known = {"key": wanted.key, "replay_key": wanted.replay_key}
-        message = CreateRun(token=self._token, settings=wanted.settings, **known)
+        message = messages.CreateRun(token=self._token, settings=wanted.settings, **known)
         try:
-            return await self._once_available("create", message, RunCreated, timeout_s=TIMEOUT_S)
+            return await self._once_available("create", message, messages.RunCreated, timeout_s=TIMEOUT_S)
         except RefusedError as error:
             raise _settings_error(error) from error
 
-    async def wait(self, run: str) -> AsyncIterator[RunProgress]:
+    async def wait(self, run: str) -> AsyncIterator[messages.RunProgress]:
         """Yields the run's progress every few seconds; the last one holds the finished run.
 
         Logs once why the coordinator accepts no changes.
         """
         trouble = ""
         while True:
-            message = WaitRun(token=self._token, run=run, wait_s=WAIT_S)
-            progress = await self._requests.until_answered("wait", message, RunProgress, wait_s=WAIT_S)
+            progress = await self._progress(run, WAIT_S)
             if progress.trouble not in ("", trouble):
                 log.warning(progress.trouble)
             trouble = progress.trouble
@@ -79,11 +69,13 @@ class Operations(OperatorClient):
 
     async def phase(self, run: str) -> str | None:
         """The run's current phase, as `RunProgress.phase`; None when the cluster does not know the run."""
-        message = WaitRun(token=self._token, run=run, wait_s=0.0)
-        try:
-            return (await self._requests.until_answered("wait", message, RunProgress, wait_s=0.0)).phase
-        except RefusedError:
-            return None
+        with contextlib.suppress(RefusedError):
+            return (await self._progress(run, 0.0)).phase
+        return None
+
+    async def _progress(self, run: str, wait_s: float) -> messages.RunProgress:
+        message = messages.WaitRun(token=self._token, run=run, wait_s=wait_s)
+        return await self._requests.until_answered("wait", message, messages.RunProgress, wait_s=wait_s)
 
     async def claim(
         self,
@@ -93,11 +85,11 @@ class Operations(OperatorClient):
         ttl_s: float,
         run: str = "",
         result: dict[str, Any] | None = None,
-    ) -> ClaimState:
+    ) -> messages.ClaimState:
         """Takes, renews, releases (`ttl_s` 0) or settles (`result`) a run of a sweep."""
         known: dict[str, Any] = {"suite": suite, "name": name, "holder": holder, "ttl_s": ttl_s}
-        message = Claim(token=self._token, **known, run=run, result=result)
-        return await self._once_available("claim", message, ClaimState)
+        message = messages.Claim(token=self._token, **known, run=run, result=result)
+        return await self._once_available("claim", message, messages.ClaimState)
 
     async def _once_available(
         self, verb: str, message: Message, wanted: type[T], timeout_s: float | None = None
@@ -140,7 +132,7 @@ class Operations(OperatorClient):
                 await self.agent_gone(run)
 
     async def evaluate(
-        self, message: Evaluate | Rescore
+        self, message: messages.Evaluate | messages.Rescore
     ) -> AsyncGenerator[tuple[EpisodeOutcome | None, int, str], None]:
         try:
             async with contextlib.aclosing(super().evaluate(message)) as outcomes:
