@@ -50,7 +50,7 @@ _MAX_QUICK_DEATHS = 5
 _USAGE_ERROR = 2
 
 
-class _Kept:
+class Kept:
     """A part of an open run, over all its processes, of which one is alive at a time."""
 
     def __init__(self, run: OpenRun) -> None:
@@ -73,7 +73,7 @@ class _Kept:
         return self._child
 
 
-class GatewayProcess(_Kept):
+class GatewayProcess(Kept):
     """The gateway of one run."""
 
     def __init__(
@@ -163,7 +163,7 @@ _ENDLESS = 1 << 62
 """Bytes that a remote agent's workspace may take: its files may be elsewhere, and are its operator's."""
 
 
-class SupervisedAgent(_Kept):
+class SupervisedAgent(Kept):
     """The agent of one run below its supervisor."""
 
     def __init__(self, run: OpenRun, gateway: Credentials) -> None:

@@ -10,10 +10,10 @@ from __future__ import annotations
 import asyncio
 import os
 import secrets
+import socket
 import sys
 import sysconfig
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 
 import msgspec
@@ -34,7 +34,7 @@ from evopolicy_gateway.processes.agent_process import environment_of
 from evopolicy_gateway.processes.child_messages import AgentDoing, Child, ModelBudgetSpent, Ready, StartRelay
 from evopolicy_gateway.relay.service import Order
 from evopolicy_gateway.run import recorded_agent
-from evopolicy_gateway.run.children import OpenRun
+from evopolicy_gateway.run.children import Kept, OpenRun
 from evopolicy_gateway.run.plan import Replays
 from evopolicy_gateway.run_folder.layout import saved
 from evopolicy_gateway.workspace import staging as workspace
@@ -43,63 +43,45 @@ _MAX_DEATHS = 20
 _PAUSE_S = 0.2
 
 
-class ModelRelay:
-    """The relay, from `start` to `end`."""
+class ModelRelay(Kept):
+    """The relay of one run, from `serve` to `end`."""
 
-    def __init__(
-        self,
-        order: Callable[[str], Order],
-        ledger: Path,
-        log: Path,
-        *,
-        jailed: bool,
-        doing: Callable[[AgentDoing], None],
-        spent: Callable[[str], None],
-        port: int = 0,
-        token: str = "",
-    ) -> None:
-        """`order` makes the relay's order from the agent's token. `doing` and `spent` get its reports. `port`,
-        `token`: 0 and empty for new ones."""
-        self._sock = bound(LOOPBACK, port)
+    def __init__(self, run: OpenRun, order: Order, sock: socket.socket, spent: Callable[[str], None]) -> None:
+        """`sock`: bound to the relay's address. `spent` gets the limit beyond which it has refused a request."""
+        super().__init__(run)
+        self._sock, self._spent = sock, spent
         # Connections queue here while a relay is started.
-        self._sock.listen(64)
-        self.port = self._sock.getsockname()[1]
-        url, token = f"http://{LOOPBACK}:{self.port}", token or secrets.token_hex(24)
-        self.address = RelayAddress(url=url, token=token)
-        ledger.parent.mkdir(parents=True, exist_ok=True)
-        ledger.touch(mode=0o600)
-        made = order(token)
-        self._order = StartRelay(order=msgspec.to_builtins(made))
-        written = [ledger]
-        if made.record != "off":
-            written.append(Path(made.folder))
+        sock.listen(64)
+        self.port = sock.getsockname()[1]
+        self.address = RelayAddress(url=f"http://{LOOPBACK}:{self.port}", token=order.token)
+        written = [Path(order.ledger)]
+        written[0].parent.mkdir(parents=True, exist_ok=True)
+        written[0].touch(mode=0o600)
+        if order.record != "off":
+            written.append(Path(order.folder))
             written[1].mkdir(mode=0o700, parents=True, exist_ok=True)
-        read = [Path(made.replay)] if made.replay else []
-        self._program = _program(self._sock.fileno(), read, written, jailed)
-        self._log = log
-        self._doing, self._spent = doing, spent
-        self._child: Child | None = None
+        read = [Path(order.replay)] if order.replay else []
+        self._program = _program(sock.fileno(), read, written, run.plan.jail.mode != "none")
+        self._order = StartRelay(order=msgspec.to_builtins(order))
 
     async def serve(self) -> None:
         """Runs the relay until this is cancelled. Raises EvopolicyError when it cannot stay alive."""
+        log, keeps = self._run.folder.harness_log, (self._sock.fileno(),)
         for _ in range(_MAX_DEATHS):
-            self._child = await Child.start(
-                self._program, self._log, talks=True, keeps=(self._sock.fileno(),)
-            )
+            self._child = await Child.start(self._program, log, talks=True, keeps=keeps)
             await self._child.tell(self._order)
             async for event in self._child.events():
                 if isinstance(event, AgentDoing):
-                    self._doing(event)
+                    self._run.watch.doing(self._run.plan.name, event)
                 elif isinstance(event, ModelBudgetSpent):
                     self._spent(event.what)
             await self._child.ended()
             await asyncio.sleep(_PAUSE_S)
-        raise EvopolicyError(f"the relay for model calls died {_MAX_DEATHS} times; see {self._log}")
+        raise EvopolicyError(f"the relay for model calls died {_MAX_DEATHS} times; see {log}")
 
     async def end(self, grace_s: float) -> None:
         self._sock.close()
-        if self._child is not None:
-            await self._child.end(grace_s)
+        await super().end(grace_s)
 
 
 def of_run(run: OpenRun, ready: Ready, model_spent: asyncio.Event) -> ModelRelay | None:
@@ -114,37 +96,30 @@ def of_run(run: OpenRun, ready: Ready, model_spent: asyncio.Event) -> ModelRelay
         run.note(f"model limits: {terms.limits}; metering: agent ({how})")
         return None
     run.note(f"model limits: {terms.limits}; metering: relay")
-    upstream, service = terms.upstream, saved(folder.service, Address)
+    service = saved(folder.service, Address)
+    port, token = (0, secrets.token_hex(24)) if replays is None else (replays.model_port, replays.model_token)
 
     def spent(what: str) -> None:
         if not model_spent.is_set():
             run.note(f"the model budget is spent: {what}" if replays is None else f"the replay ends: {what}")
         model_spent.set()
 
-    made = ModelRelay(
-        lambda token: Order(
-            upstream=upstream,
-            token=token,
-            ledger=str(folder.model_requests),
-            limits=terms.limits,
-            prices=terms.prices,
-            model=terms.model,
-            declared_only=terms.declared_only,
-            own_tools_only=terms.own_tools_only,
-            record=plan.record_model,
-            replay="" if replays is None else str(replays.folder),
-            folder=str(folder.model_record),
-            tokens=(service.token, token),
-            secrets=_secrets(run, ready),
-        ),
-        folder.model_requests,
-        folder.harness_log,
-        jailed=plan.jail.mode != "none",
-        doing=partial(run.watch.doing, plan.name),
-        spent=spent,
-        port=0 if replays is None else replays.model_port,
-        token="" if replays is None else replays.model_token,
+    order = Order(
+        upstream=terms.upstream,
+        token=token,
+        ledger=str(folder.model_requests),
+        limits=terms.limits,
+        prices=terms.prices,
+        model=terms.model,
+        declared_only=terms.declared_only,
+        own_tools_only=terms.own_tools_only,
+        record=plan.record_model,
+        replay="" if replays is None else str(replays.folder),
+        folder=str(folder.model_record),
+        tokens=(service.token, token),
+        secrets=_secrets(run, ready),
     )
+    made = ModelRelay(run, order, bound(LOOPBACK, port), spent)
     # A replay needs the jail, for its paths; and an agent without one could read this file.
     if plan.record_model == "full" and plan.jail.mode != "none":
         kept = Replays(
@@ -155,7 +130,7 @@ def of_run(run: OpenRun, ready: Ready, model_spent: asyncio.Event) -> ModelRelay
             port=service.port,
             token=service.token,
             model_port=made.port,
-            model_token=made.address.token,
+            model_token=token,
         )
         recorded_agent.keep(folder, plan, kept)
     return made
