@@ -261,9 +261,9 @@ def replay(
             run_to_end(plain_runs.play([plan], where, 1, terminal(stderr=True)))
         except KeyboardInterrupt:
             fail("interrupted", 130)
-        found = recorded_agent.outcome(run_directory, plan)
-    say_lines(found.splitlines() if found else ["identical"])
-    raise typer.Exit(1 if found else 0)
+        difference = recorded_agent.outcome(run_directory, plan)
+    say_lines(difference.splitlines() or ["identical"])
+    raise typer.Exit(int(bool(difference)))
 
 
 @app.command(epilog="Example: evopolicy finish runs/their-agent/gym_acrobot/20260115-093000")

@@ -1,4 +1,4 @@
-"""What `evopolicy replay` needs of a recorded run besides its record of model calls: its plan and its addresses.
+"""The plan and the addresses of a recorded run, which `evopolicy replay` needs besides its record of model calls.
 
 `.replay.json` in the run's folder (mode 0600) has both. It is never published: it names paths, and tokens that were
 valid while the run was open. A replay runs the programs that the plan names, some of them without a jail. So a file
@@ -95,21 +95,21 @@ def plan_of(run: Path, runs: Path, *, trusted: bool = False) -> Plan:
 def outcome(run: Path, plan: Plan) -> str:
     """The first place in which the replay differs from the run, with versions that differ; empty where they are
     identical but for these."""
-    found = differences(run, plan.folder.root)
-    others = (line for line in found if not line.startswith((*_OWN, *_VERSIONS)))
+    lines = differences(run, plan.folder.root)
+    others = (line for line in lines if not line.startswith((*_OWN, *_VERSIONS)))
     first = _different_request(run, plan.folder) or next(others, "")
-    explained = [f"other versions: {line}" for line in found if line.startswith(_VERSIONS)]
+    explained = [f"other versions: {line}" for line in lines if line.startswith(_VERSIONS)]
     return "\n".join([first, *explained]) if first else ""
 
 
 def _different_request(run: Path, again: RunFolder) -> str:
     with contextlib.suppress(FileNotFoundError):
         return (again.model_record / DIFFERENCE).read_text().strip()
-    left = [call.digest for call in model_record.read_calls(again.model_record)]
+    again_asked = [call.digest for call in model_record.read_calls(again.model_record)]
     for call in model_record.read_calls(RunFolder(run.absolute()).model_record):
-        if call.digest not in left:
+        if call.digest not in again_asked:
             return f"request {call.n} to {call.api} did not come again"
-        left.remove(call.digest)
+        again_asked.remove(call.digest)
     return ""
 
 
