@@ -182,24 +182,6 @@ def test_a_bug_in_one_run_ends_that_run_alone(staged: Staged) -> None:
     assert "Traceback" in log.read_text()
 
 
-def test_a_paused_sweep_begins_nothing_and_goes_on_later(staged: Staged) -> None:
-    stage = staged(EVOLVE.format("a") + EVOLVE.format("b"))
-    stage.root.mkdir(parents=True, exist_ok=True)
-    paused = stage.root / "paused"
-    paused.touch()
-
-    async def resume() -> None:
-        await until(lambda: any("paused: no further run begins" in line for line in stage.events))
-        assert stage.begun == []
-        paused.unlink()
-
-    stage.beside = resume
-    index = stage.play()
-    assert sorted(stage.begun) == sorted(index.runs)
-    assert len(index.runs) == 2
-    assert sum("paused" in line for line in stage.events) == 1
-
-
 def test_a_run_is_finished_again_after_an_error(staged: Staged, monkeypatch: pytest.MonkeyPatch) -> None:
     stage = staged(CODEX.format("a") + CODEX.format("b"))
     monkeypatch.setattr(sweep, "FINISH_AGAIN_S", (0.0, 0.0))
