@@ -74,9 +74,6 @@ class ClaimedSweep(Sweep):
         self._ending: set[str] = set()
         """Cancelled runs that have not ended yet."""
         self._unsaved = False
-        self._unwritable = ""
-        """Why the disk refused the index the last time."""
-        self._paused = False
         view.on_doing = self._on_doing
 
     async def play(self, decisions: Sequence[Decision]) -> None:
@@ -91,10 +88,10 @@ class ClaimedSweep(Sweep):
 
     def _startable(self) -> list[Decision]:
         """As in `Sweep`; empty while the sweep is paused."""
-        was_paused, self._paused = self._paused, (self._root / PAUSED).exists()
-        if self._paused and not was_paused:
+        paused = (self._root / PAUSED).exists()
+        if self._view.is_new("", "paused", paused) and paused:
             self._view.say(f"paused: no further run begins while {self._root / PAUSED} is there")
-        return [] if self._paused else super()._startable()
+        return [] if paused else super()._startable()
 
     def _given_up(self) -> bool:
         if (why := self._used_up()) is not None:
@@ -281,11 +278,12 @@ class ClaimedSweep(Sweep):
         try:
             suite_index.save(self._root, self._index)
         except (StorageError, OSError) as error:
-            if self._unwritable != str(error):
+            if self._view.is_new("", "unwritable", str(error)):
                 self._view.say(f"{INDEX} is not up to date, and is written again later: {error}")
-            self._unsaved, self._unwritable = True, str(error)
+            self._unsaved = True
         else:
-            self._unsaved, self._unwritable = False, ""
+            self._view.is_new("", "unwritable", "")
+            self._unsaved = False
 
 
 def _opened(run: Plan) -> str:
