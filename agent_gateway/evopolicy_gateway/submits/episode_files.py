@@ -121,7 +121,7 @@ def set_aside_files(episode: EpisodeFeedback, why: str, *, at: float, texts: boo
         message=f"{why}; the episode's return counts",
         step_index=None,
     )
-    files["error.txt"] = files.get("error.txt", b"") + failure_line(failure, at, with_step=True)
+    files["error.txt"] = files.get("error.txt", b"") + failure_line(failure, at)
     return files
 
 
@@ -130,7 +130,7 @@ def _text_files(episode: EpisodeFeedback, at: float, *, whole: bool) -> dict[str
     if (failure := episode.failure) is not None:
         if not whole:
             failure = msgspec.structs.replace(failure, message=_NO_MESSAGE, traceback="")
-        files["error.txt"] = failure_line(failure, at, with_step=True)
+        files["error.txt"] = failure_line(failure, at)
     return files
 
 

@@ -59,20 +59,16 @@ def failure_text(failure: PolicyFailure | None) -> str | None:
     return f"{failure.category}{at}: {failure.message}"
 
 
-def failure_line(failure: PolicyFailure, at: float, *, with_step: bool) -> bytes:
-    """A failure as a line of `errors.txt` or, with the step, of an episode's `error.txt`; cut to 64 KiB.
-
-    `at`: Unix time, seconds.
-    """
+def failure_line(failure: PolicyFailure, at: float) -> bytes:
+    """A failure as a line of an episode's `error.txt`, cut to 64 KiB. `at`: Unix time, seconds."""
     line: dict[str, Any] = {
         "schema_version": SCHEMA_VERSION,
         "timestamp": utc_text(at),
         "category": failure.category,
         "message": failure.message,
         "traceback": failure.traceback,
+        "step_index": failure.step_index,
     }
-    if with_step:
-        line["step_index"] = failure.step_index
     if failure.limit is not None:
         line |= {"limit": failure.limit, "used": failure.used}
     return _fitting(line)

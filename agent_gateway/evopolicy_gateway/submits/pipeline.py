@@ -47,8 +47,8 @@ class SubmitPipeline:
         workspace: Path,
         journal: Journal,
         blobs: BlobStore,
-        on_change: Callable[[], None] = lambda: None,
-        trees: Recorder | None = None,
+        on_change: Callable[[], None],
+        trees: Recorder,
     ) -> None:
         """`on_change` is called after every change that a watcher shows. `trees` records the workspace at submits."""
         self.machine = TicketMachine(run, zip(journal.entries, journal.places, strict=True))
@@ -162,9 +162,8 @@ class SubmitPipeline:
                     system, published = self._workspace / "system", machine.run.profile != "own"
                     take = partial(snapshots.take, system, self._blobs, published=published)
                     snapshot = await self._on_disk(take)
-                    if self._trees is not None:
-                        given = (ticket.submit_id, self._trees, self._blobs, self._workspace.parent)
-                        snapshot = await asyncio.to_thread(snapshots.record_tree, snapshot, *given)
+                    given = (ticket.submit_id, self._trees, self._blobs, self._workspace.parent)
+                    snapshot = await asyncio.to_thread(snapshots.record_tree, snapshot, *given)
                     return machine.snapshotted(snapshot)
                 case "send":
                     return machine.sent(await self._send(ticket.request))

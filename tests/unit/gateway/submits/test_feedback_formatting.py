@@ -180,7 +180,7 @@ def test_an_error_line_is_one_json_line_of_at_most_64_kib(message: str, n: int, 
     failure = PolicyFailure(
         category="act_error", step_index=3, message=message, traceback=filler * n + "the end"
     )
-    data = failure_line(failure, 0.0, with_step=True)
+    data = failure_line(failure, 0.0)
     assert len(data) <= MAX_TEXT_BYTES
     assert data.count(b"\n") == 1
     line = json.loads(data)
