@@ -18,11 +18,13 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
 from evopolicy_common.errors import ProtocolError, RefusedError
 from evopolicy_common.logs import structlog
+from evopolicy_common.messages.episode import BlobRef
 from evopolicy_common.messages.gateway import EpisodeFeedback, ResultsPage, SubmitDone
 from evopolicy_common.processes.scratch import give_back_rights, remove_tree
 from evopolicy_common.records.blobs import fsync_directory, sync_filesystem
@@ -39,7 +41,6 @@ from evopolicy_gateway.submits.episode_files import (
     shows_texts,
     takes_much,
 )
-from evopolicy_gateway.submits.formatting import EpisodeScore
 from evopolicy_gateway.submits.tickets import MAX_DEATHS, Ticket, TicketMachine
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
@@ -51,6 +52,9 @@ SHORTEST_LINGER_S = 0.002
 """Bounds of the pause before the next request, which collects several results of short episodes, seconds."""
 FETCHES_AT_ONCE = 4
 _NOT_WRITTEN = "this episode's trajectory cannot be written"
+_NOTHING = BlobRef(digest="", size=0)
+_WRITTEN: dict[str, Any] = {"trajectory": _NOTHING, "video": None, "stdout": b"", "stderr": b""}
+"""Fields of an episode whose files are written."""
 _Fetched = tuple[bytes, bytes | None] | str
 """The bytes of an episode's trajectory and video, or why they are missing."""
 _much = threading.Lock()
@@ -158,8 +162,8 @@ class Collector:
     at_work: AtWork
     on_page: Callable[[], None]
     """Called when a page is written, and counted in `machine`."""
-    scores: dict[int, EpisodeScore] = field(default_factory=dict)
-    """Of the episodes written so far, by request index."""
+    scores: dict[int, EpisodeFeedback] = field(default_factory=dict)
+    """Episodes written so far, without their bytes, by request index."""
 
     async def collect(self) -> tuple[SubmitDone, bytes]:
         """Returns the end and the summary of the committed folder. Raises OSError when the disk refuses."""
@@ -197,8 +201,7 @@ class Collector:
                 fetched = [(episode, await self._fetch(episode)) for episode in episodes]
                 await asyncio.to_thread(self._put, fetched)
                 for episode in episodes:
-                    score = msgspec.convert(episode, EpisodeScore, from_attributes=True)
-                    self.scores[episode.index] = score
+                    self.scores[episode.index] = msgspec.structs.replace(episode, **_WRITTEN)
 
         # All writes end before an error is raised: none may write into a tree that is started over.
         writes = [write(whole), *(write([episode]) for episode in others)]

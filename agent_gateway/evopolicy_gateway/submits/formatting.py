@@ -12,7 +12,7 @@ import msgspec
 
 from evopolicy_common.messages.environment import ObservationForm
 from evopolicy_common.messages.episode import NO_POLICY, TIME_LIMITS, PolicyFailure
-from evopolicy_common.messages.gateway import SubmitDone
+from evopolicy_common.messages.gateway import EpisodeFeedback, SubmitDone
 from evopolicy_common.records.aggregates import mean, std
 from evopolicy_common.records.json_text import json_bytes, plain
 from evopolicy_common.records.summary import SCHEMA_VERSION, Summary, utc_text
@@ -29,21 +29,6 @@ _VERDICTS = {
 """Messages of submits that are not ok without a failure of the policy, by status."""
 _MAX_WARNED = 300
 """Characters of a policy's own message in a warning."""
-
-
-class EpisodeScore(msgspec.Struct, frozen=True, kw_only=True):
-    """One episode's values for the summary."""
-
-    index: int
-    """Request index."""
-    episode_return: float
-    length: int
-    """Steps."""
-    failure: PolicyFailure | None
-    """How the policy failed; None when it did not."""
-    reward_components: dict[str, float] = {}
-    success: bool | None = None
-    """Whether the task was solved; None when the environment does not report it."""
 
 
 def cut_text(data: bytes) -> bytes:
@@ -101,7 +86,7 @@ def summary_bytes(
     env: str,
     submit_index: int,
     done: SubmitDone,
-    scores: Sequence[EpisodeScore],
+    scores: Sequence[EpisodeFeedback],
     observations: ObservationForm = "arrays",
     *,
     messages: bool = True,
@@ -164,7 +149,7 @@ def summary_bytes(
 
 
 def _warning(
-    scores: Sequence[EpisodeScore], observations: ObservationForm, *, ends: bool, messages: bool
+    scores: Sequence[EpisodeFeedback], observations: ObservationForm, *, ends: bool, messages: bool
 ) -> str | None:
     """The warning to the agent about policy failures in a played submit; None when no episode failed. `ends`: whether
     such an episode ended."""
@@ -187,7 +172,7 @@ def _warning(
     return text + (" Each error.txt has the traceback." if messages else "")
 
 
-def _where(scores: Sequence[EpisodeScore], categories: frozenset[str] | None) -> tuple[int, ...]:
+def _where(scores: Sequence[EpisodeFeedback], categories: frozenset[str] | None) -> tuple[int, ...]:
     """Request indices of the episodes that failed in one of `categories` (None: in any)."""
     return tuple(
         score.index

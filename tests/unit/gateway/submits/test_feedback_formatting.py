@@ -16,7 +16,7 @@ from rigs.finished_run import played_episode
 
 from evopolicy_common.messages.environment import ObservationForm, ObsStorage
 from evopolicy_common.messages.episode import PolicyFailure, ResourceLimits
-from evopolicy_common.messages.gateway import FeedbackDetail, SubmitDone
+from evopolicy_common.messages.gateway import EpisodeFeedback, FeedbackDetail, SubmitDone
 from evopolicy_common.records.episodes.rendered import decode, files_of
 from evopolicy_common.records.episodes.trajectory import Recorder
 from evopolicy_common.records.json_text import json_bytes
@@ -25,7 +25,6 @@ from evopolicy_gateway.run_folder.layout import episode_name, submit_id
 from evopolicy_gateway.submits.episode_files import LEFT_OUT_FIRST, episode_files, episode_share, within_share
 from evopolicy_gateway.submits.formatting import (
     MAX_TEXT_BYTES,
-    EpisodeScore,
     failure_line,
     summary_bytes,
     verdict_line,
@@ -42,10 +41,8 @@ def done(n: int, status: Any = "ok", **fields: Any) -> SubmitDone:
     return SubmitDone(**usual | {"started_at": 100.0, "completed_at": 101.25} | fields)
 
 
-def scores(returns: list[float]) -> list[EpisodeScore]:
-    return [
-        EpisodeScore(index=i, episode_return=r, length=i + 1, failure=None) for i, r in enumerate(returns)
-    ]
+def scores(returns: list[float]) -> list[EpisodeFeedback]:
+    return [played_episode(index=i, episode_return=r, length=i + 1) for i, r in enumerate(returns)]
 
 
 values = st.recursive(
@@ -151,7 +148,7 @@ def test_a_summary_of_missing_episodes_is_a_bug_not_a_file() -> None:
 @pytest.mark.parametrize("form", ["arrays", "lists"])
 def test_a_policy_that_failed_in_every_episode_is_reported_loudly(form: ObservationForm) -> None:
     failure = PolicyFailure(category="act_error", step_index=0, message="ValueError: ambiguous", traceback="")
-    failed = [EpisodeScore(index=i, episode_return=1.0, length=9, failure=failure) for i in range(3)]
+    failed = [played_episode(index=i, episode_return=1.0, length=9, failure=failure) for i in range(3)]
     document = json.loads(summary_bytes("e", 0, done(3), failed, form))
     assert (document["status"], document["policy_failures"]) == ("ok", 3)
     for word in ("ALL 3 episodes", "at step 0", "ValueError: ambiguous", "nothing about your policy"):
@@ -166,7 +163,7 @@ def test_a_policy_that_failed_in_every_episode_is_reported_loudly(form: Observat
 
 def test_reward_components_are_meant_over_episodes() -> None:
     with_parts = [
-        EpisodeScore(index=i, episode_return=0.0, length=1, failure=None, reward_components={"a": float(i)})
+        played_episode(index=i, episode_return=0.0, length=1, reward_components={"a": float(i)})
         for i in range(3)
     ]
     document = json.loads(summary_bytes("e", 0, done(3), with_parts))
@@ -285,7 +282,7 @@ def test_a_level_of_detail_has_its_files_and_hides_the_rest(
 
 def test_a_warning_without_messages_still_says_where_the_policy_failed() -> None:
     failure = PolicyFailure(category="act_error", message=SECRET, traceback="", step_index=1)
-    failed = EpisodeScore(index=0, episode_return=1.0, length=2, failure=failure)
+    failed = played_episode(index=0, episode_return=1.0, length=2, failure=failure)
     text = summary_bytes("toy/line", 0, done(1), [failed], messages=False).decode()
     assert SECRET not in text
     assert "first at step 1, act_error)" in text
