@@ -47,7 +47,7 @@ from evopolicy_gateway.run import replays
 from evopolicy_gateway.run.operations import Operations
 from evopolicy_gateway.run.plan import Plan
 from evopolicy_gateway.run.times import Times
-from evopolicy_gateway.run.transitions import Transitions, count_transitions
+from evopolicy_gateway.run.transitions import count_transitions
 from evopolicy_gateway.run_folder.journal import Journal
 from evopolicy_gateway.run_folder.layout import RunFolder, Staged, saved, submit_id
 
@@ -151,7 +151,7 @@ def run_record(
     recorded: tuple[schema.Replay, ...] = (),
     code: Mapping[int, CodeMetrics | None] | None = None,
     artifacts: schema.Artifacts | None = None,
-    transitions: Transitions | None = None,
+    transitions: dict[str, int] | None = None,
 ) -> RunRecord:
     """The record of a finished run; pure. `staged` None: the run ended before it had a workspace. `code`: by submit."""
     settings = finished.settings
@@ -301,7 +301,7 @@ def _agent(plan: Plan, facts: dict[str, Any], times: Times) -> schema.Agent:
 
 
 def _outcome(
-    finished: RunFinished, code: Mapping[int, CodeMetrics | None], transitions: Transitions | None
+    finished: RunFinished, code: Mapping[int, CodeMetrics | None], transitions: dict[str, int] | None
 ) -> schema.Outcome:
     heldout, reference = finished.heldout_returns, finished.random_heldout_returns
     completed = finished.status == "completed"
@@ -320,7 +320,7 @@ def _outcome(
         "policy_failures": dict(finished.policy_failures),
         "infrastructure_retries": finished.infrastructure_retries,
         "nondeterministic_results": finished.nondeterministic_results,
-        **({} if transitions is None else {"transitions": msgspec.to_builtins(transitions)}),
+        **({} if transitions is None else {"transitions": transitions}),
     }
     random = None
     if reference:

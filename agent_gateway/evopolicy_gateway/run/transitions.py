@@ -6,8 +6,6 @@ import os
 import stat
 from pathlib import Path
 
-import msgspec
-
 from evopolicy_common.processes.left_files import left_files
 from evopolicy_common.regular_files import open_regular
 
@@ -17,16 +15,9 @@ _INVALID = b'"action_invalid":true'
 """As written by `json_text.rows_text`. Quotes within a text are escaped there, so no text contains these bytes."""
 
 
-class Transitions(msgspec.Struct, frozen=True, kw_only=True):
-    """Counts over all recorded train episodes."""
-
-    steps: int
-    action_invalid: int
-    """Steps whose action was outside the action space and was repaired."""
-
-
-def count_transitions(feedback: Path) -> Transitions | None:
-    """Returns None when the feedback is too large or cannot be read."""
+def count_transitions(feedback: Path) -> dict[str, int] | None:
+    """Over all recorded train episodes: `steps`, and as `action_invalid` those whose action was outside the action
+    space and was repaired. None when the feedback is too large or cannot be read."""
     try:
         if not stat.S_ISDIR(os.lstat(feedback).st_mode):
             return None
@@ -40,9 +31,8 @@ def count_transitions(feedback: Path) -> Transitions | None:
         counts = [_count(path) for path, _ in files]
     except OSError:
         return None
-    return Transitions(
-        steps=sum(steps for steps, _ in counts), action_invalid=sum(invalid for _, invalid in counts)
-    )
+    steps, invalid = (sum(column) for column in zip((0, 0), *counts, strict=True))
+    return {"steps": steps, "action_invalid": invalid}
 
 
 def _count(path: Path) -> tuple[int, int]:

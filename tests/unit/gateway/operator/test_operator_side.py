@@ -33,7 +33,6 @@ from evopolicy_gateway.run.options import cases_of, limits_of, one_environment, 
 from evopolicy_gateway.run.record import run_record
 from evopolicy_gateway.run.run_options import ClusterOptions, RunOptions
 from evopolicy_gateway.run.times import Times
-from evopolicy_gateway.run.transitions import Transitions
 from evopolicy_gateway.run.watch import RunView
 from evopolicy_gateway.run_folder.layout import Staged
 
@@ -73,7 +72,7 @@ def test_a_completed_run_is_recorded_with_all_its_numbers(tmp_path: Path) -> Non
         Rejected(status="conflict", message="busy", at=106.0, after_submits=1),
     ]
     times = Times(open_s=9.0, in_flight_s=4.0, feedback_s=0.5)
-    counted = Transitions(steps=10, action_invalid=3)
+    counted = {"steps": 10, "action_invalid": 3}
     record = run_record(plan_in(tmp_path), finished(), STAGED, rejected, times, transitions=counted)
     assert record.outcome.auxiliary["transitions"] == {"steps": 10, "action_invalid": 3}
     assert decode_run_record(encode_run_record(record)) == record

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from evopolicy_common.records.json_text import rows_text
 from evopolicy_gateway.run import transitions
-from evopolicy_gateway.run.transitions import Transitions, count_transitions
+from evopolicy_gateway.run.transitions import count_transitions
 
 TEXT = '"action_invalid":true'
 """A text that a policy may return as its action, or an environment may show."""
@@ -25,7 +25,7 @@ def write(feedback: Path, submit: int, episode: int, *infos: dict[str, object]) 
 def test_steps_and_repaired_ones_are_counted_over_all_submits(tmp_path: Path) -> None:
     write(tmp_path, 0, 0, {"steps": 1}, {"steps": 2, "action_invalid": True})
     write(tmp_path, 1, 1, {"action_invalid": True}, {"said": TEXT}, {"action_invalid": False})
-    assert count_transitions(tmp_path) == Transitions(steps=5, action_invalid=2)
+    assert count_transitions(tmp_path) == {"steps": 5, "action_invalid": 2}
 
 
 def test_pipes_links_and_other_files_are_passed_over(tmp_path: Path) -> None:
@@ -39,7 +39,7 @@ def test_pipes_links_and_other_files_are_passed_over(tmp_path: Path) -> None:
     linked.mkdir(parents=True)
     (linked / "trajectory.jsonl").symlink_to("/dev/zero")
     (folder / "notes.jsonl").write_text('{"action_invalid":true}\n')
-    assert count_transitions(feedback) == Transitions(steps=1, action_invalid=1)
+    assert count_transitions(feedback) == {"steps": 1, "action_invalid": 1}
 
 
 def test_feedback_that_is_absent_a_link_or_too_large_is_not_counted(tmp_path: Path) -> None:
