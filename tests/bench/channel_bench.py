@@ -20,6 +20,7 @@ import tempfile
 import time
 from pathlib import Path
 
+import frame
 import numpy as np
 from attacks import channels, gaps
 from rich.console import Console
@@ -97,18 +98,15 @@ def tell_gaps(slots: Slots, console: Console, chosen: argparse.Namespace) -> Non
 
 
 def main() -> None:
-    options = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    chosen = frame.options(
+        __doc__,
+        wait=(60.0, "seconds after an episode's end"),
+        episodes=(10, "of each wait"),
+        gaps=(0, "episodes of each kind; only the gaps are measured"),
+        gap_steps=(100, "of each of their episodes"),
+        gap_envs=(list(ACTIONS), "environments of the gaps", ACTIONS),
+        seed=(0, "of their order and cases"),
     )
-    options.add_argument("--wait", type=float, default=60.0, help="seconds after an episode's end")
-    options.add_argument("--episodes", type=int, default=10, help="of each wait")
-    options.add_argument(
-        "--gaps", type=int, default=0, help="episodes of each kind; only the gaps are measured"
-    )
-    options.add_argument("--gap-steps", type=int, default=100, help="of each of their episodes")
-    options.add_argument("--gap-envs", nargs="+", choices=ACTIONS, default=list(ACTIONS))
-    options.add_argument("--seed", type=int, default=0, help="of their order and cases")
-    chosen = options.parse_args()
     console = Console()
     with tempfile.TemporaryDirectory(prefix="evopolicy-channels-") as name:
         folder = Path(name)

@@ -10,13 +10,14 @@ worst case.
 
 from __future__ import annotations
 
-import argparse
 import os
 import subprocess
 import sys
 import tempfile
 import time
 from pathlib import Path
+
+import frame
 
 from evopolicy_common.records.run_record import RunRecord, decode_run_record
 
@@ -35,15 +36,16 @@ PHASES = ("agent_s", "queue_s", "rollout_s", "feedback_s", "permit_s", "held_s",
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--agents", type=int, default=4)
-    parser.add_argument("--environments", nargs="+", default=["core16"])
-    parser.add_argument("--parallel", type=int, default=4, help="agents at once")
-    parser.add_argument("--slots", type=int, default=os.cpu_count() or 1)
-    parser.add_argument("--budget", type=int, default=4)
-    parser.add_argument("--validation", type=int, default=2)
-    parser.add_argument("--heldout", type=int, default=4)
-    options = parser.parse_args()
+    options = frame.options(
+        __doc__,
+        agents=(4, "of the sweep"),
+        environments=(["core16"], "suites, ids or globs"),
+        parallel=(4, "agents at once"),
+        slots=(os.cpu_count() or 1, "of the worker"),
+        budget=(4, "train episodes of a run"),
+        validation=(2, "cases"),
+        heldout=(4, "cases"),
+    )
     text = SUITE.format(
         **{**vars(options), "environments": ", ".join(f'"{name}"' for name in options.environments)}
     ) + "".join(AGENT.format(f"random-{number}") for number in range(options.agents))

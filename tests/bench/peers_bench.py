@@ -9,7 +9,6 @@ versions, and times over the bare loop's; a peer that is not installed for `--py
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import subprocess
@@ -18,14 +17,14 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
+import frame
 from rich.console import Console
-from rich.table import Table
 from runtime_bench import submit_time
 
 from evopolicy_common import __version__, catalogue
 
 HERE = Path(__file__).parent
-ENVIRONMENTS = ("gym/acrobot", "gym/reacher5", "gymnasium/MiniGrid-FourRooms-v0")
+ENVIRONMENTS = ["gym/acrobot", "gym/reacher5", "gymnasium/MiniGrid-FourRooms-v0"]
 
 BEGIN = """
 import importlib.metadata, json, os, sys, time
@@ -148,16 +147,13 @@ def has(python: str, module: str) -> bool:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    options = frame.options(
+        __doc__,
+        env=(ENVIRONMENTS, "ids"),
+        episodes=(32, "cases"),
+        python=(sys.executable, "the Python that the peers are installed for"),
+        json=(Path, "also write all numbers to this file"),
     )
-    parser.add_argument("--env", nargs="+", default=ENVIRONMENTS, help="ids (default: three of Core16)")
-    parser.add_argument("--episodes", type=int, default=32, help="cases (default: 32)")
-    parser.add_argument(
-        "--python", default=sys.executable, help="the Python that the peers are installed for"
-    )
-    parser.add_argument("--json", type=Path, help="also write all numbers to this file")
-    options = parser.parse_args()
 
     console, n = Console(), options.episodes
     found: dict[str, dict[str, Any]] = {}
@@ -189,12 +185,8 @@ def main() -> None:
             found[env] = row
     columns = ["evopolicy", *(peer for peer in PEERS if peer not in skipped)]
     cores = len(os.sched_getaffinity(0))
-    table = Table(
-        title=f"{n} episodes on {cores} cores over the bare loop on one (load {os.getloadavg()[0]:.1f})"
-    )
-    table.add_column("environment")
-    for column in columns:
-        table.add_column(column, justify="right")
+    title = f"{n} episodes on {cores} cores over the bare loop on one (load {os.getloadavg()[0]:.1f})"
+    table = frame.table("environment", *columns, title=title)
     for env, row in found.items():
         cells = [row[column] for column in columns]
         table.add_row(env, *(one if isinstance(one, str) else f"{one / row['bare']:.2f}" for one in cells))
@@ -202,10 +194,7 @@ def main() -> None:
     console.print("; ".join(versions.values()))
     for peer, why in skipped.items():
         console.print(f"skipped: {peer}: {why}")
-    if options.json:
-        options.json.write_text(
-            json.dumps({"rows": found, "versions": versions, "skipped": skipped}, indent=2)
-        )
+    frame.save(options.json, {"rows": found, "versions": versions, "skipped": skipped})
 
 
 if __name__ == "__main__":

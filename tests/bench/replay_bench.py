@@ -11,22 +11,19 @@ tells. Asserts nothing.
 
 from __future__ import annotations
 
-import argparse
+import contextlib
 import itertools
 import json
 import os
 import random
 import re
-import subprocess
-import sys
 import tempfile
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from commands import evopolicy
+import frame
+from commands import evopolicy, worker_of
 from coordinator_harness import Coordinator
 from rich.console import Console
 from stages.model_api import ModelApi, Step
@@ -141,8 +138,7 @@ def own_tools(harness: str, comment: str) -> dict[str, list[Step]]:
 
 
 FAILING = (
-    "python3 system/none.py",
-    "cat feedback/submit_009/summary.json",
+    *("python3 system/none.py", "cat feedback/submit_009/summary.json"),
     "cd system && python3 -c 'from policy import Policy as P; raise ValueError(P(), P.act)'",
     "python3 -c 'import torch_of_no_machine'",
     "printf 'def f(:\\n' > t.py; python3 t.py; rm t.py; exit 1",
@@ -235,23 +231,6 @@ def hard(harness: str, index: int) -> Script:
 KINDS = {"ordinary": ordinary, "hard": hard}
 
 
-@contextmanager
-def cluster(root: Path) -> Iterator[str]:
-    """The operator's credentials for a cluster with both environments."""
-    coordinator = Coordinator(root / "s")
-    words = [word for env in ENVS for word in ("--env", env)]
-    words += ["--slots", "2", "--grace", "0", "--credentials", coordinator.ready["credentials"]["worker"]]
-    with coordinator.log.open("ab") as log:
-        program = [sys.executable, "-m", "evopolicy_worker.cli", *words]
-        worker = subprocess.Popen(program, stdout=log, stderr=log)
-    try:
-        yield coordinator.ready["credentials"]["operator"]
-    finally:
-        worker.terminate()
-        worker.wait()
-        coordinator.stop()
-
-
 def agent(harness: str, folder: Path, base_url: str) -> None:
     program, protocol, model = CLIS[harness]
     path = f"{os.environ['EVOPOLICY_REAL_CLIS']}/{program}"
@@ -291,25 +270,29 @@ def play(harness: str, kind: str, index: int, root: Path, operator: str) -> tupl
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    chosen = frame.options(
+        __doc__,
+        runs=(10, "of each CLI and kind"),
+        kinds=(list(KINDS), "of scripts", KINDS),
+        clis=(["codex", "claude-code"], "programs", CLIS),
+        only=("", "only runs of these numbers, comma separated"),
+        parallel=(2, "runs at once"),
+        keep=(Path, "keep the runs in this new folder"),
     )
-    parser.add_argument("--runs", type=int, default=10, help="of each CLI and kind (default: 10)")
-    parser.add_argument("--kinds", nargs="+", choices=KINDS, default=list(KINDS))
-    parser.add_argument("--clis", nargs="+", choices=CLIS, default=["codex", "claude-code"])
-    parser.add_argument("--only", type=int, nargs="*", help="only runs of these numbers")
-    parser.add_argument("--parallel", type=int, default=2, help="runs at once (default: 2)")
-    parser.add_argument("--keep", type=Path, help="keep the runs in this new folder")
-    chosen = parser.parse_args()
     os.environ["MODEL_ACCESS"] = "key-of-the-bench-0123456789"
     console = Console(width=200)
     with tempfile.TemporaryDirectory(prefix="evopolicy-replays-") as name:
         root = chosen.keep or Path(name)
         root.mkdir(exist_ok=chosen.keep is None)
-        with cluster(root) as operator, ThreadPoolExecutor(chosen.parallel) as pool:
+        with contextlib.ExitStack() as stack:
+            coordinator = Coordinator(root / "s")
+            stack.callback(coordinator.stop)
+            stack.enter_context(worker_of(coordinator, *(f"--env={env}" for env in ENVS)))
+            pool = stack.enter_context(ThreadPoolExecutor(chosen.parallel))
+            operator = coordinator.ready["credentials"]["operator"]
             for harness, kind in itertools.product(chosen.clis, chosen.kinds):
                 rows = []
-                numbers = chosen.only or range(chosen.runs)
+                numbers = [*map(int, filter(None, chosen.only.split(",")))] or range(chosen.runs)
                 for row in pool.map(lambda n: play(harness, kind, n, root, operator), numbers):  # noqa: B023
                     rows.append(row)
                     console.print(" | ".join((harness, *row)), markup=False, highlight=False)

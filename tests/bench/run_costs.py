@@ -10,7 +10,6 @@ Time is counted by a cgroup, for which it runs as root.
 
 from __future__ import annotations
 
-import argparse
 import os
 import subprocess
 import sys
@@ -18,6 +17,7 @@ import tempfile
 import time
 from pathlib import Path
 
+import frame
 from machines.cgroups import counted
 from stages.model_api import ModelApi, Step
 
@@ -41,10 +41,8 @@ N_SUBMITS = 8
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--budget", type=int, default=128)
-    parser.add_argument("--only", nargs="+", default=sorted({agent for agent, _ in ROWS}))
-    given = parser.parse_args()
+    agents = sorted({agent for agent, _ in ROWS})
+    given = frame.options(__doc__, budget=(128, "train episodes of a run"), only=(agents, "agents"))
     print("agent    environment         submits  CPU s  wall s  agent s  run MB  state MB", flush=True)
     for agent, env in ROWS:
         if agent in given.only:

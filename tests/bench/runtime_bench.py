@@ -1,7 +1,7 @@
 """`make bench`: what an episode costs through a sandboxed slot, and through the whole cluster, beside a bare loop.
 
 Prints, per environment of Core16 and for one of each family: the bare loop's time per step; the slot's time over the
-bare loop's with accelerations off and on, for Core16 also over the limit of `step_profile.py`; and a whole submit on
+bare loop's with accelerations off and on, for Core16 also over the limit of `limit.py`; and a whole submit on
 two slots, from POST to committed feedback, over (bare time / 2). Then the geometric means, a pipe's round trip on one
 core, the slot's overhead per step in such round trips, its overhead per episode, its memory, and what a one-episode
 submit takes beside its episode. At last a second small submit on two slots, over the bare loop on one core.
@@ -9,7 +9,6 @@ submit takes beside its episode. At last a second small submit on two slots, ove
 
 from __future__ import annotations
 
-import argparse
 import asyncio
 import contextlib
 import json
@@ -23,10 +22,10 @@ import time
 from pathlib import Path
 from typing import Any
 
+import frame
 import proofs
 from bare_loop import POLICY, seeds
 from rich.console import Console
-from rich.table import Table
 from submit_agent import SMALL
 
 from evopolicy_common import catalogue
@@ -59,6 +58,14 @@ SMALL_ROUNDS = 3
 """Bare loops, and runs with small submits, of each environment."""
 
 
+RATIOS = {
+    "slot": "slot_plain_s",
+    "slot, acc.": "slot_accelerated_s",
+    "slot ÷ limit": "limit_s",
+    "submit ×2": "submit_plain_s",
+    "submit, acc.": "submit_accelerated_s",
+}
+"""Columns of the table, and what they are made of."""
 CORE16 = set(catalogue.suites()["core16"].environments)
 PACES = {"step_median_s": 5.0, "reset_median_s": 10.0}
 """Of a web page, what a step and a reset are wanted to take, ms, without a slot."""
@@ -214,7 +221,7 @@ def beside_the_limit(env: str, n: int) -> dict[str, float]:
     """The shortest time of `n` episodes at the limit and in a slot, measured in turns: a machine's speed varies."""
     limit_s, slot_s = math.inf, math.inf
     for _ in range(LIMIT_ROUNDS):
-        found = quietly([sys.executable, str(HERE / "step_profile.py"), "--limit", env, str(n)])
+        found = quietly([sys.executable, str(HERE / "limit.py"), env, str(n)])
         limit_s = min(limit_s, json.loads(found.splitlines()[-1])["limit_s"])
         slot_s = min(slot_s, asyncio.run(slot_time(env, n, accelerations=True))[0])
     return {"limit_s": limit_s, "slot_beside_limit_s": slot_s}
@@ -264,18 +271,8 @@ def over(row: dict[str, Any], name: str) -> float:
 
 def report(rows: list[dict[str, Any]], round_trip_s: float, console: Console) -> dict[str, Any]:
     """Prints the table and the summary; returns the summary."""
-    table = Table(title="time over the bare loop's (below 1: faster)")
-    for heading in (
-        "environment",
-        "episodes",
-        "bare µs/step",
-        "slot",
-        "slot, acc.",
-        "slot ÷ limit",
-        "submit ×2",
-        "submit, acc.",
-    ):
-        table.add_column(heading, justify="left" if heading == "environment" else "right")
+    headings = ("environment", "episodes", "bare µs/step", *RATIOS)
+    table = frame.table(*headings, title="time over the bare loop's (below 1: faster)")
     # The means are those of Core16, so that they compare with earlier ones; of other environments where it is not
     # there.
     measured = CORE16.intersection(row["env"] for row in rows)
@@ -283,13 +280,7 @@ def report(rows: list[dict[str, Any]], round_trip_s: float, console: Console) ->
     overheads: list[float] = []
     for row in rows:
         cells = [row["env"], str(row["episodes"]), f"{1e6 * row['bare_s'] / row['steps']:.0f}"]
-        for name in (
-            "slot_plain_s",
-            "slot_accelerated_s",
-            "limit_s",
-            "submit_plain_s",
-            "submit_accelerated_s",
-        ):
+        for name in RATIOS.values():
             if name not in row:
                 cells.append("")
                 continue
@@ -327,16 +318,8 @@ def report(rows: list[dict[str, Any]], round_trip_s: float, console: Console) ->
             f"one-episode submit without its episode, ms: median {summary['single_median_ms']:.1f}, "
             f"95 % {summary['single_95_ms']:.1f}; one fsync here: {summary['fsync_ms']:.1f}"
         )
-    table = Table(title="slot overhead (accelerations off), and the slot's peak memory")
-    for heading in (
-        "environment",
-        "µs per step",
-        "pipe round trips per step",
-        "ms per episode",
-        "MB",
-        "MB, acc.",
-    ):
-        table.add_column(heading, justify="left" if heading == "environment" else "right")
+    headings = ("environment", "µs per step", "pipe round trips per step", "ms per episode", "MB", "MB, acc.")
+    table = frame.table(*headings, title="slot overhead (accelerations off), and the slot's peak memory")
     for row, overhead in zip(rows, overheads, strict=True):
         table.add_row(
             row["env"],
@@ -354,9 +337,8 @@ def tell_paces(rows: list[dict[str, Any]], console: Console) -> None:
     paced = [row for row in rows if PACES.keys() <= row.keys()]
     if not paced:
         return
-    table = Table(title="web pages: medians in ms, without a slot (wanted), and in a slot")
-    for heading in ("environment", "a step", "a reset", "a step in a slot, mean"):
-        table.add_column(heading, justify="left" if heading == "environment" else "right")
+    headings = ("environment", "a step", "a reset", "a step in a slot, mean")
+    table = frame.table(*headings, title="web pages: medians in ms, without a slot (wanted), and in a slot")
     for row in paced:
         medians = [f"{1000 * row[name]:.1f} ({wanted:g})" for name, wanted in PACES.items()]
         table.add_row(row["env"], *medians, f"{1000 * row['slot_plain_s'] / row['slot_plain_steps']:.1f}")
@@ -364,19 +346,9 @@ def tell_paces(rows: list[dict[str, Any]], console: Console) -> None:
 
 
 def tell_small(rows: list[dict[str, Any]], console: Console) -> None:
-    table = Table(title="a second small submit on two slots, over the bare loop on one core")
-    headings = (
-        "environment",
-        "episodes",
-        "bare ms",
-        "submit ms",
-        "ratio of the shortest",
-        "of the medians",
-        "wanted",
-        "published software",
-    )
-    for heading in headings:
-        table.add_column(heading, justify="left" if heading == "environment" else "right")
+    headings = ["environment", "episodes", "bare ms", "submit ms", "ratio of the shortest", "of the medians"]
+    headings += ["wanted", "published software"]
+    table = frame.table(*headings, title="a second small submit on two slots, over the bare loop on one core")
     for row in rows:
         _, wanted, published = SMALL_SUBMITS[row["env"]]
         bare, small = row["bare_s"], row["small_s"]
@@ -389,19 +361,16 @@ def tell_small(rows: list[dict[str, Any]], console: Console) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
     usual = ["core16", *(each.env for each in proofs.table())]
-    parser.add_argument("--env", nargs="+", default=usual, help="suites, ids or globs")
-    parser.add_argument("--seconds", type=float, default=4.0, help="bare time per environment (default: 4)")
-    parser.add_argument(
-        "--episodes", type=int, default=128, help="most episodes per environment (default: 128)"
+    options = frame.options(
+        __doc__,
+        env=(usual, "suites, ids or globs"),
+        seconds=(4.0, "bare time per environment"),
+        episodes=(128, "most episodes per environment"),
+        slots_only=(False, "leave the whole submits out"),
+        small_only=(False, "only the second small submits"),
+        json=(Path, "also write all numbers to this file"),
     )
-    parser.add_argument("--slots-only", action="store_true", help="leave the whole submits out")
-    parser.add_argument("--small-only", action="store_true", help="only the second small submits")
-    parser.add_argument("--json", type=Path, help="also write all numbers to this file")
-    options = parser.parse_args()
     console = Console()
     envs = catalogue.resolve(options.env)
     small = [] if options.slots_only else [env for env in SMALL_SUBMITS if env in envs]
@@ -437,9 +406,7 @@ def main() -> None:
     submits = [small_submit(env, SMALL_SUBMITS[env][0]) for env in small]
     if submits:
         tell_small(submits, console)
-    if options.json:
-        document = {"rows": rows, "summary": summary, "small": submits}
-        options.json.write_text(json.dumps(document, indent=2))
+    frame.save(options.json, {"rows": rows, "summary": summary, "small": submits})
     if failed:
         raise SystemExit(f"not measured: {', '.join(failed)}")
 

@@ -32,11 +32,11 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
 
+import frame
 import msgspec
 import numpy as np
 from coordinator_harness import FINGERPRINT, Coordinator, operator_of
 from rich.console import Console
-from rich.table import Table
 
 from evopolicy_common import catalogue
 from evopolicy_common.messages.environment import Case, EnvironmentDescription
@@ -69,11 +69,8 @@ class Policy:
             return int(self.rng.integers(self.space["n"]))
         return self.rng.uniform(-0.5, 0.5, self.space["shape"]).astype(np.float32)
 '''
-CASES = 32
-"""Most episodes that are really played of each environment."""
 FEWEST_CASES = 4
 SPARE_SUBMITS = 2
-TICK_S = 1 / os.sysconf("SC_CLK_TCK")
 
 
 class Outcomes(msgspec.Struct):
@@ -185,18 +182,12 @@ class Cpu:
         return self._now() - self._before
 
     def _now(self) -> Counter[str]:
-        found: Counter[str] = Counter({"": _ticks(Path(f"/proc/{self._pid}/stat"))[1] * TICK_S})
+        found: Counter[str] = Counter({"": frame.cpu_s(self._pid)})
         for task in Path(f"/proc/{self._pid}/task").iterdir():
             with contextlib.suppress(OSError):
-                name, ticks = _ticks(task / "stat")
-                found["main" if task.name == str(self._pid) else name.rstrip("0123456789-")] += ticks * TICK_S
+                name = (task / "comm").read_text().strip().rstrip("0123456789-")
+                found["main" if task.name == str(self._pid) else name] += frame.cpu_s(f"{task}/stat")
         return found
-
-
-def _ticks(path: Path) -> tuple[str, int]:
-    head, _, tail = path.read_text().rpartition(")")
-    fields = tail.split()
-    return head.partition("(")[2], int(fields[11]) + int(fields[12])
 
 
 def _written(pid: int) -> int:
@@ -411,8 +402,6 @@ def answered(
         pids = {"coordinator": [coordinator.process.pid]}
         pids["gateway"] = [run.process.pid for run in runs]
         pids["supervisor"] = [process.pid for process in answering]
-        if options.perf:
-            profiler = subprocess.Popen([*options.perf.split(), str(pids[options.perf_of][0])])
         before = {what: [Cpu(pid) for pid in of] for what, of in pids.items()}
         written = _written(coordinator.process.pid)
         started = time.monotonic()
@@ -426,8 +415,6 @@ def answered(
         wall_s = time.monotonic() - started
         used = {what: sum((each.used() for each in of), Counter()) for what, of in before.items()}
         written = _written(coordinator.process.pid) - written
-        if options.perf:
-            profiler.wait()
         hashes = {run.hash(index) for run in runs for index in (0, submits)}
         assert hashes == {played.expected(per_submit)}, f"{env}: the feedback differs from a real run's"
         latencies = sorted(latency for run in runs for latency in run.latencies)
@@ -500,9 +487,7 @@ COLUMNS = {
 def tell(rows: list[dict[str, Any]], console: Console) -> None:
     """All rows in one table, and the CPU of each row by thread."""
     console.print(f"{os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}; CPU of one core an episode")
-    table = Table()
-    for heading in COLUMNS:
-        table.add_column(heading, justify="left" if heading == "environment" else "right")
+    table = frame.table(*COLUMNS)
     for row in rows:
         table.add_row(*(str(row[name]) for name in COLUMNS.values()))
     console.print(table)
@@ -513,43 +498,31 @@ def tell(rows: list[dict[str, Any]], console: Console) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    options = frame.options(
+        __doc__,
+        envs=("gym/acrobot,gym/reacher5", "suites, ids or globs, comma separated"),
+        runs=("1,8,32", "runs at once, comma separated"),
+        episodes=(2048, "episodes of all runs of a row together"),
+        per_submit=(128, "episodes of a submit"),
+        cases=(32, "most episodes that are really played of each environment"),
+        play=(15.0, "CPU seconds of episodes that are really played"),
+        megabytes=(1000.0, "most feedback of all runs of a row together"),
+        paced=(False, "slots take the bare time of an episode"),
+        processes=(2, "processes of answering workers"),
+        workers=(4, "workers in each, a connection a worker"),
+        slots=(32, "slots of each worker"),
+        folder=(Path, "where the temporary folders go"),
+        json=(Path, "also write all numbers to this file"),
+        answer=(Path, argparse.SUPPRESS),
+        process=(int, argparse.SUPPRESS),
+        pace=(float, argparse.SUPPRESS),
     )
-    parser.add_argument(
-        "--envs", default="gym/acrobot,gym/reacher5", help="suites, ids or globs, comma separated"
-    )
-    parser.add_argument("--runs", default="1,8,32", help="runs at once, comma separated")
-    parser.add_argument("--episodes", type=int, default=2048, help="episodes of all runs of a row together")
-    parser.add_argument("--per-submit", type=int, default=128)
-    parser.add_argument("--cases", type=int, default=CASES, help="most episodes that are really played")
-    parser.add_argument(
-        "--play", type=float, default=15.0, help="CPU seconds of episodes that are really played"
-    )
-    parser.add_argument(
-        "--megabytes", type=float, default=1000.0, help="most feedback of all runs of a row together"
-    )
-    parser.add_argument("--paced", action="store_true", help="slots take the bare time of an episode")
-    parser.add_argument("--processes", type=int, default=2, help="processes of answering workers")
-    parser.add_argument("--workers", type=int, default=4, help="workers in each, a connection a worker")
-    parser.add_argument("--slots", type=int, default=32, help="slots of each worker")
-    parser.add_argument("--folder", type=Path, help="where the temporary folders go")
-    parser.add_argument("--json", type=Path, help="write the rows to this file too")
-    parser.add_argument(
-        "--perf", help="a profiler's command, which is given a process id as its last argument"
-    )
-    parser.add_argument("--perf-of", default="coordinator", choices=["coordinator", "gateway", "supervisor"])
-    parser.add_argument("--answer", type=Path, help=argparse.SUPPRESS)
-    parser.add_argument("--process", type=int, default=0, help=argparse.SUPPRESS)
-    parser.add_argument("--pace", type=float, default=0.0, help=argparse.SUPPRESS)
-    options = parser.parse_args()
     if options.answer is not None:
         asyncio.run(answer(options))
         return
     rows = [row for env in catalogue.resolve(options.envs.split(",")) for row in bench(env, options)]
     tell(rows, Console(width=None if sys.stdout.isatty() else 220))
-    if options.json is not None:
-        options.json.write_text(json.dumps(rows, indent=2) + "\n")
+    frame.save(options.json, rows)
 
 
 if __name__ == "__main__":

@@ -12,7 +12,6 @@ that the command starts, which import what it imports. Prints a table, asserts n
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import http.client
 import json
@@ -28,11 +27,11 @@ from typing import NamedTuple
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
 
+import frame
 from bare_loop import POLICY
 from coordinator_harness import Coordinator
 from invented.study import AGENTS, write_suite
 from rich.console import Console
-from rich.table import Table
 from stages.model_api import ModelApi
 
 from evopolicy_common import catalogue
@@ -161,10 +160,7 @@ def workers(folder: Path, times: int) -> list[Row]:
         registered_s(folder, coordinator, core16)
         few, many = zip(
             *(
-                (
-                    registered_s(folder, coordinator, core16),
-                    registered_s(folder, coordinator, everything),
-                )
+                (registered_s(folder, coordinator, core16), registered_s(folder, coordinator, everything))
                 for _ in range(times)
             ),
             strict=True,
@@ -263,14 +259,13 @@ def rows(folder: Path, times: int) -> list[Row]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    options = frame.options(
+        __doc__,
+        times=(3, "of each; the least counts"),
+        workers_only=(False, "only the start of a worker"),
+        relay_only=(False, "only the relay for model calls"),
+        json=(Path, "also write all numbers to this file"),
     )
-    parser.add_argument("--times", type=int, default=3, help="of each; the least counts (default: 3)")
-    parser.add_argument("--workers-only", action="store_true", help="only the start of a worker")
-    parser.add_argument("--relay-only", action="store_true", help="only the relay for model calls")
-    parser.add_argument("--json", type=Path, help="also write all numbers to this file")
-    options = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="evopolicy-bench-") as name:
         folder = Path(name)
         chosen = [workers] * options.workers_only + [relay] * options.relay_only
@@ -280,16 +275,7 @@ def main() -> None:
         f"seconds, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}; over floor: CPU, or wall where there is no"
         " other"
     )
-    table = Table()
-    for heading in (
-        "",
-        "wall",
-        "CPU",
-        "floor, wall",
-        "floor, CPU",
-        "over floor",
-    ):
-        table.add_column(heading, justify="right" if heading else "left")
+    table = frame.table("", "wall", "CPU", "floor, wall", "floor, CPU", "over floor")
     for row in found:
         cells = [_text(row.cost.wall_s), _text(row.cost.cpu_s)]
         if row.floor is not None:
@@ -298,8 +284,7 @@ def main() -> None:
             cells += [_text(row.floor.wall_s), _text(row.floor.cpu_s), f"{ratio:.1f}"]
         table.add_row(row.name, *cells)
     console.print(table)
-    if options.json:
-        options.json.write_text(json.dumps([row._asdict() for row in found], indent=2))
+    frame.save(options.json, [row._asdict() for row in found])
 
 
 def _text(seconds: float) -> str:

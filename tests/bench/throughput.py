@@ -4,30 +4,26 @@ Rows, each with a coordinator process of its own on a state folder of its own, o
 - `slots`: one real worker with two slots and sandboxes on `toy/line`; short episodes, train splits.
 - `one by one`, `batches`: workers that answer at once, taking one lease at a time or sixteen. Every episode is
   committed for itself, durably, and read back by the gateway that submitted it.
-- `dask`: as many tasks that do nothing through `dask.distributed`, in a virtual environment of its own.
 And the time from a submit's acceptance to its first lease, seen by the clients.
 """
 
 from __future__ import annotations
 
-import argparse
 import asyncio
 import contextlib
-import json
-import os
 import statistics
-import subprocess
 import sys
 import tempfile
 import time
-import venv
-from collections.abc import AsyncIterator, Callable
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
 
+import frame
 import msgspec
+from commands import worker_of
 from coordinator_harness import (
     Coordinator,
     GatewayClient,
@@ -54,27 +50,6 @@ TARGETS = {
     "batches": {"episodes_per_s": 2000, "coordinator_us": 250},
     "latency": {"median_ms": 5, "p99_ms": 25},
 }
-DASK = """
-import json, sys, time
-from distributed import Client, LocalCluster
-
-def nothing(n):
-    return n
-
-if __name__ == "__main__":
-    n = int(sys.argv[1])
-    with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster, Client(cluster) as client:
-        client.gather(client.map(nothing, range(-100, 0), pure=False))
-        started = time.monotonic()
-        client.gather(client.map(nothing, range(n), pure=False))
-        print(json.dumps(n / (time.monotonic() - started)))
-"""
-
-
-def cpu_s(pid: int) -> float:
-    """User and system time of a process, seconds."""
-    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def playing(wall_s: float) -> Callable[[Job, EpisodeSpec], EpisodeOutcome]:
@@ -93,12 +68,12 @@ async def evaluate(coordinator: Coordinator, n: int, source: str = "policy") -> 
         )
         async with gateway_of(coordinator, created) as gateway:
             await submit(gateway, source, 0)
-            cpu = cpu_s(coordinator.process.pid)
+            cpu = frame.cpu_s(coordinator.process.pid)
             started = time.monotonic()
             for number in range(1, submits + 1):
                 await submit(gateway, source, number)
             wall_s = time.monotonic() - started
-            cpu = cpu_s(coordinator.process.pid) - cpu
+            cpu = frame.cpu_s(coordinator.process.pid) - cpu
     episodes = submits * PER_SUBMIT
     return {
         "episodes": episodes,
@@ -115,27 +90,8 @@ async def submit(gateway: GatewayClient, source: str, number: int) -> None:
     assert len(episodes) == PER_SUBMIT
 
 
-@contextlib.asynccontextmanager
-async def real_worker(coordinator: Coordinator) -> AsyncIterator[None]:
-    log = coordinator.state.with_name("worker.log").open("wb")
-    process = subprocess.Popen(
-        [
-            *(sys.executable, "-m", "evopolicy_worker.cli", "--env", "toy/line", "--slots", "2"),
-            *("--grace", "0", "--credentials", coordinator.ready["credentials"]["worker"]),
-        ],
-        stdout=log,
-        stderr=log,
-    )
-    try:
-        yield
-    finally:
-        process.terminate()
-        await asyncio.to_thread(process.wait, 30)
-        log.close()
-
-
 async def slots_row(coordinator: Coordinator, n: int) -> dict[str, float]:
-    async with real_worker(coordinator):
+    with worker_of(coordinator, "--env", "toy/line"):
         return await evaluate(coordinator, n, POLICY)
 
 
@@ -199,35 +155,6 @@ async def latency_row(coordinator: Coordinator, n: int) -> dict[str, float]:
     }
 
 
-def dask_row(n: int, folder: Path) -> dict[str, Any]:
-    """As many no-op tasks through Dask, installed into `folder` when it is not there yet."""
-    python = folder / "bin" / "python"
-    try:
-        if not python.exists():
-            venv.create(folder, with_pip=True)
-            install = [
-                str(python),
-                "-m",
-                "pip",
-                "install",
-                "-q",
-                "--disable-pip-version-check",
-                "distributed",
-            ]
-            subprocess.run(install, check=True, capture_output=True, text=True, timeout=300)
-        script = folder / "bench.py"
-        script.write_text(DASK)
-        ran = subprocess.run(
-            [str(python), str(script), str(n)], check=True, capture_output=True, text=True, timeout=300
-        )
-    except (subprocess.SubprocessError, OSError) as error:
-        lines = (getattr(error, "stderr", None) or str(error)).strip().splitlines()
-        return {
-            "left_out": f"dask.distributed cannot be installed or run here: {lines[-1] if lines else error}"
-        }
-    return {"episodes": n, "episodes_per_s": round(float(ran.stdout.strip().splitlines()[-1]), 1)}
-
-
 def on_fresh_coordinator(row: Any, *args: Any) -> dict[str, float]:
     with tempfile.TemporaryDirectory(prefix="evopolicy-bench-") as folder:
         coordinator = Coordinator(Path(folder) / "state", "--log-level", "warning")
@@ -249,34 +176,24 @@ def verdict(name: str, row: dict[str, Any]) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    options = frame.options(
+        __doc__,
+        episodes=(4096, "episodes in a row of workers that answer at once"),
+        rows=("slots,one by one,batches,latency", "rows, comma separated"),
+        json=(Path, "also write all numbers to this file"),
     )
-    parser.add_argument(
-        "--episodes", type=int, default=4096, help="episodes in a row of workers that answer at once"
-    )
-    parser.add_argument(
-        "--rows", default="slots,one by one,batches,latency,dask", help="rows, comma separated"
-    )
-    parser.add_argument(
-        "--dask-venv", type=Path, default=Path(tempfile.gettempdir()) / "evopolicy-bench-dask"
-    )
-    parser.add_argument("--json", type=Path, help="write the rows to this file too")
-    options = parser.parse_args()
     makers = {
         "slots": lambda: on_fresh_coordinator(slots_row, options.episodes // 8),
         "one by one": lambda: on_fresh_coordinator(instant_row, options.episodes, 8, 1, 2.0),
         "batches": lambda: on_fresh_coordinator(instant_row, 2 * options.episodes, 4, 16, 2.0),
         "latency": lambda: on_fresh_coordinator(latency_row, 200),
-        "dask": lambda: dask_row(options.episodes, options.dask_venv),
     }
     rows: dict[str, dict[str, Any]] = {}
     for name in options.rows.split(","):
         rows[name] = makers[name]()
         line = "  ".join(f"{key} {value}" for key, value in rows[name].items())
         print(f"{name:<12}{line}  {verdict(name, rows[name])}", flush=True)
-    if options.json is not None:
-        options.json.write_text(json.dumps(rows, indent=2) + "\n")
+    frame.save(options.json, rows)
 
 
 if __name__ == "__main__":

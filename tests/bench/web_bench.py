@@ -12,7 +12,6 @@ from __future__ import annotations
 import argparse
 import asyncio
 import gzip
-import json
 import sys
 import tempfile
 import time
@@ -21,6 +20,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parents[1] / "simulation"))
 sys.path.insert(1, str(Path(__file__).parents[1] / "support"))
 
+import frame
 import msgspec
 from invented.web_site import site_of, status
 from scale import Load
@@ -155,21 +155,20 @@ async def watch(options: argparse.Namespace) -> int:
         f"the view's own process: {1e3 * busy_s / max(1, updates):.0f} ms an update of both pages, whatever the"
         " browsers"
     )
-    if options.json:
-        Path(options.json).write_text(
-            json.dumps({"status_ms": 1e3 * cost, "share": share, "updates_per_s": rate})
-        )
+    frame.save(options.json, {"status_ms": 1e3 * cost, "share": share, "updates_per_s": rate})
     return int(bool(failed) or share > CORE_SHARE or rate > 2.0)
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
-    parser.add_argument("--workers", type=int, default=2000)
-    parser.add_argument("--runs", type=int, default=500)
-    parser.add_argument("--browsers", type=int, default=200)
-    parser.add_argument("--seconds", type=float, default=20.0)
-    parser.add_argument("--json", default="")
-    return asyncio.run(watch(parser.parse_args()))
+    options = frame.options(
+        __doc__,
+        workers=(2000, "of the cluster"),
+        runs=(500, "open runs"),
+        browsers=(200, "of each view"),
+        seconds=(20.0, "of updates"),
+        json=(Path, "also write all numbers to this file"),
+    )
+    return asyncio.run(watch(options))
 
 
 if __name__ == "__main__":

@@ -14,7 +14,6 @@ import argparse
 import asyncio
 import contextlib
 import json
-import os
 import subprocess
 import sys
 import tempfile
@@ -22,13 +21,13 @@ from collections.abc import AsyncIterator
 from pathlib import Path
 from urllib.parse import urlsplit
 
+import frame
 from coordinator_harness import Coordinator, InstantWorker, operator_of
 
 from evopolicy_common.wire.transport import connect
 
 AT_ONCE = 50
 CORE_SHARE = 0.02
-TICKS_PER_S = os.sysconf("SC_CLK_TCK")
 
 
 async def filled(coordinator: Coordinator, workers: int, runs: int) -> None:
@@ -44,17 +43,11 @@ async def filled(coordinator: Coordinator, workers: int, runs: int) -> None:
             await asyncio.sleep(2.0)
 
 
-def cpu_s(pid: int) -> float:
-    """User and system time of a process, seconds."""
-    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / TICKS_PER_S
-
-
 async def share(pid: int, seconds: float) -> float:
     """Share of one core that a process uses now."""
-    before = cpu_s(pid)
+    before = frame.cpu_s(pid)
     await asyncio.sleep(seconds)
-    return (cpu_s(pid) - before) / seconds
+    return (frame.cpu_s(pid) - before) / seconds
 
 
 async def browser(port: int, token: str, page: str, seen: list[int]) -> None:
@@ -126,12 +119,14 @@ async def measure(options: argparse.Namespace) -> int:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
-    parser.add_argument("--workers", type=int, default=2000)
-    parser.add_argument("--runs", type=int, default=500)
-    parser.add_argument("--browsers", type=int, default=100)
-    parser.add_argument("--seconds", type=float, default=60.0)
-    return asyncio.run(measure(parser.parse_args()))
+    options = frame.options(
+        __doc__,
+        workers=(2000, "of the cluster"),
+        runs=(500, "open runs"),
+        browsers=(100, "of each view"),
+        seconds=(60.0, "of each measurement"),
+    )
+    return asyncio.run(measure(options))
 
 
 if __name__ == "__main__":

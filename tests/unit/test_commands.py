@@ -204,15 +204,6 @@ def test_a_long_value_is_shortened_and_the_remedy_stays(forked: Forks) -> None:
     assert "has 100,000 characters, and 32,768 are the limit" in done.stderr
 
 
-def test_the_help_of_local_is_in_groups_and_fits_a_narrow_terminal(forked: Forks) -> None:
-    output = forked(["evopolicy", "local", "--help"], COLUMNS="60").stdout
-    headings = [line[:-1] for line in output.splitlines() if line.endswith(":") and not line.startswith(" ")]
-    assert headings[0] == "Run"
-    assert headings[-1] == "Other options"
-    assert len(headings) >= 6
-    assert max(map(len, output.splitlines())) <= 60
-
-
 def test_ctrl_c_is_told_whatever_a_command_was_doing() -> None:
     program = """
 from evopolicy_common.cli.frame import App, run_app
