@@ -14,6 +14,7 @@ import pytest
 from invented.agent_logs import LOGS
 from invented.policies import Version, png, policy
 
+from evopolicy_gateway.workspace.staging import initial_policy
 from evopolicy_results.scan.code import code_signals
 from evopolicy_results.scan.log import log_signals
 from evopolicy_results.scan.run import feedback_actions, log_lines, policy_files, scan
@@ -247,8 +248,7 @@ def own_policies() -> dict[str, dict[str, bytes]]:
     }
     found["evolve"] = policy_files(EVOLVE / "evolved")
     found["evolve, the whole agent"] = policy_files(EVOLVE.parent)
-    initial = ROOT / "agent_gateway" / "evopolicy_gateway" / "workspace" / "initial_policy.py"
-    found["initial policy"] = {"policy.py": initial.read_bytes()}
+    found["initial policy"] = {"policy.py": initial_policy({"type": "Discrete", "n": 2}).encode()}
     return {name: files for name, files in found.items() if files}
 
 
