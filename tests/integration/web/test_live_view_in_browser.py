@@ -1,0 +1,314 @@
+"""The live view in a real browser, over a real cluster: a sweep is watched from start to end, whatever dies
+meanwhile; an operator's acts are confirmed, have their effect, and are written down."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sys
+import urllib.request
+from pathlib import Path
+
+import pytest
+from browser import Page
+from commands import AGENT, command, process
+from coordinator_harness import Coordinator
+from machines.own_certs import free_port
+from waiting import TIMEOUT_S, wait_until
+
+from evopolicy_coordinator.web.access import kept_tokens
+
+pytestmark = [pytest.mark.system, pytest.mark.slow]
+
+SUITE = """
+name = "watched"
+environments = ["toy/line"]
+[defaults]
+repeats = 2
+budget = {budget}
+validation = 1
+heldout = 1
+[parallel]
+machine = 1
+[[agents]]
+name = "<b>careful"
+agent = "command:{python} {agent}"
+[agents.jail]
+read = ["{agent}"]
+"""
+WAITS = """
+def wait_for(name):
+    while not os.path.exists(name):
+        time.sleep(0.05)
+
+submit("0")
+"""
+TEXT = "(document.body?.innerText ?? '')"
+LIVE = "document.getElementById('live')"
+
+
+class Sweep:
+    """A suite of one agent and two repeats, a coordinator, and the programs of a worker, view and suite."""
+
+    def __init__(self, folder: Path, code: str, budget: int, *options: str) -> None:
+        program, suite = folder / "agent.py", folder / "suite.toml"
+        program.write_text(AGENT + WAITS + code)
+        suite.write_text(SUITE.format(budget=budget, python=sys.executable, agent=program))
+        self.folder, self.runs, self.log = folder, folder / "runs", folder / "log"
+        self.runs.mkdir()
+        self.tokens = kept_tokens(folder / "tokens")
+        self.options = ("--hidden-isolation", "off", *options)
+        self.coordinator = Coordinator(folder / "s", *self.options)
+        joins, operator = (self.coordinator.ready["credentials"][role] for role in ("worker", "operator"))
+        self.works = ("evopolicy_worker.cli", "--env", "toy", "--grace", "0", "--credentials", joins)
+        operates = ("--credentials", operator)
+        self.shows = ("evopolicy_gateway.cli", "web", str(self.runs), *operates)
+        self.shows += ("--token-file", str(folder / "tokens"))
+        self.plays = ("suite", str(suite), "--runs", str(self.runs / "watched"), *operates)
+
+    def workspaces(self) -> list[Path]:
+        return sorted((self.runs / "watched").glob("*/*/*/workspace"))
+
+
+def done(workspace: Path) -> int:
+    return len(list(workspace.glob("feedback/submit_*/summary.json")))
+
+
+def answer(url: str) -> str:
+    """What is at an address; nothing if nobody answers."""
+    try:
+        with urllib.request.urlopen(url, timeout=5) as response:
+            return response.read().decode()
+    except OSError:
+        return ""
+
+
+def rows(cell: str) -> str:
+    return f"[...document.querySelectorAll('#run-rows {cell}')]"
+
+
+@pytest.mark.timeout(600)
+def test_a_sweep_is_watched_from_start_to_end(tmp_path: Path) -> None:
+    metrics, web = (f"127.0.0.1:{free_port()}" for _ in range(2))
+    code = 'print("<i>I saw</i> the first return", flush=True)\nwait_for("go")\nsubmit("1-2")\n'
+    sweep = Sweep(tmp_path, code, 3, "--metrics", metrics)
+    works, shows = (*sweep.works, "--slots", "2"), (*sweep.shows, "--http", web)
+    hidden = f"{rows('tr')}.some((row) => row.innerText.includes('hidden'))"
+    fact = "document.querySelector('#facts b')?.textContent.startsWith"
+    away = "document.querySelector('#notices')?.innerText.includes('does not answer')"
+    try:
+        with (
+            process(sweep.log, *works) as worker,
+            process(sweep.log, *shows) as view,
+            Page(timeout_s=120) as page,
+        ):
+            wait_until(lambda: answer(f"http://{web}/healthz") == "ok\n")
+            page.visit(f"http://{web}/login#token={sweep.tokens.read}")
+            page.until(f"document.title === 'runs' && {LIVE}?.textContent === 'live'")
+            assert page.run("location.hash") == ""
+            assert page.run("document.cookie") == "", "scripts see no cookie"
+            with command(tmp_path, *sweep.plays) as played:
+                # The page has been open since before the sweep began: its rows come by themselves.
+                wait_until(sweep.workspaces, lambda: played.text)
+                page.until(f"{TEXT}.includes('watched') && {TEXT}.includes('training')")
+                assert "<b>careful" in page.run(TEXT)
+                page.until(f"{rows('tr')}.length === 2")
+                page.until(f"{rows('tr td:nth-child(7)')}[0]?.textContent === '1'")
+                assert page.violations() == []
+                page.visit(page.run(f"{rows('a')}[0].href"))
+                page.until("document.querySelectorAll('#submit-rows tr').length === 1")
+                page.until("document.getElementById('messages')?.innerText.includes('<i>I saw</i>')")
+                assert page.violations() == []
+                (first,) = sweep.workspaces()
+
+                # A worker is killed and comes back.
+                page.visit(f"http://{web}/cluster")
+                page.until("document.querySelector('#worker-rows td:nth-child(3)')?.textContent === 'active'")
+                assert page.violations() == []
+                assert page.problems == []
+                os.kill(worker.pid, signal.SIGKILL)
+                page.until(f"{fact}('1 of 1') === false")
+                with process(sweep.log, *works):
+                    page.until(f"{fact}('1 of ')")
+
+                    # The coordinator restarts, and the page says so meanwhile.
+                    sweep.coordinator.kill()
+                    page.until(away)
+                    sweep.coordinator = Coordinator(tmp_path / "s", *sweep.options)
+                    page.until(f"{away} === false")
+                    assert page.problems == []
+
+                    # The view restarts, and the page reconnects by itself.
+                    view.terminate()
+                    view.wait(timeout=TIMEOUT_S)
+                    page.until(f"{LIVE}?.dataset.state === 'away'")
+                    with process(sweep.log, *shows):
+                        wait_until(lambda: answer(f"http://{web}/healthz") == "ok\n")
+                        page.until(f"{LIVE}?.dataset.state === 'live'")
+                        page.problems.clear()
+
+                        # The first run is scored while the second one's agent is alive: its scores are hidden
+                        # until that ends.
+                        page.visit(f"http://{web}/")
+                        (first / "go").touch()
+                        wait_until(lambda: sum(map(done, sweep.workspaces())) == 3, lambda: played.text)
+                        wait_until(lambda: [*first.parent.glob("run.json")], lambda: played.text)
+                        page.until(hidden)
+                        for folder in sweep.workspaces():
+                            (folder / "go").touch()
+                        assert played.wait() == 0, played.err
+                        page.until(f"{fact}('2 of 2')")
+                        page.until(f"!{hidden}")
+                        scores = page.run(f"{rows('td:nth-child(9)')}.map((cell) => cell.textContent)")
+                        assert all(float(score.replace("−", "-")) for score in scores), scores
+                        page.visit(page.run(f"{rows('a')}[0].href"))
+                        page.visit(page.run("document.querySelector('#submit-rows a').href"))
+                        assert "What changed in the code" in page.run(TEXT)
+                        assert page.violations() == []
+                        page.visit(page.run("document.querySelector('a[href*=\"/episode/\"]').href"))
+                        assert page.run("document.querySelectorAll('figure svg[role=img]').length") >= 2
+                        assert page.violations() == []
+                        for width, dark in ((1280, True), (390, False)):
+                            page.look(width=width, dark=dark, phone=width < 500)
+                            page.visit(f"http://{web}/")
+                            assert page.violations() == []
+                            assert page.run("document.documentElement.scrollWidth <= innerWidth")
+                        assert page.problems == []
+            output = answer(f"http://{metrics}/metrics")
+            for line in (
+                'evopolicy_submits_total{verdict="ok"}',
+                'evopolicy_episodes_total{split="heldout",verdict="ok"} 2.0',
+                "evopolicy_submit_duration_seconds_bucket",
+                "process_cpu_seconds_total",
+                "evopolicy_up 1.0",
+                "evopolicy_store_database_bytes",
+            ):
+                assert line in output, output
+            assert answer(f"http://{metrics}/healthz") == "ok\n"
+    finally:
+        sweep.coordinator.stop()
+
+
+STEPS = """
+for number in range(1, 6):
+    wait_for(f"go-{number}")
+    if number == 2:  # a slow one: its worker is killed meanwhile
+        with open("system/policy.py", "a") as file:
+            file.write("\\nimport time\\nact_at_once = Policy.act\\ndef act(self, obs):\\n")
+            file.write("    time.sleep(0.4)\\n    return act_at_once(self, obs)\\nPolicy.act = act\\n")
+    if number == 3:
+        source = open("system/policy.py").read()
+        open("system/policy.py", "w").write(source.replace("time.sleep(0.4)", "pass"))
+    submit(str(number))
+wait_for("the end")
+"""
+
+
+@pytest.mark.timeout(900)
+def test_runs_workers_and_sweeps_are_acted_on_from_the_page(tmp_path: Path) -> None:
+    other = tmp_path / "other" / "numpy-99.0.dist-info"
+    other.mkdir(parents=True)
+    (other / "METADATA").write_text("Metadata-Version: 2.1\nName: numpy\nVersion: 99.0\n")
+    log, acts, address = (tmp_path / name for name in ("log", "acts.jsonl", "address"))
+    sweep = Sweep(tmp_path, STEPS, 6)
+    runs, tokens, workspaces = sweep.runs, sweep.tokens, sweep.workspaces
+    works = (*sweep.works, "--slots", "1")
+    shows = (*sweep.shows, "--http", "127.0.0.1:0", "--url-file", str(address))
+    shows += ("--act", "--action-log", str(acts))
+    try:
+        with (
+            process(log, *works, "--name", "w-first") as first,
+            process(log, *shows),
+            Page(timeout_s=TIMEOUT_S) as page,
+            Page(timeout_s=TIMEOUT_S) as reader,
+        ):
+            wait_until(address.exists, log.read_text)
+            base = address.read_text().partition("/login")[0]
+
+            def act(where: str, link: str, reason: str = "") -> None:
+                """Follows a link to an act, and confirms it."""
+                page.visit(f"{base}{where}")
+                anchor = f"[...document.querySelectorAll('a[href^=\"/act/\"]')].find((a) => {link})"
+                page.until(f"{anchor} !== undefined")
+                page.visit(page.run(f"{anchor}.href"))
+                assert "What happens:" in page.run(TEXT)
+                assert page.violations() == []
+                if reason:
+                    page.run(f"document.querySelector('input[name=reason]').value = {json.dumps(reason)}")
+                page.run("document.querySelector('button.danger').click()")
+                page.until("!location.pathname.startsWith('/act/')")
+
+            for one, token in ((page, tokens.act), (reader, tokens.read)):
+                one.visit(f"{base}/login#token={token}")
+                one.until(f"{LIVE}?.textContent === 'live'")
+            with command(tmp_path, *sweep.plays) as played:
+                (folder,) = wait_until(workspaces, lambda: played.text)
+                wait_until(lambda: done(folder) == 1, lambda: played.text)
+
+                # A second operator sees the same and has nothing to act with.
+                reader.visit(f"{base}/")
+                reader.until(f"{TEXT}.includes('watched')")
+                assert reader.run("document.querySelectorAll('a[href^=\"/act/\"]').length") == 0
+
+                act("/", "a.href.endsWith('/pause')")
+                assert (runs / "watched" / "paused").exists()
+                reader.until("document.querySelector('.pill')?.textContent === 'paused'")
+
+                # A paused worker gets no work: the submit waits for it, and the page says so.
+                act("/cluster", "a.href.endsWith('/worker/w-first/pause')")
+                page.until(f"{TEXT}.includes('paused')")
+                (folder / "go-1").touch()
+                page.until("document.getElementById('queue')?.innerText.includes('those that do are paused')")
+                assert done(folder) == 1
+                act("/cluster", "a.href.endsWith('/worker/w-first/resume')")
+                wait_until(lambda: done(folder) == 2, lambda: played.text)
+
+                # Its worker is killed in the midst of an episode, and one of other versions comes.
+                busy = "document.querySelector('#worker-rows td:nth-child(4)')?.textContent"
+                page.until(f"{busy} === '0/1'")
+                (folder / "go-2").touch()
+                page.until(f"{busy} === '1/1'")
+                os.kill(first.pid, signal.SIGKILL)
+                with process(log, *works, "--name", "w-other", PYTHONPATH=str(other.parent)) as second:
+                    opened = "document.querySelector('#open-rows a')?.getAttribute('href')"
+                    page.until(f"{opened} !== undefined")
+                    run_page = page.run(opened)
+                    act(run_page, "a.href.includes('/repin?class=')", reason="the first machine has died")
+                    page.visit(f"{base}{run_page}")
+                    lost = "Worker w-first was lost with 1 job of this run"
+                    page.until(f"document.getElementById('events')?.innerText.includes({lost!r})")
+                    (folder / "go-3").touch()
+                    wait_until(lambda: done(folder) == 4, lambda: played.text)
+
+                    act("/", "a.href.endsWith('/resume')")
+                    assert not (runs / "watched" / "paused").exists()
+                    act(run_page, "a.href.endsWith('/cancel')")
+                    wait_until(lambda: len(workspaces()) == 2, lambda: played.text)
+                    (written,) = wait_until(lambda: list(folder.parent.glob("run.json")))
+                    record = json.loads(written.read_text())
+                    assert record["outcome"]["status"] == "cancelled"
+                    assert "the first machine has died" in json.dumps(record)
+                    reader.until(f"{rows('td')}.some((cell) => cell.textContent === 'cancelled')")
+
+                    # A drained worker ends by itself.
+                    act("/cluster", "a.href.endsWith('/worker/w-other/drain')")
+                    assert second.wait(timeout=TIMEOUT_S) == 0
+            page.visit(f"{base}/log")
+            assert page.violations() == []
+            assert "the first machine has died" in page.run(TEXT)
+            assert page.problems == []
+            assert reader.problems == []
+    finally:
+        sweep.coordinator.stop()
+    entries = [json.loads(line) for line in acts.read_text().splitlines()]
+    names = ["sweep pause", "worker pause", "worker resume", "run repin", "sweep resume", "run cancel"]
+    names += ["worker drain"]
+    told = [(name, outcome) for name in names for outcome in ("asked", "done")]
+    assert [(one["act"], one["outcome"]) for one in entries] == told
+    assert [one["name"] for one in entries[::2]][:3] == ["watched", "w-first", "w-first"]
+    assert entries[6]["reason"] == entries[7]["reason"] == "the first machine has died"
+    assert {one["by"] for one in entries} == {"browser at 127.0.0.1"}
+    text = acts.read_text()
+    assert tokens.act not in text
+    assert tokens.read not in text
