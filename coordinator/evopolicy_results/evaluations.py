@@ -85,7 +85,7 @@ class Evaluations:
         limits: ResourceLimits | None = None,
     ) -> AsyncIterator[tuple[int, EpisodeOutcome | None]]:
         """Plays some of a list's episodes again, by recorded `actions` (trajectories, one for each index) or
-        with the policy of `bundle`. Yields each index with its outcome as it arrives, then those that have none.
+        with the policy of `bundle`. Yields each index with its outcome as it arrives, then those without one.
         `run`: the coordinator's id, for the policies' random seeds."""
         for data in actions:
             await self.ask.upload(digest_of(data), data)

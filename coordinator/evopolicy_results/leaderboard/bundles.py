@@ -47,8 +47,8 @@ class LabRun(msgspec.Struct, frozen=True, kw_only=True):
     published: str
     """The coordinator's id."""
     episodes: tuple[tuple[Episode, tuple[float, ...]], ...]
-    """Held-out episodes of the selected checkpoint, each with the sum of its rewards so far at `_POINTS` steps
-    at most; without sums where the recording was withheld."""
+    """Held-out episodes of the selected checkpoint, each with the sum of its rewards so far at `_POINTS`
+    steps at most; without sums where the recording was withheld."""
     unrecorded: bool = False
     """Some of its episodes have no recording, so that no replay can contradict their returns."""
 

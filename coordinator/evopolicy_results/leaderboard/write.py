@@ -303,8 +303,8 @@ def _checking(bundles: Sequence[LabBundle]) -> dict[str, Any]:
         "Take each signer's key from a place that you know to be theirs, not from this page.",
         (
             "No check shows that recorded actions came from the policy, that a publisher did not start over"
-            " with a new journal (unless you have an earlier head of it), or what a publisher states about jails"
-            " and machines."
+            " with a new journal (unless you have an earlier head of it), or what a publisher states about"
+            " jails and machines."
         ),
     ]
     return section("check", "Check it yourself", texts=texts, code="\n".join(lines))

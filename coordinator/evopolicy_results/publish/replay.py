@@ -7,9 +7,9 @@ Rules that this module owns:
   versions than the run tells, is not played: other versions give other numbers. Nor is one whose environment does not
   repeat episodes according to this machine; the file's own statement does not count.
 - A policy is untrusted code: it runs in the worker's sandbox, with default limits, like any agent's. It gets
-  the published arguments (`env_meta`, episode indexes) and other random seeds than in the run, which are secret.
-  Only policies that declare `deterministic = True` are played. One that fails here, or failed in the run, shows
-  nothing: limits and machines differ.
+  the published arguments (`env_meta`, episode indexes) and other random seeds than in the run, which are
+  secret. Only policies that declare `deterministic = True` are played. One that fails here, or failed in the
+  run, shows nothing: limits and machines differ.
 - The packages that a run's policies import are those that its `run.json` names, and only if the operator names them
   too: names in the file alone make nothing of this machine visible or imported.
 """

@@ -178,8 +178,8 @@ def _order(
 ) -> Iterator[tuple[State, str]]:
     """Whether the journal had the heads that were noted elsewhere."""
     if not noted:
-        text = "the journal is its owner's, who could have deleted it and begun another: compare its head with one"
-        yield "open", f"{text} that was noted elsewhere in time (--head)"
+        text = "the journal is its owner's, who could have deleted it and begun another"
+        yield "open", f"{text}: compare its head with one that was noted elsewhere in time (--head)"
     for each in noted:
         head, by = each, "that you gave"
         if isinstance(each, Countersignature):

@@ -26,7 +26,7 @@ from evopolicy_common.terminal import counted
 from evopolicy_results.publish import contents, fields
 from evopolicy_results.publish.contents import Group
 from evopolicy_results.publish.findings import KINDS, Checked, Fault, Files, History, PublishedRun, decoded
-from evopolicy_results.verify.numbers import outcome_pairs
+from evopolicy_results.verify.numbers import outcome_pairs, short
 
 T = TypeVar("T")
 
@@ -179,7 +179,7 @@ def _record(run: PublishedRun, history: History) -> Iterator[str]:
             pairs.append((name, getattr(dimensions, name), len(cases)))
     for path, fixed in result.record.items():
         here = fields.value_at(run.as_written, path)
-        if not _alike(here, fixed):
+        if contents.document(here) != contents.document(fixed):
             pairs.append((path, here, fixed))
     if not result.random_heldout_returns:
         pairs.append(("outcome.random_reference", record.outcome.random_reference, None))
@@ -200,7 +200,7 @@ def _record(run: PublishedRun, history: History) -> Iterator[str]:
     ):
         for name, here, fixed in told:
             if here != fixed:
-                yield f"run.json tells {name} {_short(here)}; {source} {_short(fixed)}"
+                yield f"run.json tells {name} {short(here)}; {source} {short(fixed)}"
 
 
 def _budget(run: PublishedRun, history: History) -> Iterator[str]:
@@ -317,10 +317,10 @@ def _recordings(files: Files, run: PublishedRun, damaged: set[str], checked: Che
     checked.recorded[name] = recorded
     left = ""
     if missing := checked.unrecorded(name):
-        left = f"only {', '.join(missing)} episodes have a recording: the other returns rest on the publisher's word"
-    checked.conclude(
-        "recordings", faults, counted(sum(n for n, _ in recorded.values()), "episode"), name, left
-    )
+        left = f"only {', '.join(missing)} episodes have a recording"
+        left += ": the other returns rest on the publisher's word"
+    episodes = counted(sum(n for n, _ in recorded.values()), "episode")
+    checked.conclude("recordings", faults, episodes, name, left)
 
 
 def recording_fault(episode: contents.Episode, data: bytes) -> str | None:
@@ -408,15 +408,5 @@ def _metrics(run: PublishedRun, policies: dict[int, Bundle], checked: Checked) -
         yield "run.json tells metrics of code in another form than the software"
         return
     for name, here, fixed in pairs:
-        if not _alike(here, fixed):
-            yield f"run.json tells {name} {_short(here)}; the policies give {_short(fixed)}"
-
-
-def _alike(here: Any, fixed: Any) -> bool:
-    """Whether two values are the same JSON."""
-    return msgspec.json.encode(here, order="sorted") == msgspec.json.encode(fixed, order="sorted")
-
-
-def _short(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= 80 else f"{text[:77]}…"
+        if contents.document(here) != contents.document(fixed):
+            yield f"run.json tells {name} {short(here)}; the policies give {short(fixed)}"

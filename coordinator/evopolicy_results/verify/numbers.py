@@ -256,9 +256,10 @@ def _unlike(
 ) -> Iterator[tuple[str, str]]:
     for name, here, wanted in told:
         if here != wanted:
-            yield file, f"{name} is {_short(here)}; {source} {_short(wanted)}"
+            yield file, f"{name} is {short(here)}; {source} {short(wanted)}"
 
 
-def _short(value: Any) -> str:
+def short(value: Any) -> str:
+    """A value as a difference quotes it."""
     text = repr(value)
     return text if len(text) <= _MAX_CHARS else f"{text[: _MAX_CHARS - 1]}…"
