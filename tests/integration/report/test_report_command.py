@@ -231,7 +231,7 @@ def test_left_out_run_is_listed_with_its_reason(report: Path) -> None:
 
 
 def test_report_is_the_same_whether_one_or_two_processes_make_it(tmp_path: Path) -> None:
-    for folder in write_suite(tmp_path / "runs", environments=("gym/racing", "my/glider"), n_submits=4):
+    for folder in write_suite(tmp_path / "runs", environments=("gym/racing", "own/glider"), n_submits=4):
         amend(folder, {"env_title": "Glider"} if "glider" in str(folder) else {})
     written = []
     for jobs in ("1", "2"):
