@@ -194,7 +194,8 @@ def _capped(fit: _Fit, cap: int) -> int:
 def _height(panel: list[_Fit]) -> int:
     """Number of lines of a panel, including its heading and rules."""
     lines = ([-(-len(text) // max(1, fit.width)) for text in fit.texts] for fit in panel)
-    return 4 + sum(max(row) for row in zip(*lines, strict=True))
+    rows: list[tuple[int, ...]] = list(zip(*lines, strict=True))
+    return 4 + sum(map(max, rows))
 
 
 def _spec(fit: _Fit) -> str:
