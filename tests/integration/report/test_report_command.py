@@ -255,7 +255,7 @@ def test_papers_table_as_input_gives_its_aggregate_table(tmp_path: Path) -> None
 
 def test_mixed_runs_are_refused_unless_told_and_then_marked(tmp_path: Path) -> None:
     write_run(tmp_path / "runs", PLAIN)
-    other = write_run(tmp_path / "runs", PLAIN, entry="Other", scope="submit")
+    other = write_run(tmp_path / "runs", PLAIN, entry="Other", policy_scope="submit")
     refused = reported(tmp_path / "runs", tmp_path / "report", code=3).output
     assert "policy scope on core16: episode (1 run), submit (1 run)" in refused
     assert f"    submit: {other}\n" in refused

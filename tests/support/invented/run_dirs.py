@@ -11,8 +11,6 @@ from typing import Any, Literal
 
 import msgspec
 
-from evopolicy_common.messages.gateway import FeedbackDetail
-from evopolicy_common.messages.run_settings import Start
 from evopolicy_common.records.policies import checkpoints
 from evopolicy_common.records.policies.bundles import BundleFile, pack
 from evopolicy_common.records.policies.checkpoints import CheckpointMeta
@@ -54,24 +52,18 @@ def write_run(
     log: str | None = "claude",
     rejected: int = 0,
     replays: Mapping[str, bytes] | None = None,
-    scope: str = "episode",
-    jail: str = "bwrap",
-    hidden_isolation: str = "exclusive",
-    hidden_cases: str = "shared",
     split: str = "split-1",
     fingerprint: Mapping[str, str] | None = None,
     status: str | None = None,
     seeded_by: Literal["case", "run"] = "run",
     closed_reason: str | None = None,
     settings: Mapping[str, Any] | None = None,
-    simulation: Literal["forbidden", "allowed"] = "forbidden",
-    feedback: FeedbackDetail = "pictures",
-    start: Start | None = None,
-    run: str = "",
     change: Mapping[str, Any] | None = None,
+    **fields: Any,
 ) -> Path:
     """Writes one run directory under `runs` and returns it. `heldout` defaults to the best validation score alone.
-    `change`: as of `amend`."""
+    `change`: as of `amend`. `fields` of the record or of its dimensions, such as `jail` or `policy_scope`."""
+    dimensions = {name: fields.pop(name) for name in ExperimentDimensions.__struct_fields__ if name in fields}
     folder = (
         runs / entry.replace(" ", "-") / env.replace("/", "_") / (exp_id + (f"-{repeat}" if repeat else ""))
     )
@@ -94,8 +86,6 @@ def write_run(
         env=env,
         exp_id=exp_id,
         repeat=repeat,
-        start=start,
-        run=run,
         agent=Agent(
             entry=entry,
             harness=harness,
@@ -105,20 +95,15 @@ def write_run(
             tokens=tokens,
         ),
         sandbox_tier="bwrap",
-        jail=jail,
-        hidden_isolation=hidden_isolation,  # type: ignore[arg-type]
+        **{"jail": "bwrap", "hidden_isolation": "exclusive", **fields},
         experiment_dimensions=ExperimentDimensions(
             episode_budget=budget,
             min_episodes_per_submit=1,
             max_episodes_per_submit=budget,
-            policy_scope=scope,  # type: ignore[arg-type]
-            observations="arrays",
             n_train=64,
             n_validation=16,
             n_heldout=32,
-            simulation=simulation,
-            hidden_cases=hidden_cases,  # type: ignore[arg-type]
-            feedback=feedback,
+            **{"policy_scope": "episode", "observations": "arrays", "simulation": "forbidden", **dimensions},
         ),
         timing=Timing(
             start_time=utc_text(START),
@@ -131,7 +116,7 @@ def write_run(
             finalise_s=90.0,
         ),
         outcome=Outcome(
-            status=status or ("completed" if best is not None else "no_ok_submit"),  # type: ignore[arg-type]
+            status=status or ("completed" if best is not None else "no_ok_submit"),
             error="worker lost" if status == "error" else None,
             final_score=fmean(heldout) if heldout else None,
             best_submit_index=int(best) if best is not None else None,
@@ -204,7 +189,7 @@ def _write_submit(
         schema_version=SCHEMA_VERSION,
         submit_index=index,
         env=env,
-        status=version.status,  # type: ignore[arg-type]
+        status=version.status,
         n_episodes=len(returns),
         first_global_episode=first if ok else None,
         env_instances=tuple(range(len(returns))),

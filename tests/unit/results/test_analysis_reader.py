@@ -266,7 +266,7 @@ def mixed(runs: Path) -> list[str]:
     ("change", "what"),
     [
         ({"budget": 64}, "episode budget"),
-        ({"scope": "submit"}, "policy scope"),
+        ({"policy_scope": "submit"}, "policy scope"),
         ({"split": "split-2"}, "held-out split"),
         ({"fingerprint": {"numpy": "1.26.4"}}, "fingerprint"),
         ({"jail": "none"}, "jail"),
