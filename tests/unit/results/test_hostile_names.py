@@ -14,7 +14,7 @@ from xml.etree import ElementTree
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from invented.policies import Version, policy
-from invented.run_dirs import write_run
+from invented.run_dirs import amend, write_run
 
 from evopolicy_common.terminal import harmless
 from evopolicy_coordinator.web.content.rendering import _environment as live_environment
@@ -91,14 +91,10 @@ def test_no_file_of_a_report_has_more_than_the_names(tmp_path: Path) -> None:
         code = run / "checkpoints" / "submit_001" / "policy.py"
         code.chmod(0o644)
         code.write_text(f"# {name}\n" + code.read_text())
-        record = json.loads((run / "run.json").read_text())
-        record |= {"model": name, "env_title": name, "env_family": name, "exp_id": name}
-        record["agent"] = {
-            key: f"{entry}{name}" if isinstance(value, str) else value
-            for key, value in record["agent"].items()
-        }
-        record["outcome"]["closed_reason"] = name
-        (run / "run.json").write_text(json.dumps(record))
+        agent = json.loads((run / "run.json").read_text())["agent"]
+        agent = {key: f"{entry}{name}" for key, value in agent.items() if isinstance(value, str)}
+        names = {"model": name, "env_title": name, "env_family": name, "exp_id": name}
+        amend(run, {**names, "agent": agent, "outcome": {"closed_reason": name}})
     found = study([tmp_path / "runs"])
     assert len(found.runs) == 2
     write_report(found, tmp_path / "report")

@@ -24,7 +24,7 @@ from evopolicy_common.statistics.intervals import TOO_FEW_CASES
 from evopolicy_results.notebook import figures_of, tables_of
 from evopolicy_results.scoring.normalised import Scale
 from evopolicy_results.scoring.paper import heldout_returns
-from evopolicy_results.statistics.aggregates import NO_SCALE, aggregates
+from evopolicy_results.statistics.aggregates import NO_SCALE, Aggregate, aggregates
 from evopolicy_results.statistics.pairs import NO_COMMON_CASES, NO_RETURNS, NO_SCORE, Pair, cell_mean, pairs
 from evopolicy_results.statistics.samples import RunReturns, Sample, matched
 from evopolicy_results.statistics.standings import Standings, standings
@@ -44,10 +44,12 @@ def entry(name: str, *runs: RunReturns, env: str = "env", is_fixed: bool = False
     return Sample(entry=name, env=env, runs=runs, is_fixed=is_fixed)
 
 
+def together(*entries: Sample) -> dict[tuple[str, str], Sample]:
+    return {(one.entry, one.env): one for one in entries}
+
+
 def pair_of(first: Sample, second: Sample) -> Pair:
-    (found,) = pairs(
-        {(first.entry, "env"): first, (second.entry, "env"): second}, [first.entry, second.entry], ["env"]
-    )
+    (found,) = pairs(together(first, second), [first.entry, second.entry], ["env"])
     return found
 
 
@@ -124,12 +126,8 @@ def test_returns_of_nought_and_one_are_counted() -> None:
 
 
 def test_a_run_without_an_ok_submit_has_no_gap_and_stays_last() -> None:
-    failed = RunReturns(score=None)
-    samples = {
-        ("A", "env"): entry("A", run(*rising(32, 1.0))),
-        ("B", "env"): entry("B", run(*rising(32))),
-        ("C", "env"): entry("C", failed),
-    }
+    failed = entry("C", RunReturns(score=None))
+    samples = together(entry("A", run(*rising(32, 1.0))), entry("B", run(*rising(32))), failed)
     found = pairs(samples, ["A", "B", "C"], ["env"])
     assert [one.reason for one in found] == ["", NO_SCORE, NO_SCORE]
     assert found[1].gap is None
@@ -138,19 +136,17 @@ def test_a_run_without_an_ok_submit_has_no_gap_and_stays_last() -> None:
     (a, _, c), _ = aggregates(samples, ["A", "B", "C"], {"env": Scale(random=0.0, best=20.0)})
     assert a.iqm is not None
     assert c.iqm is None
-    assert cell_mean(samples["C", "env"]) is None
+    assert cell_mean(failed) is None
 
 
 def test_scores_alone_have_no_interval_and_do_not_tie() -> None:
-    samples = {
-        (name, "env"): entry(name, RunReturns(score=score)) for name, score in (("A", 1.0), ("B", 2.0))
-    }
+    samples = together(*(entry(name, RunReturns(score=score)) for name, score in (("A", 1.0), ("B", 2.0))))
     assert pairs(samples, ["A", "B"], ["env"])[0].reason == NO_RETURNS
     assert standings(samples, {"A": 0.0, "B": 1.0}, ["env"]) == Standings(rows=(), gap=None, over="")
 
 
 def test_an_aggregate_without_spread_says_so_instead_of_a_zero_width() -> None:
-    samples = {("A", "env"): entry("A", *(run(*[1.0] * 8) for _ in range(6)))}
+    samples = together(entry("A", *[run(*[1.0] * 8)] * 6))
     (found,), _ = aggregates(samples, ["A"], {"env": Scale(random=0.0, best=2.0)})
     assert (found.iqm.value, found.iqm.low, found.iqm.reason) == (0.5, None, "no spread: 6 identical repeats")
     # The best agent's own mean is the scale, whatever it is.
@@ -158,32 +154,30 @@ def test_an_aggregate_without_spread_says_so_instead_of_a_zero_width() -> None:
     assert (found.iqm.value, found.iqm.low) == (1.0, None)
 
 
+def aggregated(a: Sample, b: Sample, reference: Sample, best: Sample) -> list[Aggregate]:
+    """Of A and B, on the scale from the reference's mean to that of the best."""
+    scale = Scale(random=float(np.mean(reference.scores)), best=float(np.mean(best.scores)))
+    return aggregates(together(a, b, reference), ["A", "B"], {"env": scale})[0]
+
+
 def test_an_uncertain_scale_widens_the_interval_of_an_iqm() -> None:
     """A's own scores hardly vary, B's (the best) and the reference's do: A's share of the scale is uncertain."""
     generator = np.random.default_rng(0)
-    samples = {
-        ("A", "env"): entry("A", *(run(*[5.0 + 0.001 * r] * 32) for r in range(6))),
-        ("B", "env"): entry("B", *(run(*generator.normal(10.0 + 2.0 * r, 1.0, 32)) for r in range(6))),
-        ("R", "env"): entry("R", run(*generator.normal(0.0, 4.0, 32)), is_fixed=True),
-    }
-    best, random = (float(np.mean(samples[name, "env"].scores or ())) for name in ("B", "R"))
-    (a, _), _ = aggregates(samples, ["A", "B"], {"env": Scale(random=random, best=best)})
+    a = entry("A", *(run(*[5.0 + 0.001 * r] * 32) for r in range(6)))
+    b = entry("B", *(run(*generator.normal(10.0 + 2.0 * r, 1.0, 32)) for r in range(6)))
+    found, _ = aggregated(a, b, entry("R", run(*generator.normal(0.0, 4.0, 32)), is_fixed=True), b)
     # Standard errors of the ends: about 1.5 and 0.7, of a width of 15.
-    assert 0.08 < a.iqm.high - a.iqm.low < 0.4
+    assert 0.08 < found.iqm.high - found.iqm.low < 0.4
 
 
 def test_a_scale_that_may_be_none_gives_no_interval() -> None:
     """The best agent's mean is above the reference's by far less than its standard error."""
     generator = np.random.default_rng(1)
     reference = generator.normal(0.0, 1.0, 32)
-    samples = {
-        ("A", "env"): entry("A", *(run(*(reference[::-1] + 0.1 * r)) for r in range(6))),
-        ("B", "env"): entry("B", *(run(*generator.normal(-0.5, 1.0, 32)) for _ in range(6))),
-        ("R", "env"): entry("R", run(*reference), is_fixed=True),
-    }
-    best, random = (float(np.mean(samples[name, "env"].scores or ())) for name in ("A", "R"))
-    (_, b), _ = aggregates(samples, ["A", "B"], {"env": Scale(random=random, best=best)})
-    assert (b.iqm.low, b.iqm.reason) == (None, NO_SCALE)
+    a = entry("A", *(run(*(reference[::-1] + 0.1 * r)) for r in range(6)))
+    b = entry("B", *(run(*generator.normal(-0.5, 1.0, 32)) for _ in range(6)))
+    _, found = aggregated(a, b, entry("R", run(*reference), is_fixed=True), a)
+    assert (found.iqm.low, found.iqm.reason) == (None, NO_SCALE)
 
 
 def test_tie_letters_are_shared_exactly_where_entries_are_not_told_apart() -> None:
@@ -191,15 +185,13 @@ def test_tie_letters_are_shared_exactly_where_entries_are_not_told_apart() -> No
     generator = np.random.default_rng(0)
     base = generator.normal(size=(16, 32))
     shifts = {"A": 0.35, "B": 0.175, "C": 0.0}
-    samples = {
-        (name, f"e{i}"): Sample(
-            entry=name,
-            env=f"e{i}",
-            runs=(run(*(base[i] + shift + generator.normal(0, 1, 32)).tolist()),),
+    samples = together(
+        *(
+            entry(name, run(*(base[i] + shift + generator.normal(0, 1, 32)).tolist()), env=f"e{i}")
+            for name, shift in shifts.items()
+            for i in range(16)
         )
-        for name, shift in shifts.items()
-        for i in range(16)
-    }
+    )
     found = standings(samples, {"A": 0.9, "B": 0.5, "C": 0.1}, [f"e{i}" for i in range(16)])
     letters = {row.entry: set(row.ties) for row in found.rows}
     ranks = {row.entry: (row.rank_low, row.rank_high) for row in found.rows}
