@@ -43,29 +43,27 @@ def test_markdown_marks_best_and_second_and_escapes_pipes() -> None:
     assert "| E | *0.00* | – | **3** |" in lines
 
 
-HOSTILE = (
-    ("=HYPERLINK(1)", "'=HYPERLINK(1)"),
-    ("+1+cmd", "'+1+cmd"),
-    ("-1-cmd", "'-1-cmd"),
-    ("@SUM(A1)", "'@SUM(A1)"),
-    ("\t=1", "'\t=1"),
-    ("-1.5", "-1.5"),
-    ("-0.300 to +1.2e-05", "-0.300 to +1.2e-05"),
-    ("a=b", "a=b"),
-    ("\x1b]8;;http://evil\x1b\\x", "\ufffd]8;;http://evil\ufffd\\x"),
+def table_of(text: str) -> Table:
+    columns = (Column("x", "X", "number"), Column("who", "Who"))
+    return Table(name="t", title="T", caption="", columns=columns, rows=({"who": text, "x": -1.5},))
+
+
+@pytest.mark.parametrize(
+    ("text", "written"),
+    [
+        ("=HYPERLINK(1)", "'=HYPERLINK(1)"),
+        ("+1+cmd", "'+1+cmd"),
+        ("-1-cmd", "'-1-cmd"),
+        ("@SUM(A1)", "'@SUM(A1)"),
+        ("\t=1", "'\t=1"),
+        ("-1.5", "-1.5"),
+        ("-0.300 to +1.2e-05", "-0.300 to +1.2e-05"),
+        ("a=b", "a=b"),
+        ("\x1b]8;;http://evil\x1b\\x", "\ufffd]8;;http://evil\ufffd\\x"),
+    ],
 )
-
-
-@pytest.mark.parametrize(("text", "written"), HOSTILE)
 def test_csv_holds_no_formula_and_nothing_that_steers_a_terminal(text: str, written: str) -> None:
-    table = Table(
-        name="t",
-        title="T",
-        caption="",
-        columns=(Column("who", "Who"), Column("x", "X", "number")),
-        rows=({"who": text, "x": -1.5},),
-    )
-    assert list(csv.reader(io.StringIO(to_csv(table)))) == [["who", "x"], [written, "-1.5"]]
+    assert list(csv.reader(io.StringIO(to_csv(table_of(text))))) == [["x", "who"], ["-1.5", written]]
 
 
 @pytest.mark.parametrize(
@@ -79,19 +77,14 @@ def test_csv_holds_no_formula_and_nothing_that_steers_a_terminal(text: str, writ
     ],
 )
 def test_markdown_shows_text_and_no_html_links_or_images(text: str, written: str) -> None:
-    table = Table(name="t", title="T", caption="", columns=(Column("who", "Who"),), rows=({"who": text},))
-    assert to_markdown(table).splitlines()[-1] == f"| {written} |"
+    assert to_markdown(table_of(text)).splitlines()[-1] == f"| -1.500 | {written} |"
 
 
-def test_number_too_small_to_show_is_told_from_nought() -> None:
-    column = Column("x", "X", "number", digits=2, below=True)
-    assert [shown(value, column) for value in (0.0, 0.0001, 0.0099, 0.01, 0.014)] == [
-        "0.00",
-        "<0.01",
-        "<0.01",
-        "0.01",
-        "0.01",
-    ]
+@pytest.mark.parametrize(
+    ("value", "text"), [(0.0, "0.00"), (0.0001, "<0.01"), (0.0099, "<0.01"), (0.01, "0.01"), (0.014, "0.01")]
+)
+def test_number_too_small_to_show_is_told_from_nought(value: float, text: str) -> None:
+    assert shown(value, Column("x", "X", "number", digits=2, below=True)) == text
     assert shown(0.0001, Column("x", "X", "number", digits=2)) == "0.00"
 
 
@@ -193,13 +186,8 @@ def test_log_gives_each_submit_what_was_read_and_said_before_it(tmp_path: Path, 
     run = read_run(write_run(tmp_path, VERSIONS, log=form))
     found = trace(run)
     evidence = [row.evidence for row in found.rows]
-    assert all(one is not None for one in evidence)
-    assert [one.attribution for one in evidence if one] == [
-        "I start simple.",
-        "It is too slow.",
-        "",
-        "Back to work.",
-    ]
+    said = ["I start simple.", "It is too slow.", "", "Back to work."]
+    assert [one.attribution for one in evidence] == said
     assert evidence[0].read == ()
     assert evidence[1].read[0] == "feedback/submit_000/summary.json"
     assert [path.name for path in found.rows[1].images] == ["probe.png"]
@@ -233,10 +221,8 @@ def test_stamped_lines_are_placed_by_time(tmp_path: Path) -> None:
     ]
     log.write_text("".join(json.dumps(line) + "\n" for line in lines))
     reading = read_agent_log(log, run.submits)
-    assert {index: one.messages for index, one in reading.by_submit.items()} == {
-        0: ("early",),
-        1: ("between",),
-    }
+    placed = {index: one.messages for index, one in reading.by_submit.items()}
+    assert placed == {0: ("early",), 1: ("between",)}
     assert reading.unplaced == ("late",)
 
 
