@@ -80,18 +80,15 @@ def _structs(root: type[msgspec.Struct]) -> list[type[msgspec.Struct]]:
     structs: dict[type[msgspec.Struct], None] = {}
 
     def visit(each: Any) -> None:
-        if isinstance(each, msgspec.inspect.StructType):
-            if each.cls in structs:
-                return
-            structs[each.cls] = None
-            for field in each.fields:
-                visit(field.type)
-        elif isinstance(each, msgspec.Struct):
-            for name in each.__struct_fields__:
-                inner = getattr(each, name)
-                for one in inner if isinstance(inner, tuple) else (inner,):
-                    if isinstance(one, msgspec.inspect.Type):
-                        visit(one)
+        if isinstance(each, tuple):
+            for one in each:
+                visit(one)
+        elif isinstance(each, msgspec.inspect.StructType):
+            if each.cls not in structs:
+                structs[each.cls] = None
+                visit(tuple(field.type for field in each.fields))
+        elif isinstance(each, msgspec.inspect.Type):
+            visit(msgspec.structs.astuple(each))
 
     visit(msgspec.inspect.type_info(root))
     return list(structs)

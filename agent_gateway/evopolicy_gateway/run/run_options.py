@@ -231,7 +231,7 @@ class RunOptions(PolicyPart, frozen=True, kw_only=True):
         if self.start_from is not None:
             origin = starts.find(self.start_from, started_in)
             settings = msgspec.structs.replace(settings, start=origin.start)
-            more["start_from"] = origin.text
+            more["start_from"] = f"{origin.folder.root}@{origin.submit}"
         return Plan(
             settings=settings,
             config=config,

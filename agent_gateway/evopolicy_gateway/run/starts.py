@@ -25,10 +25,8 @@ from evopolicy_gateway.run_folder.layout import RunFolder, save, saved
 class StartPoint(msgspec.Struct, frozen=True, kw_only=True):
     """A start, and where its files are."""
 
-    text: str
-    """`RUN@submit_NNN` with an absolute path."""
     start: Start
-    folder: Path
+    folder: RunFolder
     """Of the earlier run."""
     submit: str
     tree: Tree
@@ -60,18 +58,15 @@ def find(text: str, started_in: Path) -> StartPoint:
     if not (folder.feedback / submit).is_dir():
         raise ConfigError(f"--start-from {text}: the submit has no feedback yet; wait until it is played")
     start = Start(run=run, submit_index=number, tree=digest)
-    return StartPoint(
-        text=f"{folder.root}@{submit}", start=start, folder=folder.root, submit=submit, tree=tree
-    )
+    return StartPoint(start=start, folder=folder, submit=submit, tree=tree)
 
 
 def stage(start: StartPoint, folder: RunFolder) -> None:
     """Makes the workspace of a new run. StorageError for a missing content, and where the disk refuses."""
     folder.workspace.mkdir()
-    trees.restore(start.folder, start.tree, folder.workspace)
-    source = RunFolder(start.folder)
-    history = (source.feedback, source.history)
-    omitted = trees.copy_history(*history, start.start.submit_index, folder.history)
+    source = start.folder
+    trees.restore(source.root, start.tree, folder.workspace)
+    omitted = trees.copy_history(source.feedback, source.history, start.start.submit_index, folder.history)
     folder.history.mkdir(exist_ok=True)
     about = {"submit": start.submit, "omitted": omitted}
     (folder.history / "START.json").write_bytes(msgspec.json.format(msgspec.json.encode(about)) + b"\n")
