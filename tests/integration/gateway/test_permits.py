@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable
 from pathlib import Path
+from typing import TypeVar
 
 import pytest
 from gateway_double import Double, answering, gateway_on, opened, prepare, prepared, served
@@ -23,10 +24,11 @@ from evopolicy_gateway.run_folder.layout import RunFolder, save
 from evopolicy_gateway.run_folder.listener import AgentPlace, Listener
 from evopolicy_gateway.submits import coordinator_client
 
+Asked = TypeVar("Asked", bound=Message)
 KERNEL = "0f2e9a7c-11d0-4b35-8d2f-5a3c9e7b1d60"
 
 
-def asked(double: Double, kind: type[Message]) -> list[Message]:
+def asked(double: Double, kind: type[Asked]) -> list[Asked]:
     return [message for message in double.asked if isinstance(message, kind)]
 
 
@@ -69,11 +71,8 @@ async def test_nothing_is_served_before_the_permit_and_the_operator_hears_why(tm
         assert gateway.permit_s > 0.0
         gateway.tell(None)
         assert not await task
-    opening = asked(double, OpenRun)[0]
-    assert isinstance(opening, OpenRun)
-    assert opening.asks_permit
+    assert asked(double, OpenRun)[0].asks_permit
     first = asked(double, RequestPermit)[0]
-    assert isinstance(first, RequestPermit)
     assert (first.run, first.boot_id) == (double.run_id, host.boot_id())
 
 
@@ -148,9 +147,7 @@ async def test_a_remote_agents_run_closes_on_its_operators_word(tmp_path: Path) 
             assert service.pipeline.machine.closed
             listener.finish(folder)
             assert await service.task
-    assert [message.reason for message in asked(double, CloseRun) if isinstance(message, CloseRun)] == [
-        "budget_spent"
-    ]
+    assert [message.reason for message in asked(double, CloseRun)] == ["budget_spent"]
 
 
 async def test_run_whose_operator_vouches_for_its_agent_is_closed_at_once(tmp_path: Path) -> None:
@@ -182,9 +179,7 @@ async def test_agent_that_nobody_watches_ends_by_its_operators_word(tmp_path: Pa
         assert double.closed is None
         listener.finish(folder)
         assert await service.task
-    permit = asked(double, RequestPermit)[0]
-    assert isinstance(permit, RequestPermit)
-    assert permit.boot_id == KERNEL
+    assert asked(double, RequestPermit)[0].boot_id == KERNEL
 
 
 async def test_time_held_by_hidden_episodes_counts_against_no_limit(tmp_path: Path) -> None:

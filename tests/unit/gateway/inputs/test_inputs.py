@@ -9,6 +9,7 @@ import shutil
 import tomllib
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import pytest
@@ -167,6 +168,7 @@ def test_the_digest_is_a_setting_of_the_run(tmp_path: Path) -> None:
 
 
 def words_of(folder: Path, config: AgentConfig, options: str = "") -> list[str]:
+    folder.mkdir()
     harness = make(config.harness, folder, config)
     assert isinstance(harness, CliAgent)
     harness.take(kept(folder, folder / "run"))
@@ -174,21 +176,17 @@ def words_of(folder: Path, config: AgentConfig, options: str = "") -> list[str]:
 
 
 def test_each_cli_is_told_in_its_own_form(tmp_path: Path) -> None:
-    def folder(name: str) -> Path:
-        (tmp_path / name).mkdir()
-        return tmp_path / name
-
     options = "--tools --safe-mode --strict-mcp-config --setting-sources --mcp-config"
-    words = words_of(folder("claude"), AgentConfig(harness="claude-code"), options)
+    words = words_of(tmp_path / "claude", AgentConfig(harness="claude-code"), options)
     assert words[words.index("--mcp-config") + 1] == MCP_FILE
     assert words[words.index("--tools") + 1].endswith(",Skill")
     assert "--strict-mcp-config" in words
     assert "--safe-mode" not in words
-    words = words_of(folder("codex"), AgentConfig(harness="codex"))
+    words = words_of(tmp_path / "codex", AgentConfig(harness="codex"))
     assert 'mcp_servers.lamp.args=["/inputs/mcp/lamp/tools/mcp_server.py"]' in words
     assert 'mcp_servers.lamp.env={"UNIT" = "lux"}' in words
     cli = Cli(first=("--go",), mcp=("--mcp-config", "{mcp_config}"))
-    words = words_of(folder("own"), AgentConfig(harness="own", program=("true",), cli=cli))
+    words = words_of(tmp_path / "own", AgentConfig(harness="own", program=("true",), cli=cli))
     assert words == ["--go", "--mcp-config", MCP_FILE]
 
 
@@ -237,18 +235,15 @@ def test_the_built_in_agent_tells_its_model_when_to_read_a_skill(tmp_path: Path)
     pytest.importorskip("openai")
     declare(tmp_path)
     path = str(tmp_path / "skills/lamps/SKILL.md")
-    settings = {
+    settings: dict[str, Any] = {
         "protocol": "openai",
         "model": "m",
         "base_url": "",
         "system": "",
         "skills": [path],
-        "parameters": {},
-        "max_output_tokens": 10,
-        "context_tokens": 1000,
-        "retries": 0,
-        "timeout_s": 1.0,
     }
+    settings |= {"parameters": {}, "max_output_tokens": 10, "context_tokens": 1000, "retries": 0}
+    settings["timeout_s"] = 1.0
     system = open_api(settings, "key", [])._system
     assert path in system
     assert DESCRIPTION in system

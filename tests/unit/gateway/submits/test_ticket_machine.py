@@ -6,8 +6,7 @@ import inspect
 import json
 import textwrap
 from collections import Counter
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import pytest
 from gateway_double import opened
@@ -238,61 +237,37 @@ def test_submits_survive_any_order_of_requests_errors_and_crashes(
     play(actions, profile)
 
 
-class Bug(NamedTuple):
-    """In the method `name`, `old` becomes `new`."""
-
-    title: str
-    name: str
-    old: str
-    new: str
-
-
-BUGS = (
-    Bug(
-        "a key answers for another body", "repeated", "ticket.request.body_digest != digest_of(body)", "False"
-    ),
-    Bug("a key is forgotten", "repeated", "next(keyed, None)", "None"),
-    Bug("two submits at once", "ask", "self.in_flight is not None", "False"),
-    Bug("sent before it is journalled", "next", "not self.in_flight.requested", "False"),
-    Bug("sent after it is accepted", "next", "self.in_flight.accepted is None", "True"),
-    Bug("journalled without its bundle", "snapshotted", "bundle=digest", "bundle=None"),
-    Bug(
-        "snapshot again after a crash",
-        "noted",
-        "ticket.requested = entry, True",
-        "ticket.requested = entry, False",
-    ),
-    Bug(
-        "nothing charged",
-        "noted",
-        "remaining_budget=remaining",
-        "remaining_budget=self.state.remaining_budget",
-    ),
-    Bug("a refused submit takes an index", "_end", "self._open.accepted is None", "False"),
-    Bug("an accepted submit loses its index", "_end", "self._open.accepted is None", "True"),
-    Bug("a crash not counted", "noted", "self.deaths.update", "list"),
-    Bug("given up too late", "_after_death", "< MAX_DEATHS", "<= MAX_DEATHS"),
-    Bug("an old failure ends the next submit", "_end", "self._failure = None", "None"),
-    Bug("a closed run takes submits", "close", "self.cancelled = True", "self.cancelled = False"),
-    Bug("a state older than the acceptance", "hear", "state.n_submits < self.state.n_submits", "False"),
-    Bug("refused requests counted twice", "noted", "self.n_rejected += 1", "self.n_rejected += 2"),
-    Bug("an end without its summary", "_settle", "entry.status, place", "entry.status, None"),
-)
+BUGS = {
+    "a key answers for another body": ("repeated", "ticket.request.body_digest != digest_of(body)", "False"),
+    "a key is forgotten": ("repeated", "next(keyed, None)", "None"),
+    "two submits at once": ("ask", "self.in_flight is not None", "False"),
+    "sent before it is journalled": ("next", "not self.in_flight.requested", "False"),
+    "sent after it is accepted": ("next", "self.in_flight.accepted is None", "True"),
+    "journalled without its bundle": ("snapshotted", "bundle=digest", "bundle=None"),
+    "snapshot again after a crash": ("noted", "requested = entry, True", "requested = entry, False"),
+    "nothing charged": ("noted", "budget=remaining", "budget=self.state.remaining_budget"),
+    "a refused submit takes an index": ("_end", "self._open.accepted is None", "False"),
+    "an accepted submit loses its index": ("_end", "self._open.accepted is None", "True"),
+    "a crash not counted": ("noted", "self.deaths.update", "list"),
+    "given up too late": ("_after_death", "< MAX_DEATHS", "<= MAX_DEATHS"),
+    "an old failure ends the next submit": ("_end", "self._failure = None", "None"),
+    "a closed run takes submits": ("close", "self.cancelled = True", "self.cancelled = False"),
+    "a state older than the acceptance": ("hear", "state.n_submits < self.state.n_submits", "False"),
+    "refused requests counted twice": ("noted", "self.n_rejected += 1", "self.n_rejected += 2"),
+    "an end without its summary": ("_settle", "entry.status, place", "entry.status, None"),
+}
+"""A method, some of its text, and the text in its place."""
 
 
-def with_bug(bug: Bug) -> Callable[..., Any]:
-    """The method with the bug in it."""
-    source = textwrap.dedent(inspect.getsource(getattr(TicketMachine, bug.name)))
-    assert source.count(bug.old) == 1, f"{bug.title}: {bug.old!r} is not once in {bug.name}"
+@pytest.mark.parametrize(("name", "old", "new"), BUGS.values(), ids=BUGS)
+def test_a_bug_in_the_machine_is_found(
+    name: str, old: str, new: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source = textwrap.dedent(inspect.getsource(getattr(TicketMachine, name)))
+    assert source.count(old) == 1
     made: dict[str, Any] = {}
-    exec(source.replace(bug.old, bug.new), vars(tickets), made)
-    planted: Callable[..., Any] = made[bug.name]
-    return planted
-
-
-@pytest.mark.parametrize("bug", BUGS, ids=lambda bug: bug.title)
-def test_a_bug_in_the_machine_is_found(bug: Bug, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(TicketMachine, bug.name, with_bug(bug))
+    exec(source.replace(old, new), vars(tickets), made)
+    monkeypatch.setattr(TicketMachine, name, made[name])
 
     @given(ANY, st.sampled_from(("own", "published")))
     @settings(deadline=None, max_examples=1000, derandomize=True, database=None, phases=[Phase.generate])
