@@ -131,9 +131,6 @@ timeout_sec = {VERIFIER_S}
     }
 
 
-_TOKEN = ".token"
-
-
 def write_task(tasks: Path, run: Path, url: str, agent_s: float) -> Path:
     """Writes the task of an open run; `url`: of the scores. Raises ConfigError for any other folder."""
     folder = folder_of(run)
@@ -159,7 +156,7 @@ def write_task(tasks: Path, run: Path, url: str, agent_s: float) -> Path:
 
 def token_of(tasks: Path) -> str:
     """The token of all tasks in a folder, which stays the same when they are served again."""
-    path = tasks / _TOKEN
+    path = tasks / ".token"
     with contextlib.suppress(FileNotFoundError):
         return path.read_text().strip()
     tasks.mkdir(parents=True, exist_ok=True)

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 from collections.abc import AsyncGenerator, AsyncIterator, Callable, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from evopolicy_common.errors import ConfigError, EvopolicyError, RefusedError
 from evopolicy_common.logs import structlog
 from evopolicy_common.messages import operator as messages
 from evopolicy_common.messages.episode import EpisodeOutcome
-from evopolicy_common.messages.worker import Message
 from evopolicy_common.processes.notices import notify_if_slow
 from evopolicy_common.records.open_run import IntendedRun, OpenedRun
 from evopolicy_common.refusals import WRONG_SETTINGS, Refusal
@@ -22,12 +20,11 @@ from evopolicy_common.wire.operator_client import TIMEOUT_S, WAIT_S, OperatorCli
 from evopolicy_common.wire.transport import Link
 from evopolicy_gateway.run_folder.layout import RunFolder, saved
 from evopolicy_gateway.run_folder.locks import until_free
-
-T = TypeVar("T")
+from evopolicy_gateway.submits.coordinator_client import until_served
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
-_UNAVAILABLE_PAUSE_S = 1.0
+_AWAY = (Refusal.UNAVAILABLE,)
 
 
 class Operations(OperatorClient):
@@ -48,7 +45,8 @@ class Operations(OperatorClient):
         known = {"key": wanted.key, "replay_key": wanted.replay_key}
         message = messages.CreateRun(token=self._token, settings=wanted.settings, **known)
         try:
-            return await self._once_available("create", message, messages.RunCreated, timeout_s=TIMEOUT_S)
+            kind = messages.RunCreated
+            return await until_served(self._requests, _AWAY, "create", message, kind, timeout_s=TIMEOUT_S)
         except RefusedError as error:
             raise _settings_error(error) from error
 
@@ -89,23 +87,7 @@ class Operations(OperatorClient):
         """Takes, renews, releases (`ttl_s` 0) or settles (`result`) a run of a sweep."""
         known: dict[str, Any] = {"suite": suite, "name": name, "holder": holder, "ttl_s": ttl_s}
         message = messages.Claim(token=self._token, **known, run=run, result=result)
-        return await self._once_available("claim", message, messages.ClaimState)
-
-    async def _once_available(
-        self, verb: str, message: Message, wanted: type[T], timeout_s: float | None = None
-    ) -> T:
-        """Returns the answer; retries while the coordinator is unavailable, and logs the reason once."""
-        last_message = ""
-        while True:
-            try:
-                return await self._requests.until_answered(verb, message, wanted, timeout_s=timeout_s)
-            except RefusedError as error:
-                if error.status != Refusal.UNAVAILABLE:
-                    raise
-                if error.message != last_message:
-                    log.warning(error.message)
-                last_message = error.message
-            await asyncio.sleep(_UNAVAILABLE_PAUSE_S)
+        return await until_served(self._requests, _AWAY, "claim", message, messages.ClaimState)
 
     async def drop(self, folder: RunFolder) -> None:
         """Cancels the open run of a folder, so that it plays no more and its agent's permit ends.

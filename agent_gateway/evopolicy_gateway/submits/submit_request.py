@@ -98,15 +98,13 @@ def ids_in(text: str, bounds: Bounds) -> tuple[int, ...]:
     if not text.strip():
         return ()
     ranges: list[range] = []
-    total = 0
     for part in text.split(","):
         match = _PART.fullmatch(part)
         if match is None:
             _instance(
                 f"{part[:40]!r} in {_FIELD} is neither an id nor a range; write ids and ranges as '0-3,7'"
             )
-        first = int(match[1])
-        last = int(match[2]) if match[2] is not None else first
+        first, last = int(match[1]), int(match[2] or match[1])
         shown = part.strip()[:40]
         _check_id(first, f"{shown!r} in {_FIELD}", bounds)
         _check_id(last, f"{shown!r} in {_FIELD}", bounds)
@@ -114,9 +112,8 @@ def ids_in(text: str, bounds: Bounds) -> tuple[int, ...]:
             _instance(
                 f"{shown!r} in {_FIELD} runs backwards; write it '{last}-{first}', or list the ids in order"
             )
-        total += last - first + 1
         ranges.append(range(first, last + 1))
-    if total > bounds.max_episodes:
+    if (total := sum(map(len, ranges))) > bounds.max_episodes:
         _refuse_count(total, bounds)
     return tuple(number for numbers in ranges for number in numbers)
 
