@@ -16,7 +16,7 @@ from rich.progress import Progress
 from evopolicy._arguments import OPTIONS, AnyPath, RunOptions, check_names, take, taken
 from evopolicy._evaluation import Episode, Evaluation, episode_of
 from evopolicy._functions import agent_of, name_of, policy_of
-from evopolicy._loop import awaited, call, loop
+from evopolicy._loop import awaited, call, loop, twins
 from evopolicy._runs import Run, read_run
 from evopolicy_common.console import terminal
 from evopolicy_common.errors import ConfigError
@@ -132,7 +132,7 @@ class Cluster:
     async def __aexit__(self, *_: object) -> None:
         await awaited(self._close())
 
-    def evaluate(
+    async def _evaluate(
         self,
         policy: AnyPath | PolicyFunction,
         *,
@@ -153,23 +153,10 @@ class Cluster:
 
         Raises ConfigError, with the remedy, for wrong arguments and for missing requirements on this machine.
         """
-        return call(self._evaluate(trial_of(policy, env, cases, tier, limits), take("progress", progress)))
+        trial = await asyncio.to_thread(trial_of, policy, env, cases, tier, limits)
+        return await self._evaluated(trial, take("progress", progress))
 
-    async def evaluate_async(
-        self,
-        policy: AnyPath | PolicyFunction,
-        *,
-        env: str,
-        cases: Iterable[int] = range(4),
-        tier: Tier = "bwrap",
-        limits: Limits | None = None,
-        progress: bool = True,
-    ) -> Evaluation:
-        """Async twin of `evaluate`."""
-        trial = trial_of(policy, env, cases, tier, limits)
-        return await awaited(self._evaluate(trial, take("progress", progress)))
-
-    def run(
+    async def _run(
         self,
         *,
         env: str,
@@ -178,20 +165,15 @@ class Cluster:
         **options: Unpack[RunOptions],
     ) -> Run:
         """Plays one run on this cluster; arguments as for `evopolicy.run` without `slots` and `policy_packages`."""
-        return call(self._run(env, agent, progress, options))
+        take("progress", progress)
+        with contextlib.ExitStack() as stack:
+            plan = await self._planned(stack, env, agent, options)
+            return await self._play(plan, progress)
 
-    async def run_async(
-        self,
-        *,
-        env: str,
-        agent: str | AgentFunction,
-        progress: bool = True,
-        **options: Unpack[RunOptions],
-    ) -> Run:
-        """Async twin of `run`."""
-        return await awaited(self._run(env, agent, progress, options))
+    evaluate, evaluate_async = twins(_evaluate)
+    run, run_async = twins(_run)
 
-    # The methods below run on the package's event loop.
+    # The methods that begin with an underscore run on the package's event loop.
 
     async def _open(self) -> None:
         if self._held is not None:
@@ -239,7 +221,7 @@ class Cluster:
         await unless_failed(asyncio.create_task(kept()), failed)
         return results[0]
 
-    async def _evaluate(self, trial: Trial, progress: bool) -> Evaluation:
+    async def _evaluated(self, trial: Trial, progress: bool) -> Evaluation:
         env, cases, bundle = trial.message.env, trial.message.cases or (), trial.bundle
 
         async def work(reached: operator.Reached) -> Evaluation:
@@ -259,12 +241,6 @@ class Cluster:
             return Evaluation(env, episodes)
 
         return await self._on(env, trial.message.sandbox_tier, work)
-
-    async def _run(self, env: str, agent: str | AgentFunction, progress: bool, options: RunOptions) -> Run:
-        take("progress", progress)
-        with contextlib.ExitStack() as stack:
-            plan = await self._planned(stack, env, agent, options)
-            return await self._play(plan, progress)
 
     async def _planned(
         self, stack: contextlib.ExitStack, env: str, agent: str | AgentFunction, options: RunOptions
@@ -332,7 +308,7 @@ def plan_of(
     return plan
 
 
-def evaluate(
+async def _evaluate(
     policy: AnyPath | PolicyFunction,
     *,
     env: str,
@@ -347,29 +323,16 @@ def evaluate(
 
     `policy_packages`: as for `Cluster.local`; a policy in a run's directory by default gets the packages of its run.
     """
-    trial = trial_of(policy, env, cases, tier, limits)
-    return call(_evaluated(trial, take("policy", policy), slots, policy_packages, take("progress", progress)))
+    trial = await asyncio.to_thread(trial_of, policy, env, cases, tier, limits)
+    given = taken(policy=policy, progress=progress, policy_packages=policy_packages)
+    names: Iterable[str] = given["policy_packages"]
+    if isinstance(given["policy"], Path):
+        names = packages_for(shipped.found(given["policy"], Path.cwd()), tuple(names))
+    async with _opened(Cluster.local(slots, policy_packages=names)) as cluster:
+        return await cluster._evaluated(trial, progress)
 
 
-async def evaluate_async(
-    policy: AnyPath | PolicyFunction,
-    *,
-    env: str,
-    cases: Iterable[int] = range(4),
-    slots: int = 2,
-    tier: Tier = "bwrap",
-    limits: Limits | None = None,
-    progress: bool = True,
-    policy_packages: Iterable[str] = (),
-) -> Evaluation:
-    """Async twin of `evaluate`."""
-    trial = trial_of(policy, env, cases, tier, limits)
-    return await awaited(
-        _evaluated(trial, take("policy", policy), slots, policy_packages, take("progress", progress))
-    )
-
-
-def run(
+async def _run(
     *,
     env: str,
     agent: str | AgentFunction,
@@ -388,47 +351,17 @@ def run(
     Raises ConfigError, with the remedy, for wrong arguments and for missing requirements on this machine. Ctrl-C
     cancels the run, and its folder records that.
     """
-    return call(_ran(slots, policy_packages, env, agent, progress, options))
-
-
-async def run_async(
-    *,
-    env: str,
-    agent: str | AgentFunction,
-    slots: int = 2,
-    policy_packages: Iterable[str] = (),
-    progress: bool = True,
-    **options: Unpack[RunOptions],
-) -> Run:
-    """Async twin of `run`."""
-    return await awaited(_ran(slots, policy_packages, env, agent, progress, options))
-
-
-async def _evaluated(
-    trial: Trial, policy: Path | PolicyFunction, slots: int, packages: Iterable[str], progress: bool
-) -> Evaluation:
-    names: Iterable[str] = take("policy_packages", packages)
-    if isinstance(policy, Path):
-        names = packages_for(shipped.found(policy, Path.cwd()), tuple(names))
-    async with _opened(Cluster.local(slots, policy_packages=names)) as cluster:
-        return await cluster._evaluate(trial, progress)
-
-
-async def _ran(
-    slots: int,
-    packages: Iterable[str],
-    env: str,
-    agent: str | AgentFunction,
-    progress: bool,
-    options: RunOptions,
-) -> Run:
     take("progress", progress)
-    cluster = Cluster.local(slots, policy_packages=packages)
+    cluster = Cluster.local(slots, policy_packages=policy_packages)
     with contextlib.ExitStack() as stack:
         # Before the cluster is opened: a wrong argument starts no process.
         plan = await cluster._planned(stack, env, agent, options)
         async with _opened(cluster):
             return await cluster._play(plan, progress)
+
+
+evaluate, evaluate_async = twins(_evaluate)
+run, run_async = twins(_run)
 
 
 @contextlib.asynccontextmanager

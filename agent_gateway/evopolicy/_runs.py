@@ -111,9 +111,7 @@ class Run:
         """The run as one row."""
         record, outcome = self._record, self._record.outcome
         return RunSummary(
-            run=str(self.folder),
-            env=record.env,
-            entry=record.agent.entry,
+            **self._known,
             model=record.model,
             repeat=record.repeat,
             status=outcome.status,
@@ -156,63 +154,42 @@ class Run:
     def submits(self) -> Records[SubmitRecord]:
         """In the order of their indices."""
         outcome = self._record.outcome
-        validated = outcome.val_scores or {}
-        return Records(
-            SubmitRecord,
-            [
-                SubmitRecord(
-                    run=str(self.folder),
-                    env=self._record.env,
-                    entry=self._record.agent.entry,
-                    submit=one.submit_index,
-                    status=one.status,
-                    n_episodes=one.n_episodes,
-                    mean_return=one.mean_return,
-                    std_return=one.std_return,
-                    remaining_budget=one.remaining_budget,
-                    validation=validated.get(str(one.submit_index)),
-                    selected=one.submit_index == outcome.best_submit_index,
-                )
-                for one in self._summaries
-            ],
-        )
+        same = ("status", "n_episodes", "mean_return", "std_return", "remaining_budget")
+        rows = [
+            SubmitRecord(
+                **self._known,
+                **{name: getattr(one, name) for name in same},
+                submit=one.submit_index,
+                validation=(outcome.val_scores or {}).get(str(one.submit_index)),
+                selected=one.submit_index == outcome.best_submit_index,
+            )
+            for one in self._summaries
+        ]
+        return Records(SubmitRecord, rows)
+
+    @property
+    def _known(self) -> dict[str, Any]:
+        return {"run": str(self.folder), "env": self._record.env, "entry": self._record.agent.entry}
 
     @property
     def episodes(self) -> Records[EpisodeRecord]:
         """Train episodes of ok submits, then the held-out episodes."""
-        known = {"run": str(self.folder), "env": self._record.env, "entry": self._record.agent.entry}
-        found = []
+        rows = []
         for one in self._summaries:
-            failed = set(one.errors or ())
-            cases, lengths = one.env_instances or (), one.episode_lengths or ()
+            known = self._known | {"split": "train", "submit": one.submit_index}
+            cases, lengths, failed = one.env_instances or (), one.episode_lengths or (), set(one.errors or ())
             for index, value in enumerate(one.returns or ()):
-                found.append(
-                    EpisodeRecord(
-                        **known,
-                        split="train",
-                        submit=one.submit_index,
-                        episode=index,
-                        case=cases[index] if index < len(cases) else None,
-                        episode_return=value,
-                        length=lengths[index] if index < len(lengths) else None,
-                        failed=index in failed,
-                    )
-                )
+                known |= {"case": cases[index] if index < len(cases) else None, "failed": index in failed}
+                known |= {"length": lengths[index] if index < len(lengths) else None}
+                rows.append(EpisodeRecord(**known, episode=index, episode_return=value))
         outcome = self._record.outcome
-        for index, value in enumerate(outcome.heldout_returns):
-            found.append(
-                EpisodeRecord(
-                    **known,
-                    split="heldout",
-                    submit=outcome.best_submit_index,
-                    episode=index,
-                    case=None,
-                    episode_return=value,
-                    length=None,
-                    failed=None,
-                )
-            )
-        return Records(EpisodeRecord, found)
+        known = self._known | {"split": "heldout", "submit": outcome.best_submit_index}
+        known |= {"case": None, "length": None, "failed": None}
+        rows += [
+            EpisodeRecord(**known, episode=index, episode_return=value)
+            for index, value in enumerate(outcome.heldout_returns)
+        ]
+        return Records(EpisodeRecord, rows)
 
     @property
     def replays(self) -> list[Path]:

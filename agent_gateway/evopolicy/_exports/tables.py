@@ -24,11 +24,12 @@ def names(runs: Runs) -> dict[str, str]:
 def _tables(runs: Runs) -> Iterator[tuple[str, Records[Any], list[dict[str, Any]]]]:
     """A table's name, its records, and their rows."""
     known = names(runs)
-    for name, records in (
-        ("runs", runs.summaries()),
-        ("submits", runs.submits()),
-        ("episodes", runs.episodes()),
-    ):
+    tables: dict[str, Records[Any]] = {
+        "runs": runs.summaries(),
+        "submits": runs.submits(),
+        "episodes": runs.episodes(),
+    }
+    for name, records in tables.items():
         yield name, records, [row | {"run": known[row["run"]]} for row in records.to_dicts()]
 
 
@@ -50,16 +51,11 @@ def write_parquet(runs: Runs, out: Path) -> list[Path]:
     import pyarrow
     from pyarrow import parquet
 
-    types = {
-        "str": pyarrow.string(),
-        "int": pyarrow.int64(),
-        "float": pyarrow.float64(),
-        "bool": pyarrow.bool_(),
-    }
+    types = {"str": "string", "int": "int64", "float": "float64", "bool": "bool_"}
     written = []
     for name, records, rows in _tables(runs):
         fields = [
-            pyarrow.field(column, types[str(text).partition(" ")[0]], nullable="None" in str(text))
+            pyarrow.field(column, getattr(pyarrow, types[text.partition(" ")[0]])(), nullable="None" in text)
             for column, text in records.types.items()
         ]
         path = out / f"{name}.parquet"

@@ -59,6 +59,15 @@ class Curve(NamedTuple):
         begun = self.summaries[0].submit_started_at if self.summaries else ""
         return hashlib.sha256(f"{self.folder} {begun}".encode()).hexdigest()[:32]
 
+    @property
+    def known(self) -> int:
+        """As `Tracker.n_known`, once all of it was added."""
+        return len(self.summaries) if self.record is None else -1
+
+    @property
+    def completed(self) -> bool:
+        return self.record is not None and self.record.outcome.status == "completed"
+
     def settings(self) -> dict[str, str]:
         """Known from the start: entry, environment, and once it is finished the experiment's settings."""
         entry, env, experiment = self.folder.parts[-3:]
@@ -66,11 +75,8 @@ class Curve(NamedTuple):
         if self.record is not None:
             settings |= {"entry": self.record.agent.entry, "env": self.record.env, "model": self.record.model}
             settings |= {"repeat": str(self.record.repeat), "status": self.record.outcome.status}
-            settings |= {
-                name: str(value)
-                for name, value in msgspec.to_builtins(self.record.experiment_dimensions).items()
-                if isinstance(value, str | int)
-            }
+            dimensions = msgspec.to_builtins(self.record.experiment_dimensions).items()
+            settings |= {name: str(value) for name, value in dimensions if isinstance(value, str | int)}
         return settings
 
 
@@ -90,8 +96,8 @@ class Tracker(Protocol):
     def n_known(self, curve: Curve) -> int:
         """Number of submits of this run that it has; -1 when it has the whole run."""
 
-    def add(self, curve: Curve, points: list[Point], n_submits: int, *, finished: bool) -> None:
-        """Adds metrics; `n_submits` counts those that it has now."""
+    def add(self, curve: Curve, points: list[Point]) -> None:
+        """Adds metrics, and the settings of a finished run."""
 
     def close(self) -> None:
         """Writes the remaining data."""
@@ -141,16 +147,13 @@ def _awaited(paths: list[Path]) -> bool:
 
 
 def _send(curve: Curve, tracker: Tracker) -> None:
-    if not curve.summaries and curve.record is None:
-        return
-    known = tracker.n_known(curve)
-    if known < 0:
+    if curve.known == 0 or (known := tracker.n_known(curve)) < 0:
         return
     points = list(_points(curve.summaries))[known:]
     if curve.record is not None:
         points += _hidden(curve.record, curve.summaries)
-    if points or curve.record is not None:
-        tracker.add(curve, points, len(curve.summaries), finished=curve.record is not None)
+    if points:
+        tracker.add(curve, points)
 
 
 def _points(summaries: list[Summary]) -> Iterator[Point]:
@@ -181,21 +184,15 @@ def _hidden(record: RunRecord, summaries: list[Summary]) -> list[Point]:
         if score is not None:
             points.append(Point(spent, ended, _finite({"validation/mean_return": score})))
     metrics = {"heldout/mean_return": record.outcome.score, "random/mean_return": record.outcome.random_score}
-    if record.agent.tokens is not None:
-        metrics |= {
-            "agent/output_tokens": record.agent.tokens.output,
-            "agent/cost_usd": record.agent.tokens.cost,
-        }
+    if (tokens := record.agent.tokens) is not None:
+        metrics |= {"agent/output_tokens": tokens.output, "agent/cost_usd": tokens.cost}
     points.append(Point(spent, ended, _finite(metrics)))
     return points
 
 
 def _finite(metrics: dict[str, Any]) -> dict[str, float]:
-    return {
-        name: float(value)
-        for name, value in metrics.items()
-        if value is not None and math.isfinite(float(value))
-    }
+    known = {name: float(value) for name, value in metrics.items() if value is not None}
+    return {name: value for name, value in known.items() if math.isfinite(value)}
 
 
 def _unix(text: str) -> float:
@@ -223,13 +220,18 @@ class _Known(msgspec.Struct, frozen=True):
     """As `Tracker.n_known`."""
 
 
-def _read_known(path: Path) -> _Known | None:
+def _read_known(path: Path) -> _Known:
     try:
         return msgspec.json.decode(path.read_bytes(), type=_Known)
     except FileNotFoundError:
-        return None
+        return _Known(run="", submits=0)
     except DECODE_ERRORS as error:
         raise ConfigError(f"{path} is damaged: {error}; choose another --out") from error
+
+
+def _write_known(path: Path, curve: Curve) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(path, msgspec.json.encode(_Known(run=curve.id, submits=curve.known)))
 
 
 class TensorBoard:
@@ -242,17 +244,14 @@ class TensorBoard:
     def _folder(self, curve: Curve) -> Path:
         """Named as the run; with a part of its id where another run of that name has been before."""
         usual = self._out / curve.name
-        known = _read_known(usual / _KNOWN)
-        if known is None or known.run == curve.id:
-            return usual
-        return usual.with_name(f"{usual.name}-{curve.id[:8]}")
+        own = _read_known(usual / _KNOWN).run in ("", curve.id)
+        return usual if own else usual.with_name(f"{usual.name}-{curve.id[:8]}")
 
     def n_known(self, curve: Curve) -> int:
         """Read from the file `evopolicy.json` beside the events."""
-        known = _read_known(self._folder(curve) / _KNOWN)
-        return 0 if known is None else known.submits
+        return _read_known(self._folder(curve) / _KNOWN).submits
 
-    def add(self, curve: Curve, points: list[Point], n_submits: int, *, finished: bool) -> None:
+    def add(self, curve: Curve, points: list[Point]) -> None:
         """Appends scalars to the run's event file."""
         from tensorboardX import SummaryWriter
 
@@ -268,13 +267,12 @@ class TensorBoard:
         for point in points:
             for name, value in point.metrics.items():
                 writer.add_scalar(name, value, point.step, walltime=point.time_s)
-        if finished:
+        if curve.record is not None:
             table = "".join(f"| {name} | {value} |\n" for name, value in curve.settings().items())
             writer.add_text("settings", "| setting | value |\n|---|---|\n" + table)
         writer.flush()
-        known = _Known(run=curve.id, submits=-1 if finished else n_submits)
-        write_atomically(folder / _KNOWN, msgspec.json.encode(known))
-        if finished:
+        _write_known(folder / _KNOWN, curve)
+        if curve.record is not None:
             self._writers.pop(curve.id).close()
 
     def close(self) -> None:
@@ -300,9 +298,7 @@ class MLflow:
         self._client = MlflowClient(tracking_uri=out)
         name = os.environ.get("MLFLOW_EXPERIMENT_NAME", "evopolicy")
         experiment = self._client.get_experiment_by_name(name)
-        self._experiment = (
-            self._client.create_experiment(name) if experiment is None else experiment.experiment_id
-        )
+        self._experiment = experiment.experiment_id if experiment else self._client.create_experiment(name)
         self._runs: dict[str, Any] = {}
 
     def _find(self, curve: Curve) -> Any:
@@ -317,20 +313,15 @@ class MLflow:
         run = self._find(curve)
         return 0 if run is None else int(run.data.tags.get("evopolicy.submits", 0))
 
-    def add(self, curve: Curve, points: list[Point], n_submits: int, *, finished: bool) -> None:
+    def add(self, curve: Curve, points: list[Point]) -> None:
         """Logs metrics, and parameters once the run is finished."""
         from mlflow.entities import Metric, Param, RunTag
 
         run = self._find(curve)
         if run is None:
-            run = self._client.create_run(
-                self._experiment,
-                run_name=curve.name,
-                tags={"evopolicy.id": curve.id},
-            )
-            self._runs[curve.id] = run
-        params = [Param(name, value) for name, value in curve.settings().items()] if finished else []
-        tags = [RunTag("evopolicy.submits", str(-1 if finished else n_submits))]
+            tags = {"evopolicy.id": curve.id}
+            run = self._client.create_run(self._experiment, run_name=curve.name, tags=tags)
+        params = [Param(name, value) for name, value in curve.settings().items()] if curve.record else []
         metrics = [
             Metric(name, value, int(1000 * point.time_s), point.step)
             for point in points
@@ -339,11 +330,10 @@ class MLflow:
         # A batch of the server holds at most 1,000 metrics.
         for first in range(0, len(metrics), 900):
             self._client.log_batch(run.info.run_id, metrics=metrics[first : first + 900])
-        self._client.log_batch(run.info.run_id, params=params, tags=tags)
-        if finished:
-            assert curve.record is not None
-            completed = curve.record.outcome.status == "completed"
-            self._client.set_terminated(run.info.run_id, "FINISHED" if completed else "FAILED")
+        tag = RunTag("evopolicy.submits", str(curve.known))
+        self._client.log_batch(run.info.run_id, params=params, tags=[tag])
+        if curve.record is not None:
+            self._client.set_terminated(run.info.run_id, "FINISHED" if curve.completed else "FAILED")
         self._runs[curve.id] = self._client.get_run(run.info.run_id)
 
     def close(self) -> None:
@@ -362,14 +352,17 @@ class WeightsAndBiases:
 
     def n_known(self, curve: Curve) -> int:
         """Read from a file below `out`: an offline run cannot be asked."""
-        known = _read_known(self._known(curve))
-        return 0 if known is None else known.submits
+        return _read_known(self._known(curve)).submits
 
-    def add(self, curve: Curve, points: list[Point], n_submits: int, *, finished: bool) -> None:
+    def add(self, curve: Curve, points: list[Point]) -> None:
         """Logs metrics over `budget/spent`, and the settings."""
         import wandb
 
         if curve.id not in self._open:
+            off = dict.fromkeys(
+                ("disable_git", "x_disable_stats", "x_disable_meta", "x_disable_machine_info"), True
+            )
+            names = dict.fromkeys(("host", "program", "x_executable"), "evopolicy")
             self._open[curve.id] = wandb.init(
                 project=os.environ.get("WANDB_PROJECT", "evopolicy"),
                 id=curve.id,
@@ -378,29 +371,16 @@ class WeightsAndBiases:
                 dir=str(self._out),
                 resume="allow",
                 reinit="create_new",
-                settings=wandb.Settings(
-                    console="off",
-                    silent=True,
-                    disable_git=True,
-                    x_disable_stats=True,
-                    x_disable_meta=True,
-                    x_disable_machine_info=True,
-                    host="evopolicy",
-                    program="evopolicy",
-                    x_executable="evopolicy",
-                ),
+                settings=wandb.Settings(console="off", silent=True, **off, **names),
             )
             self._open[curve.id].define_metric("*", step_metric="budget/spent")
         run = self._open[curve.id]
         run.config.update(curve.settings(), allow_val_change=True)
         for point in points:
             run.log(point.metrics | {"budget/spent": point.step})
-        self._known(curve).parent.mkdir(parents=True, exist_ok=True)
-        known = _Known(run=curve.id, submits=-1 if finished else n_submits)
-        write_atomically(self._known(curve), msgspec.json.encode(known))
-        if finished:
-            assert curve.record is not None
-            run.finish(exit_code=0 if curve.record.outcome.status == "completed" else 1)
+        _write_known(self._known(curve), curve)
+        if curve.record is not None:
+            run.finish(exit_code=0 if curve.completed else 1)
             del self._open[curve.id]
 
     def close(self) -> None:

@@ -16,41 +16,36 @@ from evopolicy import _arguments
 from evopolicy_common.messages.episode import ResourceLimits
 
 RUN: dict[str, Any] = {"env": "toy/line", "agent": "random"}
-WRONG_RUNS: list[dict[str, Any]] = [
-    {"agent": None},
-    {"agent": ""},
-    {"env": None},
-    {"env": ["toy/line"]},
-    {"budget": 0},
-    {"budget": -1},
-    {"budget": "8"},
-    {"budget": True},
-    {"slots": None},
-    {"slots": 1.5},
-    {"runs": None},
-    {"repeat": -1},
-    {"validation": 0},
-    {"tier": None},
-    {"replays": "some"},
-    {"agent_wall_s": float("nan")},
-    {"exp_id": 3},
-    {"overwrite": "yes"},
-    {"policy_packages": "scipy"},
-    {"policy_packages": (3,)},
-    {"progress": "no"},
-]
-WRONG_EVALUATIONS: list[dict[str, Any]] = [
-    {"policy": None},
-    {"policy": dict},
-    {"env": 3},
-    {"cases": 3},
-    {"cases": "0-3"},
-    {"tier": "x"},
-    {"limits": {"act_wall_s": None}},
-    {"limits": 3},
-    {"slots": "2"},
-    {"progress": None},
-]
+WRONG_RUNS: dict[str, list[Any]] = {
+    "agent": [None, ""],
+    "env": [None, ["toy/line"]],
+    "budget": [0, -1, "8", True],
+    "slots": [None, 1.5],
+    "runs": [None],
+    "repeat": [-1],
+    "validation": [0],
+    "tier": [None],
+    "replays": ["some"],
+    "agent_wall_s": [float("nan")],
+    "exp_id": [3],
+    "overwrite": ["yes"],
+    "policy_packages": ["scipy", (3,)],
+    "progress": ["no"],
+}
+WRONG_EVALUATIONS: dict[str, list[Any]] = {
+    "policy": [None, dict],
+    "env": [3],
+    "cases": [3, "0-3"],
+    "tier": ["x"],
+    "limits": [{"act_wall_s": None}, 3],
+    "slots": ["2"],
+    "progress": [None],
+}
+
+
+def each(wrong: dict[str, list[Any]]) -> pytest.MarkDecorator:
+    pairs = [(name, value) for name, values in wrong.items() for value in values]
+    return pytest.mark.parametrize(("name", "value"), pairs, ids=str)
 
 
 @pytest.fixture(autouse=True)
@@ -61,20 +56,18 @@ def _no_cluster(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(evp.Cluster, "_open", opened)
 
 
-@pytest.mark.parametrize("wrong", WRONG_RUNS, ids=str)
-def test_a_wrong_argument_of_run_is_named(wrong: dict[str, Any], tmp_path: Path) -> None:
-    ((name, value),) = wrong.items()
+@each(WRONG_RUNS)
+def test_a_wrong_argument_of_run_is_named(name: str, value: Any, tmp_path: Path) -> None:
     with pytest.raises(evp.ConfigError) as error:
-        evp.run(**({"runs": tmp_path / "runs"} | RUN | wrong))
+        evp.run(**({"runs": tmp_path / "runs"} | RUN | {name: value}))
     assert str(error.value).startswith(f"{name} is {value!r}: give ")
     assert not (tmp_path / "runs").exists()
 
 
-@pytest.mark.parametrize("wrong", WRONG_EVALUATIONS, ids=str)
-def test_a_wrong_argument_of_evaluate_is_named(wrong: dict[str, Any], tmp_path: Path) -> None:
+@each(WRONG_EVALUATIONS)
+def test_a_wrong_argument_of_evaluate_is_named(name: str, value: Any, tmp_path: Path) -> None:
     (tmp_path / "policy.py").write_text("class Policy: pass")
-    ((name, value),) = wrong.items()
-    arguments: dict[str, Any] = {"policy": tmp_path, "env": "toy/line"} | wrong
+    arguments: dict[str, Any] = {"policy": tmp_path, "env": "toy/line"} | {name: value}
     with pytest.raises(evp.ConfigError) as error:
         evp.evaluate(**arguments)
     assert str(error.value).startswith(f"{name} is {value!r}: give ")

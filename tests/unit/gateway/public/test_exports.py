@@ -17,6 +17,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 from invented import run_dirs
 from invented.policies import Version
@@ -59,6 +60,14 @@ def export(*words: str | Path, **environment: str) -> subprocess.CompletedProces
     )
 
 
+def exported(*words: str | Path, **environment: str) -> str:
+    """What the command says on stderr when it succeeds."""
+    done = export(*words, **environment)
+    assert done.returncode == 0, done.stderr
+    return done.stderr
+
+
+ROW = {"t": 0, "obs": [1.0], "action": 1, "reward": 1.5, "terminated": True, "truncated": False, "info": {}}
 OUT = {"mlflow": "sqlite:///{}/out/mlflow.db"}
 
 
@@ -67,23 +76,13 @@ OUT = {"mlflow": "sqlite:///{}/out/mlflow.db"}
 )
 def test_no_export_names_a_path_the_host_or_the_user(kind: str, tmp_path: Path) -> None:
     run = write_run(tmp_path / "runs", VERSIONS)
-    row = {
-        "t": 0,
-        "obs": [1.0],
-        "action": 1,
-        "reward": 1.5,
-        "terminated": True,
-        "truncated": False,
-        "info": {},
-    }
-    write_episode(run, 0, 0, [row])
+    write_episode(run, 0, 0, [ROW])
     (run / "logs").mkdir(exist_ok=True)
     (run / "logs" / "agent.jsonl").write_text('{"type": "prompt", "text": "go"}\n')
     (tmp_path / "out").mkdir()
     to = OUT.get(kind, "{}/out").format(tmp_path)
     user = "zaphod.beeblebrox"
-    done = export(tmp_path / "runs", "--to", kind, "--out", to, LOGNAME=user, USER=user)
-    assert done.returncode == 0, done.stderr
+    exported(tmp_path / "runs", "--to", kind, "--out", to, LOGNAME=user, USER=user)
     files = [path for path in (tmp_path / "out").rglob("*") if path.is_file()]
     assert files
     host = socket.gethostname()
@@ -104,39 +103,28 @@ def test_no_export_names_a_path_the_host_or_the_user(kind: str, tmp_path: Path) 
 
 def test_csv_holds_every_record_and_no_formula(tmp_path: Path) -> None:
     write_run(tmp_path / "runs", VERSIONS, entry=" =HYPERLINK(1)")
-    done = export(tmp_path / "runs", "--to", "csv", "--out", tmp_path / "tables")
-    assert done.returncode == 0, done.stderr
-    rows = {
-        name: list(
-            csv.DictReader((tmp_path / "tables" / f"{name}.csv").read_text(encoding="utf-8").splitlines())
-        )
-        for name in ("runs", "submits", "episodes")
-    }
+    exported(tmp_path / "runs", "--to", "csv", "--out", tmp_path / "tables")
+    rows: dict[str, list[dict[str, str]]] = {}
+    for name in ("runs", "submits", "episodes"):
+        lines = (tmp_path / "tables" / f"{name}.csv").read_text(encoding="utf-8").splitlines()
+        rows[name] = list(csv.DictReader(lines))
     assert [row["entry"] for row in rows["runs"]] == ["' =HYPERLINK(1)"]
     assert [row["mean_return"] for row in rows["submits"]] == ["1.5", "4.0", ""]
-    assert [row["episode_return"] for row in rows["episodes"] if row["split"] == "train"] == [
-        "1.0",
-        "2.0",
-        "3.0",
-        "5.0",
-    ]
+    train = [row["episode_return"] for row in rows["episodes"] if row["split"] == "train"]
+    assert train == ["1.0", "2.0", "3.0", "5.0"]
 
 
 def test_parquet_has_the_types_of_the_records(runs: Path, tmp_path: Path) -> None:
     from pyarrow import parquet
 
-    done = export(runs, "--to", "parquet", "--out", tmp_path)
-    assert done.returncode == 0, done.stderr
+    exported(runs, "--to", "parquet", "--out", tmp_path)
     episodes = parquet.read_table(tmp_path / "episodes.parquet")
     assert str(episodes.schema.field("episode_return").type) == "double"
     assert str(episodes.schema.field("case").type) == "int64"
     assert not episodes.schema.field("split").nullable
     assert episodes.column("episode_return").to_pylist() == [1.0, 2.0, 3.0, 5.0, 4.0, 6.0]
-    assert parquet.read_table(tmp_path / "submits.parquet").column("selected").to_pylist() == [
-        False,
-        True,
-        False,
-    ]
+    selected = parquet.read_table(tmp_path / "submits.parquet").column("selected")
+    assert selected.to_pylist() == [False, True, False]
 
 
 def scalars(out: Path) -> dict[str, list[tuple[int, float]]]:
@@ -150,8 +138,7 @@ def scalars(out: Path) -> dict[str, list[tuple[int, float]]]:
 
 def test_tensorboard_reads_returns_over_the_budget_once(runs: Path, tmp_path: Path) -> None:
     for _ in range(2):
-        done = export(runs, "--to", "tensorboard", "--out", tmp_path / "events")
-        assert done.returncode == 0, done.stderr
+        exported(runs, "--to", "tensorboard", "--out", tmp_path / "events")
     found = scalars(tmp_path / "events")
     assert found["train/mean_return"] == [(2, 1.5), (4, 4.0)]
     assert found["submit/ok"] == [(2, 1.0), (4, 1.0), (5, 0.0)]
@@ -162,8 +149,7 @@ def test_tensorboard_reads_returns_over_the_budget_once(runs: Path, tmp_path: Pa
 
 def test_runs_of_one_name_have_curves_of_their_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def n_curves() -> int:
-        done = export(tmp_path / "a", tmp_path / "b", "--to", "tensorboard", "--out", tmp_path / "events")
-        assert done.returncode == 0, done.stderr
+        exported(tmp_path / "a", tmp_path / "b", "--to", "tensorboard", "--out", tmp_path / "events")
         return len({path.parent for path in (tmp_path / "events").rglob("events.out.tfevents.*")})
 
     for place in ("a", "b"):
@@ -179,8 +165,7 @@ def test_runs_of_one_name_have_curves_of_their_own(tmp_path: Path, monkeypatch: 
 def test_submits_of_a_budget_with_four_digits_are_found(tmp_path: Path) -> None:
     write_run(tmp_path / "runs", VERSIONS, budget=1000)
     assert [one.mean_return for one in load_runs(tmp_path / "runs").submits()] == [1.5, 4.0, None]
-    done = export(tmp_path / "runs", "--to", "tensorboard", "--out", tmp_path / "events")
-    assert done.returncode == 0, done.stderr
+    exported(tmp_path / "runs", "--to", "tensorboard", "--out", tmp_path / "events")
     assert scalars(tmp_path / "events")["train/mean_return"] == [(2, 1.5), (4, 4.0)]
 
 
@@ -189,8 +174,7 @@ def test_mlflow_has_each_run_once_with_its_settings(runs: Path, tmp_path: Path) 
 
     uri = f"sqlite:///{tmp_path}/mlflow.db"
     for _ in range(2):
-        done = export(runs, "--to", "mlflow", "--out", uri)
-        assert done.returncode == 0, done.stderr
+        exported(runs, "--to", "mlflow", "--out", uri)
     client = MlflowClient(tracking_uri=uri)
     experiment = client.get_experiment_by_name("evopolicy")
     assert experiment is not None
@@ -220,17 +204,14 @@ def test_wandb_records_offline(runs: Path, tmp_path: Path) -> None:
     from wandb.proto import wandb_internal_pb2
 
     for _ in range(2):
-        done = export(runs, "--to", "wandb", "--out", tmp_path)
-        assert done.returncode == 0, done.stderr
+        exported(runs, "--to", "wandb", "--out", tmp_path)
     (file,) = tmp_path.glob("wandb/offline-run-*/run-*.wandb")
     rows = []
     for data in records_of(file):
         record = wandb_internal_pb2.Record()
         record.ParseFromString(data)
-        if record.HasField("history"):
-            rows.append(
-                {one.key or one.nested_key[0]: json.loads(one.value_json) for one in record.history.item}
-            )
+        items = record.history.item if record.HasField("history") else ()
+        rows.append({one.key or one.nested_key[0]: json.loads(one.value_json) for one in items})
     means = [(row["budget/spent"], row["train/mean_return"]) for row in rows if "train/mean_return" in row]
     assert means == [(2, 1.5), (4, 4.0)]
     assert [row["heldout/mean_return"] for row in rows if "heldout/mean_return" in row] == [5.0]
@@ -242,35 +223,24 @@ def write_episode(run: Path, submit: int, episode: int, rows: list[dict[str, Any
     (folder / "trajectory.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
 
 
-def test_minari_reads_episodes_with_their_observations(tmp_path: Path) -> None:
+def test_minari_reads_episodes_with_their_observations(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     import minari
     import numpy as np
 
     run = write_run(tmp_path / "runs", VERSIONS[:2])
     for submit in range(2):
         for episode in range(2):
-            rows = [
-                {
-                    "t": t,
-                    "obs": {"position": [float(submit), t / 2], "mission": "go"},
-                    "action": (t + episode) % 3,
-                    "reward": 1.5 if t else "-Inf",
-                    "terminated": t == 2,
-                    "truncated": False,
-                    "info": {},
-                }
-                for t in range(3)
-            ]
+            seen = [{"position": [float(submit), t / 2], "mission": "go"} for t in range(3)]
+            rows = [{"t": t, "obs": obs, "action": (t + episode) % 3} for t, obs in enumerate(seen)]
+            rows = [{**ROW, "terminated": False, **row} for row in rows]
+            rows[0]["reward"], rows[2]["terminated"] = "-Inf", True
             write_episode(run, submit, episode, rows)
-    done = export(tmp_path / "runs", "--to", "minari", "--out", tmp_path / "sets")
-    assert done.returncode == 0, done.stderr
-    assert "Warning" not in done.stderr
-    os.environ["MINARI_DATASETS_PATH"] = str(tmp_path / "sets")
-    try:
-        dataset = minari.load_dataset("evopolicy/gym-acrobot/Agent-A-v0")
-        episodes = list(dataset.iterate_episodes())
-    finally:
-        del os.environ["MINARI_DATASETS_PATH"]
+    assert "Warning" not in exported(tmp_path / "runs", "--to", "minari", "--out", tmp_path / "sets")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "sets"))
+    dataset = minari.load_dataset("evopolicy/gym-acrobot/Agent-A-v0")
+    episodes = list(dataset.iterate_episodes())
     assert len(episodes) == 4
     last = episodes[3]
     np.testing.assert_array_equal(last.observations["position"], [[1, 0], [1, 0.5], [1, 1], [1, 1]])
@@ -303,28 +273,22 @@ def test_steps_of_an_episode_are_read_one_by_one(tmp_path: Path) -> None:
     assert _columns([each.obs for each in rows])["v"].shape == (steps, 200)
 
 
-def test_minari_leaves_out_odd_episodes_and_keeps_each_with_its_own_facts(tmp_path: Path) -> None:
+def test_minari_leaves_out_odd_episodes_and_keeps_each_with_its_own_facts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     import minari
 
     four = Version({"policy.py": "x = 1"}, (1.0, 2.0, 3.0, 4.0), 0.5)
     run = write_run(tmp_path / "runs", [four])
     for episode, action in enumerate([None, 1, [[0], 1], 2]):
-        row = {"t": 0, "obs": [1.0, 2.0], "reward": 1.0, "terminated": True, "truncated": False, "info": {}}
-        write_episode(run, 0, episode, [{**row, "action": action}])
+        write_episode(run, 0, episode, [{**ROW, "obs": [1.0, 2.0], "action": action}])
     # As an episode whose trajectory did not fit.
     (run / "workspace/feedback/submit_000/episodes/ep_001/trajectory.jsonl").unlink()
-    done = export(tmp_path / "runs", "--to", "minari", "--out", tmp_path / "sets")
-    assert done.returncode == 0, done.stderr
-    assert [line.partition(": left out")[0][-9:] for line in done.stderr.splitlines()] == [
-        "episode 0",
-        "episode 2",
-    ]
-    os.environ["MINARI_DATASETS_PATH"] = str(tmp_path / "sets")
-    try:
-        dataset = minari.load_dataset("evopolicy/gym-acrobot/Agent-A-v0")
-        (metadata,) = dataset.storage.get_episode_metadata([0])
-    finally:
-        del os.environ["MINARI_DATASETS_PATH"]
+    said = exported(tmp_path / "runs", "--to", "minari", "--out", tmp_path / "sets").splitlines()
+    assert [line.partition(": left out")[0][-9:] for line in said] == ["episode 0", "episode 2"]
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "sets"))
+    dataset = minari.load_dataset("evopolicy/gym-acrobot/Agent-A-v0")
+    (metadata,) = dataset.storage.get_episode_metadata([0])
     assert (dataset.total_episodes, metadata["case"], metadata["episode_return"]) == (1, 3, 4.0)
 
 
@@ -348,10 +312,8 @@ def test_a_sweep_is_followed_to_its_end_and_shows_nothing_hidden_before(
         def n_known(self, curve: tracking.Curve) -> int:
             return sum(1 for points, _ in kept for point in points if "submit/ok" in point.metrics)
 
-        def add(
-            self, curve: tracking.Curve, points: list[tracking.Point], n_submits: int, *, finished: bool
-        ) -> None:
-            kept.append((points, finished))
+        def add(self, curve: tracking.Curve, points: list[tracking.Point]) -> None:
+            kept.append((points, curve.record is not None))
             first.set()
 
         def close(self) -> None:
@@ -362,23 +324,14 @@ def test_a_sweep_is_followed_to_its_end_and_shows_nothing_hidden_before(
     follower.start()
     assert first.wait(60)
     assert [point.step for points, _ in kept for point in points] == SPENT
-    assert not [
-        name
-        for points, _ in kept
-        for point in points
-        for name in point.metrics
-        if name.startswith(("val", "held"))
-    ]
+    names = {name for points, _ in kept for point in points for name in point.metrics}
+    assert not [name for name in names if name.startswith(("val", "held"))]
     write_atomically(run / "run.json", finished)
-    save(runs, Index(suite="s", runs={"a": Entry(**{**vars_of(entry), "state": "completed"})}))
+    save(runs, Index(suite="s", runs={"a": msgspec.structs.replace(entry, state="completed")}))
     follower.join(60)
     assert not follower.is_alive()
     assert ended == ["/".join(run.parts[-3:])]
     assert [point.metrics for point in kept[1][0]][-1]["heldout/mean_return"] == 5.0
-
-
-def vars_of(entry: Entry) -> dict[str, Any]:
-    return {name: getattr(entry, name) for name in entry.__struct_fields__}
 
 
 @pytest.mark.parametrize(

@@ -58,6 +58,8 @@ def test_claude_codes_blocks_of_one_message_are_one_step_with_its_results(tmp_pa
     def assistant(identity: str, *blocks: dict[str, Any]) -> dict[str, Any]:
         return {"type": "assistant", "message": {"id": identity, "content": list(blocks)}}
 
+    texts = [{"type": "text", "text": text} for text in "ab"]
+    result = {"type": "tool_result", "tool_use_id": "t", "content": texts, "is_error": True}
     steps = read_steps(
         log_of(
             tmp_path,
@@ -66,19 +68,7 @@ def test_claude_codes_blocks_of_one_message_are_one_step_with_its_results(tmp_pa
             assistant("m1", {"type": "thinking", "thinking": "Hm."}),
             assistant("m1", {"type": "text", "text": "I look."}),
             assistant("m1", {"type": "tool_use", "id": "t", "name": "Bash", "input": {"command": "ls"}}),
-            {
-                "type": "user",
-                "message": {
-                    "content": [
-                        {
-                            "type": "tool_result",
-                            "tool_use_id": "t",
-                            "content": [{"type": "text", "text": "a"}, {"type": "text", "text": "b"}],
-                            "is_error": True,
-                        }
-                    ]
-                },
-            },
+            {"type": "user", "message": {"content": [result]}},
             {"type": "turn_failed", "kind": "passing", "message": "it broke"},
             # A resumed program begins to count anew.
             assistant("m1", {"type": "tool_use", "id": "t", "name": "Bash", "input": {"command": "pwd"}}),
@@ -91,8 +81,9 @@ def test_claude_codes_blocks_of_one_message_are_one_step_with_its_results(tmp_pa
         ("agent", ""),
     ]
     assert steps[1].reasoning == ["Hm."]
-    (result,) = steps[1].results
-    assert (result.text, result.failed, result.call) == ("a\nb", True, steps[1].calls[0])
+    assert [(one.text, one.failed, one.call) for one in steps[1].results] == [
+        ("a\nb", True, steps[1].calls[0])
+    ]
     assert len({steps[1].calls[0].id, steps[3].calls[0].id}) == 2
 
 
@@ -125,8 +116,13 @@ def test_lines_of_one_stream_are_one_step(tmp_path: Path) -> None:
     ]
 
 
-def test_whatever_an_agent_wrote_is_no_error(tmp_path: Path) -> None:
-    odd = [
+BEGIN = b'{"type":"assistant","message":{"content":[{"type":"tool_use","input":'
+DEPTHS = [b"[" * depth + b"]" * depth for depth in (*range(1, sys.getrecursionlimit() + 10), 5000)]
+"""A depth that one step of an export just reads must not be too deep for the next one."""
+ODD: dict[str, list[object]] = {
+    "nested": [BEGIN + each + b"}]}}" for each in DEPTHS]
+    + [b'{"type":"paused","why":' + each + b"}" for each in DEPTHS],
+    "odd": [
         b"\xff\xfe",
         b"[" * 100_000,
         b'{"type": "stdout", "text": "\\ud800"}',
@@ -138,21 +134,14 @@ def test_whatever_an_agent_wrote_is_no_error(tmp_path: Path) -> None:
         {"type": "item.completed", "item": {"type": None, "text": [1]}},
         {"type": "prompt", "message": None, "timestamp": "yesterday"},
         {"turn": 1, "text": "x", "timestamp": 9e99},
-    ]
-    (run,) = load_runs(write_run(tmp_path / "runs", VERSIONS))
-    log_of(run.folder / "logs", *odd)
-    (path,) = write_atif(load_runs(tmp_path / "runs"), tmp_path / "out")
-    check(json.loads(path.read_text()))
+    ],
+}
 
 
-def test_no_depth_of_nesting_ends_an_export(tmp_path: Path) -> None:
-    """A depth that one step of the export just reads must not be too deep for the next one."""
-    begin = b'{"type":"assistant","message":{"content":[{"type":"tool_use","input":'
-    depths = [*range(1, sys.getrecursionlimit() + 10), 5000]
-    lines = [begin + b"[" * depth + b"]" * depth + b"}]}}" for depth in depths]
-    lines += [b'{"type":"paused","why":' + b"[" * depth + b"]" * depth + b"}" for depth in depths]
+@pytest.mark.parametrize("kind", ODD)
+def test_whatever_an_agent_wrote_is_no_error(tmp_path: Path, kind: str) -> None:
     (run,) = load_runs(write_run(tmp_path / "runs", VERSIONS))
-    log_of(run.folder / "logs", *lines)
+    log_of(run.folder / "logs", *ODD[kind])
     (path,) = write_atif(load_runs(tmp_path / "runs"), tmp_path / "out")
     check(json.loads(path.read_text()))
 
@@ -236,7 +225,7 @@ def test_a_run_whose_times_are_none_is_exported_with_the_others(tmp_path: Path) 
         def n_known(self, curve: Curve) -> int:
             return 0
 
-        def add(self, curve: Curve, points: list[Point], n_submits: int, *, finished: bool) -> None:
+        def add(self, curve: Curve, points: list[Point]) -> None:
             times.extend(point.time_s for point in points)
 
         def close(self) -> None:
