@@ -6,13 +6,13 @@ import importlib
 import json
 import shutil
 import sys
-import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
+
+from stages.loopback import serving_json
 
 Play = Callable[[Any, int], tuple[float, list[dict[str, Any]]]]
 """(policy after reset, case id) → return and trajectory rows."""
@@ -69,10 +69,8 @@ class FakeGateway:
         if key not in self.keys:
             n = len(env_instances)
             if not max(1, self.min_per_submit) <= n <= min(self.max_per_submit, self.left):
-                return 400, {
-                    "status": "budget_invalid",
-                    "error": {"message": f"{n} episodes, {self.left} left"},
-                }
+                message = f"{n} episodes, {self.left} left"
+                return 400, {"status": "budget_invalid", "error": {"message": message}}
             self.keys[key] = self._evaluate(env_instances)
         return 202, {"submit_id": int(self.keys[key][-3:]), "status": "running"}
 
@@ -80,14 +78,9 @@ class FakeGateway:
         self.n_asked += 1
         if self.n_asked % 2:  # the first question after a submit always comes too early
             return 202, {"submit_id": int(submit_id), "status": "running"}
-        summary = self.submits[int(submit_id)]
-        folder = f"feedback/submit_{int(submit_id):03d}"
-        return 200, {
-            "submit_id": int(submit_id),
-            "status": summary["status"],
-            "summary": summary,
-            "feedback": folder,
-        }
+        summary, folder = self.submits[int(submit_id)], f"feedback/submit_{int(submit_id):03d}"
+        known = {"submit_id": int(submit_id), "status": summary["status"]}
+        return 200, known | {"summary": summary, "feedback": folder}
 
     def _evaluate(self, env_instances: list[int]) -> str:
         index = len(self.submits)
@@ -96,19 +89,18 @@ class FakeGateway:
         shutil.copytree(self.workspace / "system", bundle)
         status = self.statuses.pop(0) if self.statuses else "ok"
         first = self.budget - self.left
-        returns: list[float] | None = [] if status == "ok" else None
-        for i, case in enumerate(env_instances if returns is not None else ()):
+        returns: list[float] = []
+        for i, case in enumerate(env_instances if status == "ok" else ()):
             policy = load_policy(bundle)(self.obs_space, self.action_space, {})
             policy.reset(i)
             value, rows = self.play(policy, case)
-            assert returns is not None
             returns.append(value)
             folder = self.workspace / "feedback" / submit_id / "episodes" / f"ep_{first + i:03d}"
             folder.mkdir(parents=True)
             (folder / "trajectory.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
         summary = {
             "status": status,
-            "returns": returns,
+            "returns": returns if status == "ok" else None,
             "env_instances": env_instances,
             "n_episodes": len(env_instances),
             "first_global_episode": first,
@@ -124,37 +116,13 @@ class FakeGateway:
 def serving(gateway: FakeGateway) -> Iterator[FakeGateway]:
     """Serve `gateway` on an ephemeral loopback port, its URL in `gateway.url`."""
 
-    class Handler(BaseHTTPRequestHandler):
-        def do_GET(self) -> None:
-            if self.path == "/info":
-                self._answer(200, gateway.info())
-            elif self.path == "/task":
-                self._answer(200, "# Task")
-            else:
-                self._answer(*gateway.get_submit(self.path.removeprefix("/submit/")))
+    def answer(path: str, headers: Mapping[str, str], body: Any) -> tuple[int, Any]:
+        if body is not None:
+            assert path == "/submit?wait=false"
+            return gateway.post(headers["Idempotency-Key"], body["env_instances"])
+        if path == "/info":
+            return 200, gateway.info()
+        return (200, "# Task") if path == "/task" else gateway.get_submit(path.removeprefix("/submit/"))
 
-        def do_POST(self) -> None:
-            body = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
-            assert self.path == "/submit?wait=false"
-            self._answer(*gateway.post(self.headers["Idempotency-Key"], body["env_instances"]))
-
-        def _answer(self, status: int, value: Any) -> None:
-            payload = (value if isinstance(value, str) else json.dumps(value)).encode()
-            self.send_response(status)
-            self.send_header("Content-Length", str(len(payload)))
-            self.end_headers()
-            self.wfile.write(payload)
-
-        def log_message(self, format: str, *args: Any) -> None:
-            pass
-
-    server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-    thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
-    thread.start()
-    gateway.url = f"http://127.0.0.1:{server.server_address[1]}"
-    try:
+    with serving_json(answer) as gateway.url:
         yield gateway
-    finally:
-        server.shutdown()
-        thread.join()
-        server.server_close()

@@ -2,22 +2,29 @@
 
 from __future__ import annotations
 
+import json
+import os
+import shutil
 import sys
+from collections.abc import Sequence
+from importlib import resources
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from evopolicy_gateway.agents.client import Client, ProtocolError, Refusal, Verdict
-from evopolicy_gateway.agents.evolve.families import families_for
-from evopolicy_gateway.agents.evolve.feedback import Step, episode_folders, novelty, read_steps
-from evopolicy_gateway.agents.evolve.lessons import Lessons
+from evopolicy_gateway.agents.evolve.evolved.grids import find_grid
+from evopolicy_gateway.agents.evolve.evolved.policy import CANDIDATES_FILE
+from evopolicy_gateway.agents.evolve.evolved.spaces import Schema, goal_keys
+from evopolicy_gateway.agents.evolve.families import Family, families_for, moving_families, seeking_family
+from evopolicy_gateway.agents.evolve.feedback import Step, novelty, read_episodes
+from evopolicy_gateway.agents.evolve.plant import find_plant
 from evopolicy_gateway.agents.evolve.search import Candidate, Episode, Search, make_plan
-from evopolicy_gateway.agents.evolve.staging import stage_candidates, stage_code
+from evopolicy_gateway.agents.evolve.views import ViewLog, find_views, view_logs
 
-MAX_ROWS_READ = 3000
-"""Most rows that the agent reads of one trajectory."""
 MAX_REFUSALS = 3
+MAX_VIEW_LOGS = 96
+PACKAGE = "evolved"
 
 
 class Agent:
@@ -25,18 +32,17 @@ class Agent:
 
     def __init__(self, client: Client, workspace: Path, seed: int = 0) -> None:
         self._client = client
-        self._workspace = workspace
-        self._system = workspace / "system"
+        self._feedback, self._system = workspace / "feedback", workspace / "system"
         info = client.info()
         meta = info["env_meta"]
         self._env = str(meta["env"])
-        self._spaces: tuple[dict[str, Any], dict[str, Any]] = meta["obs_space"], meta["action_space"]
+        spaces = meta["obs_space"], meta["action_space"]
         self._n_cases = int(meta["n_env_instances"])
         self._budget = int(info["state"]["remaining_budget"])
         self._bounds = int(info["min_episodes_per_submit"]), int(info["max_episodes_per_submit"])
-        self._search = Search(families_for(*self._spaces), np.random.default_rng(seed))
+        self._search = Search(families_for(*spaces), np.random.default_rng(seed))
         self._next_case = 0
-        self._lessons = Lessons(*self._spaces)
+        self._lessons = Lessons(*spaces)
         self._n_refusals = 0
 
     def run(self) -> None:
@@ -105,21 +111,18 @@ class Agent:
         episodes = self._trajectories(verdict, len(schedule)) if len(candidates) > 1 else []
         for index, (turn, case, value) in enumerate(zip(schedule, cases, returns, strict=True)):
             if index not in failed and value is not None and np.isfinite(value):
-                new = float(novelty(episodes[index])) if index < len(episodes) else 0.0
+                new = novelty(episodes[index]) if episodes else 0
                 candidates[turn].episodes.append(Episode(case=case, episode_return=float(value), novelty=new))
-        if episodes:
-            for family in self._lessons.learn(episodes):
-                self._search.add_family(family)
+        for family in self._lessons.learn(episodes):
+            self._search.add_family(family)
 
     def _trajectories(self, verdict: Verdict, n_episodes: int) -> list[list[Step]]:
         """Trajectories of a population's episodes, if they can teach anything; else none."""
         returns = verdict.summary["returns"]
-        tells_apart = len(set(returns)) > len(returns) // 2
-        if tells_apart and not self._lessons.wanted:
+        if len(set(returns)) > len(returns) // 2 and not self._lessons.wanted:
             return []
         first = int(verdict.summary["first_global_episode"])
-        folders = episode_folders(self._workspace, verdict.name, n_episodes, first)
-        return [read_steps(folder, MAX_ROWS_READ) for folder in folders]
+        return read_episodes(self._feedback / verdict.name, range(first, first + n_episodes))
 
     def _report(self, title: str, verdict: Verdict, candidates: list[Candidate]) -> None:
         """Prints one line: the submit, its result, the leader, the remaining budget."""
@@ -129,22 +132,69 @@ class Agent:
             line += f", mean {np.mean(returns):.2f}, best {np.max(returns):.2f}"
         else:
             line += f", {verdict.summary.get('n_episodes')} episodes charged for nothing"
-        ranked = self._search.ranking()
-        if ranked:
-            leader = ranked[0]
+        for leader in self._search.ranking()[:1]:
             values = [episode.episode_return for episode in leader.episodes]
             line += f"; leader {leader.family.name} {np.mean(values):.2f} over {len(values)}"
         print(f"{line}; {self._budget} episodes left", flush=True)
+
+
+class Lessons:
+    """Learns from trajectories more than returns: families of controllers that need a model of the environment."""
+
+    def __init__(self, obs_space: Schema, action_space: Schema) -> None:
+        self._spaces = obs_space, action_space
+        self._wants_plant = goal_keys(obs_space)
+        self._wants_views = find_grid(obs_space)[0] and action_space["type"] == "Discrete"
+        self._logs: list[ViewLog] = []
+
+    @property
+    def wanted(self) -> bool:
+        """Whether more trajectories can teach anything."""
+        return self._wants_plant or self._wants_views
+
+    def learn(self, episodes: list[list[Step]]) -> list[Family]:
+        """Families that these and the earlier trajectories make possible; a known family may have newer settings."""
+        if self._wants_plant and (plant := find_plant(*self._spaces, episodes)) is not None:
+            self._wants_plant = False
+            return moving_families(plant, *self._spaces)
+        if self._wants_views and episodes:
+            self._logs = (self._logs + view_logs(*self._spaces, episodes))[-MAX_VIEW_LOGS:]
+            views = find_views(*self._spaces, self._logs)
+            return [] if views is None else [seeking_family(views)]
+        return []
+
+
+def stage_code(system: Path) -> None:
+    """Copies the policy's code into `system`, and replaces its `policy.py`."""
+    target = system / PACKAGE
+    target.mkdir(parents=True, exist_ok=True)
+    for item in (resources.files("evopolicy_gateway.agents.evolve") / PACKAGE).iterdir():
+        if item.name.endswith(".py"):
+            with resources.as_file(item) as path:
+                shutil.copyfile(path, target / item.name)
+    does = f'"""Plays the candidates listed in `{CANDIDATES_FILE}`."""'
+    _replace(system / "policy.py", f"{does}\n\nfrom {PACKAGE}.policy import Policy as Policy\n")
+
+
+def stage_candidates(system: Path, candidates: Sequence[Candidate], schedule: Sequence[int]) -> None:
+    """Writes `candidates`, and which of them plays each episode of the next submit."""
+    plan = {"candidates": [c.as_json() for c in candidates], "schedule": list(schedule)}
+    _replace(system / CANDIDATES_FILE, json.dumps(plan))
+
+
+def _replace(path: Path, text: str) -> None:
+    """Replaces the file atomically: a snapshot may be taken at any moment."""
+    temporary = path.with_name(path.name + ".new")
+    temporary.write_text(text, encoding="utf-8")
+    os.replace(temporary, path)
 
 
 def main() -> int:
     """Runs the agent in the current folder. Returns 0 when the budget is spent, 1 when the gateway is unusable."""
     try:
         Agent(Client.from_environment(), Path.cwd()).run()
-    except KeyError as missing:
-        print(f"evolve: {missing} is not set; it is started by a gateway", file=sys.stderr)
-        return 1
-    except ProtocolError as error:
-        print(f"evolve: {error}", file=sys.stderr)
+    except (KeyError, ProtocolError) as error:
+        why = f"{error} is not set; it is started by a gateway" if isinstance(error, KeyError) else error
+        print(f"evolve: {why}", file=sys.stderr)
         return 1
     return 0

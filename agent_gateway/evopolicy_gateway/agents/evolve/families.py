@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from evopolicy_gateway.agents.evolve.evolved.controllers import parameter_count
+from evopolicy_gateway.agents.evolve.evolved.pushing import Mover
 from evopolicy_gateway.agents.evolve.evolved.spaces import ActionHead, Features, Schema, bounds
 
 Vector = NDArray[np.float64]
@@ -30,14 +30,14 @@ class Family:
     name: str
     kind: str
     """A kind of `evolved.controllers.build`."""
+    spread: Vector
+    """Standard deviation of the random candidates."""
+    centre: Vector
+    """Mean of the random candidates."""
     scale: Vector
     """Standard deviation of a mutation of strength 1, for every number of the vector."""
     first: tuple[Vector, ...] = ()
     """Candidates to try before random ones."""
-    centre: Vector
-    """Mean of the random candidates."""
-    spread: Vector
-    """Standard deviation of the random candidates."""
     settings: dict[str, Any] = field(default_factory=dict)
     weight: int = 1
     """How many candidates it contributes each time its turn comes in the opening."""
@@ -49,173 +49,86 @@ class Family:
             yield self.centre + self.spread * rng.standard_normal(self.centre.size)
 
 
+def _family(kind: str, spread: Any, **more: Any) -> Family:
+    """A family around zero, which mutates by half of its spread."""
+    spread = np.asarray(spread, dtype=float)
+    usual = {"name": kind, "centre": np.zeros(spread.size), "scale": spread / 2, "weight": 2}
+    return Family(kind=kind, spread=spread, **usual | more)
+
+
 def families_for(obs_space: Schema, action_space: Schema) -> list[Family]:
     """Families for these spaces, most promising first."""
     n_outputs = ActionHead(action_space).size
     n_features = Features(obs_space).size
-    chooses = action_space["type"] in ("Discrete", "MultiDiscrete")
-
-    def count(kind: str) -> int:
-        return parameter_count(kind, obs_space, action_space)
-
     families = [_constant(action_space, n_outputs)]
     if obs_space["type"] == "Image":
-        families.append(_saliency(n_outputs))
+        spread = np.tile([2.0, 0.5, 0.5, 0.3], n_outputs)
+        scale = np.concatenate([np.full(3, 0.4), spread / 2])
+        families.append(_family("saliency", [1.0, 1.0, 1.0, *spread], scale=scale, weight=4))
     if action_space["type"] == "Discrete":
-        families.append(_explorer(n_outputs))
+        usual = np.array([*np.zeros(n_outputs), 1.0, 0.0, 0.5])
+        first = [usual, *(usual + 2.0 * axis for axis in np.eye(n_outputs, usual.size)[: 2 * MAX_CONSTANTS])]
+        spread = np.array([*np.full(n_outputs, 1.5), 0.7, 0.7, 0.3])
+        families.append(_family("explorer", spread, first=tuple(first), centre=usual))
     if n_features:
-        families.append(
-            _bang_bang(n_outputs, _switchable(obs_space, n_features), n_features, chooses=chooses)
-        )
-        families.append(_linear(n_outputs, n_features))
+        families.append(_bang_bang(obs_space, action_space, n_outputs, n_features))
+        row = [*np.full(n_features, 1.5 / np.sqrt(n_features)), 0.2]
+        spread = np.tile(row, n_outputs)
+        families.append(_family("linear", spread, scale=spread))
     if n_outputs:
-        families.append(_oscillator(count("oscillator"), n_outputs))
+        spread = np.array([0.7, *np.repeat([0.6, 0.7, 0.3], n_outputs)])
+        centre = np.array([0.0, *np.repeat([0.5, 0.0, 0.0], n_outputs)])
+        families.append(_family("oscillator", spread, centre=centre))
     return families
 
 
 def moving_families(settings: dict[str, Any], obs_space: Schema, action_space: Schema) -> list[Family]:
     """The families that use an identified plant; defaults first, then variations."""
-    n_outputs = ActionHead(action_space).size
-    families = []
-    for kind in ("pusher", "carrier"):
-        size = parameter_count(kind, obs_space, action_space)
-        others = np.zeros(size)
-        others[-n_outputs:] = 1.0
-        others[-n_outputs:][settings["outputs"]] = 0.0
-        parameters = np.zeros(size)
-        parameters[:-n_outputs] = 1.0
-        families.append(
-            Family(
-                name=kind,
-                kind=kind,
-                settings=settings,
-                first=(-others, others),
-                centre=-others if kind == "pusher" else others,
-                spread=0.6 * parameters,
-                scale=0.6 * parameters + 0.3 * others,
-            )
-        )
-    return families
+    others = np.ones(ActionHead(action_space).size)
+    others[settings["outputs"]] = 0.0
+    offsets = np.array([*np.zeros(Mover.PARAMETERS), *others])
+    factors = np.array([*np.ones(Mover.PARAMETERS), *np.zeros(others.size)])
+    first, scale = (-offsets, offsets), 0.6 * factors + 0.3 * offsets
+    same: dict[str, Any] = {"settings": settings, "first": first, "scale": scale, "weight": 1}
+    centres = {"pusher": -offsets, "carrier": offsets}
+    return [_family(kind, 0.6 * factors, centre=centre, **same) for kind, centre in centres.items()]
 
 
 def seeking_family(settings: dict[str, Any]) -> Family:
     """The family that plans in a view whose motion was identified from trajectories."""
     first = tuple(np.array(v, dtype=float) for v in ((0, 0, 0), (2, 0, -1), (0, 1, -1), (-2, 1, 0)))
-    return Family(
-        name="seeker",
-        kind="seeker",
-        settings=settings,
-        first=first,
-        centre=np.zeros(3),
-        spread=np.array([1.5, 0.7, 1.0]),
-        scale=np.array([1.0, 0.5, 0.7]),
-    )
+    scale = np.array([1.0, 0.5, 0.7])
+    return _family("seeker", [1.5, 0.7, 1.0], settings=settings, first=first, scale=scale, weight=1)
 
 
 def _constant(action_space: Schema, n_outputs: int) -> Family:
-    zero = np.zeros(n_outputs)
     axes = np.eye(n_outputs)
     if action_space["type"] == "Discrete":
         order = np.linspace(0, n_outputs - 1, min(n_outputs, MAX_CONSTANTS)).round().astype(int)
-        first = tuple(axes[i] for i in order)
-        return Family(
-            name="constant", kind="constant", first=first, centre=zero, spread=zero, scale=zero, weight=2
-        )
-    pairs = [sign * axis for axis in axes for sign in (1.0, -1.0)] if n_outputs <= MAX_CONSTANTS // 2 else []
-    return Family(
-        name="constant",
-        kind="constant",
-        first=(zero, *(0.5 * pair for pair in pairs)),
-        centre=zero,
-        spread=np.full(n_outputs, 0.5),
-        scale=np.full(n_outputs, 0.5),
-        weight=2,
-    )
+        return _family("constant", np.zeros(n_outputs), first=tuple(axes[order]))
+    pairs = [sign * axis for axis in axes for sign in (0.5, -0.5)] if n_outputs <= MAX_CONSTANTS // 2 else []
+    spread = np.full(n_outputs, 0.5)
+    return _family("constant", spread, first=(np.zeros(n_outputs), *pairs), scale=spread)
 
 
-def _linear(n_outputs: int, n_features: int) -> Family:
-    size = n_outputs * (n_features + 1)
-    spread = np.full((n_outputs, n_features + 1), 1.5 / np.sqrt(n_features))
-    spread[:, -1] = 0.2
-    return Family(
-        name="linear",
-        kind="linear",
-        centre=np.zeros(size),
-        spread=spread.reshape(-1),
-        scale=spread.reshape(-1),
-        weight=2,
-    )
-
-
-def _switchable(obs_space: Schema, n_features: int) -> list[int]:
-    """Features that may be switched on alone: for a Box the signed ones, last components (often velocities) first."""
+def _bang_bang(obs_space: Schema, action_space: Schema, n_outputs: int, n_features: int) -> Family:
+    """Linear controllers, first those that decide by a single feature: for a Box the signed ones, last components
+    (often velocities) first."""
     signed = np.ones(n_features, dtype=bool)
     if obs_space["type"] == "Box":
         low, high = bounds(obs_space)
         signed = (low < 0) & (high > 0)
-    return [int(i) for i in np.flatnonzero(signed)[::-1]] or list(range(n_features))
-
-
-def _bang_bang(n_outputs: int, switchable: list[int], n_features: int, *, chooses: bool) -> Family:
-    """Linear controllers, first those that decide by a single feature."""
+    switchable = [int(i) for i in np.flatnonzero(signed)[::-1]] or list(range(n_features))
+    # Choosers switch between the two ends, since neighbours in meaning are neighbours in number.
+    chooses = action_space["type"] in ("Discrete", "MultiDiscrete")
+    ends = np.linspace(-1, 1, n_outputs) if chooses else np.ones(n_outputs)
     first = []
     for feature in switchable[: 2 * MAX_CONSTANTS]:
         for sign in (1.0, -1.0):
             weights = np.zeros((n_outputs, n_features + 1))
-            # Choosers switch between the two ends, since neighbours in meaning are neighbours in number.
-            weights[:, feature] = sign * (np.linspace(-1, 1, n_outputs) if chooses else 1.0)
-            first.append(BANG_BANG_GAIN * weights.reshape(-1))
+            weights[:, feature] = sign * BANG_BANG_GAIN * ends
+            first.append(weights.reshape(-1))
     size = n_outputs * (n_features + 1)
-    sparse = np.full(size, BANG_BANG_GAIN / 10)
-    return Family(
-        name="bang-bang",
-        kind="linear",
-        first=tuple(first),
-        centre=np.zeros(size),
-        spread=np.full(size, BANG_BANG_GAIN / 3),
-        scale=sparse,
-    )
-
-
-def _oscillator(size: int, n_outputs: int) -> Family:
-    spread = np.concatenate(
-        [[0.7], np.full(n_outputs, 0.6), np.full(n_outputs, 0.7), np.full(n_outputs, 0.3)]
-    )
-    centre = np.zeros(size)
-    centre[1 : 1 + n_outputs] = 0.5
-    return Family(
-        name="oscillator", kind="oscillator", centre=centre, spread=spread, scale=0.5 * spread, weight=2
-    )
-
-
-def _explorer(n_outputs: int) -> Family:
-    def vector(logits: Vector, curiosity: float, persistence: float) -> Vector:
-        return np.concatenate([logits, [curiosity, persistence, 0.5]])
-
-    zero = np.zeros(n_outputs)
-    first = [vector(zero, 1.0, 0.0)]
-    first += [vector(2.0 * axis, 1.0, 0.0) for axis in np.eye(n_outputs)[: 2 * MAX_CONSTANTS]]
-    spread = np.concatenate([np.full(n_outputs, 1.5), [0.7, 0.7, 0.3]])
-    return Family(
-        name="explorer",
-        kind="explorer",
-        first=tuple(first),
-        centre=vector(zero, 1.0, 0.0),
-        spread=spread,
-        scale=spread / 2,
-        weight=2,
-    )
-
-
-def _saliency(n_outputs: int) -> Family:
-    centre = np.zeros((n_outputs, 4))
-    spread = np.tile([2.0, 0.5, 0.5, 0.3], (n_outputs, 1))
-    colours = np.concatenate([np.zeros(3), centre.reshape(-1)])
-    return Family(
-        name="saliency",
-        kind="saliency",
-        centre=colours,
-        spread=np.concatenate([np.ones(3), spread.reshape(-1)]),
-        scale=np.concatenate([np.full(3, 0.4), spread.reshape(-1) / 2]),
-        weight=4,
-    )
+    scale = np.full(size, BANG_BANG_GAIN / 10)
+    spread = np.full(size, BANG_BANG_GAIN / 3)
+    return _family("linear", spread, name="bang-bang", first=tuple(first), scale=scale, weight=1)

@@ -139,9 +139,9 @@ class Search:
             for family in list(sources):
                 # A small opening shows every family once before any twice.
                 share = family.weight if n > 2 * len(self._families) else 1
-                vectors = list(islice(self._sources[family.name], share))
-                drawn += [Candidate(family=family, vector=v) for v in vectors]
-                if len(vectors) < share:
+                found = self._drawn(family, share)
+                drawn += found
+                if len(found) < share:
                     sources.remove(family)
         return self._joined(drawn[:n])
 
@@ -149,11 +149,7 @@ class Search:
         """Survivors and their mutants, `n` together."""
         strength = FIRST_STRENGTH * STRENGTH_DECAY**self._round
         self._round += 1
-        fresh = [
-            Candidate(family=family, vector=vector)
-            for family in self._newcomers
-            for vector in islice(self._sources[family.name], max(2, n // 3))
-        ]
+        fresh = [one for family in self._newcomers for one in self._drawn(family, max(2, n // 3))]
         self._newcomers.clear()
         fresh = fresh[: n // 2]
         survivors = self._survivors(max(1, round((n - len(fresh)) * SURVIVING_SHARE)))
@@ -186,12 +182,11 @@ class Search:
     def ranking(self) -> list[Candidate]:
         """All evaluated candidates, best first."""
         worth = self.worth()
-        tried = [c for c in self.candidates if c.episodes]
-        return sorted(tried, key=lambda c: worth[id(c)], reverse=True)
+        return sorted(self._tried, key=lambda c: worth[id(c)], reverse=True)
 
     def worth(self) -> dict[int, float]:
         """By `id` of each evaluated candidate: its effect, shrunk towards its family's mean if it has few episodes."""
-        tried = [c for c in self.candidates if c.episodes]
+        tried = self._tried
         if not tried:
             return {}
         effects, ratio = self._effects(tried)
@@ -206,8 +201,8 @@ class Search:
     @property
     def repeats(self) -> int:
         """Number of cases that each candidate of the next round should play: more if one does not distinguish them."""
-        tried = [c for c in self.candidates if c.episodes]
-        if not tried or self.is_flat:
+        tried = self._tried
+        if not tried or np.ptp(self._returns) < 1e-9:
             return 1
         if self.is_sparse:
             return 2
@@ -228,46 +223,42 @@ class Search:
         return effects, min(noise**2 / max(float(np.var(better)), 1e-12), 2.0)
 
     @property
-    def is_flat(self) -> bool:
-        """True while all returns are equal."""
-        returns = [e.episode_return for c in self.candidates for e in c.episodes]
-        return not returns or max(returns) - min(returns) < 1e-9
+    def _tried(self) -> list[Candidate]:
+        return [c for c in self.candidates if c.episodes]
+
+    @property
+    def _returns(self) -> list[float]:
+        return [e.episode_return for c in self.candidates for e in c.episodes]
 
     @property
     def is_sparse(self) -> bool:
         """True while most returns are equal."""
-        returns = np.array([e.episode_return for c in self.candidates for e in c.episodes])
-        if not returns.size:
-            return False
-        return bool(np.isclose(returns, np.median(returns), rtol=0.0, atol=1e-9).mean() > SPARSE_SHARE)
+        returns = self._returns
+        equal = np.isclose(returns, np.median(returns), rtol=0.0, atol=1e-9) if returns else np.zeros(1)
+        return bool(equal.mean() > SPARSE_SHARE)
 
     def _scores(self, tried: list[Candidate]) -> list[list[tuple[int, float]]]:
         """Per candidate, (case, score) of its episodes: the returns, with a bonus for novelty while they are sparse."""
         bonus = 0.0
         if self.is_sparse:
-            returns = [e.episode_return for c in tried for e in c.episodes]
             most = max(e.novelty for c in tried for e in c.episodes) or 1.0
-            bonus = NOVELTY_BONUS * (max(returns) - min(returns) or 1.0) / most
+            bonus = NOVELTY_BONUS * (float(np.ptp(self._returns)) or 1.0) / most
         return [[(e.case, e.episode_return + bonus * e.novelty) for e in c.episodes] for c in tried]
 
     def _hedge_bar(self, worth: dict[int, float]) -> float:
         """The least worth of a hedge: near the leader's if returns are reliable, down to the median if they are not."""
         values = np.array(list(worth.values()) or [0.0])
-        tried = [c for c in self.candidates if c.episodes]
-        doubt = min(1.0, self._effects(tried)[1]) if tried else 1.0
+        doubt = min(1.0, self._effects(self._tried)[1]) if self._tried else 1.0
         best = float(values.max())
         return best - (0.25 + 0.75 * doubt) * (best - float(np.median(values)))
 
     def _survivors(self, n: int) -> list[Candidate]:
         ranked = self.ranking()
         limit = max(1, int(np.ceil(n * MAX_PER_FAMILY)))
-        held: dict[str, int] = {}
         kept: list[Candidate] = []
         for candidate in ranked:
-            name = candidate.family.name
-            if len(kept) < n and held.get(name, 0) < limit:
+            if len(kept) < n and [c.family for c in kept].count(candidate.family) < limit:
                 kept.append(candidate)
-                held[name] = held.get(name, 0) + 1
         return kept + [c for c in ranked if c not in kept][: n - len(kept)]
 
     def _mutant(self, parents: list[Candidate], strength: float) -> Candidate:
@@ -290,9 +281,8 @@ class Search:
     def _draw(self, parents: list[Candidate]) -> Candidate:
         """A new candidate of any family that has candidates left; else the best parent again."""
         for index in self._rng.permutation(len(self._families)):
-            family = self._families[int(index)]
-            for vector in islice(self._sources[family.name], 1):
-                return Candidate(family=family, vector=vector)
+            for one in self._drawn(self._families[int(index)], 1):
+                return one
         return Candidate(family=parents[0].family, vector=parents[0].vector)
 
     def _mean_of_best(self) -> Candidate | None:
@@ -303,6 +293,10 @@ class Search:
             return None
         vector = np.mean([c.vector for c in elite], axis=0)
         return self._joined([Candidate(family=elite[0].family, vector=vector)])[0]
+
+    def _drawn(self, family: Family, n: int) -> list[Candidate]:
+        """The next `n` candidates of a family, or as many as there are."""
+        return [Candidate(family=family, vector=v) for v in islice(self._sources[family.name], n)]
 
     def _joined(self, candidates: list[Candidate]) -> list[Candidate]:
         self.candidates += candidates
@@ -336,13 +330,10 @@ def _fit(scores: list[list[tuple[int, float]]]) -> tuple[Vector, float]:
     values = np.array([value for played in scores for _, value in played])
     n_candidates, n_cases = len(scores), int(cases.max()) + 1
     effect, case_effect = np.zeros(n_candidates), np.zeros(n_cases)
+    per_candidate, per_case = np.bincount(owner), np.bincount(cases)
     for _ in range(30):
-        effect = np.bincount(owner, values - case_effect[cases], n_candidates) / np.bincount(
-            owner, minlength=n_candidates
-        )
-        case_effect = np.bincount(cases, values - effect[owner], n_cases) / np.bincount(
-            cases, minlength=n_cases
-        )
+        effect = np.bincount(owner, values - case_effect[cases]) / per_candidate
+        case_effect = np.bincount(cases, values - effect[owner]) / per_case
         case_effect -= case_effect.mean()
     residual = values - effect[owner] - case_effect[cases]
     freedom = len(values) - n_candidates - n_cases + 1

@@ -10,7 +10,8 @@ view.
 
 from __future__ import annotations
 
-from typing import Any
+from collections import Counter
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,13 +33,15 @@ RARE_FRAMES = 0.3
 Symbols = NDArray[np.int32]
 
 
-class ViewLog:
-    """One episode as arrays: `frames` (steps, cells) of symbols, `actions` (steps,) from 0, `rewards` (steps,)."""
+class ViewLog(NamedTuple):
+    """One episode as arrays."""
 
-    def __init__(self, steps: list[Step], key: str | None, first_action: int) -> None:
-        self.frames: Symbols = np.array([read_symbols(step.obs, key) for step in steps])
-        self.actions = np.array([int(step.action) - first_action for step in steps])
-        self.rewards = np.array([step.reward for step in steps])
+    frames: Symbols
+    """Shape (steps, cells)."""
+    actions: NDArray[np.int64]
+    """Shape (steps,), from 0."""
+    rewards: NDArray[np.float64]
+    """Shape (steps,)."""
 
 
 def view_logs(obs_space: Schema, action_space: Schema, episodes: list[list[Step]]) -> list[ViewLog]:
@@ -47,7 +50,15 @@ def view_logs(obs_space: Schema, action_space: Schema, episodes: list[list[Step]
     if not exists or action_space["type"] != "Discrete":
         return []
     first = int(action_space.get("start", 0))
-    return [ViewLog(steps, key, first) for steps in episodes if len(steps) > 1 and steps[0].obs is not None]
+    return [
+        ViewLog(
+            np.array([read_symbols(step.obs, key) for step in steps]),
+            np.array([int(step.action) - first for step in steps]),
+            np.array([step.reward for step in steps]),
+        )
+        for steps in episodes
+        if len(steps) > 1 and steps[0].obs is not None
+    ]
 
 
 def find_views(obs_space: Schema, action_space: Schema, runs: list[ViewLog]) -> dict[str, Any] | None:
@@ -165,10 +176,7 @@ def _barriers(
 
 def _rare(frames: Symbols) -> set[int]:
     """Symbols that few frames contain."""
-    shown: dict[int, int] = {}
-    for frame in frames:
-        for symbol in set(frame.tolist()):
-            shown[symbol] = shown.get(symbol, 0) + 1
+    shown = Counter(symbol for frame in frames for symbol in set(frame.tolist()))
     return {symbol for symbol, count in shown.items() if count < RARE_FRAMES * len(frames)}
 
 
@@ -177,12 +185,10 @@ def _prizes(runs: list[ViewLog], touch: int) -> list[list[int]]:
     rewards = np.concatenate([run.rewards for run in runs])
     if np.mean(rewards > 0) > 0.05:
         return []
-    pairs: dict[tuple[int, int], int] = {}
-    for run in runs:
-        for t in np.flatnonzero(run.rewards > 0):
-            pair = int(run.frames[t, touch]), int(run.actions[t])
-            pairs[pair] = pairs.get(pair, 0) + 1
-    best: dict[int, tuple[int, int]] = {}
-    for (symbol, action), count in pairs.items():
-        best[symbol] = max(best.get(symbol, (0, 0)), (count, action))
-    return [[symbol, action] for symbol, (_, action) in sorted(best.items())]
+    pairs = Counter(
+        (int(run.frames[t, touch]), int(run.actions[t]))
+        for run in runs
+        for t in np.flatnonzero(run.rewards > 0)
+    )
+    usual = dict(pair for _, pair in sorted((count, pair) for pair, count in pairs.items()))
+    return [list(pair) for pair in sorted(usual.items())]

@@ -29,7 +29,7 @@ def play_point(policy: Any, case: int) -> tuple[float, list[dict[str, Any]]]:
         action = np.asarray(policy.act(obs), dtype=float)
         position = np.clip(position + 0.2 * action, -1, 1)
         total -= float(np.linalg.norm(position))
-        rows.append({"obs": obs.tolist(), "action": action.tolist(), "reward": total, "terminated": False})
+        rows.append({"obs": obs.tolist(), "action": action.tolist(), "reward": total})
     return total, rows
 
 
@@ -161,7 +161,7 @@ def play_arm(policy: Any, case: int) -> tuple[float, list[dict[str, Any]]]:
         reward = -float(np.linalg.norm(thing - goal) > 0.05)
         total += reward
         plain = {key: value.tolist() for key, value in obs.items()}
-        rows.append({"obs": plain, "action": action.tolist(), "reward": reward, "terminated": False})
+        rows.append({"obs": plain, "action": action.tolist(), "reward": reward})
     return total, rows
 
 

@@ -10,7 +10,7 @@ import pytest
 from stages.agent_fakes import FakeGateway, serving
 
 from evopolicy_gateway.agents.client import Client, ProtocolError, Refusal, Verdict
-from evopolicy_gateway.agents.evolve.staging import stage_code
+from evopolicy_gateway.agents.evolve.agent import stage_code
 
 BOX = {"type": "Box", "shape": [1], "dtype": "float32", "low": [-1.0], "high": [1.0]}
 
@@ -18,7 +18,9 @@ BOX = {"type": "Box", "shape": [1], "dtype": "float32", "low": [-1.0], "high": [
 def a_gateway(workspace: Path, **options: Any) -> FakeGateway:
     (workspace / "system").mkdir()
     stage_code(workspace / "system")
-    (workspace / "system" / "candidates.json").write_text('{"candidates": [{}], "schedule": [0]}')
+    (workspace / "system" / "candidates.json").write_text(
+        '{"candidates": [{"kind": "constant", "vector": [0.0]}], "schedule": [0]}'
+    )
     return FakeGateway(
         workspace=workspace,
         obs_space=BOX,
@@ -29,39 +31,15 @@ def a_gateway(workspace: Path, **options: Any) -> FakeGateway:
     )
 
 
-class FakeTime:
-    """A clock that only sleeping moves."""
-
-    def __init__(self) -> None:
-        self.now = 0.0
-
-    def sleep(self, seconds: float) -> None:
-        self.now += seconds
-
-    def clock(self) -> float:
-        return self.now
-
-
 def a_client(url: str, **options: Any) -> Client:
-    time = FakeTime()
-    return Client(
-        info_url=f"{url}/info",
-        task_url=f"{url}/task",
-        submit_url=f"{url}/submit",
-        sleep=time.sleep,
-        clock=time.clock,
-        **options,
-    )
-
-
-def zero_policy(workspace: Path) -> None:
-    text = '{"candidates": [{"kind": "constant", "vector": [0.0]}], "schedule": [0]}'
-    (workspace / "system" / "candidates.json").write_text(text)
+    """A client with a clock that only sleeping moves."""
+    slept = [0.0]
+    urls = {f"{name}_url": f"{url}/{name}" for name in ("info", "task", "submit")}
+    return Client(**urls, sleep=slept.append, clock=lambda: sum(slept), **options)
 
 
 def test_submit_is_asked_for_until_its_summary_is_there(tmp_path: Path) -> None:
     with serving(a_gateway(tmp_path)) as gateway:
-        zero_policy(tmp_path)
         verdict = a_client(gateway.url).submit([3, 4])
         assert isinstance(verdict, Verdict)
         assert verdict.name == "submit_000"
@@ -69,27 +47,21 @@ def test_submit_is_asked_for_until_its_summary_is_there(tmp_path: Path) -> None:
         assert gateway.n_asked == 2
 
 
-def test_another_submit_in_flight_is_waited_for(tmp_path: Path) -> None:
-    busy = (409, {"error": {"message": "submit_000 runs"}})
-    with serving(a_gateway(tmp_path, script=[busy, busy])) as gateway:
-        zero_policy(tmp_path)
+@pytest.mark.parametrize("first", [(409, {"error": {"message": "submit_000 runs"}}), (503, {})])
+def test_a_submit_is_sent_again_until_it_is_taken_once(
+    first: tuple[int, dict[str, Any]], tmp_path: Path
+) -> None:
+    with serving(a_gateway(tmp_path, script=[first, first])) as gateway:
         assert isinstance(a_client(gateway.url).submit([0]), Verdict)
+        assert len(gateway.submits) == 1
 
 
 @pytest.mark.parametrize("status", ["run_closed", "cancelled"])
 def test_a_run_that_takes_no_more_ends_the_asking(tmp_path: Path, status: str) -> None:
     over = (409, {"status": status, "error": {"message": "no more submits are taken"}})
     with serving(a_gateway(tmp_path, script=[over])) as gateway:
-        zero_policy(tmp_path)
         refusal = a_client(gateway.url).submit([0])
         assert refusal == Refusal(status=status, message="no more submits are taken")
-
-
-def test_a_retry_after_a_server_error_costs_no_second_submit(tmp_path: Path) -> None:
-    with serving(a_gateway(tmp_path, script=[(503, {})])) as gateway:
-        zero_policy(tmp_path)
-        assert isinstance(a_client(gateway.url).submit([0]), Verdict)
-        assert len(gateway.submits) == 1
 
 
 def test_refused_submit_tells_status_and_message(tmp_path: Path) -> None:

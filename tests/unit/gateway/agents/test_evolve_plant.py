@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import pytest
 
 from evopolicy_gateway.agents.evolve.feedback import Step
 from evopolicy_gateway.agents.evolve.plant import find_plant
@@ -41,39 +42,36 @@ def episodes(*, moved: bool = True, n_steps: int = 40) -> list[list[Step]]:
             thing = thing + np.array([*rng.normal(0, 0.02, 2), 0.0]) * moved
             whole = {"observation": obs, "achieved_goal": thing, "desired_goal": np.array([1.4, 0.6, 0.6])}
             plain = {key: value.tolist() for key, value in whole.items()}
-            steps.append(Step(obs=plain, action=action.tolist(), reward=-1.0, terminated=False))
+            steps.append(Step(obs=plain, action=action.tolist(), reward=-1.0))
             hand = hand + 0.03 * action[DRIVERS]
             action = np.clip(0.8 * action + 0.4 * rng.normal(size=4), -1, 1)
         made.append(steps)
     return made
 
 
-def test_effector_and_the_outputs_that_move_it_are_found() -> None:
-    plant = find_plant(goal_space(3), box(4), episodes())
+@pytest.mark.parametrize("moved", [True, False])
+def test_effector_and_the_outputs_that_move_it_are_found(moved: bool) -> None:
+    plant = find_plant(goal_space(3), box(4), episodes(moved=moved))
     assert plant is not None
-    assert plant["effector"] == HAND
-    assert plant["outputs"] == DRIVERS
+    assert (plant["effector"], plant["outputs"], plant["lift_axis"]) == (HAND, DRIVERS, 2)
     np.testing.assert_allclose(plant["slopes"], [0.03] * 3, rtol=0.1)
-    assert plant["lift_axis"] == 2
 
 
-def test_last_axis_is_up_when_nothing_was_moved() -> None:
-    plant = find_plant(goal_space(3), box(4), episodes(moved=False))
-    assert plant is not None
-    assert plant["lift_axis"] == 2
+STILL = [[step._replace(action=[0.0] * 4) for step in steps] for steps in episodes()]
 
 
-def test_goals_that_are_not_positions_in_space_give_no_plant() -> None:
-    assert find_plant(goal_space(6), box(4), episodes()) is None
-    assert find_plant(box(3), box(4), episodes()) is None
-    assert find_plant(goal_space(3), {"type": "Discrete", "n": 4}, episodes()) is None
-
-
-def test_too_few_steps_give_no_plant() -> None:
-    assert find_plant(goal_space(3), box(4), episodes(n_steps=5)) is None
-    assert find_plant(goal_space(3), box(4), []) is None
-
-
-def test_actions_without_effect_give_no_plant() -> None:
-    still = [[Step(obs=s.obs, action=[0.0] * 4, reward=0.0, terminated=False) for s in e] for e in episodes()]
-    assert find_plant(goal_space(3), box(4), still) is None
+@pytest.mark.parametrize(
+    ("obs_space", "action_space", "played"),
+    [
+        (goal_space(6), box(4), episodes()),  # no positions in space
+        (box(3), box(4), episodes()),
+        (goal_space(3), {"type": "Discrete", "n": 4}, episodes()),
+        (goal_space(3), box(4), episodes(n_steps=5)),
+        (goal_space(3), box(4), []),
+        (goal_space(3), box(4), STILL),
+    ],
+)
+def test_other_spaces_and_too_little_play_give_no_plant(
+    obs_space: Any, action_space: Any, played: Any
+) -> None:
+    assert find_plant(obs_space, action_space, played) is None

@@ -12,83 +12,50 @@ import numpy as np
 import pytest
 from stages.agent_fakes import load_policy
 
-from evopolicy_gateway.agents.evolve.evolved.controllers import build, parameter_count
+from evopolicy_gateway.agents.evolve.agent import stage_candidates, stage_code
+from evopolicy_gateway.agents.evolve.evolved.controllers import build
 from evopolicy_gateway.agents.evolve.evolved.spaces import ActionHead, Features
 from evopolicy_gateway.agents.evolve.families import families_for
 from evopolicy_gateway.agents.evolve.search import Candidate, Search
-from evopolicy_gateway.agents.evolve.staging import stage_candidates, stage_code
+from evopolicy_worker.environments import compile_actions
 
-BOX = {"type": "Box", "shape": [2], "dtype": "float32", "low": [-2.0, 0.0], "high": [2.0, "inf"]}
-WIDE = {"type": "Box", "shape": [40], "dtype": "float64", "low": "-inf", "high": "inf"}
-IMAGE = {
-    "type": "Image",
-    "shape": [20, 24, 3],
-    "dtype": "uint8",
-    "layout": "height_width_channels",
-    "value_range": [0, 255],
-    "storage": "external",
-}
-GRID = {"type": "Box", "shape": [7, 7, 3], "dtype": "uint8", "low": 0, "high": 255}
+
+def box(shape: list[int], low: Any = "-inf", high: Any = "inf", dtype: str = "float64") -> dict[str, Any]:
+    return {"type": "Box", "shape": shape, "dtype": dtype, "low": low, "high": high}
+
+
+UNIT = box([1], [-1.0], [1.0], "float32")
+BOX = box([2], [-2.0, 0.0], [2.0, "inf"], "float32")
+WIDE = box([40])
+GRID = box([7, 7, 3], 0, 255, "uint8")
+IMAGE = box([20, 24, 3], 0, 255, "uint8") | {"layout": "height_width_channels", "value_range": [0, 255]}
 TEXT = {"type": "Text", "min_length": 2, "max_length": 9}
 MULTI = {"type": "MultiDiscrete", "nvec": [2, 3]}
+DISCRETE = {"type": "Discrete", "n": 5, "start": 2}
 GOAL = {
     "type": "Dict",
-    "spaces": {
-        "achieved_goal": {
-            "type": "Box",
-            "shape": [3],
-            "dtype": "float64",
-            "low": ["-inf"] * 3,
-            "high": ["inf"] * 3,
-        },
-        "desired_goal": {
-            "type": "Box",
-            "shape": [3],
-            "dtype": "float64",
-            "low": ["-inf"] * 3,
-            "high": ["inf"] * 3,
-        },
-        "observation": {
-            "type": "Box",
-            "shape": [5],
-            "dtype": "float64",
-            "low": ["-inf"] * 5,
-            "high": ["inf"] * 5,
-        },
-    },
+    "spaces": {"achieved_goal": box([3]), "desired_goal": box([3]), "observation": box([5])},
 }
+BOTH = {"type": "Tuple", "spaces": [{"type": "MultiBinary", "n": 3}, MULTI]}
 MIXED = {
     "type": "Dict",
     "spaces": {
         "direction": {"type": "Discrete", "n": 4, "start": 1},
         "image": GRID,
         "mission": TEXT,
-        "both": {"type": "Tuple", "spaces": [{"type": "MultiBinary", "n": 3}, MULTI]},
+        "both": BOTH,
     },
 }
-SPACES = {"box": BOX, "wide": WIDE, "image": IMAGE, "grid": GRID, "text": TEXT, "multi": MULTI, "goal": GOAL}
-SPACES |= {"mixed": MIXED, "discrete": {"type": "Discrete", "n": 5, "start": 2}}
-SPACES |= {"binary": {"type": "MultiBinary", "n": [2, 2]}, "large": {"type": "Discrete", "n": 500}}
+ACTIONS = {"box": BOX, "discrete": DISCRETE, "multi": MULTI, "binary": {"type": "MultiBinary", "n": [2, 2]}}
+ACTIONS |= {"text": TEXT, "both": {"type": "Tuple", "spaces": [BOX, DISCRETE]}}
+ACTIONS |= {"dict": {"type": "Dict", "spaces": {"a": MULTI, "b": BOX}}}
+SPACES = ACTIONS | {"wide": WIDE, "image": IMAGE, "grid": GRID, "goal": GOAL, "mixed": MIXED}
+SPACES |= {"large": {"type": "Discrete", "n": 500}}
 
 
-def sample(space: dict[str, Any], rng: np.random.Generator) -> Any:
-    kind = space["type"]
-    if kind in ("Box", "Image"):
-        dtype = np.dtype(space["dtype"])
-        if dtype.kind == "u":
-            return rng.integers(0, 256, space["shape"]).astype(dtype)
-        return rng.normal(size=space["shape"]).astype(dtype)
-    if kind == "Discrete":
-        return int(rng.integers(space["n"])) + space.get("start", 0)
-    if kind == "MultiDiscrete":
-        return rng.integers(0, space["nvec"])
-    if kind == "MultiBinary":
-        return rng.integers(0, 2, space["n"]).astype(np.int8)
-    if kind == "Text":
-        return "go"
-    if kind == "Dict":
-        return {key: sample(part, rng) for key, part in space["spaces"].items()}
-    return tuple(sample(part, rng) for part in space["spaces"])
+def seen(space: dict[str, Any]) -> dict[str, Any]:
+    """The space as an observation's, in which pictures have a type of their own."""
+    return space | {"type": "Image"} if "layout" in space else space
 
 
 def as_lists(obs: Any) -> Any:
@@ -99,52 +66,31 @@ def as_lists(obs: Any) -> Any:
     return obs.tolist() if isinstance(obs, np.ndarray) else obs
 
 
-def contains(space: dict[str, Any], action: Any) -> bool:
-    kind = space["type"]
-    if kind == "Box":
-        low = np.array([float(v) for v in space["low"]])
-        high = np.array([float(v) for v in space["high"]])
-        right_form = action.dtype == space["dtype"] and list(action.shape) == space["shape"]
-        return bool(right_form and (action >= low).all() and (action <= high).all())
-    if kind == "Discrete":
-        return isinstance(action, int) and 0 <= action - space.get("start", 0) < space["n"]
-    if kind == "MultiDiscrete":
-        return bool((np.array(action) >= 0).all() and (np.array(action) < space["nvec"]).all())
-    if kind == "MultiBinary":
-        return bool(np.isin(action, (0, 1)).all()) and list(action.shape) == list(np.atleast_1d(space["n"]))
-    if kind == "Text":
-        return space["min_length"] <= len(action) <= space["max_length"]
-    if kind == "Dict":
-        return all(contains(part, action[key]) for key, part in space["spaces"].items())
-    return all(contains(part, value) for part, value in zip(space["spaces"], action, strict=True))
-
-
 @pytest.mark.parametrize("obs_space", SPACES.values(), ids=SPACES.keys())
-@pytest.mark.parametrize("action_name", ["box", "discrete", "multi", "binary", "text", "both", "dict"])
-def test_every_family_acts_within_the_action_space(obs_space: dict[str, Any], action_name: str) -> None:
-    more = {
-        "both": {"type": "Tuple", "spaces": [BOX, SPACES["discrete"]]},
-        "dict": {"type": "Dict", "spaces": {"a": MULTI, "b": BOX}},
-    }
-    action_space = (SPACES | more)[action_name]
+@pytest.mark.parametrize("action_space", ACTIONS.values(), ids=ACTIONS.keys())
+def test_every_family_acts_within_the_action_space(
+    obs_space: dict[str, Any], action_space: dict[str, Any]
+) -> None:
     rng = np.random.default_rng(0)
-    candidates = Search(families_for(obs_space, action_space), rng).opening(12)
+    codec, observed = compile_actions(action_space), compile_actions(obs_space)
+    candidates = Search(families_for(seen(obs_space), action_space), rng).opening(12)
     assert candidates
     for candidate in candidates:
-        assert candidate.vector.size == parameter_count(candidate.family.kind, obs_space, action_space)
-        controller = build(candidate.family.kind, candidate.vector, {}, obs_space, action_space, rng)
+        kind = candidate.family.kind
+        controller = build(kind, candidate.vector, {}, seen(obs_space), action_space, rng)
         for _ in range(3):
-            obs = sample(obs_space, rng)
-            assert contains(action_space, controller.act(obs))
-            assert contains(action_space, controller.act(as_lists(obs)))
+            obs = observed.sample(rng)
+            for given in (obs, as_lists(obs)):
+                action, repaired = codec.repair(controller.act(given))
+                assert not repaired, action
 
 
 @pytest.mark.parametrize("space", SPACES.values(), ids=SPACES.keys())
 def test_features_are_finite_of_fixed_size_and_the_same_for_lists(space: dict[str, Any]) -> None:
-    features = Features(space)
+    features, observed = Features(seen(space)), compile_actions(space)
     rng = np.random.default_rng(1)
     for _ in range(5):
-        obs = sample(space, rng)
+        obs = observed.sample(rng)
         vector = features.vector(obs)
         assert vector.shape == (features.size,)
         assert np.isfinite(vector).all()
@@ -163,16 +109,9 @@ def test_nan_and_infinity_do_not_reach_the_outputs() -> None:
 
 
 def test_zero_outputs_are_the_action_nearest_to_zero() -> None:
-    space = {
-        "type": "Box",
-        "shape": [3],
-        "dtype": "float32",
-        "low": [-1.0, 0.5, -4.0],
-        "high": [1.0, 2.0, -1.0],
-    }
-    np.testing.assert_allclose(ActionHead(space).action(np.zeros(3)), [0.0, 0.5, -1.0])
-    np.testing.assert_allclose(ActionHead(space).action(np.ones(3)), [1.0, 2.0, -1.0])
-    np.testing.assert_allclose(ActionHead(space).action(-np.ones(3)), [-1.0, 0.5, -4.0])
+    head = ActionHead(box([3], [-1.0, 0.5, -4.0], [1.0, 2.0, -1.0], "float32"))
+    for output, expected in ((0.0, [0.0, 0.5, -1.0]), (1.0, [1.0, 2.0, -1.0]), (-1.0, [-1.0, 0.5, -4.0])):
+        np.testing.assert_allclose(head.action(np.full(3, output)), expected)
 
 
 def test_explorer_turns_to_what_it_has_not_tried_where_nothing_changes() -> None:
@@ -183,9 +122,8 @@ def test_explorer_turns_to_what_it_has_not_tried_where_nothing_changes() -> None
 
 
 def test_saliency_steers_towards_the_side_where_its_colour_is() -> None:
-    space = {"type": "Box", "shape": [1], "dtype": "float32", "low": [-1.0], "high": [1.0]}
     vector = np.array([0.0, 1.0, 0.0, 5.0, 0.0, 0.0, 0.0])
-    controller = build("saliency", vector, {}, IMAGE, space, np.random.default_rng(0))
+    controller = build("saliency", vector, {}, seen(IMAGE), UNIT, np.random.default_rng(0))
     image = np.zeros(IMAGE["shape"], dtype=np.uint8)
     image[:, 18:, 1] = 255
     assert controller.act(image)[0] > 0.1
@@ -215,7 +153,7 @@ def test_episode_k_plays_the_candidate_that_the_schedule_names(tmp_path: Path) -
 
 def test_staged_policy_runs_without_this_package(tmp_path: Path) -> None:
     system = tmp_path / "system"
-    search = Search(families_for(MIXED, SPACES["discrete"]), np.random.default_rng(0))
+    search = Search(families_for(MIXED, DISCRETE), np.random.default_rng(0))
     stage(system, search.opening(8), list(range(8)))
     code = f"""
 import sys
@@ -235,17 +173,13 @@ for k in range(8):
 extra = {{m.split(".")[0] for m in sys.modules}} - set(sys.stdlib_module_names)
 print(sorted(m for m in extra - {{"cython_runtime"}} if not m.startswith("_")))
 """
-    spaces = json.dumps([MIXED, SPACES["discrete"]])
-    done = subprocess.run(
-        [sys.executable, "-S", "-c", _with_numpy(code), spaces], capture_output=True, text=True, check=False
-    )
+    spaces = json.dumps([MIXED, DISCRETE])
+    # Without site packages, so without an editable install, but with numpy.
+    code = f"import sys; sys.path.append({str(Path(np.__file__).parent.parent)!r})\n{code}"
+    command = [sys.executable, "-S", "-c", code, spaces]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert done.stdout.strip() == "['evolved', 'numpy', 'policy']"
-
-
-def _with_numpy(code: str) -> str:
-    """`code` in a bare interpreter (no site packages, so no editable install) that can import numpy."""
-    return f"import sys; sys.path.append({str(Path(np.__file__).parent.parent)!r})\n{code}"
 
 
 def test_staging_replaces_the_given_policy_and_stays_within_system(tmp_path: Path) -> None:

@@ -6,7 +6,6 @@ import os
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -15,6 +14,7 @@ from evopolicy_gateway.agents.client import ProtocolError, Refusal, Verdict
 from evopolicy_gateway.agents.replay import play, policies_in, shares, stage
 from evopolicy_gateway.agents.uniform import POLICY
 from evopolicy_gateway.agents.uniform import play as play_uniform
+from evopolicy_worker.environments import compile_actions
 
 
 class FakeClient:
@@ -78,20 +78,20 @@ def test_staging_replaces_everything_and_keeps_links_for_the_service_to_judge(tm
     assert os.readlink(system / "link") == "/etc"
 
 
-def test_a_checkpoint_is_replayed_without_what_the_run_has_put_beside_it(tmp_path: Path) -> None:
-    checkpoint, system = tmp_path / "submit_000", tmp_path / "system"
-    (checkpoint / "deep").mkdir(parents=True)
-    for name in ("policy.py", "_meta.json", "metrics.json", "deep/metrics.json"):
-        (checkpoint / name).write_text(name)
-    (tmp_path / "plain").mkdir()
-    for name in ("policy.py", "metrics.json"):
-        (tmp_path / "plain" / name).write_text(name)
-    for source, kept in (
-        (checkpoint, {"policy.py", "deep/metrics.json"}),
-        (tmp_path / "plain", {"policy.py", "metrics.json"}),
-    ):
-        stage(source, system)
-        assert {path.relative_to(system).as_posix() for path in system.rglob("*") if path.is_file()} == kept
+@pytest.mark.parametrize(
+    ("beside", "left_out"), [(("_meta.json",), {"_meta.json", "metrics.json"}), ((), set())]
+)
+def test_a_checkpoint_is_replayed_without_what_the_run_has_put_beside_it(
+    beside: tuple[str, ...], left_out: set[str], tmp_path: Path
+) -> None:
+    given, system = tmp_path / "submit_000", tmp_path / "system"
+    (given / "deep").mkdir(parents=True)
+    names = {"policy.py", "metrics.json", "deep/metrics.json", *beside}
+    for name in names:
+        (given / name).write_text(name)
+    stage(given, system)
+    kept = {path.relative_to(system).as_posix() for path in system.rglob("*") if path.is_file()}
+    assert kept == names - left_out
 
 
 def test_replay_copies_no_set_id_bits_which_the_jail_refuses(tmp_path: Path) -> None:
@@ -133,27 +133,6 @@ SPACES: list[dict[str, Any]] = [
 ]
 
 
-def inside(space: dict[str, Any], action: Any) -> bool:
-    kind = space["type"]
-    if kind == "Discrete":
-        return bool(space.get("start", 0) <= action < space.get("start", 0) + space["n"])
-    if kind == "Box":
-        low = np.array(space.get("low", space.get("min")), dtype=float)
-        high = np.array(space.get("high", space.get("max")), dtype=float)
-        array = np.array(action)
-        return array.shape == tuple(space["shape"]) and bool(np.all(low <= array) and np.all(array <= high))
-    if kind == "MultiDiscrete":
-        start, nvec = np.array(space.get("start", 0)), np.array(space["nvec"])
-        return bool(np.all(start <= action) and np.all(np.array(action) < start + nvec))
-    if kind == "MultiBinary":
-        return set(np.ravel(action)) <= {0, 1}
-    if kind == "Text":
-        return bool(space["min_length"] <= len(action) <= space["max_length"])
-    if kind == "Tuple":
-        return all(inside(part, item) for part, item in zip(space["spaces"], action, strict=True))
-    return all(inside(part, action[key]) for key, part in space["spaces"].items())
-
-
 @pytest.mark.parametrize("space", SPACES)
 def test_the_uniform_policy_acts_inside_every_space_and_not_always_alike(space: dict[str, Any]) -> None:
     scope: dict[str, Any] = {}
@@ -161,7 +140,8 @@ def test_the_uniform_policy_acts_inside_every_space_and_not_always_alike(space: 
     player = scope["Policy"]({}, space, {})
     player.reset(0)
     actions = [player.act(None) for _ in range(60)]
-    assert all(inside(space, action) for action in actions)
+    codec = compile_actions(space)
+    assert not any(codec.repair(action)[1] for action in actions)
     assert len({repr(action) for action in actions}) > 1
 
 

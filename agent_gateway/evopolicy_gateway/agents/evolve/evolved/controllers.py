@@ -1,7 +1,6 @@
 """Parametrised controllers: each maps a flat vector of numbers to behaviour.
 
-A controller is built from a candidate: its `kind`, its `vector`, and `settings` identified from feedback. Both the
-search and the policy get the length of a kind's vector from `parameter_count`.
+A controller is built from a candidate: its `kind`, its `vector`, and `settings` identified from feedback.
 """
 
 from __future__ import annotations
@@ -12,7 +11,7 @@ import numpy as np
 
 from .grids import GridSeeker
 from .pushing import Carrier, Pusher
-from .spaces import ActionHead, Features, Schema, Vector, as_image
+from .spaces import ActionHead, Features, Given, Schema, Vector, as_image
 
 OSCILLATOR_PERIOD_STEPS = 25.0
 """Period of an oscillator whose tempo is 0; each unit of tempo halves it."""
@@ -20,27 +19,11 @@ SALIENCY_FEATURES = 4
 """Left-right and up-down balance and mean of the salient colour, and a constant 1."""
 
 
-def parameter_count(kind: str, obs_space: Schema, action_space: Schema) -> int:
-    """Length of the vector of `kind` for these spaces. Raises KeyError for an unknown kind."""
-    outputs = ActionHead(action_space).size
-    features = Features(obs_space).size
-    return {
-        "constant": outputs,
-        "linear": outputs * (features + 1),
-        "oscillator": 1 + 3 * outputs,
-        "explorer": outputs + 3,
-        "saliency": 3 + SALIENCY_FEATURES * outputs,
-        "pusher": Pusher.PARAMETERS + outputs,
-        "carrier": Carrier.PARAMETERS + outputs,
-        "seeker": GridSeeker.PARAMETERS,
-    }[kind]
-
-
 class Constant:
     """The same outputs at every step."""
 
-    def __init__(self, head: ActionHead, vector: Vector) -> None:
-        self._action = head.action(vector)
+    def __init__(self, given: Given, vector: Vector) -> None:
+        self._action = given.head.action(vector)
 
     def act(self, obs: Any) -> Any:
         return self._action
@@ -49,9 +32,9 @@ class Constant:
 class Linear:
     """Outputs = tanh(W · features + b); a large W makes it bang-bang."""
 
-    def __init__(self, head: ActionHead, features: Features, vector: Vector) -> None:
-        self._head, self._features = head, features
-        weights = vector.reshape(head.size, features.size + 1)
+    def __init__(self, given: Given, vector: Vector) -> None:
+        self._head, self._features = given.head, Features(given.obs_space)
+        weights = vector.reshape(self._head.size, self._features.size + 1)
         self._weights, self._bias = weights[:, :-1], weights[:, -1]
 
     def act(self, obs: Any) -> Any:
@@ -61,10 +44,10 @@ class Linear:
 class Oscillator:
     """Open loop: every output is a sine of one common period, with its own amplitude, phase and offset."""
 
-    def __init__(self, head: ActionHead, vector: Vector) -> None:
-        self._head = head
+    def __init__(self, given: Given, vector: Vector) -> None:
+        self._head = given.head
         self._radians_per_step = 2 * np.pi / OSCILLATOR_PERIOD_STEPS * 2.0 ** np.clip(vector[0], -3, 3)
-        self._amplitude, self._phase, self._offset = vector[1:].reshape(3, head.size)
+        self._amplitude, self._phase, self._offset = vector[1:].reshape(3, self._head.size)
         self._t = 0
 
     def act(self, obs: Any) -> Any:
@@ -80,12 +63,12 @@ class Explorer:
     `persistence` when it was the last choice, plus Gumbel noise × `temperature`.
     """
 
-    def __init__(self, head: ActionHead, vector: Vector, rng: np.random.Generator) -> None:
-        self._head, self._rng = head, rng
+    def __init__(self, given: Given, vector: Vector) -> None:
+        self._head, self._rng = given.head, given.rng
         self._logits, (self._curiosity, self._persistence, temperature) = vector[:-3], vector[-3:]
         self._temperature = abs(temperature)
         self._counts: dict[bytes, Vector] = {}
-        self._last = np.zeros(head.size)
+        self._last = np.zeros(self._head.size)
 
     def act(self, obs: Any) -> Any:
         tried = self._counts.setdefault(fingerprint(obs), np.zeros(self._head.size))
@@ -104,10 +87,10 @@ class Saliency:
     The first three numbers weight the colour channels (one channel counts as three equal ones).
     """
 
-    def __init__(self, head: ActionHead, schema: Schema, vector: Vector) -> None:
-        self._head, self._schema = head, schema
+    def __init__(self, given: Given, vector: Vector) -> None:
+        self._head, self._schema = given.head, given.obs_space
         self._colour = vector[:3]
-        self._weights = vector[3:].reshape(head.size, SALIENCY_FEATURES)
+        self._weights = vector[3:].reshape(self._head.size, SALIENCY_FEATURES)
 
     def act(self, obs: Any) -> Any:
         image = as_image(obs, self._schema)
@@ -137,7 +120,16 @@ def fingerprint(obs: Any) -> bytes:
     return np.round(values, 2).tobytes() if values.dtype.kind == "f" else values.tobytes()
 
 
-Controller = Constant | Linear | Oscillator | Explorer | Saliency | Pusher | Carrier | GridSeeker
+_CONTROLLERS = {
+    "constant": Constant,
+    "linear": Linear,
+    "oscillator": Oscillator,
+    "explorer": Explorer,
+    "saliency": Saliency,
+    "pusher": Pusher,
+    "carrier": Carrier,
+    "seeker": GridSeeker,
+}
 
 
 def build(
@@ -147,23 +139,6 @@ def build(
     obs_space: Schema,
     action_space: Schema,
     rng: np.random.Generator,
-) -> Controller:
-    """A new controller for one episode. Raises ValueError for an unknown kind."""
-    head = ActionHead(action_space)
-    if kind == "constant":
-        return Constant(head, vector)
-    if kind == "linear":
-        return Linear(head, Features(obs_space), vector)
-    if kind == "oscillator":
-        return Oscillator(head, vector)
-    if kind == "explorer":
-        return Explorer(head, vector, rng)
-    if kind == "saliency":
-        return Saliency(head, obs_space, vector)
-    if kind == "pusher":
-        return Pusher(head, vector, settings)
-    if kind == "carrier":
-        return Carrier(head, vector, settings)
-    if kind == "seeker":
-        return GridSeeker(head, vector, settings, rng)
-    raise ValueError(f"no controller of kind {kind!r}")
+) -> Any:
+    """A new controller for one episode, with a method `act(obs)`. Raises KeyError for an unknown kind."""
+    return _CONTROLLERS[kind](Given(ActionHead(action_space), obs_space, settings, rng), vector)

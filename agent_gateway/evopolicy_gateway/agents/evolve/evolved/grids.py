@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .spaces import ActionHead, Schema, Vector
+from .spaces import Given, Schema, Vector
 
 MAX_GRID_SIDE = 15
 MAX_VIEWS_PLANNED = 400
@@ -58,19 +58,15 @@ def read_symbols(obs: Any, key: str | None) -> Symbols:
 class GridSeeker:
     """Parameters: the appeal of rare symbols, the appeal of distant places, the share of random actions."""
 
-    PARAMETERS = 3
-
-    def __init__(
-        self, head: ActionHead, vector: Vector, settings: dict[str, Any], rng: np.random.Generator
-    ) -> None:
-        self._head, self._rng = head, rng
+    def __init__(self, given: Given, vector: Vector) -> None:
+        self._head, self._rng, settings = given.head, given.rng, given.settings
         self._key = settings["key"]
         self._maps = {int(action): np.array(cells) for action, cells in settings["maps"].items()}
         self._advance, self._touch = int(settings["advance"]), int(settings["touch"])
         self._blocked = set(settings["blocked"])
         self._rare = set(settings["rare"])
         self._prizes = {int(symbol): int(action) for symbol, action in settings["prizes"]}
-        self._handling = [a for a in range(head.size) if a not in self._maps]
+        self._handling = [a for a in range(self._head.size) if a not in self._maps]
         self._rare_appeal, self._distance_appeal = float(2.0 ** vector[0]), float(vector[1])
         self._random_share = 0.04 * float(2.0 ** np.clip(vector[2], -4, 4))
         self._queue: deque[int] = deque()

@@ -17,19 +17,20 @@ from typing import Any
 
 import numpy as np
 
-from .spaces import ActionHead, Vector
+from .spaces import Given, Vector
 
 FACTOR_RANGE = 3.0
 """Factors lie between 2 to minus this and 2 to this."""
 
 
-class _Mover:
+class Mover:
     """Shared by pushing and carrying: reads the observation, and moves the effector to a point."""
 
     PARAMETERS = 6
 
-    def __init__(self, head: ActionHead, vector: Vector, settings: dict[str, Any]) -> None:
-        self._head = head
+    def __init__(self, given: Given, vector: Vector) -> None:
+        settings = given.settings
+        self._head = given.head
         self._effector = np.array(settings["effector"], dtype=int)
         self._outputs = np.array(settings["outputs"], dtype=int)
         self._slopes = np.array(settings["slopes"], dtype=float)
@@ -60,14 +61,14 @@ class _Mover:
         return self._head.action(outputs)
 
 
-class Pusher(_Mover):
+class Pusher(Mover):
     """Moves behind the thing, touches it, and pushes it along the line to the goal.
 
     Parameters: distance kept behind, clearance, depth of touch, sideways tolerance, speed, goal tolerance.
     """
 
-    def __init__(self, head: ActionHead, vector: Vector, settings: dict[str, Any]) -> None:
-        super().__init__(head, vector, settings)
+    def __init__(self, given: Given, vector: Vector) -> None:
+        super().__init__(given, vector)
         self._behind = 2.5 * self._step * self._factors[0]
         self._clearance = 2.0 * self._step * self._factors[1]
         self._sideways = 0.7 * self._step * self._factors[3]
@@ -101,14 +102,14 @@ class Pusher(_Mover):
         return behind
 
 
-class Carrier(_Mover):
+class Carrier(Mover):
     """Approaches the thing from above, reverses the other outputs to grasp it, and carries it to the goal.
 
     Parameters: sideways tolerance, clearance, depth of touch, reach within which to grasp, speed, steps to grasp for.
     """
 
-    def __init__(self, head: ActionHead, vector: Vector, settings: dict[str, Any]) -> None:
-        super().__init__(head, vector, settings)
+    def __init__(self, given: Given, vector: Vector) -> None:
+        super().__init__(given, vector)
         self._sideways = 0.5 * self._step * self._factors[0]
         self._clearance = 2.0 * self._step * self._factors[1]
         self._reach = 0.5 * self._step * self._factors[3]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -204,3 +204,13 @@ def _box_head(schema: Schema) -> tuple[int, Callable[[Vector], Any]]:
         return np.clip(values, low, high).astype(dtype).reshape(shape)
 
     return low.size, scale
+
+
+class Given(NamedTuple):
+    """What a controller is built with, besides its vector."""
+
+    head: ActionHead
+    obs_space: Schema
+    settings: dict[str, Any]
+    """Identified from feedback."""
+    rng: np.random.Generator
