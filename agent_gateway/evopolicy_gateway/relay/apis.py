@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 from urllib.parse import urlencode, urlsplit
 
 import msgspec
@@ -59,14 +59,6 @@ FREE: dict[Protocol, tuple[str, ...]] = {
 """Paths of requests that cost nothing; they pass on uncounted."""
 
 
-def path_of(protocol: Protocol, path: str) -> tuple[str, str] | None:
-    """The API of a request's path and the path below the base URL; None for a path that is not served."""
-    api = path.strip("/").removeprefix("v1/")
-    if api not in METERED[protocol] + FREE[protocol]:
-        return None
-    return api, f"v1/{api}" if protocol == "anthropic" else api
-
-
 _CLIENTS_TOOLS = re.compile(
     r"function|custom|namespace|tool_search|(local_)?shell|apply_patch|(computer|bash|text_editor|memory)(_.*)?"
 )
@@ -113,14 +105,11 @@ def passed_down(headers: Mapping[str, str]) -> dict[str, str]:
 
 
 def _chosen(headers: Mapping[str, str], names: tuple[str, ...], starts: tuple[str, ...]) -> dict[str, str]:
-    return {
-        name: value
-        for name, value in ((name.lower(), value) for name, value in headers.items())
-        if name in names or name.startswith(starts)
-    }
+    lower = {name.lower(): value for name, value in headers.items()}
+    return {name: value for name, value in lower.items() if name in names or name.startswith(starts)}
 
 
-class Refusal(msgspec.Struct, frozen=True, kw_only=True):
+class Refusal(NamedTuple):
     """An error that the relay answers itself, in the words of each protocol."""
 
     status: int
@@ -140,23 +129,14 @@ class Refusal(msgspec.Struct, frozen=True, kw_only=True):
 
 
 _INVALID = ("invalid_request_error", "invalid_request")
-SPENT = Refusal(
-    status=400,
-    openai=("billing_limit_user_error", "billing_hard_limit_reached"),
-    anthropic="invalid_request_error",
-)
+SPENT = Refusal(400, ("billing_limit_user_error", "billing_hard_limit_reached"), "invalid_request_error")
 """As OpenAI and Anthropic refuse an account without money: clients do not try again."""
-NO_TOKEN = Refusal(
-    status=401, openai=("invalid_request_error", "invalid_api_key"), anthropic="authentication_error"
-)
-HOSTED_TOOL = Refusal(status=400, openai=_INVALID, anthropic="invalid_request_error")
-OTHER_MODEL = Refusal(
-    status=404, openai=("invalid_request_error", "model_not_found"), anthropic="not_found_error"
-)
-NO_PATH = Refusal(status=404, openai=("invalid_request_error", "unknown_url"), anthropic="not_found_error")
-INVALID = Refusal(status=400, openai=_INVALID, anthropic="invalid_request_error")
-TOO_LARGE = Refusal(status=413, openai=_INVALID, anthropic="request_too_large")
-COMPRESSED = Refusal(status=415, openai=_INVALID, anthropic="invalid_request_error")
-TOO_SLOW = Refusal(status=408, openai=_INVALID, anthropic="invalid_request_error")
-TOO_MANY = Refusal(status=429, openai=("requests", "rate_limit_exceeded"), anthropic="rate_limit_error")
-UNREACHABLE = Refusal(status=502, openai=("server_error", "server_error"), anthropic="api_error")
+NO_TOKEN = Refusal(401, ("invalid_request_error", "invalid_api_key"), "authentication_error")
+OTHER_MODEL = Refusal(404, ("invalid_request_error", "model_not_found"), "not_found_error")
+NO_PATH = Refusal(404, ("invalid_request_error", "unknown_url"), "not_found_error")
+INVALID = Refusal(400, _INVALID, "invalid_request_error")
+TOO_SLOW = Refusal(408, _INVALID, "invalid_request_error")
+TOO_LARGE = Refusal(413, _INVALID, "request_too_large")
+COMPRESSED = Refusal(415, _INVALID, "invalid_request_error")
+TOO_MANY = Refusal(429, ("requests", "rate_limit_exceeded"), "rate_limit_error")
+UNREACHABLE = Refusal(502, ("server_error", "server_error"), "api_error")

@@ -135,7 +135,8 @@ class Recorder:
         if self._n >= model_record.MAX_CALLS:
             raise ValueError(f"its limit of {model_record.MAX_CALLS:,} calls is reached")
         request = canonical(api, self._clean(body))
-        call = Call(n=n, api=api, method=method, digest=key_of(request), status=0, broken=True)
+        call: dict[str, Any] = {"n": n, "api": api, "method": method, "digest": key_of(request)}
+        call |= {"status": 0, "broken": True}
         if answer is not None:
             data = self._clean(bytes(answer.heard))
             passed = list(apis.passed_down(answer.headers).items())[:_MAX_HEADERS]
@@ -143,19 +144,13 @@ class Recorder:
                 name: self._clean(value.encode()).decode("utf-8", "replace")[:_MAX_HEADER]
                 for name, value in passed
             }
-            call = msgspec.structs.replace(
-                call,
-                status=answer.status,
-                headers=headers,
-                broken=not answer.ended,
-                answer="" if answer.left_out else key_of(data),
-                left_out=answer.left_out,
-            )
+            call |= {"status": answer.status, "headers": headers, "broken": not answer.ended}
+            call |= {"answer": "" if answer.left_out else key_of(data), "left_out": answer.left_out}
             if self._pack is not None and not answer.left_out:
                 self._pack.put(data)
         if self._pack is not None:
-            call = msgspec.structs.replace(call, request=_put_request(self._pack, request))
-        self._calls.write(msgspec.json.encode(call) + b"\n")
+            call["request"] = _put_request(self._pack, request)
+        self._calls.write(msgspec.json.encode(Call(**call)) + b"\n")
         self._n += 1
 
 
@@ -198,10 +193,7 @@ def document_of(request: bytes) -> dict[str, Any]:
 def _put_request(pack: Pack, request: bytes) -> str:
     """Keeps a request as `Kept`."""
     document = document_of(request)
-    lists = {
-        name: [pack.put(orjson.dumps(each)) for each in value]
-        for name, value in document.items()
-        if isinstance(value, list)
-    }
+    lists = {name: value for name, value in document.items() if isinstance(value, list)}
     plain = {name: value for name, value in document.items() if name not in lists}
+    lists = {name: [pack.put(orjson.dumps(each)) for each in value] for name, value in lists.items()}
     return pack.put(msgspec.json.encode(Kept(plain=plain, lists=lists)))

@@ -88,22 +88,19 @@ class Relay:
         """`counted` is called after each request, `note` with a line for the operator, `spent` with the
         limit that is used up. `now`: Unix time, seconds."""
         self._order = order
-        self._upstream = order.upstream
+        self.upstream = order.upstream
         self._ledger = Ledger(Path(order.ledger), order.model)
+        self.used = self._ledger.used
         self._counted, self._note, self._spent = counted, note, spent
         self.now = now
         self.in_flight = 0
-        self._troubles = 0
+        self.troubles = 0
         """Failed requests since the last answered one."""
         self._told: set[str] = set()
-        self._secrets = tuple(
-            value.encode()
-            for value in (order.upstream.key, *order.upstream.headers.values())
-            if len(value) >= 8
-        )
+        keys = order.upstream.key, *order.upstream.headers.values()
+        self.secrets = tuple(value.encode() for value in keys if len(value) >= 8)
         base_url = order.upstream.base_url
-        key = order.upstream.key, *order.upstream.headers.values()
-        clean, folder = Cleaning(order.tokens, (*order.secrets, *key)), Path(order.folder)
+        clean, folder = Cleaning(order.tokens, (*order.secrets, *keys)), Path(order.folder)
         self._provider: Source
         if order.replay:
             self._provider = Replayed(Path(order.replay), clean, base_url, folder, spent)
@@ -112,15 +109,6 @@ class Relay:
         if order.record != "off":
             self._provider = Recorder(self._provider, folder, order.record, clean, base_url, note)
         self._authorization = order.upstream.authorization()
-
-    @property
-    def shown(self) -> str:
-        """The base URL, for people."""
-        return self._upstream.shown
-
-    @property
-    def used(self) -> limits.Used:
-        return self._ledger.used
 
     async def close(self) -> None:
         await self._provider.close()
@@ -141,18 +129,19 @@ class Relay:
             )
         if "transfer-encoding" in request.headers and "content-length" in request.headers:
             return self.refused(apis.INVALID, "the request has two lengths", more={"connection": "close"})
-        found = apis.path_of(self._upstream.protocol, request.url.path)
-        if found is None:
-            why = f"{request.url.path[:_SHOWN]} is not served: only {', '.join(apis.METERED[self._upstream.protocol])}"
-            return self.refused(apis.NO_PATH, why)
-        api, path = found
+        protocol = self.upstream.protocol
+        api = request.url.path.strip("/").removeprefix("v1/")
+        path = f"v1/{api}" if protocol == "anthropic" else api
+        if api not in apis.METERED[protocol] + apis.FREE[protocol]:
+            served = ", ".join(apis.METERED[protocol])
+            return self.refused(apis.NO_PATH, f"{request.url.path[:_SHOWN]} is not served: only {served}")
         if request.headers.get("content-encoding", "identity").lower() != "identity":
             return self.refused(apis.COMPRESSED, "send the request uncompressed")
         body = b""
         if request.method == "POST":
             try:
                 async with asyncio.timeout(REQUEST_WAIT_S):
-                    body = await _read(request)
+                    body = await _whole(request.stream(), "request", MAX_REQUEST_BYTES)
             except TimeoutError:
                 return self.refused(apis.TOO_SLOW, f"the request did not arrive within {REQUEST_WAIT_S:g} s")
             except ValueError as error:
@@ -167,7 +156,7 @@ class Relay:
         """Passes on a request that costs nothing."""
         try:
             async with self.sent(request, path, body) as answer:
-                data = await _all(answer, MAX_ERROR_BYTES)
+                data = await _whole(_unpacked(answer), "answer", MAX_ERROR_BYTES)
         except (*FAILED, ValueError, zlib.error) as error:
             return self.refused(apis.UNREACHABLE, self.unreachable(error))
         return Response(self.clean(data), answer.status, self.headers_of(answer))
@@ -192,9 +181,7 @@ class Relay:
             self._once(f"the agent asks for the model {asked!r} besides {order.model}")
         if hosted := tuple(kind[:_SHOWN] for kind in apis.hosted_tools(document)[:_MAX_TOOLS]):
             if order.own_tools_only:
-                return self.refused(
-                    apis.HOSTED_TOOL, f"tools of the provider are refused: {', '.join(hosted)}"
-                )
+                return self.refused(apis.INVALID, f"tools of the provider are refused: {', '.join(hosted)}")
             self._once(f"the agent offers its model tools of the provider: {', '.join(hosted)}")
         if what := used.over(order.limits, order.prices, self.in_flight):
             if not used.over(order.limits, order.prices):
@@ -234,7 +221,7 @@ class Relay:
     ) -> contextlib.AbstractAsyncContextManager[Answer]:
         """The request to the provider, built anew."""
         headers = apis.passed_up(request.headers) | self._authorization
-        url = self._upstream.url(path, request.query_params)
+        url = self.upstream.url(path, request.query_params)
         return self._provider.sent(request.method, url, headers, body)
 
     def refused(
@@ -243,17 +230,13 @@ class Relay:
         """An answer of the relay's own. Without `retry_after` or headers in `more`, it is final."""
         headers = {"retry-after": retry_after} if retry_after else dict(more) or {"x-should-retry": "false"}
         headers["content-type"] = "application/json"
-        return Response(refusal.body(self._upstream.protocol, message), refusal.status, headers)
+        return Response(refusal.body(self.upstream.protocol, message), refusal.status, headers)
 
     def count(self, request: limits.Request) -> None:
         """Writes a finished request to the ledger. Raises OSError when the disk refuses."""
         self.in_flight -= 1
         self._ledger.write(request)
         self._counted()
-
-    def answered(self) -> None:
-        """The provider has answered: the next failure is a first one."""
-        self._troubles = 0
 
     def headers_of(self, answer: Answer) -> dict[str, str]:
         return {
@@ -263,17 +246,13 @@ class Relay:
 
     def clean(self, data: bytes) -> bytes:
         """The bytes without the key, which some servers repeat in their errors."""
-        for secret in self._secrets:
+        for secret in self.secrets:
             data = data.replace(secret, b"[key]")
         return data
 
-    def cleaner(self) -> Cleaner:
-        """Takes the key out of an answer that comes in pieces."""
-        return Cleaner(self._secrets)
-
     def unreachable(self, error: Exception) -> str:
         why = str(error) or type(error).__name__
-        return self.clean(f"base_url {self._upstream.shown} gives no answer: {why}".encode()).decode(
+        return self.clean(f"base_url {self.upstream.shown} gives no answer: {why}".encode()).decode(
             "utf-8", "replace"
         )
 
@@ -285,11 +264,11 @@ class Relay:
     def trouble(self, what: str, stated_s: float | None) -> float:
         """Seconds until the next try, after a failure that another try may resolve: as stated, or longer each time.
         Tells the operator of the first."""
-        wait_s = stated_s if stated_s is not None else min(MAX_RETRY_S, _FIRST_RETRY_S * 2.0**self._troubles)
-        self._troubles = min(self._troubles + 1, 10)
-        if self._troubles == 1:
+        wait_s = stated_s if stated_s is not None else min(MAX_RETRY_S, _FIRST_RETRY_S * 2.0**self.troubles)
+        self.troubles = min(self.troubles + 1, 10)
+        if self.troubles == 1:
             at = time.strftime("%H:%M:%S UTC", time.gmtime(self.now() + wait_s))
-            self._note(f"{self._upstream.shown} {what}; next try in {wait_s:.0f} s, at {at}")
+            self._note(f"{self.upstream.shown} {what}; next try in {wait_s:.0f} s, at {at}")
         return wait_s
 
 
@@ -323,25 +302,27 @@ class _Exchange:
         kind = got.headers.get("content-type", "").partition(";")[0].strip().lower()
         events = kind == "text/event-stream"
         if 200 <= got.status < 300 and (events or kind.endswith("json")):
-            relay.answered()
+            relay.troubles = 0
             self._reader = AnswerReader(SHAPES[self._api], events=events, drops_usage=self._drops_usage)
             return _Streamed(self, self._passed(got, self._reader), got.status, relay.headers_of(got))
         try:
-            data = await _all(got, MAX_ERROR_BYTES)
+            data = await _whole(_unpacked(got), "answer", MAX_ERROR_BYTES)
         except (*FAILED, ValueError, zlib.error):
             data = b""
         return self._failed(got, kind, data)
 
     async def close(self) -> None:
         """Counts an answer that broke off, and ends the provider's."""
-        self._write_read(broken=True)
+        self._write(broken=True)
         await self._opened.aclose()
 
     def _failed(self, got: Answer, kind: str, data: bytes) -> Response:
         """The answer for one that is no success of this API."""
         relay, status = self._relay, got.status
         shown = relay.clean(data[:_SHOWN]).decode("utf-8", "replace").strip()
-        came = f"base_url {relay.shown} answered {status} with {kind or 'no content type'}: {shown!r}"
+        came = (
+            f"base_url {relay.upstream.shown} answered {status} with {kind or 'no content type'}: {shown!r}"
+        )
         if status < 400:
             self._write(broken=True)
             return relay.refused(apis.INVALID, f"{came}; the base URL of a model API answers with JSON")
@@ -354,36 +335,32 @@ class _Exchange:
         self._write(wait_s=wait_s)
         if kind.endswith("json"):
             return Response(relay.clean(data), status, headers)
-        same = msgspec.structs.replace(apis.UNREACHABLE, status=status)
-        return relay.refused(same, came, more=headers)
+        return relay.refused(apis.UNREACHABLE._replace(status=status), came, more=headers)
 
     async def _passed(self, got: Answer, reader: AnswerReader) -> AsyncIterator[bytes]:
         """The answer's bytes, the last of them after the request is in the ledger."""
-        cleaner = self._relay.cleaner()
+        cleaner = Cleaner(self._relay.secrets)
         async for data in _unpacked(got):
             if self._first_s is None:
                 self._first_s = time.monotonic() - self._begun
             passed = reader.feed(data)
             if reader.complete:
-                self._write_read(broken=False)
+                self._write()
             if passed and (cleaned := cleaner.feed(passed)):
                 yield cleaned
         last = reader.end()
-        self._write_read(broken=False)
+        self._write()
         if cleaned := cleaner.feed(last) + cleaner.end():
             yield cleaned
 
-    def _write_read(self, *, broken: bool) -> None:
-        if self._reader is None:
-            self._write(broken=broken)
-        elif not self._written:
-            found = self._reader.metered(len(self._body))
-            self._write(broken=broken, usage=found.usage, estimated=found.estimated, answered=found.model)
-
     def _write(self, **more: Any) -> None:
+        """Counts the request, once."""
         if self._written:
             return
         self._written = True
+        if self._reader is not None:
+            read = self._reader.metered(len(self._body))
+            more |= {"usage": read.usage, "estimated": read.estimated, "answered": read.model}
         self._relay.count(
             limits.Request(
                 at=round(self._at, 3),
@@ -420,13 +397,13 @@ async def _while_there(receive: Receive) -> AsyncIterator[None]:
     task, watching = asyncio.current_task(), True
     assert task is not None
 
-    def left(_: asyncio.Future[Any]) -> None:
+    def hung_up(_: asyncio.Future[Any]) -> None:
         if watching:
             task.cancel()
 
     # After the body, the next message is the end of the connection.
     gone = asyncio.ensure_future(receive())
-    gone.add_done_callback(left)
+    gone.add_done_callback(hung_up)
     try:
         yield
     except asyncio.CancelledError:
@@ -439,21 +416,13 @@ async def _while_there(receive: Receive) -> AsyncIterator[None]:
         gone.cancel()
 
 
-async def _read(request: Request) -> bytes:
-    body = bytearray()
-    async for chunk in request.stream():
-        body += chunk
-        if len(body) > MAX_REQUEST_BYTES:
-            raise ValueError(f"the request has more than {MAX_REQUEST_BYTES:,} bytes")
-    return bytes(body)
-
-
-async def _all(answer: Answer, limit: int) -> bytes:
+async def _whole(pieces: AsyncIterator[bytes], what: str, limit: int) -> bytes:
+    """All pieces together. Raises ValueError when they are longer."""
     data = bytearray()
-    async for chunk in _unpacked(answer):
-        data += chunk
+    async for piece in pieces:
+        data += piece
         if len(data) > limit:
-            raise ValueError(f"the answer has more than {limit:,} bytes")
+            raise ValueError(f"the {what} has more than {limit:,} bytes")
     return bytes(data)
 
 

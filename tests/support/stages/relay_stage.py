@@ -65,6 +65,19 @@ async def relay(
     await app.close()
 
 
+def asked(
+    tmp_path: Path, script: list[Step], *bodies: dict[str, Any], path: str = "chat/completions", **more: Any
+) -> tuple[list[httpx.Response], Served]:
+    """The relay's answers to requests one after another, with a relay as of `played`."""
+    answers: list[httpx.Response] = []
+
+    async def act(served: Served) -> None:
+        for body in bodies:
+            answers.append(await served.ask(path, **body))
+
+    return answers, played(tmp_path, script, act, **{"protocol": PATHS[path], **more})
+
+
 def played(
     tmp_path: Path, script: list[Step], act: Callable[[Served], Awaitable[Any]], **more: Any
 ) -> Served:

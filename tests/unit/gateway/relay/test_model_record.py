@@ -46,11 +46,8 @@ def test_a_call_is_recorded_whole_and_once(tmp_path: Path, path: str, protocol: 
     recorded(tmp_path, [Step(text="hello"), Step(text="hello")], act, protocol=protocol)
     folder = tmp_path / "model"
     calls = read_calls(folder)
-    assert [(call.n, call.api, call.status, call.broken) for call in calls] == [
-        (0, path, 200, False),
-        (1, path, 200, False),
-        (2, "models", 200, False),
-    ]
+    facts = [(call.n, call.api, call.status, call.broken) for call in calls]
+    assert facts == [(n, api, 200, False) for n, api in enumerate((path, path, "models"))]
     assert calls[0].digest != calls[1].digest
     with contextlib.closing(Pack(folder)) as pack:
         assert request_of(pack, calls[1])["messages"][-1]["content"] == "turn 1"
@@ -62,11 +59,8 @@ def test_no_secret_is_in_the_record_however_it_came(tmp_path: Path) -> None:
     named = "plain-words-of-a-variable"
 
     async def act(served: Served) -> None:
-        for text in (
-            f"{KEY} {SECRET}",
-            f"Bearer {TOKEN} {named}",
-            "http://127.0.0.1:1/" + "a" * 32 + "/submit",
-        ):
+        address = f"http://127.0.0.1:1/{'a' * 32}/submit"
+        for text in (f"{KEY} {SECRET}", f"Bearer {TOKEN} {named}", address):
             await served.ask(messages=[{"role": "user", "content": text}], **{SECRET: text})
         served.client.headers["x-codex-note"] = KEY
 

@@ -12,7 +12,7 @@ import httpx
 import pytest
 from stages import odd_answers
 from stages.model_api import CACHED, CREATED, INPUT, OUTPUT, REASONING, Step
-from stages.relay_stage import KEY, NOON, PATHS, TOKEN, TOOLS, Served, played
+from stages.relay_stage import KEY, NOON, PATHS, TOKEN, TOOLS, Served, asked, played
 
 from evopolicy_gateway.relay import service
 from evopolicy_gateway.relay.__main__ import tell
@@ -26,12 +26,9 @@ from evopolicy_gateway.relay.usage import Prices, Usage
 def test_an_answer_passes_and_is_counted_with_the_real_key(
     tmp_path: Path, path: str, protocol: Protocol
 ) -> None:
-    async def act(served: Served) -> None:
-        answer = await served.ask(path)
-        assert answer.status_code == 200
-        assert "hello" in answer.text
-
-    served = played(tmp_path, [Step(text="hello")], act, protocol=protocol)
+    (answer,), served = asked(tmp_path, [Step(text="hello")], {}, path=path)
+    assert answer.status_code == 200
+    assert "hello" in answer.text
     used = served.used.usage
     assert (used.input_noncached, used.cache_read, used.output) == (INPUT - CACHED, CACHED, OUTPUT)
     assert used.cache_creation == (CREATED if path == "messages" else 0)
@@ -66,23 +63,16 @@ def test_only_the_agents_token_is_accepted(tmp_path: Path) -> None:
 
 
 def test_a_key_that_the_provider_repeats_does_not_reach_the_agent(tmp_path: Path) -> None:
-    async def act(served: Served) -> None:
-        answer = await served.ask()
-        assert answer.status_code == 400
-        assert "bad request" in answer.text
-        assert KEY not in answer.text
-        assert "other-secret" not in answer.text
-
-    headers = {"x-team": "other-secret"}
-    served = played(tmp_path, [Step(odd=odd_answers.repeats_its_headers)], act, upstream={"headers": headers})
+    upstream = {"headers": {"x-team": "other-secret"}}
+    (answer,), served = asked(tmp_path, [Step(odd=odd_answers.repeats_its_headers)], {}, upstream=upstream)
+    assert answer.status_code == 400
+    assert "bad request" in answer.text
+    assert KEY not in answer.text
+    assert "other-secret" not in answer.text
     assert served.used.failed == 1
 
 
 def test_azure_gets_its_header_and_version(tmp_path: Path) -> None:
-    async def act(served: Served) -> None:
-        assert "hello" in (await served.ask()).text
-        assert "api-key" in (await served.ask()).text
-
     def shows(handler: Any, _: dict[str, Any]) -> None:
         names = {**dict.fromkeys(handler.headers, ""), "path": handler.path}
         handler._send(400, json.dumps(names).encode(), "application/json")
@@ -91,7 +81,9 @@ def test_azure_gets_its_header_and_version(tmp_path: Path) -> None:
 
     script = [Step(text="hello"), Step(odd=shows)]
     upstream = {"key_header": "api-key", "query": {"api-version": "7"}}
-    assert played(tmp_path, script, act, upstream=upstream).api.keys == set()
+    answers, served = asked(tmp_path, script, {}, {}, upstream=upstream)
+    assert ["hello" in answers[0].text, "api-key" in answers[1].text] == [True, True]
+    assert served.api.keys == set()
 
 
 def test_requests_beyond_a_limit_are_refused_in_the_providers_form(tmp_path: Path) -> None:
@@ -113,68 +105,50 @@ def test_requests_beyond_a_limit_are_refused_in_the_providers_form(tmp_path: Pat
     [(Limits(max_tokens=INPUT), "1,000 tokens"), (Limits(max_cost=0.001), "0.00 dollars")],
 )
 def test_tokens_and_cost_are_limited_too(tmp_path: Path, limits: Limits, what: str) -> None:
-    async def act(served: Served) -> None:
-        assert (await served.ask("messages")).status_code == 200
-        final = await served.ask("messages")
-        assert (final.status_code, final.json()["type"]) == (400, "error")
-
     prices = Prices(input=1.0, output=50.0)
-    served = played(tmp_path, [], act, protocol="anthropic", limits=limits, prices=prices)
+    (first, final), served = asked(tmp_path, [], {}, {}, path="messages", limits=limits, prices=prices)
+    assert (first.status_code, final.status_code, final.json()["type"]) == (200, 400, "error")
     assert served.spent == [what]
 
 
 def test_other_models_are_told_or_refused(tmp_path: Path) -> None:
-    async def act(served: Served) -> None:
-        assert (await served.ask(model="other")).status_code == status
-
-    status = 200
-    served = played(tmp_path, [], act, model="m")
+    (answer,), served = asked(tmp_path, [], {"model": "other"}, model="m")
+    assert answer.status_code == 200
     assert served.notes == ["the agent asks for the model 'other' besides m"]
     assert read(served.ledger, "m").other_models == {"other": 1}
-    status = 404
     (tmp_path / "strict").mkdir()
-    served = played(tmp_path / "strict", [], act, model="m", declared_only=True)
+    (answer,), served = asked(tmp_path / "strict", [], {"model": "other"}, model="m", declared_only=True)
+    assert answer.status_code == 404
     assert served.api.n_asked == served.used.requests == 0
 
 
+FUNCTION = {"type": "function", "name": "f"}
+
+
 @pytest.mark.parametrize(
-    ("protocol", "api", "more", "kinds"),
+    ("api", "more", "kinds"),
     [
+        ("responses", {"tools": [{"type": "web_search"}, FUNCTION]}, {"web_search": 1}),
+        ("chat/completions", {"web_search_options": {"a": None}}, {"web_search_options": 1}),
+        ("responses", {"tools": [{"type": "custom"}, {"type": "local_shell"}, 7]}, {}),
         (
-            "openai",
-            "responses",
-            {"tools": [{"type": "web_search"}, {"type": "function", "name": "f"}]},
-            {"web_search": 1},
-        ),
-        (
-            "openai",
-            "chat/completions",
-            {"web_search_options": {"user_location": None}},
-            {"web_search_options": 1},
-        ),
-        ("openai", "responses", {"tools": [{"type": "custom"}, {"type": "local_shell"}, 7]}, {}),
-        (
-            "anthropic",
             "messages",
             {"tools": [{"type": "web_fetch_20250910"}], "mcp_servers": [{}]},
             {"mcp_servers": 1, "web_fetch": 1},
         ),
-        ("anthropic", "messages", {"tools": [{"name": "f"}, {"type": "bash_20250124"}]}, {}),
+        ("messages", {"tools": [{"name": "f"}, {"type": "bash_20250124"}]}, {}),
     ],
 )
 def test_tools_that_the_provider_runs_are_recorded_or_refused(
-    tmp_path: Path, protocol: str, api: str, more: dict[str, Any], kinds: dict[str, int]
+    tmp_path: Path, api: str, more: dict[str, Any], kinds: dict[str, int]
 ) -> None:
-    async def act(served: Served) -> None:
-        assert (await served.ask(api, **more)).status_code == status
-
-    status = 200
-    served = played(tmp_path, [], act, protocol=protocol)
+    (answer,), served = asked(tmp_path, [], more, path=api)
+    assert answer.status_code == 200
     assert read(served.ledger).hosted_tools == kinds
     assert len(served.notes) == bool(kinds)
-    status = 400 if kinds else 200
     (tmp_path / "strict").mkdir()
-    served = played(tmp_path / "strict", [], act, protocol=protocol, own_tools_only=True)
+    (answer,), served = asked(tmp_path / "strict", [], more, path=api, own_tools_only=True)
+    assert answer.status_code == (400 if kinds else 200)
     assert served.api.n_asked == served.used.requests == (0 if kinds else 1)
 
 
@@ -188,14 +162,12 @@ def test_a_model_that_is_named_twice_is_the_one_that_was_checked(tmp_path: Path)
 
 
 def test_a_web_page_is_an_error_that_names_the_base_url(tmp_path: Path) -> None:
-    async def act(served: Served) -> None:
-        answer = await served.ask()
-        assert (answer.status_code, answer.headers["x-should-retry"]) == (400, "false")
-        message = answer.json()["error"]["message"]
-        assert f"base_url {served.api.base_url}/v1 answered 200 with text/html" in message
-        assert "Sign in" in message
-
-    assert played(tmp_path, [Step(odd=odd_answers.page)], act).used.failed == 1
+    (answer,), served = asked(tmp_path, [Step(odd=odd_answers.page)], {})
+    assert (answer.status_code, answer.headers["x-should-retry"]) == (400, "false")
+    message = answer.json()["error"]["message"]
+    assert f"base_url {served.api.base_url}/v1 answered 200 with text/html" in message
+    assert "Sign in" in message
+    assert served.used.failed == 1
 
 
 @pytest.mark.parametrize(
@@ -231,13 +203,10 @@ def test_the_operator_is_told_of_the_first_failure_with_the_next_try(
 
 
 def test_a_provider_that_cannot_be_reached_is_named(tmp_path: Path) -> None:
-    async def act(served: Served) -> None:
-        answer = await served.ask()
-        assert answer.status_code == 502
-        assert f"base_url {served.api.base_url}/v1 gives no answer" in answer.text
-
-    hangs = Step(odd=odd_answers.hang(1.0))
-    assert played(tmp_path, [hangs], act, timeout_s=0.3).used.failed == 1
+    (answer,), served = asked(tmp_path, [Step(odd=odd_answers.hang(1.0))], {}, timeout_s=0.3)
+    assert answer.status_code == 502
+    assert f"base_url {served.api.base_url}/v1 gives no answer" in answer.text
+    assert served.used.failed == 1
 
 
 def test_half_a_stream_is_no_whole_answer(tmp_path: Path) -> None:
@@ -250,33 +219,28 @@ def test_half_a_stream_is_no_whole_answer(tmp_path: Path) -> None:
     assert (used.failed, used.estimated, used.usage.output) == (1, 1, 100)
 
 
-@pytest.mark.parametrize("asked", [None, {"include_usage": False}, {"include_usage": True}])
-def test_a_stream_is_asked_for_its_counts_which_only_who_asks_sees(tmp_path: Path, asked: Any) -> None:
-    async def act(served: Served) -> None:
-        answer = await served.ask(**({} if asked is None else {"stream_options": asked}))
-        wanted = asked == {"include_usage": True}
-        assert ('"usage"' in answer.text) is wanted
-        assert answer.text.endswith("data: [DONE]\n\n")
-
-    served = played(tmp_path, [Step(text="hello")], act)
+@pytest.mark.parametrize("wanted", [None, {"include_usage": False}, {"include_usage": True}])
+def test_a_stream_is_asked_for_its_counts_which_only_who_asks_sees(tmp_path: Path, wanted: Any) -> None:
+    options = {} if wanted is None else {"stream_options": wanted}
+    (answer,), served = asked(tmp_path, [Step(text="hello")], options)
+    assert ('"usage"' in answer.text) is (wanted == {"include_usage": True})
+    assert answer.text.endswith("data: [DONE]\n\n")
     assert served.api.requests[0]["stream_options"]["include_usage"] is True
     assert (served.used.usage.output, served.used.estimated) == (OUTPUT, 0)
 
 
-@pytest.mark.parametrize(
-    "usage",
-    [
-        None,
-        {"prompt_tokens": -5, "completion_tokens": "many"},
-        {"prompt_tokens": 1e30, "completion_tokens": 10**30},
-    ],
-)
-def test_missing_and_wrong_counts_are_estimated_and_marked(tmp_path: Path, usage: Any) -> None:
-    async def act(served: Served) -> None:
-        assert "x" * 400 in (await served.ask()).text
+WRONG = [
+    {"prompt_tokens": -5, "completion_tokens": "many"},
+    {"prompt_tokens": 1e30, "completion_tokens": 10**30},
+]
 
+
+@pytest.mark.parametrize("usage", [None, *WRONG])
+def test_missing_and_wrong_counts_are_estimated_and_marked(tmp_path: Path, usage: Any) -> None:
     documents = [odd_answers.says("x" * 400)] + ([] if usage is None else [{"choices": [], "usage": usage}])
-    used = played(tmp_path, [Step(odd=odd_answers.stream(*documents))], act).used
+    (answer,), served = asked(tmp_path, [Step(odd=odd_answers.stream(*documents))], {})
+    assert "x" * 400 in answer.text
+    used = served.used
     assert (used.estimated, used.failed, used.usage.output) == (1, 0, 100)
 
 
@@ -306,12 +270,7 @@ def test_a_compressed_bomb_is_cut_off(tmp_path: Path, monkeypatch: pytest.Monkey
     ],
 )
 def test_hostile_requests_do_not_reach_the_provider(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    path: str,
-    body: bytes,
-    headers: dict[str, str],
-    status: int,
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, path: str, body: bytes, headers: Any, status: int
 ) -> None:
     monkeypatch.setattr(service, "MAX_REQUEST_BYTES", 1000)
 
@@ -355,13 +314,8 @@ def test_only_chosen_headers_reach_the_provider(tmp_path: Path) -> None:
         handler._send(200, b"{}", "application/json")
 
     async def act(served: Served) -> None:
-        served.client.headers.update(
-            {
-                "openai-organization": "other",
-                "x-forwarded-for": "1.2.3.4",
-                "openai-beta": "b",
-            }
-        )
+        served.client.headers.update({"openai-organization": "other", "openai-beta": "b"})
+        served.client.headers.update({"x-forwarded-for": "1.2.3.4"})
         await served.ask(stream=False)
 
     played(tmp_path, [Step(odd=shows)], act)
@@ -382,13 +336,10 @@ def test_an_agent_that_goes_away_leaves_no_request_behind(tmp_path: Path) -> Non
 
 
 def test_a_ledger_with_half_a_line_goes_on(tmp_path: Path) -> None:
-    async def act(served: Served) -> None:
-        await served.ask()
-
-    played(tmp_path, [], act)
+    asked(tmp_path, [], {})
     whole = (tmp_path / "ledger.jsonl").read_bytes()
     (tmp_path / "ledger.jsonl").write_bytes(whole + whole[:30])
-    assert played(tmp_path, [], act).used.requests == 2
+    assert asked(tmp_path, [], {})[1].used.requests == 2
 
 
 def test_a_line_a_minute_has_requests_tokens_and_cost() -> None:
