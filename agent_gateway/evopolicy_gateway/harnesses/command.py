@@ -49,8 +49,9 @@ class CommandHarness(Harness):
         talk = _Talk(process, stage)
         talking = asyncio.create_task(talk.go_on())
         ended = asyncio.create_task(process.ended())
-        silent = asyncio.create_task(_silence(stage))
-        tasks: list[asyncio.Task[Any]] = [talking, ended, silent]
+        silence = asyncio.Future[str]() if stage.activity is None else stage.activity.silence()
+        silent = asyncio.ensure_future(silence)
+        tasks: list[asyncio.Future[Any]] = [talking, ended, silent]
         try:
             await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
             if talking.done() and not talk.stopped:
@@ -79,14 +80,6 @@ class CommandHarness(Harness):
         how = f"exit status {exit_code}" if exit_code > 0 else f"signal {-exit_code}"
         detail = f"{self._program[0]} ended with {how}" + (f"; {self._hint}" if self._hint else "")
         return AgentEnded(reason="agent_failed", detail=detail, turns=turns, facts=facts)
-
-
-async def _silence(stage: Stage) -> str:
-    """As `Activity.silence`; never returns if inactivity is not watched."""
-    if stage.activity is None:
-        never: asyncio.Future[str] = asyncio.get_running_loop().create_future()
-        return await never
-    return await stage.activity.silence()
 
 
 class ReplayHarness(CommandHarness):
@@ -135,7 +128,9 @@ class _Talk:
                 if answer is None:
                     continue
                 self.stopped = answer.get("stop") is True
-                if _names_earlier(answer, self.turn) and not self.stopped:
+                named = answer.get("turn")
+                # Programs that count from one are accepted.
+                if isinstance(named, int) and named < self.turn and not self.stopped:
                     continue
                 self.turn += 1
                 if activity is not None:
@@ -151,23 +146,15 @@ class _Talk:
             await asyncio.gather(prompting, return_exceptions=True)
 
     async def _prompt(self) -> None:
-        while await _prompt(self._process, self._stage, self.turn):
+        while (message := await _message(self._stage, self.turn)) is not None:
+            prompt = {"type": "prompt", "turn": self.turn, "message": message}
+            self._stage.log.note(prompt)
+            await self._process.say(orjson.dumps(prompt))
             await self._answered.wait()
             self._answered.clear()
             if self._idle > IDLE_TURNS:
                 await self._stage.sleep(_IDLE_PAUSE_S)
         self._process.hang_up()
-
-
-async def _prompt(process: AgentProcess, stage: Stage, turn: int) -> bool:
-    """Sends the turn's prompt; False, and none is sent, if the budget is spent."""
-    message = await _message(stage, turn)
-    if message is None:
-        return False
-    prompt = {"type": "prompt", "turn": turn, "message": message}
-    stage.log.note(prompt)
-    await process.say(orjson.dumps(prompt))
-    return True
 
 
 async def _message(stage: Stage, turn: int) -> str | None:
@@ -182,12 +169,6 @@ async def _message(stage: Stage, turn: int) -> str | None:
     except (OSError, ValueError, KeyError):
         return "Go on. Ask /info for the budget that is left."
     return stage.prompts.stopped(remaining, prompts.NEXT_TURN) + prompts.warned(info.get("last_warning"))
-
-
-def _names_earlier(answer: dict[str, Any], turn: int) -> bool:
-    """Whether the answer names an earlier turn than this one. Programs that count from one are accepted."""
-    named = answer.get("turn")
-    return isinstance(named, int) and named < turn
 
 
 def _answer(line: bytes) -> dict[str, Any] | None:

@@ -7,10 +7,8 @@ import asyncio
 import json
 import os
 import sys
-import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +22,7 @@ from evopolicy_gateway.harnesses.interface.base import Stage
 from evopolicy_gateway.processes.agent_log import AgentLog
 from evopolicy_gateway.processes.child_messages import AgentDoing, AgentEnded
 from evopolicy_gateway.processes.clock import AgentClock
+from stages.loopback import serving_json
 
 FAKES = Path(__file__).parents[1] / "fake_clis"
 TIMEOUT_S = 150.0
@@ -33,44 +32,25 @@ PATH_TOKEN = "0123456789abcdef0123456789abcdef"
 @contextmanager
 def counting_gateway(budget: int, asked_in_flight: int = 0) -> Iterator[dict[str, str]]:
     """The three URLs of a gateway that answers every submit with `ok` and counts the budget down."""
-    left, in_flight = [budget], [asked_in_flight]
+    remaining, in_flight = [budget], [asked_in_flight]
 
-    class Handler(BaseHTTPRequestHandler):
-        def log_message(self, format: str, *args: Any) -> None:
-            pass
-
-        def do_GET(self) -> None:
-            state = {"remaining_budget": left[0], "n_submits": 0, "is_finalized": left[0] <= 0}
+    def answer(path: str, headers: Mapping[str, str], body: Any) -> tuple[int, Any]:
+        if body is None:
+            state = {"remaining_budget": remaining[0], "n_submits": 0, "is_finalized": remaining[0] <= 0}
             # The first answers of `in_flight` tell of a submit that still runs.
             running = {"submit_id": "submit_000"} if in_flight[0] > 0 else None
             in_flight[0] -= 1
-            self._answer({"state": state, "submit_in_flight": running})
+            return 200, {"state": state, "submit_in_flight": running}
+        if in_flight[0] > 0:
+            return 200, {"status": "conflict"}
+        remaining[0] -= len(body["env_instances"])
+        return 200, {"status": "ok", "submit_id": "submit_000", "summary": {}}
 
-        def do_POST(self) -> None:
-            body = json.loads(self.rfile.read(int(self.headers["content-length"])))
-            if in_flight[0] > 0:
-                self._answer({"status": "conflict"})
-                return
-            left[0] -= len(body["env_instances"])
-            self._answer({"status": "ok", "submit_id": "submit_000", "summary": {}})
-
-        def _answer(self, document: dict[str, Any]) -> None:
-            data = json.dumps(document).encode()
-            self.send_response(200)
-            self.send_header("content-length", str(len(data)))
-            self.end_headers()
-            self.wfile.write(data)
-
-    server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-    thread = threading.Thread(target=server.serve_forever, daemon=True)
-    thread.start()
-    base = f"http://127.0.0.1:{server.server_address[1]}/{PATH_TOKEN}"
-    try:
-        yield {f"EVOPOLICYGYM_{name.upper()}_URL": f"{base}/{name}" for name in ("info", "task", "submit")}
-    finally:
-        server.shutdown()
-        server.server_close()
-        thread.join()
+    with serving_json(answer) as url:
+        yield {
+            f"EVOPOLICYGYM_{name.upper()}_URL": f"{url}/{PATH_TOKEN}/{name}"
+            for name in ("info", "task", "submit")
+        }
 
 
 class Played:
@@ -78,9 +58,14 @@ class Played:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self.ending: AgentEnded | None = None
+        self.ending: AgentEnded
         self.turns: list[tuple[int, str]] = []
         self.doings: list[AgentDoing] = []
+
+    @property
+    def outcome(self) -> tuple[str, int, int]:
+        """Why it ended, its turns, and its retries."""
+        return self.ending.reason, self.ending.turns, self.ending.retries
 
     @property
     def text(self) -> str:

@@ -40,7 +40,8 @@ def declare(folder: Path) -> tuple[tuple[str, ...], dict[str, McpServer]]:
 def as_toml(value: Any) -> str:
     """A setting as TOML on one line."""
     if isinstance(value, dict):
-        return "{" + ", ".join(f"{json.dumps(key)} = {as_toml(inner)}" for key, inner in value.items()) + "}"
+        known = {key: inner for key, inner in value.items() if inner is not None}
+        return "{" + ", ".join(f"{json.dumps(key)} = {as_toml(inner)}" for key, inner in known.items()) + "}"
     if isinstance(value, list | tuple):
         return "[" + ", ".join(map(as_toml, value)) + "]"
     return json.dumps(value)

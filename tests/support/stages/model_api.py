@@ -14,12 +14,20 @@ import re
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
 from typing import Any
+
+from stages.declared_inputs import as_toml
 
 INPUT, CACHED, CREATED, OUTPUT, REASONING = 1000, 700, 50, 20, 5
 """Tokens that every answer claims. OpenAI counts the cached ones into its input, Anthropic apart."""
 
 
+SUBMIT = (
+    "echo '# better' >> system/policy.py; curl -s --noproxy '*' -X POST"
+    " -d '{\"env_instances\": [0, 1]}' $EVOPOLICYGYM_SUBMIT_URL"
+)
+"""A command that changes the policy and submits it for two episodes."""
 BESIDE = ("[SUGGESTION MODE", "Managed memory has")
 """What the last message of a request with tools says that Claude Code or Qwen Code makes beside the conversation, after
 a turn."""
@@ -181,6 +189,18 @@ class ModelApi:
             self.played += 1
             at = self.played - 1
         return self.script[at] if at < len(self.script) else Step(text="Nothing more to do.")
+
+
+def llm_agent(
+    folder: Path, base_url: str, protocol: str = "openai", key: str = "MODEL_ACCESS", **more: Any
+) -> str:
+    """`--agent` for the built-in agent with a model API at `base_url`, and further settings."""
+    base = f"{base_url}/v1" if protocol == "openai" else base_url
+    usual = {"harness": "llm", "model": "m-1", "backoff_s": 0.01, "pause_s": 0.1, "max_pause_s": 0.2}
+    lines = [f"{name} = {as_toml(value)}" for name, value in {**usual, **more}.items()]
+    table = f'[api]\nprotocol = "{protocol}"\nbase_url = "{base}"\nkey = "{key}"\n'
+    (folder / "agent.toml").write_text("\n".join([*lines, table]))
+    return f"file:{folder / 'agent.toml'}"
 
 
 def _speech(path: str) -> Any:

@@ -87,7 +87,11 @@ class AcpAgent(CliAgent):
             reader.failure = TurnFailure(kind="lost", message="the agent cannot load its session again")
             await self._hang_up(stage)
         except (ConnectionError, TimeoutError) as error:
-            reader.failure = await self._broken(stage, error)
+            if self._link is not None:
+                with contextlib.suppress(TimeoutError):
+                    await asyncio.wait_for(self._link.process.ended(), 1.0)
+            why = str(error) or f"no answer within {_START_TIMEOUT_S:g} s"
+            reader.failure = with_last_errors(f"{self._program[0]}: {why}", list(stage.log.last_errors))
             # Nothing is known of the program's state: the next turn starts it again.
             await self._hang_up(stage)
         except Exception as error:
@@ -106,25 +110,31 @@ class AcpAgent(CliAgent):
             return self._link
         await self._hang_up(stage)
         program = [*self._program, *self._acp.arguments(None, resume=False, prompt="", options="")]
-        link = self._link = await _Link.start(stage, program)
+        link = self._link = _Link(await stage.start(program, talks=True), stage)
         async with asyncio.timeout(_START_TIMEOUT_S):
             able = await link.initialize()
             self._version = link.version or self._version
             if self._acp.table.auth:
                 await link.request("authenticate", {"methodId": self._acp.table.auth})
-        known = {"cwd": str(stage.workspace), "mcpServers": self._servers()}
+        servers = [
+            {
+                "name": name,
+                "command": server.command,
+                "args": list(server.args),
+                "env": [{"name": variable, "value": value} for variable, value in server.env.items()],
+            }
+            for name, server in self._acp.kept.servers.items()
+        ]
+        known = {"cwd": str(stage.workspace), "mcpServers": servers}
         async with asyncio.timeout(_START_TIMEOUT_S):
             if session is None:
                 answer = await link.request("session_new", known)
                 link.session = string(answer.get("sessionId")) or None
             else:
-                how = (
-                    "session_resume"
-                    if "resume" in mapping(able.get("sessionCapabilities"))
-                    else "session_load"
-                )
-                if how == "session_load" and not able.get("loadSession"):
+                resumes = "resume" in mapping(able.get("sessionCapabilities"))
+                if not resumes and not able.get("loadSession"):
                     raise _LostError
+                how = "session_resume" if resumes else "session_load"
                 try:
                     answer = await link.request(how, known | {"sessionId": session})
                 except RequestError as error:
@@ -137,18 +147,6 @@ class AcpAgent(CliAgent):
             await self._set(link, answer)
         return link
 
-    def _servers(self) -> list[dict[str, Any]]:
-        """The run's MCP servers in the protocol's form."""
-        return [
-            {
-                "name": name,
-                "command": server.command,
-                "args": list(server.args),
-                "env": [{"name": variable, "value": value} for variable, value in server.env.items()],
-            }
-            for name, server in self._acp.kept.servers.items()
-        ]
-
     async def _set(self, link: _Link, answer: dict[str, Any]) -> None:
         """Chooses the mode, the model and the effort of a session, as the agent's settings say.
 
@@ -157,32 +155,24 @@ class AcpAgent(CliAgent):
         """
         modes = offered_modes(answer)
         mode = self._acp.table.mode or (MODE_THAT_ASKS if judges_itself(modes) else "")
-        if mode and (modes is None or not modes.option):
+        if mode and modes is not None and modes.option:
+            await link.choose(modes, mode)
+        elif mode:
             await link.request("session_set_mode", {"sessionId": link.session, "modeId": mode})
-        elif mode and modes is not None:
-            await self._choose(link, modes, mode)
-        for name, category, value in (
-            ("model", "model", self._config.model),
-            ("effort", "thought_level", self._config.effort),
-        ):
+        words = (*self._program, *self._config.extra_args, *self._config.environment.values())
+        for name, category in (("model", "model"), ("effort", "thought_level")):
+            value = getattr(self._config, name)
             if value is None:
                 continue
             choice = offered_choice(answer, category)
-            words = (*self._program, *self._config.extra_args, *self._config.environment.values())
             started_with_it = any(value in word for word in words)
             if choice is not None and (value in choice.values or not started_with_it):
-                await self._choose(link, choice, value)
+                await link.choose(choice, value)
             elif not started_with_it:
                 raise AgentError(
                     f"{name} = {value!r}: the agent offers no choice of it in a session; put the {name} into `program`,"
-                    " such"
-                    f' as ["{self._program[0]}", "--{name}", "{value}"], or remove `{name}`'
+                    f' such as ["{self._program[0]}", "--{name}", "{value}"], or remove `{name}`'
                 )
-
-    async def _choose(self, link: _Link, choice: Choice, value: str) -> None:
-        # The agent may know values that it does not list, such as aliases of models.
-        chosen = {"configId": choice.option, "value": choice.values.get(value, value)}
-        await link.request("session_set_config_option", {"sessionId": link.session, **chosen})
 
     async def _prompted(
         self, stage: Stage, link: _Link, prompt: str, reader: AcpReader, capped: Capped
@@ -234,14 +224,6 @@ class AcpAgent(CliAgent):
         if reader.action != before:
             stage.on_doing(AgentDoing(action=stage.log.redact.text(reader.action)))
 
-    async def _broken(self, stage: Stage, error: Exception) -> TurnFailure:
-        """The failure of a program that died or fell silent, with its last words."""
-        if self._link is not None:
-            with contextlib.suppress(TimeoutError):
-                await asyncio.wait_for(self._link.process.ended(), 1.0)
-        why = str(error) or f"no answer within {_START_TIMEOUT_S:g} s"
-        return with_last_errors(f"{self._program[0]}: {why}", list(stage.log.last_errors))
-
     async def _hang_up(self, stage: Stage) -> None:
         link, self._link = self._link, None
         if link is None:
@@ -267,10 +249,6 @@ class _Link:
         """Whether a turn is played; updates at other times, such as those of a loaded session, are dropped."""
         self._stage = stage
         self._connection = Connection(self._handle, _Pipe(process))
-
-    @classmethod
-    async def start(cls, stage: Stage, program: list[str]) -> _Link:
-        return cls(await stage.start(program, talks=True), stage)
 
     async def initialize(self) -> dict[str, Any]:
         """Opens the connection; returns the agent's capabilities."""
@@ -300,6 +278,11 @@ class _Link:
         answer = await self._connection.send_request(AGENT_METHODS[method], params)
         return answer if isinstance(answer, dict) else {}
 
+    async def choose(self, choice: Choice, value: str) -> None:
+        """Chooses a value of a setting, which may be one that the agent does not list, such as an alias of a model."""
+        chosen = {"configId": choice.option, "value": choice.values.get(value, value)}
+        await self.request("session_set_config_option", {"sessionId": self.session, **chosen})
+
     def _update(self, update: dict[str, Any]) -> None:
         if self.listens:
             self.updates.put_nowait(update)
@@ -325,10 +308,11 @@ class _Link:
             return None
         if method == CLIENT_METHODS["session_request_permission"]:
             answer = permission(fields, PurePosixPath(self._stage.workspace))
-            title = string(mapping(fields.get("toolCall")).get("title"))
-            self._stage.log.note({"type": "permission", "title": title, **answer["outcome"]})
-            # Some agents tell what they do only here.
             call = mapping(fields.get("toolCall"))
+            self._stage.log.note(
+                {"type": "permission", "title": string(call.get("title")), **answer["outcome"]}
+            )
+            # Some agents tell what they do only here.
             self._update({**call, "sessionUpdate": "tool_call_update", "status": "pending"})
             return answer
         if is_notification:

@@ -115,17 +115,13 @@ class AcpReader(TurnReader):
         """The answer to `session/prompt`."""
         self._whole()
         self.done = answer.get("stopReason") in _ENDED
-        usage = mapping(answer.get("usage"))
-        if usage:
+        # The second is Gemini CLI's own field.
+        counts = mapping(mapping(mapping(answer.get("_meta")).get("quota")).get("token_count"))
+        if usage := mapping(answer.get("usage")):
             self.usage = usage_of(usage)
-        else:
-            # Gemini CLI's own field.
-            counts = mapping(mapping(mapping(answer.get("_meta")).get("quota")).get("token_count"))
-            if counts:
-                self.usage = Usage(
-                    input_noncached=count(counts.get("input_tokens")),
-                    output=count(counts.get("output_tokens")),
-                )
+        elif counts:
+            given, output = (count(counts.get(f"{name}_tokens")) for name in ("input", "output"))
+            self.usage = Usage(input_noncached=given, output=output)
 
     def entries(self) -> list[dict[str, Any]]:
         """Entries for the log since the last call."""
@@ -216,18 +212,13 @@ def permission(request: Mapping[str, Any], workspace: PurePosixPath) -> dict[str
     what the rules protect, the feedback and `AGENTS.md`."""
     call = mapping(request.get("toolCall"))
     paths = [string(place.get("path")) for place in mappings(call.get("locations"))]
-    forbidden = call.get("kind") in _CHANGES and any(_is_protected(path, workspace) for path in paths)
-    wanted = ("reject_once", "reject_always") if forbidden else ("allow_once", "allow_always")
-    for kind in wanted:
+    whole = [PurePosixPath(os.path.normpath(workspace / path)) for path in paths]
+    protected = (workspace / "feedback", workspace / "AGENTS.md")
+    forbidden = call.get("kind") in _CHANGES and any(
+        path.is_relative_to(each) for path in whole for each in protected
+    )
+    for kind in ("reject_once", "reject_always") if forbidden else ("allow_once", "allow_always"):
         for option in mappings(request.get("options")):
             if option.get("kind") == kind and isinstance(option.get("optionId"), str):
                 return {"outcome": {"outcome": "selected", "optionId": option["optionId"]}}
     return {"outcome": {"outcome": "cancelled"}}
-
-
-def _is_protected(path: str, workspace: PurePosixPath) -> bool:
-    whole = PurePosixPath(os.path.normpath(workspace / path))
-    return any(
-        whole == protected or protected in whole.parents
-        for protected in (workspace / "feedback", workspace / "AGENTS.md")
-    )

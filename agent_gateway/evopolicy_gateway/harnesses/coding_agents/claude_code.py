@@ -18,7 +18,14 @@ import os
 from collections.abc import Mapping
 from typing import Any
 
-from evopolicy_gateway.harnesses.coding_agents.dialect import Dialect, TurnReader, first_line, mapping, string
+from evopolicy_gateway.harnesses.coding_agents.dialect import (
+    Dialect,
+    TurnReader,
+    first_line,
+    mapping,
+    mappings,
+    string,
+)
 from evopolicy_gateway.harnesses.coding_agents.turn_failure import turn_failure_of
 from evopolicy_gateway.inputs.kept import MCP_FILE
 from evopolicy_gateway.relay.usage import Usage, count
@@ -102,9 +109,8 @@ class ClaudeReader(TurnReader):
             if len(self._messages) > _MAX_OPEN_MESSAGES:
                 # Dropped messages stay counted: after so many others, a message is not reported again.
                 del self._messages[next(iter(self._messages))]
-        content = message.get("content")
-        for block in content if isinstance(content, list) else ():
-            self._block(mapping(block))
+        for block in mappings(message.get("content")):
+            self._block(block)
 
     def _block(self, block: Mapping[str, Any]) -> None:
         if block.get("type") == "text":

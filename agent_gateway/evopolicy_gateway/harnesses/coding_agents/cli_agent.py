@@ -85,7 +85,8 @@ class CliAgent(Harness):
 
     async def play(self, stage: Stage) -> AgentEnded:
         self._config.check(stage.environment)
-        stage = stage.with_environment(self._dialect.environment() | self._config.environment)
+        own = self._dialect.environment() | self._config.environment
+        stage = msgspec.structs.replace(stage, environment={**stage.environment, **own})
         if self.relay is not None:
             stage = self._relayed(stage, self.relay)
         await self._probe(stage)
@@ -109,10 +110,9 @@ class CliAgent(Harness):
         key = upstream.key
         kept = {name: value for name, value in stage.environment.items() if not (key and key in value)}
         stage.log.redact = stage.log.redact.knowing([key, relay.token])
-        variables = {}
         if self._dialect.takes_variables:
-            variables = relay_variables(upstream.protocol, relay.url, relay.token)
-        return msgspec.structs.replace(stage, environment=kept | variables)
+            kept |= relay_variables(upstream.protocol, relay.url, relay.token)
+        return msgspec.structs.replace(stage, environment=kept)
 
     async def _turn(self, stage: Stage, prompt: str) -> TurnReader:
         """Runs one turn and records its usage."""
@@ -160,7 +160,7 @@ class CliAgent(Harness):
         stage.on_turn(state.turns, stage.log.redact.text(reader.text))
         if (why := self._capped(state.usage)) is not None:
             return self._ending("agent_stopped", why)
-        n_left = await left_of(stage)
+        n_left = await episodes_left(stage)
         if n_left == 0 or stage.over.is_set():
             return self._ending()
         if state.reprompts >= self._config.reprompts:
@@ -226,7 +226,7 @@ class CliAgent(Harness):
     async def _prompt_after_failure(self, stage: Stage) -> AgentEnded | str:
         """The first prompt of a session, or the prompt that resumes an interrupted one; the end if the budget is
         spent."""
-        n_left = await left_of(stage)
+        n_left = await episodes_left(stage)
         if n_left == 0:
             return self._ending()
         if self._state.session is None or not self._dialect.resumes:
@@ -244,10 +244,9 @@ class CliAgent(Harness):
             return None  # which counts more exactly
         if used.total > config.limits.max_tokens:
             return f"cap reached: {used.total} tokens of {config.limits.max_tokens} used"
-        if config.max_cost is not None and config.prices is not None:
-            cost = used.cost(config.prices)
-            if cost > config.max_cost:
-                return f"cap reached: {cost:.2f} of {config.max_cost:.2f} dollars spent"
+        cost = 0.0 if config.prices is None else used.cost(config.prices)
+        if config.max_cost is not None and cost > config.max_cost:
+            return f"cap reached: {cost:.2f} of {config.max_cost:.2f} dollars spent"
         return None
 
     def _missing(self, environment: Mapping[str, str]) -> str | None:
@@ -255,16 +254,15 @@ class CliAgent(Harness):
         name, install = self._program[0], self._dialect.install
         if shutil.which(name, path=environment.get("PATH")) is not None:
             return None
-        return f"there is no program {name!r} on the PATH" + (
-            f"; install it with: {install}" if install else ""
-        )
+        advice = f"; install it with: {install}" if install else ""
+        return f"there is no program {name!r} on the PATH{advice}"
 
     async def _probe(self, stage: Stage) -> None:
         """Finds the program, its version and its options. Raises AgentError that names what is missing."""
         name, dialect = self._program[0], self._dialect
         if (missing := self._missing(stage.environment)) is not None:
             raise AgentError(missing)
-        output = await self._ask(stage, dialect.version_args())
+        output = await self._ask(stage, dialect.version_args)
         self._version = dialect.version_in(output)
         if not dialect.help_args:
             return
@@ -319,21 +317,20 @@ class CliAgent(Harness):
         self, reason: Literal["agent_stopped", "agent_failed"] = "agent_stopped", detail: str = ""
     ) -> AgentEnded:
         state, config = self._state, self._config
-        known = self.known()
-        settings: dict[str, Any] = known["settings"] | {
+        facts = self.known() | {"cli_version": self._version}
+        facts["settings"] |= {
             "reprompted": state.reprompts,
             "paused_s": round(state.paused_s, 1),
             "requests_failed": state.requests_failed,
         }
         if self._dialect.tested_version not in ("", self._version):
-            settings["tested_version"] = self._dialect.tested_version
-        facts: dict[str, Any] = known | {"cli_version": self._version, "settings": settings}
+            facts["settings"]["tested_version"] = self._dialect.tested_version
         if state.usage.total:
             facts["tokens"] = state.usage.recorded(config.prices)
         return AgentEnded(reason=reason, detail=detail, turns=state.turns, retries=state.retries, facts=facts)
 
 
-async def left_of(stage: Stage) -> int | None:
+async def episodes_left(stage: Stage) -> int | None:
     """Episodes left, once no submit is in flight; None when the gateway does not answer.
 
     An agent prompted while its submit runs could only answer that it waits, and would use up its reminders.

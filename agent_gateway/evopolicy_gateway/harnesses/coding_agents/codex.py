@@ -14,7 +14,14 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
-from evopolicy_gateway.harnesses.coding_agents.dialect import Dialect, TurnReader, first_line, mapping, string
+from evopolicy_gateway.harnesses.coding_agents.dialect import (
+    Dialect,
+    TurnReader,
+    first_line,
+    mapping,
+    mappings,
+    string,
+)
 from evopolicy_gateway.harnesses.coding_agents.turn_failure import turn_failure_of
 from evopolicy_gateway.relay.usage import Usage, count
 
@@ -96,10 +103,7 @@ class CodexReader(TurnReader):
         elif kind == "command_execution":
             self.action = f"$ {first_line(string(item.get('command')))}"
         elif kind == "file_change":
-            changes = item.get("changes")
-            paths = [
-                string(mapping(one).get("path")) for one in (changes if isinstance(changes, list) else ())
-            ]
+            paths = [string(one.get("path")) for one in mappings(item.get("changes"))]
             self.action = f"edits {', '.join(path.rpartition('/')[2] for path in paths)}"
 
 

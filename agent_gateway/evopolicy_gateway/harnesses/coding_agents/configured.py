@@ -6,6 +6,8 @@ reported an error.
 
 from __future__ import annotations
 
+import itertools
+import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -35,6 +37,7 @@ class ConfiguredCli(Dialect):
         self.name = config.harness
         self.program = config.program
         self.cumulative = self._cli.events.tokens.counts == "session"
+        self.version_args = self._cli.version
         self.makes_session_id = self._cli.own_session_id
         self.resumes = bool(self._cli.resume)
         self.prompt_on_stdin = self._cli.prompt == "stdin"
@@ -60,7 +63,6 @@ class ConfiguredCli(Dialect):
                 if words and words[-1].startswith("-") and word == unset[0]:
                     words.pop()
                 continue
-            # In one pass, so that `{model}` inside a prompt is not replaced.
             words.append(_filled(word, {name: value or "" for name, value in known.items()}))
         mcp_options = [_filled(word, _MCP) for word in self._cli.mcp] if self.kept.servers else []
         return words + mcp_options + list(self.config.extra_args)
@@ -69,9 +71,6 @@ class ConfiguredCli(Dialect):
         if not self.kept.servers:
             return {}
         return {name: _filled(value, _MCP) for name, value in self._cli.mcp_environment.items()}
-
-    def version_args(self) -> tuple[str, ...]:
-        return self._cli.version
 
     def reader(self) -> ConfiguredReader:
         return ConfiguredReader(self._cli.events)
@@ -96,40 +95,29 @@ class ConfiguredReader(TurnReader):
 
     def _count(self, event: Mapping[str, Any]) -> None:
         paths = self._events.tokens
-        counts: dict[str, int | None] = {
-            name: next(
-                (value for value in values(event, getattr(paths, name)) if isinstance(value, int)), None
-            )
-            for name in ("input", "cache_read", "cache_creation", "output", "reasoning", "total")
-        }
-        if all(value is None for value in counts.values()):
+        counts: dict[str, int] = {}
+        for name in ("input", "cache_read", "cache_creation", "output", "reasoning", "total"):
+            numbers = (value for value in values(event, getattr(paths, name)) if isinstance(value, int))
+            for value in itertools.islice(numbers, 1):
+                counts[name] = count(value)
+        if not counts:
             return
-        cached = count(counts["cache_read"])
-        output = count(counts["output"])
-        if counts["total"] is not None:
-            output = max(output, count(counts["total"]) - count(counts["input"]))
+        given, cached = counts.get("input", 0), counts.get("cache_read", 0)
         usage = Usage(
-            input_noncached=max(0, count(counts["input"]) - (cached if paths.input_includes_cached else 0)),
+            input_noncached=max(0, given - (cached if paths.input_includes_cached else 0)),
             cache_read=cached,
-            cache_creation=count(counts["cache_creation"]),
-            output=output,
-            reasoning=None if counts["reasoning"] is None else count(counts["reasoning"]),
+            cache_creation=counts.get("cache_creation", 0),
+            output=max(counts.get("output", 0), counts.get("total", 0) - given),
+            reasoning=counts.get("reasoning"),
         )
         self.usage = usage if paths.counts == "session" else self.usage + usage
 
 
 def _first(document: Mapping[str, Any], paths: tuple[str, ...]) -> str:
-    for path in paths:
-        for value in values(document, path):
-            if isinstance(value, str) and value:
-                return value
-    return ""
+    texts = (value for path in paths for value in values(document, path) if isinstance(value, str) and value)
+    return next(texts, "")
 
 
 def _filled(word: str, known: Mapping[str, str]) -> str:
-    out, at = "", 0
-    while at < len(word):
-        name = next((name for name in known if word.startswith(name, at)), None)
-        out += word[at] if name is None else known[name]
-        at += 1 if name is None else len(name)
-    return out
+    """The word with the values of the names in it: in one pass, so that `{model}` inside a prompt is not replaced."""
+    return re.sub("|".join(map(re.escape, known)), lambda match: known[match[0]], word)

@@ -64,6 +64,9 @@ class Dialect(ABC):
     help_args: tuple[str, ...] = ()
     """Arguments that make the CLI print its options; empty: its options are not checked."""
     prompt_on_stdin = True
+    packages: tuple[str, ...] = ()
+    """Distributions of our Python that its program imports."""
+    version_args: tuple[str, ...] = ("--version",)
     skills_at = "~/.agents/skills"
     """Folder in which the CLI looks for skills."""
     takes_variables = True
@@ -77,11 +80,6 @@ class Dialect(ABC):
         """The run's skills and MCP servers."""
         self.relay: RelayAddress | None = None
         """Where its program finds the model; None: at the provider."""
-
-    @property
-    def packages(self) -> tuple[str, ...]:
-        """Distributions of our Python that its program imports."""
-        return ()
 
     @abstractmethod
     def arguments(self, session: str | None, *, resume: bool, prompt: str, options: str) -> list[str]:
@@ -103,13 +101,10 @@ class Dialect(ABC):
         """Options that its help must list."""
         return []
 
-    def version_args(self) -> tuple[str, ...]:
-        return ("--version",)
-
     def version_in(self, text: str) -> str | None:
         """The version in its `--version` output; None if there is none."""
         match = _VERSION.search(text[:_MAX_VERSION_CHARS])
-        return None if match is None else match.group(0)
+        return match and match[0]
 
 
 def mapping(value: Any) -> Mapping[str, Any]:

@@ -12,6 +12,8 @@ import os
 import sys
 from typing import Any
 
+import msgspec
+
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.installation import add_extra
 from evopolicy_gateway.harnesses.coding_agents.claude_code import ClaudeReader
@@ -45,18 +47,16 @@ class Llm(Dialect):
         if config.mcp:
             raise ConfigError("harness llm starts no MCP servers; leave out [mcp], or use another harness")
         self._api: ApiTable = config.api
+        self.packages = (self._api.protocol,)
         if importlib.util.find_spec(self._api.protocol) is None:
             raise ConfigError(f"the agent llm needs the package {self._api.protocol}: {add_extra('llm')}")
 
-    @property
-    def packages(self) -> tuple[str, ...]:
-        return (self._api.protocol,)
-
     def arguments(self, session: str | None, *, resume: bool, prompt: str, options: str) -> list[str]:
+        version = "/v1" if self._api.protocol == "openai" else ""
         settings: dict[str, Any] = {
             "protocol": self._api.protocol,
             "model": self.config.model,
-            "base_url": self._base_url(),
+            "base_url": self._api.url if self.relay is None else f"{self.relay.url}{version}",
             "system": self._api.system,
             "skills": [
                 f"{self.config.skills_at or self.skills_at}/{name}/{SKILL}" for name in self.kept.skills
@@ -74,11 +74,6 @@ class Llm(Dialect):
         key = os.environ.get(self._api.variable, "") if self.relay is None else self.relay.token
         return json.dumps({"key": key, "prompt": prompt})
 
-    def _base_url(self) -> str:
-        if self.relay is None:
-            return self._api.url
-        return f"{self.relay.url}/v1" if self._api.protocol == "openai" else self.relay.url
-
     def version_in(self, text: str) -> str | None:
         return text.strip() or None
 
@@ -89,9 +84,8 @@ class Llm(Dialect):
         effort = self.config.effort
         if effort is None:
             return {}
-        if self._api.protocol == "openai":
-            return {"reasoning_effort": effort}
-        return {"output_config": {"effort": effort}}
+        openai = self._api.protocol == "openai"
+        return {"reasoning_effort": effort} if openai else {"output_config": {"effort": effort}}
 
 
 def config_of(rest: str) -> AgentConfig:
@@ -102,5 +96,5 @@ def config_of(rest: str) -> AgentConfig:
             f"--agent llm:{rest}: write llm:openai/MODEL or llm:anthropic/MODEL; for another endpoint that is"
             ' compatible with one of them, use --agent file:AGENT.toml with harness = "llm" and a table [api]'
         )
-    api = ApiTable(protocol="openai" if protocol == "openai" else "anthropic")
+    api = msgspec.convert({"protocol": protocol}, ApiTable)
     return AgentConfig(harness="llm", model=model, api=api)

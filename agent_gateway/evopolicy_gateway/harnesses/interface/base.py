@@ -38,10 +38,6 @@ class AgentError(EvopolicyError):
     """The agent cannot be started, or its harness cannot interpret its output; for the operator."""
 
 
-def _nobody_watches(_: AgentDoing) -> None:
-    pass
-
-
 class Stage(msgspec.Struct, frozen=True, kw_only=True):
     """The surroundings in which an agent runs."""
 
@@ -58,7 +54,7 @@ class Stage(msgspec.Struct, frozen=True, kw_only=True):
     """Ids of the processes started by `start`, which also collects their exit status."""
     session_file: Path | None = None
     """File of the session's state, with which the session resumes after its agent supervisor was killed."""
-    on_doing: Callable[[AgentDoing], None] = _nobody_watches
+    on_doing: Callable[[AgentDoing], None] = lambda _: None
     clock: AgentClock = msgspec.field(default_factory=lambda: AgentClock(float("inf")))
     activity: Activity | None = None
     """None: inactivity is not watched."""
@@ -69,10 +65,6 @@ class Stage(msgspec.Struct, frozen=True, kw_only=True):
     """The jail of every program that `start` starts."""
     joins: Sequence[str] = ()
     """The agent's cgroups, as in `ending_with_parent`."""
-
-    def with_environment(self, more: Mapping[str, str]) -> Stage:
-        """A copy with more variables."""
-        return msgspec.structs.replace(self, environment={**self.environment, **more})
 
     async def sleep(self, seconds: float) -> None:
         """Sleeps, but not beyond the agent's time."""

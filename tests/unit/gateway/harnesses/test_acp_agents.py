@@ -29,8 +29,7 @@ def kept(found: Played, name: str) -> list[str]:
 
 def test_an_agent_that_stops_is_prompted_again_in_its_session(tmp_path: Path) -> None:
     found = played(tmp_path, "work")
-    assert found.ending is not None
-    assert (found.ending.reason, found.ending.turns, found.ending.retries) == ("agent_stopped", 2, 0)
+    assert found.outcome == ("agent_stopped", 2, 0)
     assert found.turns == [(1, "done 0"), (2, "done 1")]
     assert found.ending.facts["cli_version"] == "fake 1.2"
     tokens = found.ending.facts["tokens"]
@@ -46,54 +45,44 @@ def test_an_agent_that_stops_is_prompted_again_in_its_session(tmp_path: Path) ->
     ]
 
 
-def test_a_crashed_agent_is_started_again_and_loads_its_session(tmp_path: Path) -> None:
-    found = played(tmp_path, "work,crash,work")
-    assert found.ending is not None
-    assert (found.ending.reason, found.ending.turns, found.ending.retries) == ("agent_stopped", 2, 1)
-    assert kept(found, "requests").count("session/new") == 1
-    assert kept(found, "requests").count("session/load") == 1
-    failed = next(line for line in found.log if line.get("type") == "turn_failed")
-    assert "out of cheese" in failed["message"]
-    # What a loaded session repeats is not the new turn's text.
-    assert found.turns[-1] == (2, "done 2")
+@pytest.mark.parametrize(
+    ("scenario", "requests", "retries"),
+    [
+        ("work,crash,work", {"session/new": 1, "session/load": 1}, 1),
+        ("work,crash,work,noload", {"session/new": 2}, 2),
+        ("work,crash,work,lostload", {"session/new": 2, "session/load": 1}, 2),
+        ("work,busynew", {"session/new": 2}, 1),  # a session that could not begin
+        ("busy,work", {"initialize": 1}, 1),
+        ("deeperror,deep", {}, 1),
+        ("silent,work", {"initialize": 2}, 1),
+        ("deaf,work", {}, 1),
+    ],
+)
+def test_an_agent_that_fails_goes_on_in_a_session(
+    tmp_path: Path, scenario: str, requests: dict[str, int], retries: int
+) -> None:
+    found = played(tmp_path, scenario, silence_s=1.0)
+    assert found.outcome == ("agent_stopped", 2, retries), found.ending.detail
+    assert {name: kept(found, "requests").count(name) for name in requests} == requests
+    if scenario == "work,crash,work":
+        failed = next(line for line in found.log if line.get("type") == "turn_failed")
+        assert "out of cheese" in failed["message"]
+        # What a loaded session repeats is not the new turn's text.
+        assert found.turns[-1] == (2, "done 2")
+    if scenario.endswith("load"):
+        assert found.prompts[-1]["message"].startswith("Read AGENTS.md")
+    if "deep" in scenario:
+        assert {"type": "user", "text": "nested too deeply to be kept"} in found.log
+    # An agent that reads no answers, to 20 MB of requests, is not read either: what was read stands in the log.
+    assert (tmp_path / "agent.jsonl").stat().st_size < 4 << 20
 
 
-def test_an_agent_that_cannot_load_its_session_begins_a_new_one(tmp_path: Path) -> None:
-    found = played(tmp_path, "work,crash,work,noload")
-    assert found.ending is not None
-    assert found.ending.reason == "agent_stopped", found.ending.detail
-    assert kept(found, "requests").count("session/new") == 2
-    assert [prompt["message"][:14] for prompt in found.prompts][-1] == "Read AGENTS.md"
-
-
-def test_an_agent_that_refuses_its_session_begins_a_new_one(tmp_path: Path) -> None:
-    found = played(tmp_path, "work,crash,work,lostload")
-    assert found.ending is not None
-    assert found.ending.reason == "agent_stopped", found.ending.detail
-    assert kept(found, "requests").count("session/load") == 1
-    assert kept(found, "requests").count("session/new") == 2
-
-
-def test_a_session_that_could_not_begin_is_asked_for_again(tmp_path: Path) -> None:
-    found = played(tmp_path, "work,busynew")
-    assert found.ending is not None
-    assert (found.ending.reason, found.ending.retries) == ("agent_stopped", 1), found.ending.detail
-    assert kept(found, "requests").count("session/new") == 2
-
-
-def test_a_model_that_can_be_neither_chosen_nor_seen_ends_the_run(tmp_path: Path) -> None:
-    with pytest.raises(AgentError, match="put the model into `program`"):
-        played(tmp_path / "a", "work", model="some-model")
-    found = played(tmp_path / "b", "work", model="some-model", extra_args=("--model=some-model",))
-    assert found.ending is not None
-    assert found.ending.reason == "agent_stopped"
-
-
-def test_an_effort_that_cannot_be_chosen_ends_the_run(tmp_path: Path) -> None:
-    with pytest.raises(AgentError, match="put the effort into `program`"):
-        played(tmp_path / "a", "work", effort="xhigh")
-    found = played(tmp_path / "b", "work", effort="xhigh", extra_args=("--effort=xhigh",))
-    assert found.ending is not None
+@pytest.mark.parametrize("name", ["model", "effort"])
+def test_a_setting_that_can_be_neither_chosen_nor_seen_ends_the_run(tmp_path: Path, name: str) -> None:
+    setting: dict[str, Any] = {name: "some-value"}
+    with pytest.raises(AgentError, match=f"put the {name} into `program`"):
+        played(tmp_path / "a", "work", **setting)
+    found = played(tmp_path / "b", "work", extra_args=(f"--{name}=some-value",), **setting)
     assert found.ending.reason == "agent_stopped"
 
 
@@ -108,60 +97,33 @@ def test_a_session_plays_in_the_mode_that_asks_permission(tmp_path: Path) -> Non
     assert kept(play(tmp_path / "named", named, "work,modes"), "chosen") == ["plan"]
 
 
-def test_a_model_is_chosen_by_its_id_or_its_name(tmp_path: Path) -> None:
-    for model in ("small-1", "SMALL-1"):
-        found = played(tmp_path / model.swapcase()[:3], "work,options", model=model)
-        assert kept(found, "chosen") == ["mode default", "model small-1"]
-
-
-def test_a_model_offered_under_no_name_is_the_programs(tmp_path: Path) -> None:
-    found = played(tmp_path, "work,options", model="huge", extra_args=("--model=huge",))
-    assert kept(found, "chosen") == ["mode default"]
-
-
-def test_a_failing_provider_is_asked_again_over_the_same_connection(tmp_path: Path) -> None:
-    found = played(tmp_path, "busy,work")
-    assert found.ending is not None
-    assert (found.ending.turns, found.ending.retries) == (2, 1)
-    assert kept(found, "requests").count("initialize") == 1
-
-
-def test_messages_that_nest_too_deeply_to_be_written_end_no_run(tmp_path: Path) -> None:
-    found = played(tmp_path, "deeperror,deep")
-    assert found.ending is not None
-    assert (found.ending.reason, found.ending.turns, found.ending.retries) == ("agent_stopped", 2, 1)
-    assert {"type": "user", "text": "nested too deeply to be kept"} in found.log
+@pytest.mark.parametrize(
+    ("model", "args", "chosen"),
+    [
+        ("small-1", (), ["mode default", "model small-1"]),
+        ("SMALL-1", (), ["mode default", "model small-1"]),
+        ("huge", ("--model=huge",), ["mode default"]),  # not offered, so the program's own
+    ],
+)
+def test_a_model_is_chosen_by_its_id_or_its_name(
+    tmp_path: Path, model: str, args: tuple[str, ...], chosen: list[str]
+) -> None:
+    found = played(tmp_path, "work,options", model=model, extra_args=args)
+    assert kept(found, "chosen") == chosen
 
 
 def test_requests_that_cannot_be_answered_are_not_logged_one_by_one(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     found = played(tmp_path, "deepid,work")
-    assert found.ending is not None
     assert (found.ending.reason, found.ending.turns) == ("agent_stopped", 2)
     assert [record.message for record in caplog.records if record.exc_info] == []
 
 
-def test_an_agent_that_reads_no_answers_is_not_read_either(tmp_path: Path) -> None:
-    found = played(tmp_path, "deaf,work", silence_s=1.0)
-    assert found.ending is not None
-    assert (found.ending.turns, found.ending.retries) == (2, 1)
-    # 20 MB of requests: those that were read stand in the log.
-    assert (tmp_path / "agent.jsonl").stat().st_size < 4 << 20
-
-
 def test_an_agent_that_is_not_logged_in_ends_the_run(tmp_path: Path) -> None:
     found = played(tmp_path, "login")
-    assert found.ending is not None
     assert found.ending.reason == "agent_failed"
     assert "not logged in" in found.ending.detail
-
-
-def test_a_silent_agent_is_ended_and_started_again(tmp_path: Path) -> None:
-    found = played(tmp_path, "silent,work", silence_s=1.0)
-    assert found.ending is not None
-    assert (found.ending.turns, found.ending.retries) == (2, 1)
-    assert kept(found, "requests").count("initialize") == 2
 
 
 def test_permissions_follow_the_rules_and_this_side_is_out_of_reach(tmp_path: Path) -> None:
@@ -183,42 +145,25 @@ def test_an_option_that_is_not_offered_is_not_chosen() -> None:
 
 
 @pytest.mark.parametrize(
-    ("reported", "usage"),
+    ("given", "cached", "output", "thought", "total", "usage"),
     [
-        (
-            {"inputTokens": 30, "cachedReadTokens": 70, "outputTokens": 5, "totalTokens": 105},
-            Usage(input_noncached=30, cache_read=70, output=5),
-        ),
-        (
-            {"inputTokens": 100, "cachedReadTokens": 70, "outputTokens": 5, "totalTokens": 105},
-            Usage(input_noncached=30, cache_read=70, output=5),
-        ),
-        (
-            {"inputTokens": 10, "outputTokens": 5, "thoughtTokens": 3, "totalTokens": 18},
-            Usage(input_noncached=10, output=8, reasoning=3),
-        ),
-        (
-            {"inputTokens": 10, "outputTokens": 5, "thoughtTokens": 3, "totalTokens": 15},
-            Usage(input_noncached=10, output=5, reasoning=3),
-        ),
-        ({"inputTokens": "x", "outputTokens": -1}, Usage()),
+        (30, 70, 5, None, 105, Usage(input_noncached=30, cache_read=70, output=5)),
+        (100, 70, 5, None, 105, Usage(input_noncached=30, cache_read=70, output=5)),
+        (10, None, 5, 3, 18, Usage(input_noncached=10, output=8, reasoning=3)),
+        (10, None, 5, 3, 15, Usage(input_noncached=10, output=5, reasoning=3)),
+        ("x", None, -1, None, None, Usage()),
     ],
 )
 def test_tokens_are_counted_whatever_an_agent_counts_into_its_input(
-    reported: dict[str, Any], usage: Usage
+    given: Any, cached: Any, output: Any, thought: Any, total: Any, usage: Usage
 ) -> None:
-    assert usage_of(reported) == usage
+    reported = {"inputTokens": given, "cachedReadTokens": cached, "outputTokens": output}
+    assert usage_of(reported | {"thoughtTokens": thought, "totalTokens": total}) == usage
 
 
 def test_tokens_of_requests_are_added_where_the_answer_has_none() -> None:
     chunk = {"sessionUpdate": "agent_message_chunk", "content": {"type": "text", "text": ""}}
-    counts = {
-        "inputTokens": 100,
-        "outputTokens": 5,
-        "totalTokens": 105,
-        "cachedReadTokens": 70,
-        "thoughtTokens": 0,
-    }
+    counts = {"inputTokens": 100, "outputTokens": 5, "totalTokens": 105, "cachedReadTokens": 70}
     reader = AcpReader()
     for _ in range(2):
         reader.read({**chunk, "_meta": {"usage": counts}})

@@ -6,12 +6,11 @@ import asyncio
 import json
 import re
 import sys
-import threading
-from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 
 import pytest
 from stages.command_stage import play, play_with_a_child_that_holds_the_pipes
+from stages.loopback import serving_json
 
 from evopolicy_common.errors import ConfigError
 from evopolicy_gateway.harnesses import entry_name, make
@@ -52,27 +51,29 @@ for line in sys.stdin:
     assert "AGENTS.md" in prompts[0]["message"]
 
 
-def test_every_field_of_an_answer_is_optional(tmp_path: Path) -> None:
-    code = """
+OPTIONAL = """
 import sys
-import threading
-from http.server import BaseHTTPRequestHandler, HTTPServer
 for number, line in enumerate(sys.stdin):
     print(['{}', '{"text": "two"}', '{"turn": 2}', '{"stop": false, "other": 1}', '{"stop": true}'][number], flush=True)
 """
-    ending, _, turns = play(tmp_path, code)
-    assert (ending.reason, ending.turns) == ("agent_stopped", 5)
-    assert turns == [(1, ""), (2, "two"), (3, ""), (4, ""), (5, "")]
-
-
-def test_a_program_that_counts_its_turns_from_one_is_heard(tmp_path: Path) -> None:
-    code = """
+FROM_ONE = """
 import json, sys
 for number, line in enumerate(sys.stdin, 1):
     print(json.dumps({"turn": number, "stop": number == 3}), flush=True)
 """
-    ending, _, _ = play(tmp_path, code)
-    assert (ending.reason, ending.turns) == ("agent_stopped", 3)
+
+
+@pytest.mark.parametrize(
+    ("code", "texts"),
+    [(OPTIONAL, ["", "two", "", "", ""]), (FROM_ONE, ["", "", ""])],
+    ids=["few", "from one"],
+)
+def test_every_field_is_optional_and_turns_may_count_from_one(
+    tmp_path: Path, code: str, texts: list[str]
+) -> None:
+    ending, _, turns = play(tmp_path, code)
+    assert (ending.reason, ending.turns) == ("agent_stopped", len(texts))
+    assert turns == list(enumerate(texts, 1))
 
 
 IDLE = ["import time; time.sleep(1000)", "import os, time; os.close(1); time.sleep(1000)", "input(); input()"]
@@ -177,22 +178,11 @@ def test_a_program_that_cannot_be_started_is_reported(tmp_path: Path) -> None:
     log.close()
 
 
-@pytest.mark.parametrize(
-    "agent",
-    [
-        "",
-        "evolv",
-        "evolve:x",
-        "replay",
-        "replay:",
-        "replay:nowhere",
-        "command:",
-        "command: ",
-        "command:no-such-program-x",
-        "command:python3 no_such_script.py",
-        "command:'open",
-    ],
-)
+WRONG = ["", "evolv", "evolve:x", "replay", "replay:", "replay:nowhere", "command:", "command: "]
+WRONG += ["command:no-such-program-x", "command:python3 no_such_script.py", "command:'open"]
+
+
+@pytest.mark.parametrize("agent", WRONG)
 def test_what_is_no_agent_is_refused_with_what_there_is(agent: str, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="--agent"):
         make(agent, tmp_path)
@@ -242,20 +232,27 @@ def test_files_in_a_command_are_meant_from_where_it_was_given(tmp_path: Path) ->
     assert harness._program == [str(tmp_path / "link"), str(tmp_path / "mine.py"), "--flag", "two words"]
 
 
-def test_entries_are_named_after_their_agents(tmp_path: Path) -> None:
-    assert entry_name("evolve") == "evolve"
-    assert entry_name("random") == "random"
-    assert entry_name(f"replay:{tmp_path}/gaits/") == "replay-gaits"
-    for command, name in {
-        "/opt/agents/run.sh --fast": "run",
-        "python3 my_agent.py 3": "my_agent",
-        f"{sys.executable} -u agents/mine.py": "mine",
-        "python3.12 -m my.agent": "my.agent",
-        "bash -ec 'python3 x.py'": "bash",
-        "./agent": "agent",
-        "python3 random.py": "command-random",
-    }.items():
-        assert entry_name(f"command:{command}") == name
+@pytest.mark.parametrize(
+    ("agent", "name"),
+    {
+        "evolve": "evolve",
+        "random": "random",
+        "replay:/tmp/gaits/": "replay-gaits",
+        "command:/opt/agents/run.sh --fast": "run",
+        "command:python3 my_agent.py 3": "my_agent",
+        f"command:{sys.executable} -u agents/mine.py": "mine",
+        "command:python3.12 -m my.agent": "my.agent",
+        "command:bash -ec 'python3 x.py'": "bash",
+        "command:./agent": "agent",
+        "command:python3 random.py": "command-random",
+        "codex": "codex",
+        "codex:gpt-5.5": "gpt-5.5 (codex)",
+        "claude-code:m": "m (claude-code)",
+        "file:agents/qwen.toml": "qwen",
+    }.items(),
+)
+def test_entries_are_named_after_their_agents(agent: str, name: str) -> None:
+    assert entry_name(agent) == name
 
 
 @pytest.mark.parametrize(
@@ -264,21 +261,8 @@ def test_entries_are_named_after_their_agents(tmp_path: Path) -> None:
 def test_a_program_gets_no_prompt_after_its_budget_is_spent(tmp_path: Path, state: dict[str, object]) -> None:
     states = iter([{"remaining_budget": 4, "is_finalized": False}])
 
-    class Info(BaseHTTPRequestHandler):
-        def do_GET(self) -> None:
-            body = json.dumps({"state": next(states, state)}).encode()
-            self.send_response(200)
-            self.send_header("Content-Length", str(len(body)))
-            self.end_headers()
-            self.wfile.write(body)
-
-    server = HTTPServer(("127.0.0.1", 0), Info)
-    threading.Thread(target=server.serve_forever, daemon=True).start()
-    try:
-        ending, log, turns = play(tmp_path, ANSWERS_ONLY, info=f"http://127.0.0.1:{server.server_port}/info")
-    finally:
-        server.shutdown()
-        server.server_close()
+    with serving_json(lambda *_: (200, {"state": next(states, state)})) as url:
+        ending, log, turns = play(tmp_path, ANSWERS_ONLY, info=f"{url}/info")
     prompts = [line["message"] for line in log if line.get("type") == "prompt"]
     assert (ending.reason, len(turns), len(prompts)) == ("agent_stopped", 2, 2)
     assert "4 episodes of the budget are left" in prompts[1]

@@ -8,7 +8,7 @@ from typing import Any, Literal
 import pytest
 from stages import odd_answers
 from stages.cli_stage import Played, play, settings
-from stages.model_api import CACHED, CREATED, INPUT, OUTPUT, ModelApi, Step
+from stages.model_api import CACHED, CREATED, INPUT, OUTPUT, SUBMIT, ModelApi, Step
 
 from evopolicy_common.errors import ConfigError
 from evopolicy_gateway import harnesses
@@ -19,13 +19,11 @@ from evopolicy_gateway.relay.usage import Prices
 pytestmark = pytest.mark.slow
 
 Protocol = Literal["openai", "anthropic"]
-PROTOCOLS: list[Protocol] = ["openai", "anthropic"]
-MOSTLY_ONE = ["openai", pytest.param("anthropic", marks=pytest.mark.system)]
-"""For what the agent does alike with both."""
-SUBMIT = (
-    "echo '# better' >> system/policy.py; curl -s --noproxy '*' -X POST"
-    " -d '{\"env_instances\": [0, 1]}' $EVOPOLICYGYM_SUBMIT_URL"
+protocols = pytest.mark.parametrize("protocol", ["openai", "anthropic"])
+mostly_one = pytest.mark.parametrize(
+    "protocol", ["openai", pytest.param("anthropic", marks=pytest.mark.system)]
 )
+"""For what the agent does alike with both."""
 KEY = "a-key-that-nobody-else-may-see"
 
 
@@ -46,16 +44,14 @@ def played(tmp_path: Path, protocol: Protocol, script: list[Step], **more: Any) 
         return play(tmp_path, config_for(protocol, api, **more), ""), api
 
 
-@pytest.mark.parametrize("protocol", PROTOCOLS)
+@protocols
 def test_a_model_edits_submits_and_is_prompted_again_in_its_session(
     tmp_path: Path, protocol: Protocol
 ) -> None:
     prices = Prices(input=1.0, output=10.0, cache_read=0.1)
     script = [Step(command=SUBMIT), Step(text="first"), Step(command=SUBMIT), Step(text="second")]
     found, api = played(tmp_path, protocol, script, prices=prices)
-    assert found.ending is not None
-    assert found.ending.reason == "agent_stopped", found.ending.detail
-    assert (found.ending.turns, found.ending.retries) == (2, 0)
+    assert found.outcome == ("agent_stopped", 2, 0), found.ending.detail
     assert found.turns == [(1, "first"), (2, "second")]
     assert (tmp_path / "workspace/system/policy.py").read_text() == "# better\n# better\n"
     tokens = found.ending.facts["tokens"]
@@ -69,7 +65,7 @@ def test_a_model_edits_submits_and_is_prompted_again_in_its_session(
     assert "first" in str(api.requests[2])
 
 
-@pytest.mark.parametrize("protocol", MOSTLY_ONE)
+@mostly_one
 def test_neither_its_commands_nor_its_log_have_the_key(tmp_path: Path, protocol: Protocol) -> None:
     found, api = played(tmp_path, protocol, [Step(command="env"), Step(text="done")], reprompts=0)
     assert "EVOPOLICYGYM_SUBMIT_URL" in str(api.requests[1])
@@ -77,34 +73,25 @@ def test_neither_its_commands_nor_its_log_have_the_key(tmp_path: Path, protocol:
     assert KEY not in found.text
 
 
-@pytest.mark.parametrize("protocol", MOSTLY_ONE)
+@mostly_one
 def test_a_busy_provider_is_asked_again_within_the_turn(tmp_path: Path, protocol: Protocol) -> None:
     script = [Step(status=503, text="overloaded"), Step(command=SUBMIT), Step(command=SUBMIT)]
     found, _ = played(tmp_path, protocol, [*script, Step(text="done")])
-    assert found.ending is not None
     assert (found.ending.reason, found.ending.retries) == ("agent_stopped", 0), found.ending.detail
 
 
-@pytest.mark.parametrize("protocol", MOSTLY_ONE)
+@mostly_one
 def test_a_wrong_key_ends_the_run_with_the_providers_words(tmp_path: Path, protocol: Protocol) -> None:
     found, _ = played(tmp_path, protocol, [Step(status=401, text="no such key")] * 9)
-    assert found.ending is not None
     assert found.ending.reason == "agent_failed"
     assert "no such key" in found.ending.detail
 
 
-KNOWN = {
-    "model": "m-1",
-    "system": "",
-    "parameters": {},
-    "retries": 0,
-    "context_tokens": 1000,
-    "max_output_tokens": 9,
-    "timeout_s": 9.0,
-}
+KNOWN = {"model": "m-1", "system": "", "parameters": {}, "retries": 0, "timeout_s": 9.0}
+KNOWN |= {"context_tokens": 1000, "max_output_tokens": 9}
 
 
-@pytest.mark.parametrize("protocol", PROTOCOLS)
+@protocols
 @pytest.mark.parametrize(
     "body", [b"{not json", b'{"choices": null}', b"7", b'{"choices": [{}]}', b'{"choices": []}', None]
 )
@@ -122,22 +109,17 @@ def test_an_answer_of_another_form_is_an_error_that_says_so(protocol: Protocol, 
 def test_a_session_that_failed_before_its_first_answer_begins_anew(tmp_path: Path) -> None:
     outage = [Step(status=503, text="overloaded")] * 5
     found, _ = played(tmp_path, "openai", [*outage, Step(command=SUBMIT), Step(command=SUBMIT)])
-    assert found.ending is not None
     assert (found.ending.reason, found.ending.retries) == ("agent_stopped", 1)
     assert [prompt["message"][:14] for prompt in found.prompts] == ["Read AGENTS.md"] * 2
 
 
-@pytest.mark.parametrize("protocol", MOSTLY_ONE)
+@mostly_one
 def test_a_conversation_beyond_the_models_context_goes_on_without_old_outputs(
     tmp_path: Path, protocol: Protocol
 ) -> None:
     commands = [Step(command=f"echo output-{n}-of-a-command") for n in range(12)]
-    script = [
-        *commands,
-        Step(status=400, text="prompt is too long: context length exceeded"),
-        Step(text="done"),
-    ]
-    found, api = played(tmp_path, protocol, script, reprompts=0)
+    too_long = Step(status=400, text="prompt is too long: context length exceeded")
+    found, api = played(tmp_path, protocol, [*commands, too_long, Step(text="done")], reprompts=0)
     assert found.turns == [(1, "done")]
     assert "output-0-of" in str(api.requests[-2])
     last = str(api.requests[-1]["messages"])
@@ -163,10 +145,10 @@ def test_shortening_goes_on_until_two_outputs_are_left() -> None:
     api = apis.open_api({"protocol": "openai", "base_url": "http://127.0.0.1:1", **KNOWN}, "", [])
     for n in range(12):
         api.answer([apis.Call(id=str(n))], [f"output {n}"])
-    left = []
+    kept = []
     while api.shorten():
-        left.append(sum("output" in message["content"] for message in api.messages))
-    assert left == [8, 2]
+        kept.append(sum("output" in message["content"] for message in api.messages))
+    assert kept == [8, 2]
 
 
 def test_arguments_that_are_no_object_are_not_sent_back() -> None:
@@ -199,11 +181,8 @@ def test_the_command_line_names_protocol_and_model(tmp_path: Path) -> None:
     config = harnesses.config_of("llm:openai/some/model", tmp_path)
     assert config is not None
     assert config.api is not None
-    assert (config.model, config.api.protocol, config.api.variable) == (
-        "some/model",
-        "openai",
-        "OPENAI_API_KEY",
-    )
+    assert (config.model, config.api.protocol) == ("some/model", "openai")
+    assert config.api.variable == "OPENAI_API_KEY"
     assert config.provider_name == "api.openai.com"
     for wrong in ("llm:gpt", "llm:openai/", "llm:google/gemini"):
         with pytest.raises(ConfigError, match="llm:openai/MODEL"):
