@@ -54,14 +54,22 @@ def agent(folder: Path, code: str) -> str:
     return f"command:{sys.executable} {path}"
 
 
-def evopolicy(cwd: Path, *args: str, code: int | None = None) -> subprocess.CompletedProcess[str]:
-    """`evopolicy` with these arguments in `cwd`, to its end. `code`: the exit code that it has to have."""
+def evopolicy(
+    cwd: Path | None,
+    *args: str,
+    code: int | None = None,
+    program: str = "evopolicy_gateway.cli",
+    **environment: str,
+) -> subprocess.CompletedProcess[str]:
+    """`evopolicy`, or another program of ours, with these arguments in `cwd`, to its end. `code`: the exit code that it
+    has to have."""
     done = subprocess.run(
-        [sys.executable, "-m", "evopolicy_gateway.cli", *args],
+        [sys.executable, "-m", program, *args],
         cwd=cwd,
+        env={**os.environ, **environment},
         capture_output=True,
         text=True,
-        timeout=300,
+        timeout=1200,
         check=False,
     )
     assert code in (None, done.returncode), done.stdout + done.stderr
@@ -74,17 +82,22 @@ def words(text: str) -> list[str]:
 
 
 @contextlib.contextmanager
-def process(log: Path, *arguments: str, **environment: str) -> Iterator[subprocess.Popen[bytes]]:
-    """A module of ours that runs, with its output in `log`, until the `with` is left."""
+def process(
+    log: Path, *arguments: str, cwd: Path | None = None, **environment: str
+) -> Iterator[subprocess.Popen[bytes]]:
+    """A module of ours, or a script, that runs, with its output in `log`, until the `with` is left."""
+    words = [sys.executable, *(() if arguments[0].endswith(".py") else ("-m",)), *arguments]
     with log.open("ab") as out:
-        running = subprocess.Popen(
-            [sys.executable, "-m", *arguments], stdout=out, stderr=out, env={**os.environ, **environment}
-        )
+        running = subprocess.Popen(words, stdout=out, stderr=out, cwd=cwd, env={**os.environ, **environment})
     try:
         yield running
     finally:
         running.terminate()
-        running.wait(timeout=TIMEOUT_S)
+        try:
+            running.wait(timeout=TIMEOUT_S)
+        except subprocess.TimeoutExpired:
+            running.kill()
+            running.wait()
 
 
 class Command:
@@ -194,26 +207,26 @@ Plays = Callable[..., Ran]
 
 
 @contextlib.contextmanager
+def worker_of(
+    coordinator: Coordinator, *options: str, **environment: str
+) -> Iterator[subprocess.Popen[bytes]]:
+    """A worker with these options, until the `with` is left; of two slots, if they do not say otherwise."""
+    usual = {"--slots": "2", "--grace": "0", "--credentials": coordinator.ready["credentials"]["worker"]}
+    words = [*options, *(f"{name}={value}" for name, value in usual.items() if name not in options)]
+    own = {"XDG_STATE_HOME": str(coordinator.state.parent / "xdg"), **environment}
+    with process(coordinator.log, "evopolicy_worker.cli", *words, **own) as running:
+        yield running
+
+
+@contextlib.contextmanager
 def toy_cluster(root: Path, *arguments: str) -> Iterator[Path]:
     """The operator's credentials for a coordinator, with these arguments, and a worker with two slots for the toy
     environments."""
-    coordinator = Coordinator(root / "s", *arguments)
-    credentials = coordinator.ready["credentials"]
-    options = ["--env", "toy", "--slots", "2", "--grace", "0", "--need-tier", "bwrap"]
-    options += ["--credentials", credentials["worker"]]
-    with coordinator.log.open("ab") as log:
-        worker = subprocess.Popen(
-            [sys.executable, "-m", "evopolicy_worker.cli", *options],
-            env={**os.environ, "XDG_STATE_HOME": str(root / "xdg")},
-            stdout=log,
-            stderr=log,
-        )
-    try:
-        yield Path(credentials["operator"])
-    finally:
-        worker.terminate()
-        worker.wait(timeout=TIMEOUT_S)
-        coordinator.stop()
+    with contextlib.ExitStack() as stack:
+        coordinator = Coordinator(root / "s", *arguments)
+        stack.callback(coordinator.stop)
+        stack.enter_context(worker_of(coordinator, "--env", "toy", "--need-tier", "bwrap"))
+        yield Path(coordinator.ready["credentials"]["operator"])
 
 
 def run_on(operator_file: Path, cwd: Path, agent_name: str, *more: str) -> tuple[int, str, str]:

@@ -12,7 +12,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import AsyncIterator, Callable, Coroutine
+from collections.abc import AsyncIterator, Callable, Coroutine, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -48,25 +48,26 @@ TIMEOUT_S = 60.0
 class Coordinator:
     """One coordinator process on a state folder."""
 
-    def __init__(self, state: Path, *args: str, trust_workers: bool = True) -> None:
+    def __init__(
+        self,
+        state: Path,
+        *args: str,
+        trust_workers: bool = True,
+        program: Sequence[str] = ("-m", "evopolicy_coordinator.cli"),
+        **environment: str,
+    ) -> None:
         self.state = state
         self.ready_file = state.parent / f"{state.name}.ready"
         self.log = state.parent / f"{state.name}.log"
         self.ready_file.unlink(missing_ok=True)
-        command = [
-            sys.executable,
-            "-m",
-            "evopolicy_coordinator.cli",
-            "--state",
-            str(state),
-            *(["--trust-workers"] if trust_workers else []),
-        ]
+        command = [sys.executable, *program, "--state", str(state)]
+        command += ["--trust-workers"] * trust_workers
         with self.log.open("ab") as log:
             self.process = subprocess.Popen(
                 [*command, "--ready-file", str(self.ready_file), *args],
                 stdout=log,
                 stderr=log,
-                env={**os.environ, "XDG_STATE_HOME": str(state.parent / "xdg")},
+                env={**os.environ, "XDG_STATE_HOME": str(state.parent / "xdg"), **environment},
             )
         deadline = time.monotonic() + TIMEOUT_S
         while not self.ready_file.exists():

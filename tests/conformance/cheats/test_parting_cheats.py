@@ -4,12 +4,12 @@ it."""
 from __future__ import annotations
 
 import stat
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
-from attacks.cheated import TIMEOUT_S, Cheated
+from attacks.cheated import Cheated
+from commands import evopolicy
 
 from evopolicy_common.processes.scratch import remove_tree
 from evopolicy_common.records.policies.checkpoints import METADATA
@@ -58,13 +58,7 @@ def test_traps_that_an_agent_leaves_catch_nobody(
 
 def check_readers(folder: Path, report: Path) -> None:
     """Who reports the run, or compares it, comes to an end and shows nothing of this machine."""
-    done = subprocess.run(
-        [sys.executable, "-m", "evopolicy_gateway.cli", "report", str(folder), "--out", str(report)],
-        capture_output=True,
-        text=True,
-        timeout=TIMEOUT_S,
-        check=False,
-    )
+    done = evopolicy(None, "report", str(folder), "--out", str(report))
     assert done.returncode == 0, done.stdout + done.stderr
     assert "\x1b]0" not in done.stdout + done.stderr
     page = "".join(path.read_text() for path in report.rglob("*.html"))

@@ -108,145 +108,130 @@ async def two_runs(
             yield owner, victim, client
 
 
-def in_time(scenario: Any) -> None:
-    asyncio.run(asyncio.wait_for(scenario, 2 * TIMEOUT_S))
-
-
-def test_a_captured_submit_that_is_sent_again_is_charged_and_played_once(coordinator: Coordinator) -> None:
-    async def scenario() -> None:
-        async with (
-            two_runs(coordinator, "captured") as (owner, thief, client),
-            working(coordinator, "w-1") as w,
-        ):
-            bundle = bundle_of("# captured")
-            first = await owner.submit(bundle, (0, 1), "key")
-            captured = codec.encode(
-                gateway.Submit(
-                    run=owner.run, token=owner.token, key="key", env_instances=(0, 1), bundle=bundle.digest
-                )
+async def test_a_captured_submit_that_is_sent_again_is_charged_and_played_once(
+    coordinator: Coordinator,
+) -> None:
+    async with (
+        two_runs(coordinator, "captured") as (owner, thief, client),
+        working(coordinator, "w-1") as w,
+    ):
+        bundle = bundle_of("# captured")
+        first = await owner.submit(bundle, (0, 1), "key")
+        captured = codec.encode(
+            gateway.Submit(
+                run=owner.run, token=owner.token, key="key", env_instances=(0, 1), bundle=bundle.digest
             )
-            link = thief.ask._link
-            cluster = link.credentials.cluster
-            for _ in range(5):
-                reply = await link.ask(keys.gateway_key(cluster, owner.run, "submit"), captured, 10)
-                assert codec.decode(codec.gateway_replies, reply) == first
-            # On the thief's own key the same bytes are of another run.
-            reply = await link.ask(keys.gateway_key(cluster, thief.run, "submit"), captured, 10)
-            refused = codec.decode(codec.gateway_replies, reply)
-            assert isinstance(refused, Refused)
-            assert refused.status == "wrong_key"
-            await owner.results(0)
-            assert ((await owner.state()).remaining_budget, (await thief.state()).remaining_budget) == (
-                14,
-                16,
-            )
-            await owner.close()
-            # Sent again when the run is over it is the same submit still, or none.
+        )
+        link = thief.ask._link
+        cluster = link.credentials.cluster
+        for _ in range(5):
             reply = await link.ask(keys.gateway_key(cluster, owner.run, "submit"), captured, 10)
-            assert isinstance(codec.decode(codec.gateway_replies, reply), Refused | gateway.SubmitAccepted)
-            finished = await client.finished(owner.run)
-            assert (finished.budget_used, len(finished.submits)) == (2, 1)
-            train = [job for job in w.jobs if job.bundle == bundle.digest and job.record == "full"]
-            assert len(train) == 2
+            assert codec.decode(codec.gateway_replies, reply) == first
+        # On the thief's own key the same bytes are of another run.
+        reply = await link.ask(keys.gateway_key(cluster, thief.run, "submit"), captured, 10)
+        refused = codec.decode(codec.gateway_replies, reply)
+        assert isinstance(refused, Refused)
+        assert refused.status == "wrong_key"
+        await owner.results(0)
+        assert ((await owner.state()).remaining_budget, (await thief.state()).remaining_budget) == (
+            14,
+            16,
+        )
+        await owner.close()
+        # Sent again when the run is over it is the same submit still, or none.
+        reply = await link.ask(keys.gateway_key(cluster, owner.run, "submit"), captured, 10)
+        assert isinstance(codec.decode(codec.gateway_replies, reply), Refused | gateway.SubmitAccepted)
+        finished = await client.finished(owner.run)
+        assert (finished.budget_used, len(finished.submits)) == (2, 1)
+        train = [job for job in w.jobs if job.bundle == bundle.digest and job.record == "full"]
+        assert len(train) == 2
 
-    in_time(scenario())
 
-
-def test_a_reused_key_with_another_bundle_is_refused(
+async def test_a_reused_key_with_another_bundle_is_refused(
     coordinator: Coordinator,
 ) -> None:
-    async def scenario() -> None:
-        async with two_runs(coordinator, "switched") as (owner, _, client), working(coordinator, "w-2") as w:
-            weak, strong = bundle_of("# weak"), bundle_of("# strong")
-            first = await owner.submit(weak, (0,), "key")
-            for ids in ((0,), (0, 1)):
-                with pytest.raises(RefusedError) as refused:
-                    await owner.submit(strong, ids, "key")
-                assert refused.value.status == "key_conflict"
-            assert await owner.submit(weak, (0,), "key") == first
-            await owner.results(0)
-            with pytest.raises(RefusedError):
-                await owner.submit(strong, (0,), "key")
-            await owner.close()
-            finished = await client.finished(owner.run)
-            assert [submit.bundle for submit in finished.submits] == [weak.digest]
-            assert finished.budget_used == 1
-            assert strong.digest not in {job.bundle for job in w.jobs}
-
-    in_time(scenario())
+    async with two_runs(coordinator, "switched") as (owner, _, client), working(coordinator, "w-2") as w:
+        weak, strong = bundle_of("# weak"), bundle_of("# strong")
+        first = await owner.submit(weak, (0,), "key")
+        for ids in ((0,), (0, 1)):
+            with pytest.raises(RefusedError) as refused:
+                await owner.submit(strong, ids, "key")
+            assert refused.value.status == "key_conflict"
+        assert await owner.submit(weak, (0,), "key") == first
+        await owner.results(0)
+        with pytest.raises(RefusedError):
+            await owner.submit(strong, (0,), "key")
+        await owner.close()
+        finished = await client.finished(owner.run)
+        assert [submit.bundle for submit in finished.submits] == [weak.digest]
+        assert finished.budget_used == 1
+        assert strong.digest not in {job.bundle for job in w.jobs}
 
 
-def test_another_runs_bundle_cannot_be_played_or_found_by_digest(
+async def test_another_runs_bundle_cannot_be_played_or_found_by_digest(
     coordinator: Coordinator,
 ) -> None:
-    async def scenario() -> None:
-        async with (
-            two_runs(coordinator, "stolen") as (owner, thief, client),
-            working(coordinator, "w-5") as w,
-        ):
-            rival, unknown = bundle_of("# a rival's policy"), bundle_of("# nobody's")
-            await owner.submit(rival, (0,), "key")
-            ((episode,), _) = await owner.results(0)
-            refusals = []
-            for digest in (rival.digest, episode.trajectory.digest, unknown.digest):
-                with pytest.raises(RefusedError) as refused:
-                    await thief.submit_digest(digest, (0,), digest[:8])
-                refusals.append((refused.value.status, refused.value.message.replace(digest, "")))
-                guess = worker.BlobPut(
-                    sender=thief.run, token=thief.token, digest=digest, size=99, offset=0, data=b""
-                )
-                assert (await thief.ask.once("blob", guess, worker.BlobAck)).have == 0
-            assert len(set(refusals)) == 1
-            assert refusals[0][0] == "missing_bundle"
-            assert (await thief.state()).remaining_budget == 16
-            # Who has the policy itself may play it, as anybody may.
-            await thief.submit(rival, (0,), "its own")
-            await thief.results(0)
-            await thief.close()
-            assert (await client.finished(thief.run)).budget_used == 1
-            assert {job.bundle for job in w.jobs} <= {rival.digest, None}
-
-    in_time(scenario())
-
-
-def test_the_same_key_sent_ten_times_at_once_is_one_submit(coordinator: Coordinator) -> None:
-    async def scenario() -> None:
-        async with two_runs(coordinator, "at once") as (owner, _, client), working(coordinator, "w-3"):
-            bundle = bundle_of("# at once")
-            await owner.ask.upload(owner.run, owner.token, bundle.digest, bundle.packed)
-            answers = await asyncio.gather(
-                *(owner.submit_digest(bundle.digest, (0, 1, 2), "key") for _ in range(10))
+    async with (
+        two_runs(coordinator, "stolen") as (owner, thief, client),
+        working(coordinator, "w-5") as w,
+    ):
+        rival, unknown = bundle_of("# a rival's policy"), bundle_of("# nobody's")
+        await owner.submit(rival, (0,), "key")
+        ((episode,), _) = await owner.results(0)
+        refusals = []
+        for digest in (rival.digest, episode.trajectory.digest, unknown.digest):
+            with pytest.raises(RefusedError) as refused:
+                await thief.submit_digest(digest, (0,), digest[:8])
+            refusals.append((refused.value.status, refused.value.message.replace(digest, "")))
+            guess = worker.BlobPut(
+                sender=thief.run, token=thief.token, digest=digest, size=99, offset=0, data=b""
             )
-            assert len(set(answers)) == 1
+            assert (await thief.ask.once("blob", guess, worker.BlobAck)).have == 0
+        assert len(set(refusals)) == 1
+        assert refusals[0][0] == "missing_bundle"
+        assert (await thief.state()).remaining_budget == 16
+        # Who has the policy itself may play it, as anybody may.
+        await thief.submit(rival, (0,), "its own")
+        await thief.results(0)
+        await thief.close()
+        assert (await client.finished(thief.run)).budget_used == 1
+        assert {job.bundle for job in w.jobs} <= {rival.digest, None}
+
+
+async def test_the_same_key_sent_ten_times_at_once_is_one_submit(coordinator: Coordinator) -> None:
+    async with two_runs(coordinator, "at once") as (owner, _, client), working(coordinator, "w-3"):
+        bundle = bundle_of("# at once")
+        await owner.ask.upload(owner.run, owner.token, bundle.digest, bundle.packed)
+        answers = await asyncio.gather(
+            *(owner.submit_digest(bundle.digest, (0, 1, 2), "key") for _ in range(10))
+        )
+        assert len(set(answers)) == 1
+        await owner.results(0)
+        await owner.close()
+        assert (await client.finished(owner.run)).budget_used == 3
+
+
+async def test_a_submit_while_the_run_is_scored_is_refused_and_changes_nothing(
+    coordinator: Coordinator,
+) -> None:
+    async with two_runs(coordinator, "late") as (owner, _, client):
+        honest, late = bundle_of("# honest"), bundle_of("# late")
+        async with working(coordinator, "w-4") as w:
+            await owner.ask.upload(owner.run, owner.token, late.digest, late.packed)
+            await owner.submit(honest, (0,), "honest")
             await owner.results(0)
+            w.hold.clear()
             await owner.close()
-            assert (await client.finished(owner.run)).budget_used == 3
-
-    in_time(scenario())
-
-
-def test_a_submit_while_the_run_is_scored_is_refused_and_changes_nothing(coordinator: Coordinator) -> None:
-    async def scenario() -> None:
-        async with two_runs(coordinator, "late") as (owner, _, client):
-            honest, late = bundle_of("# honest"), bundle_of("# late")
-            async with working(coordinator, "w-4") as w:
-                await owner.ask.upload(owner.run, owner.token, late.digest, late.packed)
-                await owner.submit(honest, (0,), "honest")
-                await owner.results(0)
-                w.hold.clear()
-                await owner.close()
-                assert (await client.progress(owner.run, 0.0)).finished is None
-                with pytest.raises(RefusedError) as refused:
-                    await owner.submit_digest(late.digest, (0,), "late")
-                assert refused.value.status in ("run_closed", "run_finished")
-                with pytest.raises(RefusedError) as refused:
-                    await owner.submit(bundle_of("# later still"), (0,), "later")
-                # Reading what it has had already is no harm; it is not told how the scoring goes.
-                assert (await owner.state()).is_finalized
-                w.hold.set()
-                finished = await client.finished(owner.run)
-            assert [submit.bundle for submit in finished.submits] == [honest.digest]
-            assert finished.budget_used == 1
-            assert late.digest not in {job.bundle for job in w.jobs}
-
-    in_time(scenario())
+            assert (await client.progress(owner.run, 0.0)).finished is None
+            with pytest.raises(RefusedError) as refused:
+                await owner.submit_digest(late.digest, (0,), "late")
+            assert refused.value.status in ("run_closed", "run_finished")
+            with pytest.raises(RefusedError) as refused:
+                await owner.submit(bundle_of("# later still"), (0,), "later")
+            # Reading what it has had already is no harm; it is not told how the scoring goes.
+            assert (await owner.state()).is_finalized
+            w.hold.set()
+            finished = await client.finished(owner.run)
+        assert [submit.bundle for submit in finished.submits] == [honest.digest]
+        assert finished.budget_used == 1
+        assert late.digest not in {job.bundle for job in w.jobs}

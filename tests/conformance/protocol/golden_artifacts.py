@@ -15,7 +15,6 @@ from typing import Any
 GOLDEN = Path(__file__).parent / "golden"
 BUDGET = 5
 AGENT = '''
-import json, os, urllib.error, urllib.request
 from pathlib import Path
 
 POLICY = """import numpy as np
@@ -37,15 +36,6 @@ class Policy:
 """
 
 
-def submit(ids):
-    body = json.dumps({"env_instances": ids}).encode()
-    request = urllib.request.Request(os.environ["EVOPOLICYGYM_SUBMIT_URL"], data=body)
-    try:
-        urllib.request.urlopen(request).read()
-    except urllib.error.HTTPError as error:
-        error.close()
-
-
 system = Path("system")
 (system / "notes.txt").write_text("kept")
 (system / "policy.py").write_text(POLICY.replace("FAILS_AFTER", "1000"))
@@ -61,16 +51,8 @@ submit([3])
 
 _TIMES = re.compile(r"(^|_)(at|time|timestamp|start_time|end_time|wall_time_seconds)$")
 _MACHINE = {
-    "run",
-    "committed",
-    "fingerprint",
-    "harness_version",
-    "installations",
-    "program",
-    "agents_md_hash",
-    "rules_hash",
-    "initial_policy_hash",
-    "traceback",
+    *("run", "committed", "fingerprint", "harness_version", "installations", "program", "agents_md_hash"),
+    *("rules_hash", "initial_policy_hash", "traceback"),
 }
 """Names of what changes with machine, version or run."""
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import subprocess
 import sys
 from pathlib import Path
+
+from commands import evopolicy
 
 HERE = Path(__file__).parent
 EARLIER = HERE / "earlier_run"
@@ -13,26 +14,11 @@ DATA = EARLIER / "data"
 
 def play(root: Path, agent: Path, budget: int) -> Path:
     """The run directory that `agent` leaves."""
-    done = subprocess.run(
-        [
-            *(
-                sys.executable,
-                "-m",
-                "evopolicy_gateway.cli",
-                "local",
-                "--env",
-                "toy/line",
-                "--entry",
-                "agent",
-            ),
-            *("--agent", f"command:{sys.executable} {agent}", "--jail", "none", "--data", str(DATA)),
-            *("--budget", str(budget), "--validation", "2", "--heldout", "2", "--exp-id", "t"),
-        ],
-        cwd=root,
-        capture_output=True,
-        text=True,
-        timeout=600,
-        check=False,
+    done = evopolicy(
+        root,
+        *("local", "--env", "toy/line", "--entry", "agent", "--exp-id", "t", "--data", str(DATA)),
+        *("--agent", f"command:{sys.executable} {agent}", "--jail", "none"),
+        *("--budget", str(budget), "--validation", "2", "--heldout", "2"),
     )
     assert done.returncode == 0, done.stdout + done.stderr
     return root / "runs" / "agent" / "toy_line" / "t"

@@ -35,14 +35,7 @@ TREND_FIELDS = (
     *("cyclomatic_total", "cyclomatic_max", "tree_hash"),
 )
 ARTIFACTS = ("workspace", "feedback", "checkpoints", "logs_harness", "logs_agent", "logs_env")
-VERSIONS = (
-    "harness",
-    "env",
-    "agents_md_hash",
-    "data_train_hash",
-    "data_valid_hash",
-    "data_heldout_hash",
-)
+VERSIONS = (*("harness", "env", "agents_md_hash", "data_train_hash", "data_valid_hash", "data_heldout_hash"),)
 SUMMARY_ARRAYS = ("returns", "episode_lengths", "timeouts", "errors")
 SUMMARY_AGGREGATES = ("mean_return", "std_return", "min_return", "max_return", "mean_episode_length")
 INLINE_BYTES = 4096

@@ -7,6 +7,7 @@ import json
 from pathlib import Path
 
 import pytest
+from commands import agent
 from golden_artifacts import AGENT, BUDGET, GOLDEN, artifacts
 from played import DATA, play
 from published_checker import check_run
@@ -18,7 +19,7 @@ NAMES = sorted(path.name for path in GOLDEN.iterdir())
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("golden")
-    (root / "agent.py").write_text(AGENT)
+    agent(root, AGENT)
     return play(root, root / "agent.py", BUDGET)
 
 

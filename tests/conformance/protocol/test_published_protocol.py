@@ -14,15 +14,8 @@ from gateway_double import Double, opened, served
 from evopolicy_common.messages.episode import PolicyFailure
 
 SUMMARY_FIELDS = [
-    *(
-        "schema_version",
-        "submit_index",
-        "env",
-        "status",
-        "n_episodes",
-        "first_global_episode",
-        "env_instances",
-    ),
+    *("schema_version", "submit_index", "env", "status", "n_episodes", "first_global_episode"),
+    "env_instances",
     *("remaining_budget", "submit_started_at", "submit_completed_at", "wall_time_seconds", "returns"),
     *("mean_return", "std_return", "min_return", "max_return", "episode_lengths", "mean_episode_length"),
     *("timeouts", "errors"),

@@ -4,12 +4,11 @@ letter."""
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
+from commands import agent, evopolicy
 from published_checker import check_run
 from published_checker import code_metrics as published_metrics
 
@@ -22,15 +21,7 @@ ROOT = Path(__file__).parents[3]
 
 CORE16 = catalogue.suites()["core16"].environments
 AGENT = """
-import json, os, urllib.request
 from pathlib import Path
-
-def submit(ids):
-    request = urllib.request.Request(
-        os.environ["EVOPOLICYGYM_SUBMIT_URL"], data=json.dumps({"env_instances": ids}).encode()
-    )
-    with urllib.request.urlopen(request) as answer:
-        return json.load(answer)
 
 system = Path("system")
 good = (system / "policy.py").read_text()
@@ -49,20 +40,9 @@ submit([1])
 def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """One small run of each environment, on one cluster."""
     root = tmp_path_factory.mktemp("core16")
-    (root / "agent.py").write_text(AGENT)
-    done = subprocess.run(
-        [
-            *(sys.executable, "-m", "evopolicy_gateway.cli", "local", "--env", "core16", "--entry", "small"),
-            *("--agent", f"command:{sys.executable} {root / 'agent.py'}", "--jail", "none", "--exp-id", "t"),
-            *("--budget", "2", "--validation", "1", "--heldout", "1", "--hidden-isolation", "off"),
-            *("--parallel", "4", "--json"),
-        ],
-        cwd=root,
-        capture_output=True,
-        text=True,
-        timeout=1200,
-        check=False,
-    )
+    words = ["local", "--env", "core16", "--entry", "small", "--agent", agent(root, AGENT), "--jail", "none"]
+    words += ["--budget", "2", "--validation", "1", "--heldout", "1", "--hidden-isolation", "off"]
+    done = evopolicy(root, *words, "--exp-id", "t", "--parallel", "4", "--json")
     assert done.returncode == 0, done.stdout + done.stderr
     return root / "runs" / "small"
 

@@ -36,10 +36,7 @@ pytestmark = pytest.mark.system
 ROOT = Path(__file__).parents[3]
 NAMED = re.compile(r"\b(?:(?:examples|deploy|docs)/[\w.@/-]*\w|constraints\.txt|\w[\w-]*\.toml)")
 REPOSITORY_ONLY = (
-    "docs/images",
-    "docs/_site",
-    "docs/index.md",
-    "examples/smoke-report",
+    *("docs/images", "docs/_site", "docs/index.md", "examples/smoke-report"),
     "examples/measure_policies.py",
 )
 """What pages show or tell developers, and no user needs as a file."""
@@ -175,14 +172,7 @@ def test_doctor_says_that_this_machine_plays_runs(place: Place) -> None:
     assert document["tier"] == "bwrap"
     found = {check["name"]: check for check in document["checks"]}
     for name in (
-        "Python",
-        "extra gateway",
-        "drawing (EGL)",
-        "browser",
-        "disk",
-        "ports",
-        "date",
-        "open files",
+        *("Python", "extra gateway", "drawing (EGL)", "browser", "disk", "ports", "date", "open files"),
     ):
         assert name in found
     for check in document["checks"]:

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import json
 import os
 import socket
-import subprocess
 import sys
 import sysconfig
 import threading
-import time
 from pathlib import Path
 from typing import Any
+
+from commands import evopolicy, worker_of
+from coordinator_harness import Coordinator
 
 from evopolicy_common.records.run_record import RunRecord, decode_run_record
 
@@ -89,32 +91,17 @@ class Cheated:
             "OPERATORS_SECRET": SECRET,
         }
         _log_in()
-        self._log = (root / "log").open("wb")
-        ready = root / "ready.json"
-        self.coordinator = self._start(
-            "evopolicy_coordinator.cli",
-            *("--state", str(self.state), "--ready-file", str(ready)),
-            # Runs of one environment stand beside each other here, and one is scored while another's agent listens.
-            *("--hidden-isolation", "off"),
-        )
-        deadline = time.monotonic() + TIMEOUT_S
-        while not ready.exists():
-            assert time.monotonic() < deadline, (root / "log").read_text()
-            time.sleep(0.05)
-        self.credentials: dict[str, str] = json.loads(ready.read_text())["credentials"]
-        self._worker = self._start(
-            *("evopolicy_worker.cli", "--env", "toy", "--slots", "2", "--grace", "0"),
-            *("--need-tier", "bwrap", "--credentials", self.credentials["worker"]),
-        )
+        self._stack = contextlib.ExitStack()
+        # Runs of one environment stand beside each other here, and one is scored while another's agent listens.
+        options = ("--hidden-isolation", "off")
+        coordinator = Coordinator(self.state, *options, trust_workers=False, **self.environment)
+        self._stack.callback(coordinator.stop)
+        self.coordinator = coordinator.process
+        self.credentials: dict[str, str] = coordinator.ready["credentials"]
+        options = ("--env", "toy", "--need-tier", "bwrap")
+        self._stack.enter_context(worker_of(coordinator, *options, **self.environment))
         self.listener = Listener()
-
-    def _start(self, module: str, *arguments: str) -> subprocess.Popen[bytes]:
-        return subprocess.Popen(
-            [sys.executable, "-m", module, *arguments],
-            env=self.environment,
-            stdout=self._log,
-            stderr=self._log,
-        )
+        self._stack.callback(self.listener.close)
 
     def targets(self) -> dict[str, Any]:
         (sock,) = self.state.glob("*.sock")
@@ -137,23 +124,11 @@ class Cheated:
         words = ["run", "--env", "toy/line", "--agent", agent, "--entry", "e", "--exp-id", exp_id]
         words += ["--credentials", self.credentials["operator"]]
         words += ["--budget", "4", "--validation", "2", "--heldout", "2", "--runs", str(self.runs)]
-        done = subprocess.run(
-            [sys.executable, "-m", "evopolicy_gateway.cli", *words, *options],
-            env=self.environment,
-            cwd=self.root,
-            capture_output=True,
-            text=True,
-            timeout=TIMEOUT_S,
-            check=False,
-        )
+        done = evopolicy(self.root, *words, *options, **self.environment)
         return done.returncode, done.stdout + done.stderr, self.runs / "e" / "toy_line" / exp_id
 
     def close(self) -> None:
-        self.listener.close()
-        for process in (self._worker, self.coordinator):
-            process.terminate()
-            process.wait(timeout=TIMEOUT_S)
-        self._log.close()
+        self._stack.close()
 
 
 class CheatingRun:

@@ -63,12 +63,7 @@ def write_published_run(
             (checkpoint / "policy.py").read_bytes()
         )  # line 18
     trend = (
-        "source_lines",
-        "python_files",
-        "functions",
-        "classes",
-        "cyclomatic_total",
-        "cyclomatic_max",
+        *("source_lines", "python_files", "functions", "classes", "cyclomatic_total", "cyclomatic_max"),
         "tree_hash",
     )
     run = {

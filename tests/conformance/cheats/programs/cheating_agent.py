@@ -277,17 +277,8 @@ def _():
     python = targets["python"]
     index = f"http://127.0.0.1:{targets['port']}/simple"
     words = [
-        "-m",
-        "pip",
-        "download",
-        "--no-input",
-        "--retries",
-        "0",
-        "--timeout",
-        "2",
-        "--index-url",
-        index,
-        "nothing",
+        *("-m", "pip", "download", "--no-input", "--retries", "0", "--timeout", "2", "--index-url"),
+        *(index, "nothing"),
     ]
     subprocess.run([python, *words], timeout=60, capture_output=True)
     return
