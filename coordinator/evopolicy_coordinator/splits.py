@@ -25,6 +25,7 @@ from evopolicy_common.catalogue import earlier_folder_name, folder_name
 from evopolicy_common.catalogue.worlds import KEY, OPTION, unchanged
 from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.environment import Case, Split
+from evopolicy_common.messages.operator import FurtherCases
 from evopolicy_common.records.blobs import fsync_directory, write_atomically
 from evopolicy_common.records.journal import epoch_of
 from evopolicy_common.records.splits import (
@@ -60,18 +61,12 @@ class EnvironmentSplits(msgspec.Struct, frozen=True, kw_only=True):
 
     def cases(self, split: Split) -> tuple[Case, ...]:
         """The cases of `split`, in order of their ids."""
-        return {"train": self.train, "validation": self.validation, "heldout": self.heldout}[split]
+        cases: tuple[Case, ...] = getattr(self, split)
+        return cases
 
     def hashes(self) -> dict[str, str]:
         """SHA-256 (hex) of each split's cases by split name, and of their files by file name."""
         return {split: cases_hash(self.cases(split)) for split in SPLITS} | self.files
-
-
-class FurtherSplit(msgspec.Struct, frozen=True, kw_only=True):
-    """Hidden cases outside the three splits, for a re-score."""
-
-    cases: tuple[Case, ...]
-    epoch: str
 
 
 def derive(
@@ -159,7 +154,9 @@ def load_or_create_secret(path: Path) -> bytes:
     try:
         data = path.read_bytes()
     except FileNotFoundError:
-        return _create_secret(path)
+        data = secrets.token_bytes(SECRET_BYTES)
+        write_atomically(path, data, mode=0o600)
+        return data
     if len(data) != SECRET_BYTES:
         raise ConfigError(
             f"{path} holds {len(data)} bytes instead of {SECRET_BYTES}; restore it from a backup"
@@ -167,12 +164,6 @@ def load_or_create_secret(path: Path) -> bytes:
     mode = path.stat().st_mode & 0o777
     if mode & 0o077:
         raise ConfigError(f"{path} may be read by others (mode {mode:04o}); run: chmod 600 {path}")
-    return data
-
-
-def _create_secret(path: Path) -> bytes:
-    data = secrets.token_bytes(SECRET_BYTES)
-    write_atomically(path, data, mode=0o600)
     return data
 
 
@@ -280,7 +271,7 @@ class SplitSource:
         epoch = f"files-{hidden[:16]}"
         return EnvironmentSplits(env=env, secret=splits.secret, epoch=epoch, files=splits.files, **cut)
 
-    def further(self, suite: str, env: str, name: str, n: int, taken: Sequence[Case]) -> FurtherSplit:
+    def further(self, suite: str, env: str, name: str, n: int, taken: Sequence[Case]) -> FurtherCases:
         """Derives `n` further hidden cases, equal for equal `name`, none with a seed of `taken`.
 
         Raises ConfigError when this source's cases come from files.
@@ -293,7 +284,7 @@ class SplitSource:
         key = hmac.digest(self._secret, f"further hidden cases {name}".encode(), "sha256")
         cases = derive(key, suite, env, {"heldout": n}, (case.seed for case in taken))
         cases = in_world(env, self._key(env), cases)
-        return FurtherSplit(cases=cases["heldout"], epoch=epoch_of(self._secret))
+        return FurtherCases(cases=cases["heldout"], epoch=epoch_of(self._secret))
 
     def _key(self, env: str) -> str:
         if unchanged(env) == env:

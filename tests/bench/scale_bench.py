@@ -307,7 +307,7 @@ def play_really(coordinator: Coordinator, env: str, folder: Path, n: int) -> Pla
         run.submit(ids)
         episodes, returns = run.episodes(0)
     reader = Reader(coordinator.state / "coordinator.sqlite")
-    rows = reader.outcomes(train_group(run.id, 0), 0, 1 << 30, 1 << 40).rows
+    rows = reader.outcomes(train_group(run.id, 0), 0, 1 << 30, 1 << 40)
     stored = reader.run(run.id)
     assert stored is not None
     blobs = BlobStore(coordinator.state / "blobs")

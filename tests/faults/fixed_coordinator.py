@@ -15,7 +15,7 @@ import msgspec
 from evopolicy_common.cli.conventions import setup_logging
 from evopolicy_common.records.blobs import write_atomically
 from evopolicy_coordinator.core.contract.settings import CoreSettings
-from evopolicy_coordinator.server import process, request_parser
+from evopolicy_coordinator.server import process, run_requests
 
 SETTINGS = CoreSettings(
     lease_ttl_s=3.0,
@@ -54,5 +54,5 @@ async def serve(state: Path, ready_file: Path, listen: tuple[str, ...]) -> None:
 
 if __name__ == "__main__":
     setup_logging("info")
-    request_parser.secrets = FixedKeys  # type: ignore[attr-defined]
+    run_requests.secrets = FixedKeys  # type: ignore[attr-defined]
     asyncio.run(serve(Path(sys.argv[1]), Path(sys.argv[2]), tuple(sys.argv[3:])))

@@ -75,7 +75,7 @@ BUGS = (
     Bug("send before persist", Step, "effects", "[first, *self._out]", "[*self._out, first]"),
     Bug("forget to queue after a back-off", queue, "backed_off", "if job is not None", "if False"),
     Bug("forget the adoption timer", loading, "load", "if state.adopting:", "if False:"),
-    Bug("forget the worker's timer", expiry, "check", "if deadlines:", "if False:"),
+    Bug("forget the worker's timer", expiry, "check_due", "if deadlines:", "if False:"),
     Bug(
         "skip the fencing",
         results,
@@ -169,7 +169,7 @@ BUGS = (
     Bug("mix fingerprint classes", Profile, "serves", "and fingerprint_class == self.classes[env]", ""),
     Bug("adopt a job that is leased elsewhere", leases, "_adopt", "or job.lease is not None", ""),
     Bug("forget to tell a worker to stop", leases, "hear", "stop.append(item.lease_id)", "pass"),
-    Bug("leave a lost worker's leases with it", expiry, "lose", "list(worker.leases.values())", "[]"),
+    Bug("leave a lost worker's leases with it", expiry, "_take_all", "list(worker.leases.values())", "[]"),
     Bug("refuse a worker that comes back", fleet, "of_session", 'if worker.state == "lost":', "if False:"),
     Bug("let a worker audit itself", JobGroup, "excludes", "worker.name in self.not_on or", ""),
     Bug("forget at a restart what is to be audited", audits, "resume", 'row.state != "open"', "True"),

@@ -32,11 +32,11 @@ carry out the effects that it returns (they conclude groups that were complete b
 
 *Ids and secrets.* The shell makes run ids, capabilities, run secrets, sessions, evaluation ids and stimulus ids, and
 passes them in events. The core derives the rest: group and job ids from run, submit and index; lease ids from job and
-attempt; policy seeds by HMAC (`leasing.seeds`). Attempt numbers also grow over restarts, since they start at
+attempt; policy seeds by HMAC (`leasing.jobs`). Attempt numbers also grow over restarts, since they start at
 (incarnation − 1) · 1,000,000.
 
-*Tokens.* The shell checks tokens before it raises an event. `core.capability(run)` returns the token of a run, also of
-a finished one. The core checks sessions: it answers a request with an unknown session with
+*Tokens.* The shell checks tokens before it raises an event. `core.state.capabilities` has the
+tokens of all runs, finished ones too. The core checks sessions: it answers a request with an unknown session with
 `Refused("unknown_worker")`. The worker then registers again, sends a heartbeat with all leases that it holds, and
 continues.
 

@@ -6,10 +6,10 @@ from collections import Counter
 
 from evopolicy_coordinator.core.contract.records import train_group
 from evopolicy_coordinator.core.isolation.kernels import all_related, related
-from evopolicy_coordinator.core.structures.faults import InvariantError
-from evopolicy_coordinator.core.tables import transitions
+from evopolicy_coordinator.core.structures import InvariantError
 from evopolicy_coordinator.core.tables.model import N_PRIORITIES, TRAIN, JobState
 from evopolicy_coordinator.core.tables.state import State
+from evopolicy_coordinator.core.tables.transitions import AUDIT, JOB, RUN, SUBMIT
 
 
 def check(state: State) -> None:
@@ -22,26 +22,14 @@ def check(state: State) -> None:
     for run in state.runs.values():
         run.ledger.validate()
         phase = run.state.phase
-        want(
-            run.id,
-            transitions.has_successor(transitions.RUN, phase),
-            "a finished run is not among the open ones",
-        )
-        unsettled = [
-            row.submit_index
-            for row in run.submits
-            if transitions.has_successor(transitions.SUBMIT, row.status or "open")
-        ]
+        want(run.id, RUN[phase], "only unfinished runs are open")
+        unsettled = [row.submit_index for row in run.submits if SUBMIT[row.status or "open"]]
         want(
             run.id,
             unsettled == ([] if run.open is None else [run.open]),
-            "only the open submit has no verdict",
+            "only the open submit lacks a verdict",
         )
-        want(
-            run.id,
-            (run.open is not None) == (run.ledger.reserved > 0),
-            "episodes are reserved exactly while a submit is open",
-        )
+        want(run.id, (run.open is not None) == (run.ledger.reserved > 0), "an open submit has a reservation")
         if run.open is not None:
             want(run.id, train_group(run.id, run.open) in state.groups, "an open submit has its group")
         settled = sum(
@@ -69,9 +57,7 @@ def _isolation(state: State) -> None:
             group = lease.job.group
             wanted = group.hidden or group.kind == "train"
             want(
-                lease.id,
-                (lease.occupancy is not None) == wanted,
-                "each hidden or train lease has an occupancy",
+                lease.id, (lease.occupancy is not None) == wanted, "hidden and train leases have occupancies"
             )
     flows = {group.flow for group in state.groups.values()}
     flows |= {run.flow for run in state.runs.values()} | {each.flow for each in state.evaluations.values()}
@@ -90,21 +76,13 @@ def _audits(state: State) -> None:
     for run in state.runs.values():
         for row in run.audits.values():
             n = len(row.replayed_by)
-            waits = (
-                transitions.has_successor(transitions.AUDIT, row.state)
-                and row.actions is not None
-                and n == row.compared
-            )
+            waits = AUDIT[row.state] and row.actions is not None and n == row.compared
             playing = [k for k in range(1, n + 2) if f"{row.audit}.{k}" in state.groups]
-            want(
-                row.audit,
-                playing == ([n + 1] if waits else []),
-                f"exactly the due audit is played: {playing}",
-            )
+            want(row.audit, playing == ([n + 1] if waits else []), f"only the due audit is played: {playing}")
             want(row.audit, row.player not in row.replayed_by, "no worker audits its own episode")
 
 
-def want(key: str, holds: bool, what: str) -> None:
+def want(key: str, holds: object, what: str) -> None:
     """Raises InvariantError when `holds` is false. `key` names the record concerned."""
     if not holds:
         raise InvariantError(f"{key}: violated: {what}")
@@ -126,44 +104,31 @@ def _jobs(state: State) -> None:
         for job in group.jobs.values():
             key = job.job_id
             want(key, state.jobs.get(key) is job, "an open job is known by its id")
-            found = {
+            holds = {
                 "queued": job in (state.suspects if job.alone else ready),
                 "leased": job.lease is not None,
                 "parting": job.parting is not None,
                 "backing_off": ("job", key) in state.timers,
                 "adopting": job in state.adopting,
             }
-            places = [place for place, there in found.items() if there]
+            places = [place for place, there in holds.items() if there]
             want(key, places == [job.place], f"the job is where its field says ({job.place}): {places}")
-            want(
-                key,
-                transitions.has_successor(transitions.JOB, job.place),
-                "an open job has a further transition",
-            )
+            want(key, JOB[job.place], "an open job has a further transition")
             if job.reserved is not None:
                 emptied = state.workers.get(job.reserved)
-                want(
-                    key,
-                    emptied is not None and emptied.reserved is job,
-                    "the worker that is emptied for the suspect reserves it",
-                )
+                want(key, emptied and emptied.reserved is job, "a suspect's worker reserves it")
             stopped = job.parting
             if stopped is not None:
                 there = state.workers[stopped.worker].leases.get(stopped.id) is stopped
-                want(
-                    key, there and not stopped.live, "the worker still holds the lease that the job waits for"
-                )
+                want(key, there and not stopped.live, "the worker holds the stopped lease")
             lease = job.lease
             if lease is not None:
                 worker = state.workers.get(lease.worker)
                 held = worker is not None and worker.leases.get(lease.id) is lease
                 want(key, held and lease.live, "the job's lease is live and held by its worker")
                 want(key, lease.attempt in job.held_attempts, "the attempt is among the held ones")
-    want(
-        "",
-        len(state.jobs) == sum(len(group.jobs) for group in state.groups.values()),
-        "every job belongs to an open group",
-    )
+    n_jobs = sum(len(group.jobs) for group in state.groups.values())
+    want("", len(state.jobs) == n_jobs, "every job belongs to an open group")
     want("", live == state.n_live, "live leases are counted")
 
 
@@ -196,7 +161,7 @@ def _queue(state: State) -> None:
         want(
             str(lane.key),
             checked_at or not (lane.n_ready[TRAIN] and hidden),
-            "a lane whose train jobs wait beside hidden ones has a deadline",
+            "a lane to preempt in has a deadline",
         )
         for priority in range(N_PRIORITIES):
             total = sum(flow.n_ready[priority] for flow in flows if flow.lane is lane)
@@ -210,29 +175,18 @@ def _queue(state: State) -> None:
         )
         want(str(lane.key), dict(backlog) == lane.backlog, "hidden jobs of closed runs are counted")
         for profile in lane.profiles:
-            want(
-                str(lane.key),
-                (lane in profile.busy) == any(lane.n_ready),
-                "profiles list the lanes with waiting jobs",
-            )
+            want(str(lane.key), (lane in profile.busy) == any(lane.n_ready), "profiles list busy lanes")
 
 
 def _workers(state: State) -> None:
     for profile in state.profiles.values():
         workers = [state.workers[name] for name in profile.workers]
-        want(
-            str(sorted(profile.classes.items())),
-            sum(w.slots for w in workers) == profile.slots,
-            "slots are counted",
-        )
+        key = str(sorted(profile.classes.items()))
+        want(key, sum(worker.slots for worker in workers) == profile.slots, "slots are counted")
         for name in profile.parked:
             want(name, state.workers[name].poll is not None, "a parked worker has a poll")
         for names in profile.warm.values():
-            want(
-                str(sorted(profile.classes.items())),
-                names.keys() <= profile.parked.keys(),
-                "warm workers are parked",
-            )
+            want(key, names.keys() <= profile.parked.keys(), "warm workers are parked")
         for priority, hidden in enumerate(profile.hidden):
             for lease in hidden:
                 fits = lease.live and lease.job.priority == priority != TRAIN
@@ -243,21 +197,9 @@ def _workers(state: State) -> None:
         want(worker.name, timed, "a connected worker has a deadline")
         live = [lease.job.priority for lease in worker.leases.values() if lease.live]
         held = [live.count(priority) for priority in range(N_PRIORITIES)]
-        want(
-            worker.name,
-            (len(live), held) == (worker.n_live, worker.held),
-            "the worker's live leases are counted",
-        )
+        want(worker.name, (len(live), held) == (worker.n_live, worker.held), "live leases are counted")
         want(worker.name, state.sessions.get(worker.session) == worker.name, "the worker's session is known")
         if worker.reserved is not None:
-            want(
-                worker.name,
-                worker.reserved.reserved == worker.name,
-                "the suspect that the worker is emptied for knows the worker",
-            )
+            want(worker.name, worker.reserved.reserved == worker.name, "its suspect knows the worker")
         if worker.alone is not None:
-            want(
-                worker.name,
-                worker.alone.id in worker.leases,
-                "the suspect that the worker plays alone is leased to it",
-            )
+            want(worker.name, worker.alone.id in worker.leases, "its lone suspect is leased to it")

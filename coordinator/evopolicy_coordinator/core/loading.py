@@ -9,11 +9,11 @@ Rules that this module owns:
 
 from __future__ import annotations
 
+from collections import Counter, defaultdict
 from collections.abc import Callable
 
 from evopolicy_coordinator.core.agents import permits, requests
 from evopolicy_coordinator.core.contract.records import (
-    AuditRow,
     RunStateRow,
     Snapshot,
     SubmitRow,
@@ -22,7 +22,7 @@ from evopolicy_coordinator.core.contract.records import (
 from evopolicy_coordinator.core.isolation import occupancies
 from evopolicy_coordinator.core.leasing import fleet, pins
 from evopolicy_coordinator.core.runs import audits, evaluations, finalisation, runs, submits
-from evopolicy_coordinator.core.tables.model import Ended, JobGroup, Run
+from evopolicy_coordinator.core.tables.model import Run
 from evopolicy_coordinator.core.tables.state import Loading, State
 from evopolicy_coordinator.core.tables.step import EpisodesDone, Step
 
@@ -32,24 +32,22 @@ def load(state: State, snapshot: Snapshot, step: Step, drain: Callable[[State, S
     loading = state.loading = Loading()
     state.journal = snapshot.journal
     state.revealed.update(snapshot.revealed)
-    played: dict[str, dict[str, int]] = {}
+    played: dict[str, Counter[str]] = defaultdict(Counter)
     for head in snapshot.outcomes:
         loading.heads.setdefault(head.group, []).append(head)
         if "/audit-" not in head.group:
-            of_run = played.setdefault(head.group.partition("/")[0], {})
-            of_run[head.worker] = of_run.get(head.worker, 0) + 1
+            played[head.group.partition("/")[0]][head.worker] += 1
     loading.begun.update({(row.group, row.first): row for row in snapshot.begun})
     for worker in snapshot.workers:
         fleet.set_state(state, worker.worker, worker.state, worker.reason, worker.machine)
     stored = {row.run: row for row in snapshot.states}
     permits.load(state, snapshot.permits, {row.run: row for row in snapshot.runs}, stored, step)
     occupancies.load(state, snapshot.kernels, step)
-    submits_of: dict[str, list[SubmitRow]] = {}
+    submits_of, audits_of = defaultdict(list), defaultdict(list)
     for submit in snapshot.submits:
-        submits_of.setdefault(submit.run, []).append(submit)
-    audits_of: dict[str, list[AuditRow]] = {}
-    for each_audit in snapshot.audits:
-        audits_of.setdefault(each_audit.run, []).append(each_audit)
+        submits_of[submit.run].append(submit)
+    for audit in snapshot.audits:
+        audits_of[audit.run].append(audit)
     for row in sorted(snapshot.runs, key=lambda row: (row.created_at, row.run)):
         last = stored.get(row.run, RunStateRow(run=row.run))
         if last.phase == "finished":
@@ -58,14 +56,14 @@ def load(state: State, snapshot: Snapshot, step: Step, drain: Callable[[State, S
             state.finished[row.run] = runs.last_state(last)
         else:
             run = runs.enter(state, row, last)
-            run.played = played.get(row.run, {})
-            run.audits.update((each.audit, each) for each in audits_of.get(row.run, ()))
+            run.played = dict(played[row.run])
+            run.audits.update((each.audit, each) for each in audits_of[row.run])
             requests.resume(state, run, step)
-            _run(state, run, submits_of.get(row.run, []), loading, step)
+            _run(state, run, submits_of[row.run], loading, step)
     for each in sorted(snapshot.evaluations, key=lambda row: (row.created_at, row.evaluation)):
         if each.finished:
             state.evaluation_keys[each.key] = each.evaluation
-            state.ended_evaluations[each.evaluation] = Ended(len(each.cases))
+            state.ended_evaluations[each.evaluation] = len(each.cases)
             continue
         evaluation = evaluations.enter(state, each)
         if each.fingerprint_class is not None:
@@ -73,8 +71,8 @@ def load(state: State, snapshot: Snapshot, step: Step, drain: Callable[[State, S
         evaluations.play(state, evaluation, step)
     while loading.reloaded:
         group = loading.reloaded.pop(0)
-        if not group.closed:
-            _conclude(group, step)
+        if group.done and not group.closed:
+            step.tell(EpisodesDone(group, None, ()))
             drain(state, step)
     state.loading = None
     if state.adopting:
@@ -116,8 +114,3 @@ def _spent(run: Run, row: SubmitRow) -> None:
         started_at = row.first_leased_at or row.completed_at
         run.queue_s += max(0.0, started_at - row.accepted_at)
         run.rollout_s += max(0.0, row.completed_at - started_at)
-
-
-def _conclude(group: JobGroup, step: Step) -> None:
-    if group.done:
-        step.tell(EpisodesDone(group, None, ()))

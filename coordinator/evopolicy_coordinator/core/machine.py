@@ -13,9 +13,8 @@ from typing import Any
 
 from evopolicy_common.messages import gateway, operator
 from evopolicy_common.messages import worker as wire
-from evopolicy_common.refusals import Refusal
 from evopolicy_coordinator.core import invariants, loading, status
-from evopolicy_coordinator.core.agents import open_runs, permits, precedence, requests
+from evopolicy_coordinator.core.agents import permits, precedence, requests
 from evopolicy_coordinator.core.contract import events
 from evopolicy_coordinator.core.contract.effects import Effect
 from evopolicy_coordinator.core.contract.reasons import Reason
@@ -94,13 +93,9 @@ class Core:
 
     # ---- reading ----
 
-    def capability(self, run: str) -> str | None:
-        """Returns the token of a run's gateway, also of a finished run; None for an unknown run."""
-        return self.state.capabilities.get(run)
-
-    def over(self, run: str) -> tuple[Refusal, Reason]:
+    def over(self, run: str) -> Reason:
         """Returns why a run that is not open refuses further requests."""
-        return open_runs.over(self.state, run)
+        return requests.over(self.state, run)
 
     def status(self, now: float, words: Words) -> CoreStatus:
         """Returns the core's part of a `StatusReply`; `words` puts a reason into words."""
@@ -179,15 +174,16 @@ EVENTS: dict[type, Rule] = {
 NEWS: dict[tuple[type, str], tuple[Rule, ...]] = {
     (step.ResultsPersisted, ""): (results.take,),
     (step.EpisodesDone, "train"): (audits.sample, submits.progressed),
-    (step.EpisodesDone, "validation"): (audits.sample, finalisation.progressed),
-    (step.EpisodesDone, "heldout"): (audits.sample, finalisation.progressed),
-    (step.EpisodesDone, "random"): (audits.sample, finalisation.progressed),
+    **{
+        (step.EpisodesDone, kind): (audits.sample, finalisation.progressed)
+        for kind in ("validation", "heldout", "random")
+    },
     (step.EpisodesDone, "evaluation"): (evaluations.progressed,),
     (step.EpisodesDone, "audit"): (audits.replayed,),
-    (step.EnvironmentFailed, "train"): (finalisation.environment_failed,),
-    (step.EnvironmentFailed, "validation"): (finalisation.environment_failed,),
-    (step.EnvironmentFailed, "heldout"): (finalisation.environment_failed,),
-    (step.EnvironmentFailed, "random"): (finalisation.environment_failed,),
+    **{
+        (step.EnvironmentFailed, kind): (finalisation.environment_failed,)
+        for kind in ("train", "validation", "heldout", "random")
+    },
     (step.EnvironmentFailed, "evaluation"): (evaluations.environment_failed,),
     (step.EnvironmentFailed, "audit"): (),  # its run waits for it for a limited time only
     (step.SubmitEnded, ""): (finalisation.submit_ended,),

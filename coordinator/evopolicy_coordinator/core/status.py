@@ -12,6 +12,7 @@ from typing import NamedTuple
 from evopolicy_common.messages.status import QueuedJobs, RunStatus, WorkerStatus
 from evopolicy_coordinator.core.agents import permits
 from evopolicy_coordinator.core.contract.reasons import Reason
+from evopolicy_coordinator.core.contract.records import shared
 from evopolicy_coordinator.core.isolation import conflicts
 from evopolicy_coordinator.core.leasing import pins
 from evopolicy_coordinator.core.runs import audits, finished
@@ -23,7 +24,6 @@ from evopolicy_coordinator.core.tables.model import (
     RANKS,
     JobGroup,
     JobState,
-    Lane,
     Run,
     Worker,
 )
@@ -86,14 +86,14 @@ def status(state: State, now: float, words: Words) -> CoreStatus:
 
 def _queue(state: State, waits: dict[JobGroup, Reason], words: Words) -> tuple[QueuedJobs, ...]:
     """Returns the unfinished jobs by priority and environment."""
-    found: dict[tuple[int, str], list[JobGroup]] = {}
+    grouped: dict[tuple[int, str], list[JobGroup]] = {}
     for group in state.groups.values():
         if group.jobs:
-            found.setdefault((group.priority, group.flow.env), []).append(group)
+            grouped.setdefault((group.priority, group.flow.env), []).append(group)
     order = [priority for rank in RANKS for priority in rank]
     queue = []
-    for priority, env in sorted(found, key=lambda key: (order.index(key[0]), key[1])):
-        groups = found[priority, env]
+    for priority, env in sorted(grouped, key=lambda key: (order.index(key[0]), key[1])):
+        groups = grouped[priority, env]
         leased = sum(group.n_leased for group in groups)
         reasons = Counter(words(waits[group]) for group in groups if group in waits)
         queue.append(
@@ -141,12 +141,11 @@ def _run(
     waiting = [waits[group] for group in groups if group in waits and not _yields(group, waits[group])]
     progress, waits_at_end = finished.progress(state, run)
     settings = run.row.settings
-    return RunStatus(
-        run=run.id,
-        entry=settings.entry,
-        env=settings.env,
+    return shared(
+        RunStatus,
+        run.row,
+        settings,
         phase=progress.phase,
-        budget=run.row.budget,
         remaining_budget=run.ledger.available,
         n_submits=len(run.submits),
         queued=sum(run.flow.n_ready[:AUDIT]),
@@ -154,13 +153,10 @@ def _run(
         done=run.ledger.settled + sum(group.done for group in groups),
         waits_for=words(waiting[0] if waiting else waits_at_end),
         agent_host=permits.agents(state, run.id),
-        exp_id=settings.exp_id,
-        repeat=settings.repeat,
         best_mean=max(
             (row.mean_return for row in run.submits if row.status == "ok" and row.mean_return is not None),
             default=None,
         ),
-        created_at=run.row.created_at,
         retries=tuple(run.retries),
         origin=settings.replay_of or ("" if settings.start is None else settings.start.run),
     )
@@ -177,7 +173,7 @@ def _stalls(state: State, now: float, words: Words) -> tuple[str, ...]:
         waiting = [job for job in group.jobs.values() if job.lease is None and now - job.since > limit_s]
         reason = waits_for(state, group) if waiting else None
         if waiting and not (reason is not None and _yields(group, reason)):
-            what = words(reason) or _behind(group.flow.lane)
+            what = words(reason) or f"a free slot among {group.flow.lane.slots() if group.flow.lane else 0}"
             waits.setdefault((group.run, what), []).extend(waiting)
         for job in group.jobs.values():
             lease = job.lease
@@ -202,8 +198,3 @@ def _stalls(state: State, now: float, words: Words) -> tuple[str, ...]:
 def _yields(group: JobGroup, reason: Reason) -> bool:
     """Whether the group is validation ahead of the run's end, which waits for agents and other work as it should."""
     return group.priority == EARLY_VALIDATION and reason.code in ("agent_alive", "related_train", "free_slot")
-
-
-def _behind(lane: Lane | None) -> str:
-    slots = 0 if lane is None else lane.slots()
-    return f"a free slot among {slots}"

@@ -6,7 +6,7 @@ Rules:
 - An identity is a certificate's common name: `coordinator`, or `ROLE/NAME` of a machine. Zenoh's access rules use it.
 - Only listeners may present their certificate as a server (the extended key usage), so that a worker or a gateway
   cannot impersonate the coordinator. Clients check a server's names and addresses.
-- The authority signs leaves only. It belongs to this cluster alone: none of its names are looked up anywhere.
+- The authority signs leaves only. It belongs to this cluster alone: none of its names is in any directory.
 """
 
 from __future__ import annotations
@@ -103,11 +103,11 @@ def issue(
 def describe(certificate: bytes) -> Described:
     """Parses a PEM certificate. Raises ConfigError when it is not one."""
     try:
-        found = x509.load_pem_x509_certificate(certificate)
+        parsed = x509.load_pem_x509_certificate(certificate)
         return Described(
-            serial=f"{found.serial_number:x}",
-            expires=found.not_valid_after_utc,
-            hosts=_hosts(found),
+            serial=f"{parsed.serial_number:x}",
+            expires=parsed.not_valid_after_utc,
+            hosts=_hosts(parsed),
         )
     except ValueError as error:
         raise ConfigError(f"not a certificate in PEM form: {error}") from error

@@ -66,6 +66,8 @@ class Machines:
 
     def __init__(self, state: Path) -> None:
         self.folder = state / "certs"
+        self.passwords = self.folder / "passwords"
+        """The file that Zenoh's session for other machines reads."""
         self._stamp: tuple[int, ...] = ()
         self._all: dict[str, Machine] = {}
         self._serials: dict[str, Machine] = {}
@@ -73,17 +75,12 @@ class Machines:
     @property
     def tls(self) -> TlsFiles | None:
         """The coordinator's own certificate; None before `certs init`."""
-        found = TlsFiles(
+        files = TlsFiles(
             root_ca=str(self.folder / "ca.pem"),
             certificate=str(self.folder / "coordinator.pem"),
             private_key=str(self.folder / "coordinator-key.pem"),
         )
-        return found if Path(found.private_key).exists() else None
-
-    @property
-    def passwords(self) -> Path:
-        """The file that Zenoh's session for other machines reads."""
-        return self.folder / "passwords"
+        return files if Path(files.private_key).exists() else None
 
     def all(self) -> tuple[Machine, ...]:
         """Every machine, including revoked ones, sorted by identity."""

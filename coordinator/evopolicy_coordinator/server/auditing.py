@@ -9,13 +9,15 @@ Rules that this module owns:
 
 from __future__ import annotations
 
+from typing import Any
+
 from evopolicy_common.errors import ProtocolError, StorageError
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome
 from evopolicy_common.records.blobs import BlobStore
 from evopolicy_common.records.episodes import compare
 from evopolicy_common.records.episodes.rendered import decode
 from evopolicy_common.records.episodes.trajectory import Trajectory
-from evopolicy_coordinator.core.contract.effects import AuditEffect, CompareAudit, PrepareAudit
+from evopolicy_coordinator.core.contract.effects import AuditEffect, CompareAudit
 from evopolicy_coordinator.core.contract.events import AuditCompared, AuditEvent, AuditPrepared
 from evopolicy_coordinator.storage.store import Reader
 
@@ -26,55 +28,31 @@ _LOST = "its record is not in the store any more"
 def carry_out(effect: AuditEffect, reader: Reader, blobs: BlobStore) -> AuditEvent:
     """Carries out an audit's effect: reads, stores, compares. Never raises for a bad report of a worker or a store
     error."""
-    return (
-        _prepare(effect, reader, blobs)
-        if isinstance(effect, PrepareAudit)
-        else _compare(effect, reader, blobs)
-    )
-
-
-def _prepare(effect: PrepareAudit, reader: Reader, blobs: BlobStore) -> AuditPrepared:
-    actions: BlobRef | None = None
-    error, at_fault = "", False
+    about = {"stimulus_id": effect.stimulus_id, "run": effect.run, "audit": effect.audit}
+    if isinstance(effect, CompareAudit):
+        return _compare(effect, reader, blobs, about)
     try:
-        recorded = _recording(_outcome(reader, effect.group, effect.index), blobs)
-        packed = _actions(recorded)
+        packed = _actions(_recording(_outcome(reader, effect.group, effect.index), blobs))
         actions = BlobRef(digest=blobs.put(packed), size=len(packed))
-    except ProtocolError as caught:
-        error, at_fault = f"its recording cannot be read: {caught}", True
-    except StorageError as caught:
-        error = f"{_LOST}: {caught}"
-    return AuditPrepared(
-        stimulus_id=effect.stimulus_id,
-        run=effect.run,
-        audit=effect.audit,
-        actions=actions,
-        error=error[:MAX_TEXT],
-        at_fault=at_fault,
-    )
+    except ProtocolError as error:
+        text = f"its recording cannot be read: {error}"[:MAX_TEXT]
+        return AuditPrepared(**about, actions=None, error=text, at_fault=True)
+    except StorageError as error:
+        return AuditPrepared(**about, actions=None, error=f"{_LOST}: {error}"[:MAX_TEXT])
+    return AuditPrepared(**about, actions=actions)
 
 
-def _compare(effect: CompareAudit, reader: Reader, blobs: BlobStore) -> AuditCompared:
-    with_player: str | None = None
-    with_first: str | None = None
-    error = ""
+def _compare(effect: CompareAudit, reader: Reader, blobs: BlobStore, about: dict[str, Any]) -> AuditCompared:
+    about |= {"replay": len(effect.replays)}
     try:
         player = _outcome(reader, effect.group, effect.index)
-        replays = [_outcome(reader, group, 0) for group in effect.replays]
-        with_player = outcome_difference(player, replays[-1], blobs)
-        if len(replays) > 1:
-            with_first = outcome_difference(replays[0], replays[-1], blobs)
-    except StorageError as caught:
-        error = f"{_LOST}: {caught}"
-    return AuditCompared(
-        stimulus_id=effect.stimulus_id,
-        run=effect.run,
-        audit=effect.audit,
-        replay=len(effect.replays),
-        with_player=with_player,
-        with_first=with_first,
-        error=error,
-    )
+        first, *others = [_outcome(reader, group, 0) for group in effect.replays]
+        last = others[-1] if others else first
+        with_player = outcome_difference(player, last, blobs)
+        with_first = outcome_difference(first, last, blobs) if others else None
+    except StorageError as error:
+        return AuditCompared(**about, with_player=None, error=f"{_LOST}: {error}")
+    return AuditCompared(**about, with_player=with_player, with_first=with_first)
 
 
 def outcome_difference(ours: EpisodeOutcome, theirs: EpisodeOutcome, blobs: BlobStore) -> str | None:
@@ -88,11 +66,13 @@ def outcome_difference(ours: EpisodeOutcome, theirs: EpisodeOutcome, blobs: Blob
             recordings.append(_recording(outcome, blobs))
         except ProtocolError as error:
             return f"a recording cannot be read: {error}"
-    left, right = recordings
-    if (left.record, left.observations) != (right.record, right.observations):
-        return f"records of {left.record}, {left.observations} and of {right.record}, {right.observations}"
+    first, second = recordings
+    if (first.record, first.observations) != (second.record, second.observations):
+        return (
+            f"records of {first.record}, {first.observations} and of {second.record}, {second.observations}"
+        )
     try:
-        difference = compare.episode_difference(ours, left, theirs, right)
+        difference = compare.episode_difference(ours, first, theirs, second)
     except Exception as error:
         # Their content may be anything that a worker makes up.
         difference = f"the recordings cannot be compared: {type(error).__name__}: {error}"

@@ -16,6 +16,7 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import Callable
+from math import inf
 from typing import TYPE_CHECKING
 
 from evopolicy_common.errors import DamagedStoreError, PartFailedError, StorageError
@@ -190,7 +191,8 @@ class CoreHost:
     def _on_timer(self) -> None:
         self._timer = None
         # If it fires too early, it only sets itself again.
-        self._advance(lambda core: core.handle_deadline(self.now()) if _is_due(core, self.now()) else [])
+        now = self.now()
+        self._advance(lambda core: core.handle_deadline(now) if (core.next_deadline() or inf) <= now else [])
         self.flush()
 
     # Loading and dropping.
@@ -265,8 +267,3 @@ class CoreHost:
             else:
                 log.info("the store writes again")
                 return
-
-
-def _is_due(core: Core, now: float) -> bool:
-    deadline = core.next_deadline()
-    return deadline is not None and now >= deadline

@@ -104,7 +104,7 @@ class Definitions:
             raise RefusedError(
                 Refusal.INVALID_SETTINGS,
                 f"no worker offers {env}{catalogue.near(env, sorted(known))}; install its package on a worker and start"
-                " that with --env; `evopolicy envs` lists what is offered",
+                " that with --env; `evopolicy envs` lists the offered ones",
             )
         approved = [each for each in reversed(self.approved.get(env, [])) if each in offers]
         if approved:
@@ -124,9 +124,9 @@ class Definitions:
                 f"{env}@{requested[:80]}: a definition's digest has {LEAST_DIGITS} hex digits or more, as `evopolicy"
                 " envs` shows it",
             )
-        found = [each for each in offers if each.startswith(requested) or requested.startswith(each)]
-        if len(found) == 1:
-            return found[0]
+        matching = [each for each in offers if each.startswith(requested) or requested.startswith(each)]
+        if len(matching) == 1:
+            return matching[0]
         if self._trusting and not offers:  # its worker is about to register
             return requested[:DEFINITION_DIGITS]
         offered = ", ".join(offers) or "none"
@@ -146,21 +146,21 @@ class Definitions:
 
     def offered(self, workers: Iterable[Worker]) -> list[OfferedEnvironment]:
         """Every definition of every environment that connected workers offer."""
-        found: dict[tuple[str, str], OfferedEnvironment] = {}
+        listed: dict[tuple[str, str], OfferedEnvironment] = {}
         for worker in workers:
             if worker.state == "lost":
                 continue
             profile = worker.profile
             for env, description in profile.descriptions.items():
                 digest = digits(description)
-                known = found.get((env, digest))
-                found[env, digest] = OfferedEnvironment(
+                known = listed.get((env, digest))
+                listed[env, digest] = OfferedEnvironment(
                     description=description,
                     digest=digest,
                     accepted=self._word(env, digest),
                     workers=(*(known.workers if known else ()), worker.name),
                 )
-        return [found[key] for key in sorted(found)]
+        return [listed[key] for key in sorted(listed)]
 
     def _word(self, env: str, digest: str) -> str:
         if env in self._shipped:
@@ -178,24 +178,24 @@ def _offers(env: str, workers: Iterable[Worker]) -> list[str]:
 
 def undescribed(workers: Iterable[Worker]) -> dict[str, tuple[str, ...]]:
     """By environment that no connected worker has described yet, the workers that will."""
-    found: dict[str, list[str]] = {}
+    offering: dict[str, list[str]] = {}
     described: set[str] = set()
     for worker in workers:
         if worker.state != "lost":
             described |= worker.profile.descriptions.keys()
             for env in worker.undescribed:
-                found.setdefault(env, []).append(worker.name)
-    return {env: tuple(sorted(found[env])) for env in sorted(found.keys() - described)}
+                offering.setdefault(env, []).append(worker.name)
+    return {env: tuple(sorted(offering[env])) for env in sorted(offering.keys() - described)}
 
 
 def failed(workers: Iterable[Worker]) -> dict[str, dict[str, str]]:
     """By environment, the connected workers on which it failed, with the reasons."""
-    found: dict[str, dict[str, str]] = {}
+    failures: dict[str, dict[str, str]] = {}
     for worker in workers:
         if worker.state != "lost":
             for env, why in worker.failed_environments.items():
-                found.setdefault(env, {})[worker.name] = why
-    return dict(sorted(found.items()))
+                failures.setdefault(env, {})[worker.name] = why
+    return dict(sorted(failures.items()))
 
 
 def digits(description: EnvironmentDescription) -> str:

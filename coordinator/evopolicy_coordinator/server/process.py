@@ -27,6 +27,7 @@ from evopolicy_coordinator.server.definitions import Definitions
 from evopolicy_coordinator.server.reader import ServiceReader
 from evopolicy_coordinator.server.remote_listener import declare_all, remote_listener
 from evopolicy_coordinator.server.request_parser import RequestParser
+from evopolicy_coordinator.server.run_requests import RunRequests
 from evopolicy_coordinator.server.service import Service
 from evopolicy_coordinator.server.uploads import Uploads
 from evopolicy_coordinator.splits import SplitSource, secret_of
@@ -66,11 +67,13 @@ async def run(options: Options, stop: asyncio.Event, on_ready: Callable[[Ready],
     Raises ConfigError for wrong options or a folder that is in use, StorageError when the store cannot be read,
     TransportError when it cannot listen on an endpoint, PartFailedError when a part cannot continue.
     """
-    with contextlib.ExitStack() as opened:
+    async with contextlib.AsyncExitStack() as opened:
         state = StateFolder.open(options.state, options.cluster)
         opened.callback(state.close)
         secret, note = secret_of(state.root, unjailed=options.unjailed)
-        if note and options.data is None:
+        if options.data is not None:
+            note = ""
+        elif note:
             log.warning(note)
         source = SplitSource(data=options.data, secret=secret, journal=state.root / JOURNAL)
         machines = Machines(state.root)
@@ -87,82 +90,52 @@ async def run(options: Options, stop: asyncio.Event, on_ready: Callable[[Ready],
         blobs = BlobStore(state.root / "blobs")
         blobs.drop_unfinished()
         uploads = Uploads()
-        parser = RequestParser(
-            state.identity,
-            blobs,
-            source,
-            uploads,
-            allowed_imports=("numpy", *options.allowed_packages),
-            denied_imports=SIMULATORS,
-            machines=machines,
-            definitions=Definitions(
-                state.root / "approved-environments.json",
-                shipped=catalogue.digests(),
-                trusting=options.trust_workers,
-            ),
-        )
         reader = ServiceReader(state.database, blobs, uploads)
-        service = Service(state.identity.cluster, store, reader, parser, options.core)
-        serving = contextlib.AsyncExitStack()
-        try:
-            if options.metrics is not None:
-                # Imported here so that a start without the option does not wait for these modules.
-                from evopolicy_coordinator.server.monitoring.metrics import Meter
-                from evopolicy_coordinator.server.monitoring.metrics_server import metrics_server
+        allowed = ("numpy", *options.allowed_packages)
+        runs = RunRequests(reader, blobs, source, allowed_imports=allowed, denied_imports=SIMULATORS)
+        definitions = Definitions(
+            state.root / "approved-environments.json",
+            shipped=catalogue.digests(),
+            trusting=options.trust_workers,
+        )
+        parser = RequestParser(state.identity, blobs, uploads, runs, machines, definitions)
+        cluster = state.identity.cluster
+        service = Service(cluster, store, reader, parser, options.core)
+        if options.metrics is not None:
+            # Imported here so that a start without the option does not wait for this module.
+            from evopolicy_coordinator.server.monitoring.metrics import Meter, metrics_server
 
-                meter = service.host.meter = Meter(state.root, service.status)
-                port = await serving.enter_async_context(
-                    metrics_server(options.metrics, meter, lambda: service.serves)
-                )
-                log.info("metrics are served", address=options.metrics, port=port)
-            await service.start()
-            listener = remote_listener(
-                state.identity.cluster, remote, machines, service.on_queries, service.on_liveliness
-            )
-            async with listener:
-                await _serve(state, options, listen, reachable(remote), service, stop, on_ready, note)
-        finally:
-            await service.stop()
-            await serving.aclose()
-        log.info("stopped; everything is on disk", state=str(state.root))
-
-
-async def _serve(
-    state: StateFolder,
-    options: Options,
-    listen: tuple[str, ...],
-    remote: tuple[str, ...],
-    service: Service,
-    stop: asyncio.Event,
-    on_ready: Callable[[Ready], None],
-    note: str,
-) -> None:
-    """Serves this machine on `listen` until `stop` is set. Other machines are served on `remote` by a listener of
-    their own."""
-    cluster = state.identity.cluster
-    state.write_passwords()
-    endpoints = reachable(listen)
-    files = state.write_credentials(endpoints, insecure_tcp=options.insecure_tcp)
-    config = transport.server_config(cluster, listen, state.passwords, {role: role for role in ROLES})
-    async with transport.serve(config, service.on_queries) as server:
-        declare_all(server, cluster, service.on_liveliness)
+            meter = service.host.meter = Meter(state.root, service.status)
+            serving = metrics_server(options.metrics, meter, lambda: service.serves)
+            port = await opened.enter_async_context(serving)
+            log.info("metrics are served", address=options.metrics, port=port)
+        opened.push_async_callback(service.stop)
+        await service.start()
+        queries, liveliness = service.on_queries, service.on_liveliness
+        # Other machines have a listener of their own.
+        await opened.enter_async_context(remote_listener(cluster, remote, machines, queries, liveliness))
+        state.write_passwords()
+        endpoints = reachable(listen)
+        files = state.write_credentials(endpoints, insecure_tcp=options.insecure_tcp)
+        config = transport.server_config(cluster, listen, state.passwords, {role: role for role in ROLES})
+        server = await opened.enter_async_context(transport.serve(config, queries))
+        # While the sessions are still open: handled queries get their replies, all others are dropped.
+        opened.push_async_callback(service.stop)
+        declare_all(server, cluster, liveliness)
         credentials.publish(endpoints, state.credentials)
-        try:
-            on_ready(
-                Ready(
-                    cluster=cluster,
-                    endpoints=(*endpoints, *remote),
-                    credentials={role: str(path) for role, path in files.items()},
-                    state=str(state.root),
-                    note="" if options.data is not None else note,
-                )
+        opened.callback(credentials.withdraw, endpoints)
+        on_ready(
+            Ready(
+                cluster=cluster,
+                endpoints=(*endpoints, *reachable(remote)),
+                credentials={role: str(path) for role, path in files.items()},
+                state=str(state.root),
+                note=note,
             )
-            await _until(stop, service)
-            log.info("stopping")
-        finally:
-            credentials.withdraw(endpoints)
-            # While the sessions are still open: handled queries get their replies, all others are dropped.
-            await service.stop()
+        )
+        await _until(stop, service)
+        log.info("stopping")
+    log.info("stopped; everything is on disk", state=str(state.root))
 
 
 async def _until(stop: asyncio.Event, service: Service) -> None:

@@ -9,11 +9,13 @@ Rules that this module owns:
 
 from __future__ import annotations
 
+import contextlib
 import threading
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
+from typing import Any
 from zlib import crc32
 
 from evopolicy_common.errors import DamagedStoreError, ProtocolError, RefusedError, StorageError
@@ -33,7 +35,6 @@ from evopolicy_common.messages.operator import (
     SignRequest,
 )
 from evopolicy_common.messages.run_settings import Start
-from evopolicy_common.messages.status import DiskUse
 from evopolicy_common.messages.worker import BlobAck, BlobChunk, BlobGet, BlobPut, Message, Refused
 from evopolicy_common.records import journal
 from evopolicy_common.records.blobs import BlobStore, FileState, digest_of, is_digest
@@ -43,11 +44,10 @@ from evopolicy_common.wire.transport import IncomingQuery
 from evopolicy_coordinator.core.contract import records
 from evopolicy_coordinator.core.contract.effects import AuditEffect, ReadEvaluation, ReadFinished, ReadResults
 from evopolicy_coordinator.core.contract.events import AuditEvent
-from evopolicy_coordinator.core.contract.records import RunRow, SubmitRow
+from evopolicy_coordinator.core.contract.records import JournalRow, OutcomeRow, RunRow, SubmitRow
 from evopolicy_coordinator.pki import identity
 from evopolicy_coordinator.server.reason_texts import env_failure, operator_words, words
 from evopolicy_coordinator.server.uploads import Uploads
-from evopolicy_coordinator.storage.disk_use import sizes
 from evopolicy_coordinator.storage.store import Reader
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
@@ -63,9 +63,12 @@ Answer = Callable[[Message | None], None]
 
 
 class ServiceReader:
-    """Reads pages and blobs. Every method returns at once; a thread sends the reply later."""
+    """Reads pages and blobs. The methods that take an `Answer` return at once; a thread sends the reply later.
+    Those that read the database at once raise DamagedStoreError when a row cannot be read."""
 
     def __init__(self, database: Path, blobs: BlobStore, uploads: Uploads) -> None:
+        self.state = database.parent
+        """The state folder."""
         self._database = database
         self._blobs = blobs
         self._uploads = uploads
@@ -74,15 +77,12 @@ class ServiceReader:
         self._audits = ThreadPoolExecutor(1, thread_name_prefix="audits")
         self._lanes = [ThreadPoolExecutor(1, thread_name_prefix=f"blobs-{n}") for n in range(_BLOB_LANES)]
 
-    def disk(self) -> DiskUse:
-        """Size of the database, and of its disk. Raises OSError."""
-        return sizes(self._database.parent)
+    def read(self, asked: Any, answer: Answer) -> None:
+        """Replies to a `ReadEffect` of the core or an operator's request (`_READS`): with a page of results,
+        outcomes of a finished run, published records of runs whose cases are disclosed, or a signature."""
+        self._pages.submit(self._answer, partial(_READS[type(asked)], self, asked), answer)
 
-    def page(self, effect: ReadResults | ReadEvaluation | ReadFinished, answer: Answer) -> None:
-        """Replies with a page that the core requested."""
-        self._pages.submit(self._answer, lambda: self._page(effect), answer)
-
-    def audit(self, effect: AuditEffect, tell: Callable[[AuditEvent], None]) -> None:
+    def audit(self, effect: AuditEffect, tell: Callable[[AuditEvent], object]) -> None:
         """Reads and compares recordings, one audit after another; calls `tell` from its thread."""
         self._audits.submit(self._audit, effect, tell)
 
@@ -115,25 +115,12 @@ class ServiceReader:
         """Sends one chunk of a blob; with `run`, only if this run's train feedback names the blob."""
         self._lane(message.digest).submit(self._answer, lambda: self._get(run, message), answer)
 
-    def stored(
-        self, message: RecordedRequest | JournalRequest | OpeningRequest | SignRequest, answer: Answer
-    ) -> None:
-        """Sends outcomes of a finished run, or published records of runs whose cases are disclosed, or signs a
-        digest."""
-        work = {
-            RecordedRequest: self._recorded,
-            JournalRequest: self._journal,
-            OpeningRequest: self._opening,
-            SignRequest: self._sign,
-        }
-        self._pages.submit(self._answer, lambda: work[type(message)](message), answer)  # type: ignore[operator]
-
     def epochs(self, runs: tuple[str, ...]) -> tuple[str, ...]:
         """The distinct epochs of finished runs that are to be published. Reads the database.
 
         Raises RefusedError for a run that is unknown, unfinished, or has no commitment.
         """
-        found: dict[str, None] = {}
+        epochs: dict[str, None] = {}
         for run in runs:
             row = self.finished_run(run)
             if row is None:
@@ -144,8 +131,8 @@ class ServiceReader:
                     f"run {run} was opened before this coordinator kept a journal: it has no commitment to its cases,"
                     " which cannot be added later, so it cannot be published",
                 )
-            found[row.epoch] = None
-        return tuple(found)
+            epochs[row.epoch] = None
+        return tuple(epochs)
 
     def finished_with_result(self, run: str) -> tuple[RunRow, RunFinished]:
         """A finished run and its result. Reads the database. Raises RefusedError for any other run."""
@@ -167,36 +154,22 @@ class ServiceReader:
         return self._reader.revealed()
 
     def finished_run(self, run: str) -> RunRow | None:
-        """A finished run as it was created; None for any other run. Reads the database.
-
-        Raises RefusedError when the row cannot be read.
-        """
-        try:
-            return self._reader.run(run) if run and self._reader.finished(run) is not None else None
-        except DamagedStoreError as error:
-            raise damaged(error) from error
+        """A finished run as it was created; None for any other run. Reads the database."""
+        return self._reader.run(run) if run and self._reader.finished(run) is not None else None
 
     def parent(self, start: Start) -> tuple[RunRow | None, SubmitRow | None, bool]:
         """The run and the submit that `start` names, None for an unknown one, and whether that run's agent has ended.
-        Reads the database. Raises RefusedError when a row cannot be read."""
-        try:
-            submit = self._reader.submit(start.run, start.submit_index)
-            return self._reader.run(start.run), submit, self._reader.ended(start.run)
-        except DamagedStoreError as error:
-            raise damaged(error) from error
+        Reads the database."""
+        submit = self._reader.submit(start.run, start.submit_index)
+        return self._reader.run(start.run), submit, self._reader.ended(start.run)
 
     def replayed(self, run: str) -> RunRow | None:
         """The finished run that is to be played again; None for none and for an unknown one. Reads the database. Raises
-        RefusedError for an open run, and when the row cannot be read."""
-        if not run:
-            return None
+        RefusedError for an open run."""
         finished = self.finished_run(run)
-        try:
-            if finished is None and self._reader.run(run) is not None:
-                text = f"run {run[:64]} is open; only a finished run is replayed: wait until it is scored, or cancel it"
-                raise RefusedError(Refusal.BUSY, text)
-        except DamagedStoreError as error:
-            raise damaged(error) from error
+        if run and finished is None and self._reader.run(run) is not None:
+            text = f"run {run[:64]} is open; only a finished run is replayed: wait until it is scored, or cancel it"
+            raise RefusedError(Refusal.BUSY, text)
         return finished
 
     def close(self) -> None:
@@ -227,15 +200,18 @@ class ServiceReader:
         except StorageError as error:
             log.error("an upload stays until `evopolicy-coordinator gc`", run=run, error=str(error))
 
-    def _audit(self, effect: AuditEffect, tell: Callable[[AuditEvent], None]) -> None:
+    def _audit(self, effect: AuditEffect, tell: Callable[[AuditEvent], object]) -> None:
         # Needs numpy, which a coordinator without audits never imports.
         from evopolicy_coordinator.server import auditing
 
         try:
-            tell(auditing.carry_out(effect, self._reader, self._blobs))
+            event = auditing.carry_out(effect, self._reader, self._blobs)
         except Exception:
             # The audit stays open until its timeout.
             log.exception("cannot audit", audit=effect.audit)
+            return
+        with contextlib.suppress(RuntimeError):  # the loop is closed: the process is ending
+            tell(event)
 
     @property
     def _reader(self) -> Reader:
@@ -244,11 +220,7 @@ class ServiceReader:
         reader: Reader = self._local.reader
         return reader
 
-    def _page(self, effect: ReadResults | ReadEvaluation | ReadFinished) -> Message:
-        if isinstance(effect, ReadResults):
-            return self._results(effect)
-        if isinstance(effect, ReadEvaluation):
-            return self._evaluation(effect)
+    def _finished(self, effect: ReadFinished) -> Message:
         finished = self._reader.finished(effect.run)
         if finished is None:
             return Refused(status=Refusal.UNKNOWN_RUN, message=f"run {effect.run!r} has no outcome")
@@ -266,24 +238,26 @@ class ServiceReader:
         upto = row.released if effect.upto is None or row.status is not None else effect.upto
         group = records.train_group(effect.run, effect.submit_index)
         page = self._reader.outcomes(group, effect.cursor, upto, MAX_PAGE_BYTES)
+        after = _after(page, effect.cursor)
         return ResultsPage(
-            cursor=page.cursor,
-            episodes=tuple(feedback(found.outcome) for found in page.rows),
-            done=records.submit_done(row) if page.cursor >= upto else None,
+            cursor=after,
+            episodes=tuple(feedback(each.outcome) for each in page),
+            done=records.submit_done(row) if after >= upto else None,
             waits_for=words(effect.waits_for),
             held_s=effect.held_s,
-            more=bool(page.rows) and page.cursor < upto,
+            more=bool(page) and after < upto,
         )
 
     def _evaluation(self, effect: ReadEvaluation) -> Message:
         group = records.evaluation_group(effect.evaluation)
         page = self._reader.outcomes(group, effect.cursor, effect.upto, MAX_PAGE_BYTES)
+        after = _after(page, effect.cursor)
         return EvaluationPage(
-            cursor=page.cursor,
+            cursor=after,
             total=effect.total,
-            outcomes=tuple(found.outcome for found in page.rows),
+            outcomes=tuple(each.outcome for each in page),
             # A cancelled one has fewer outcomes than cases, and after a restart only the cases are counted.
-            finished=effect.finished and (page.cursor >= effect.upto or not page.rows),
+            finished=effect.finished and (after >= effect.upto or not page),
             waits_for=operator_words(effect.waits_for),
             env_failure=env_failure(effect.waits_for),
         )
@@ -292,26 +266,20 @@ class ServiceReader:
         run = message.run
         if self._reader.finished(run) is None:
             return Refused(status=Refusal.UNKNOWN_RUN, message=f"there is no finished run {run[:64]!r} here")
-        name = {
-            "train": records.train_group,
-            "validation": records.validation_group,
-            "heldout": records.heldout_group,
-        }[message.split]
-        group = records.random_group(run) if message.submit_index < 0 else name(run, message.submit_index)
+        index = message.submit_index
+        group = records.random_group(run) if index < 0 else records.GROUPS[message.split](run, index)
         cursor = min(max(0, message.cursor), MAX_SEQ)
         page = self._reader.outcomes(group, cursor, MAX_SEQ, MAX_PAGE_BYTES)
-        return EvaluationPage(
-            cursor=page.cursor,
-            total=page.cursor,
-            outcomes=tuple(found.outcome for found in page.rows),
-            finished=not page.rows,
-        )
+        after = _after(page, cursor)
+        outcomes = tuple(each.outcome for each in page)
+        return EvaluationPage(cursor=after, total=after, outcomes=outcomes, finished=not page)
 
     def _journal(self, message: JournalRequest) -> Message:
         cursor = min(max(0, message.cursor), MAX_SEQ)
         rows = self._reader.journal(cursor, MAX_PAGE_BYTES)
-        after = rows[-1].seq + 1 if rows else cursor
-        return JournalPage(cursor=after, entries=tuple(row.entry for row in rows), finished=not rows)
+        return JournalPage(
+            cursor=_after(rows, cursor), entries=tuple(row.entry for row in rows), finished=not rows
+        )
 
     def _opening(self, message: OpeningRequest) -> Message:
         row = self.finished_run(message.run)
@@ -330,7 +298,7 @@ class ServiceReader:
             return Refused(
                 status=Refusal.BAD_REQUEST, message=f"{message.digest[:80]!r} is no SHA-256 digest"
             )
-        key, signature = identity.sign(self._database.parent, message.digest)
+        key, signature = identity.sign(self.state, message.digest)
         return Signed(key=key, signature=signature)
 
     def _put(
@@ -372,6 +340,22 @@ class ServiceReader:
         )
 
 
+_READS: dict[type, Callable[[ServiceReader, Any], Message]] = {
+    ReadResults: ServiceReader._results,
+    ReadEvaluation: ServiceReader._evaluation,
+    ReadFinished: ServiceReader._finished,
+    RecordedRequest: ServiceReader._recorded,
+    JournalRequest: ServiceReader._journal,
+    OpeningRequest: ServiceReader._opening,
+    SignRequest: ServiceReader._sign,
+}
+
+
+def _after(rows: Sequence[OutcomeRow | JournalRow], cursor: int) -> int:
+    """The cursor of the next page."""
+    return rows[-1].seq + 1 if rows else cursor
+
+
 def feedback(outcome: EpisodeOutcome) -> EpisodeFeedback:
     """The part of a train episode's outcome that an agent may see."""
     return EpisodeFeedback(
@@ -391,7 +375,9 @@ def feedback(outcome: EpisodeOutcome) -> EpisodeFeedback:
 def damaged(error: DamagedStoreError) -> RefusedError:
     """The refusal for a row that cannot be read: retrying does not help. Logs the row's name."""
     log.error("the store cannot be read", error=str(error))
-    text = "what the coordinator has stored of this cannot be read; its log names the row and the remedy"
+    text = (
+        "the stored data of this request cannot be read; the coordinator's log names the row and the remedy"
+    )
     return RefusedError(Refusal.DAMAGED, text)
 
 

@@ -6,7 +6,9 @@ an agent learns at most that it waits for hidden cases of another run to be scor
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable, Mapping
+from pathlib import Path
 
 import msgspec
 
@@ -15,7 +17,7 @@ from evopolicy_common.messages.gateway import FREE_SLOT, Permit, RunOpened, RunS
 from evopolicy_common.messages.operator import RunProgress
 from evopolicy_common.messages.worker import Message, Refused
 from evopolicy_coordinator.core.contract.effects import Refuse, Reply
-from evopolicy_coordinator.core.contract.reasons import Code, Reason
+from evopolicy_coordinator.core.contract.reasons import Reason
 from evopolicy_coordinator.core.isolation.conflicts import NO_BOOT_ID
 
 
@@ -65,7 +67,7 @@ def _unknown_class(name: str, offered: tuple[str, ...]) -> str:
     return f"no worker of class {name!r} can play the run; the classes are {', '.join(offered) or 'none'}"
 
 
-TEXTS: Mapping[Code, str | Callable[..., str]] = {
+TEXTS: Mapping[str, str | Callable[..., str]] = {
     "unknown_run": "unknown run {run!r}; `evopolicy runs list` shows those that are not finished",
     "no_unfinished_run": "no unfinished run {run!r}; `evopolicy runs list` shows them",
     "unknown_evaluation": "unknown evaluation {evaluation!r}",
@@ -81,7 +83,7 @@ TEXTS: Mapping[Code, str | Callable[..., str]] = {
     "evaluation_without_cases": "an evaluation needs at least one case",
     "epoch_revealed": (
         "the cases of epoch {epoch} are public, as runs on them were published: stop the coordinator, run"
-        " `evopolicy-coordinator epoch new` with its --state, and start it again (with --data: give it other cases)"
+        " `evopolicy-coordinator epoch new --state {state}`, and start it again, or name other cases with --data"
     ),
     "epoch_in_use": (
         "run {run!r} is not finished and plays cases of the same epoch, which publishing would reveal; wait for"
@@ -95,7 +97,7 @@ TEXTS: Mapping[Code, str | Callable[..., str]] = {
     "too_few": "{n} episodes asked for; a submit takes at least {least}",
     "too_many": "{n} episodes asked for; a submit takes at most {most}",
     "too_many_rejected": "{n} requests of this run took an index; further ones that play nothing do not",
-    "over_budget": "{n} episodes asked for; {left} of the budget remain",
+    "over_budget": "{n} episodes asked for; {remaining} of the budget remain",
     "no_worker_yet": "the run waits for {waits_for}",
     "may_not_start": "the run's agent may not start yet; it waits for {waits_for}",
     "too_many_places": (
@@ -131,13 +133,15 @@ TEXTS: Mapping[Code, str | Callable[..., str]] = {
 """By code: a text with placeholders for the reason's details, or a function of them."""
 
 
-def words(reason: Reason | None) -> str:
-    """A reason as text; empty for None."""
+def words(reason: Reason | None, state: Path | None = None) -> str:
+    """A reason as text; empty for None. `state`: the folder that commands for the operator name."""
     if reason is None:
         return ""
     text = TEXTS[reason.code]
     about = {name: words(each) if isinstance(each, Reason) else each for name, each in reason.about.items()}
-    return text.format(**about) if isinstance(text, str) else text(**about)
+    if not isinstance(text, str):
+        return text(**about)
+    return text.format(**about, state="STATE" if state is None else shlex.quote(str(state)))
 
 
 def env_failure(reason: Reason | None) -> str:
@@ -152,10 +156,10 @@ def operator_words(reason: Reason | None) -> str:
     return ": ".join(filter(None, (words(reason), env_failure(reason))))
 
 
-def message(effect: Reply | Refuse) -> Message:
-    """The reply for the client: the effect's message, with its reason as text."""
+def message(effect: Reply | Refuse, state: Path | None = None) -> Message:
+    """The reply for the client: the effect's message, with its reason as text. `state` as in `words`."""
     if isinstance(effect, Refuse):
-        return Refused(status=effect.status, message=words(effect.reason))
+        return Refused(status=effect.status, message=words(effect.reason, state))
     reply = effect.message
     if effect.waits_for is None:
         return reply

@@ -23,7 +23,7 @@ from evopolicy_coordinator.pki.machines import Machines
 
 log: structlog.stdlib.BoundLogger = structlog.get_logger()
 
-LOOK_S = 0.5
+CHECK_S = 0.5
 """Interval between checks for issued or revoked machines."""
 _PAUSE_S = 0.25
 
@@ -50,7 +50,34 @@ async def remote_listener(
         yield
         return
     opened = asyncio.get_running_loop().create_future()
-    keeping = asyncio.create_task(_keep(cluster, listen, machines, on_queries, on_liveliness, opened))
+
+    async def keep() -> None:
+        while True:
+            try:
+                seen, tls = machines.stamp(), machines.tls
+                if tls is None:
+                    raise ConfigError(
+                        f"--listen {listen[0]}: no certificates yet; make them: evopolicy-coordinator certs init"
+                    )
+                machines.write_passwords()
+                listed = [(machine.role, machine.identity) for machine in machines.admitted()]
+                config = transport.tls_server_config(cluster, listen, machines.passwords, listed, tls)
+                async with transport.serve(config, on_queries) as server:
+                    declare_all(server, cluster, on_liveliness)
+                    if opened.done():
+                        log.info("machines changed; listening again", machines=len(listed))
+                    else:
+                        opened.set_result(None)
+                    while machines.stamp() == seen:  # noqa: ASYNC110 - another process changes the file
+                        await asyncio.sleep(CHECK_S)
+            except Exception as error:
+                if not opened.done():
+                    opened.set_exception(error)
+                    return
+                log.error("cannot listen for other machines; trying again", why=str(error))
+                await asyncio.sleep(_PAUSE_S)
+
+    keeping = asyncio.create_task(keep())
     try:
         await opened
         yield
@@ -58,38 +85,3 @@ async def remote_listener(
         keeping.cancel()
         with contextlib.suppress(asyncio.CancelledError, TransportError, ConfigError):
             await keeping
-
-
-async def _keep(
-    cluster: str,
-    listen: tuple[str, ...],
-    machines: Machines,
-    on_queries: Callable[[list[IncomingQuery]], None],
-    on_liveliness: Callable[[str, bool], None],
-    opened: asyncio.Future[None],
-) -> None:
-    while True:
-        try:
-            seen = machines.stamp()
-            tls = machines.tls
-            if tls is None:
-                raise ConfigError(
-                    f"--listen {listen[0]}: no certificates yet; make them: evopolicy-coordinator certs init"
-                )
-            machines.write_passwords()
-            listed = [(machine.role, machine.identity) for machine in machines.admitted()]
-            config = transport.tls_server_config(cluster, listen, machines.passwords, listed, tls)
-            async with transport.serve(config, on_queries) as server:
-                declare_all(server, cluster, on_liveliness)
-                if opened.done():
-                    log.info("machines changed; listening again", machines=len(listed))
-                else:
-                    opened.set_result(None)
-                while machines.stamp() == seen:  # noqa: ASYNC110 - another process changes the file
-                    await asyncio.sleep(LOOK_S)
-        except Exception as error:
-            if not opened.done():
-                opened.set_exception(error)
-                return
-            log.error("cannot listen for other machines; trying again", why=str(error))
-            await asyncio.sleep(_PAUSE_S)

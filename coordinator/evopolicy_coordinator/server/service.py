@@ -16,7 +16,7 @@ import asyncio
 import contextlib
 import hmac
 import time
-from collections.abc import Callable, Coroutine, Iterator
+from collections.abc import Awaitable, Callable, Coroutine, Iterator
 from functools import partial
 from importlib import metadata
 
@@ -38,13 +38,8 @@ from evopolicy_common.refusals import Refusal
 from evopolicy_common.wire import codec
 from evopolicy_common.wire.transport import IncomingQuery
 from evopolicy_coordinator.core.contract.effects import AuditEffect, Effect, Log, ReadEffect, Refuse, Reply
-from evopolicy_coordinator.core.contract.events import (
-    AnyEvent,
-    AuditEvent,
-    DescriptionAwaited,
-    DisclosureRequested,
-    LivenessLost,
-)
+from evopolicy_coordinator.core.contract.events import AuditEvent, DescriptionAwaited, LivenessLost
+from evopolicy_coordinator.core.contract.reasons import REFUSALS
 from evopolicy_coordinator.core.contract.settings import CoreSettings
 from evopolicy_coordinator.core.machine import Core
 from evopolicy_coordinator.core.runs import finished
@@ -59,6 +54,7 @@ from evopolicy_coordinator.server.reason_texts import message, operator_words, w
 from evopolicy_coordinator.server.refused_workers import RefusedWorkers
 from evopolicy_coordinator.server.request_checks import finite_wait
 from evopolicy_coordinator.server.request_parser import Parsed, RequestParser
+from evopolicy_coordinator.storage.disk_use import sizes
 from evopolicy_coordinator.storage.store import Store
 from evopolicy_coordinator.storage.writer import Writer
 
@@ -69,7 +65,7 @@ _FORGET_S = 120.0
 """Longer than any long poll: the core answers those within `CoreSettings.max_wait_s`."""
 _SWEEP_S = _FORGET_S / 4
 _STALLS_LOGGED = 5
-_LOOK_S = 3.0
+_READ_AGAIN_S = 3.0
 _CANNOT_WRITE = "the coordinator cannot write its store and accepts no changes until it can"
 
 
@@ -161,7 +157,7 @@ class Service:
             return
         with self._answering(query):
             try:
-                parsed = self._parser.parse(query.key, query.payload, core)
+                parsed = self._parser.parse(query.key, query.payload, core.state.capabilities.get)
                 if parsed.subtree == "gw":
                     self._heard[parsed.asker] = self.host.now()
                 _ANSWERS.get(type(parsed.message), Service._serve_event)(self, core, query, parsed)
@@ -188,13 +184,27 @@ class Service:
         query.reply(self._status_bytes(core, parsed.message.max_age_s), lane_of(parsed.asker))
 
     def _serve_stored(self, core: Core, query: IncomingQuery, parsed: Parsed) -> None:
-        self._reader.stored(parsed.message, answer_to(query, parsed.asker))
+        self._reader.read(parsed.message, answer_to(query, parsed.asker))
 
     def _serve_description(self, core: Core, query: IncomingQuery, parsed: Parsed) -> None:
-        self._spawn(self._serve_read(query, self._description(core, parsed.message)))
+        read = self._description(core, parsed.message)
+        self._spawn(self._reply_with(query, asyncio.to_thread(read)))
 
     def _serve_further_cases(self, core: Core, query: IncomingQuery, parsed: Parsed) -> None:
-        self._spawn(self._serve_read(query, partial(self._further_cases, parsed.message)))
+        derived = asyncio.to_thread(self._parser.runs.further_cases, parsed.message)
+        self._spawn(self._reply_with(query, derived))
+
+    def _serve_claim(self, core: Core, query: IncomingQuery, parsed: Parsed) -> None:
+        self._spawn(self._reply_with(query, self._claim(parsed.message)))
+
+    async def _claim(self, message: operator.Claim) -> Message:
+        """Serves a claim without the core: claims change no run."""
+        try:
+            return await self._claims.ask(message, self.host.now())
+        except DamagedStoreError:
+            raise
+        except StorageError as error:
+            return Refused(status=Refusal.UNAVAILABLE, message=str(error))
 
     def _serve_environments(self, core: Core, query: IncomingQuery, parsed: Parsed) -> None:
         workers = core.state.workers.values()
@@ -239,7 +249,7 @@ class Service:
         stimulus = self._stimulus_of(parsed.message)
         with self._answering(query):
             try:
-                event = await asyncio.to_thread(self._event_from_files, parsed, request, stimulus)
+                event = await asyncio.to_thread(self._parser.event, parsed, request, stimulus)
             except BaseException:
                 self._pending.take(request)
                 raise
@@ -247,31 +257,9 @@ class Service:
                 self.host.handle(event)
                 self.host.flush()
 
-    def _event_from_files(self, parsed: Parsed, request: int, stimulus: str) -> AnyEvent:
-        message = parsed.message
-        if isinstance(message, operator.Evaluate) and message.as_in is not None:
-            row = self._reader.finished_run(message.as_in.run)
-            return self._parser.evaluation_requested(message, request, stimulus, row)
-        # A run of another coordinator is played again as any run, with this one's cases and a new secret.
-        if isinstance(message, operator.CreateRun) and (
-            of := self._reader.replayed(message.settings.replay_of)
-        ):
-            return self._parser.run_replayed(message, request, stimulus, of)
-        if isinstance(message, operator.CreateRun) and message.settings.start is not None:
-            parent = self._reader.parent(message.settings.start)
-            return self._parser.run_created(message, request, stimulus, parent)
-        if isinstance(message, operator.Rescore):
-            of, result = self._reader.finished_with_result(message.run)
-            return self._parser.rescore_requested(message, request, stimulus, of, result)
-        if isinstance(message, operator.Disclose):
-            epochs = self._reader.epochs(message.runs)
-            return DisclosureRequested(stimulus_id=stimulus, request=request, message=message, epochs=epochs)
-        return self._parser.event(parsed, request, stimulus)
-
-    async def _serve_read(self, query: IncomingQuery, read: Callable[[], Message]) -> None:
-        """Replies with a message that `read` makes from files and the store, on a thread."""
+    async def _reply_with(self, query: IncomingQuery, answer: Awaitable[Message]) -> None:
         with self._answering(query):
-            query.reply(answer_bytes(await asyncio.to_thread(read)))
+            query.reply(answer_bytes(await answer))
 
     @contextlib.contextmanager
     def _answering(self, query: IncomingQuery) -> Iterator[None]:
@@ -280,6 +268,8 @@ class Service:
             yield
         except RefusedError as error:
             self._refuse(query, error)
+        except DamagedStoreError as error:
+            self._refuse(query, damaged(error))
         except Exception:
             # A bug here must not stop the service. The client is notified immediately and may retry.
             log.exception("request failed", key=query.key)
@@ -288,23 +278,23 @@ class Service:
     def _description(self, core: Core, message: operator.DescribeEnvironment) -> Callable[[], Message]:
         """Reads the split hashes and the fingerprints that matter for replaying a run's episodes."""
         workers = core.state.workers.values()
-        found = {
+        profiles = {
             repr(each.profile.fingerprints[message.env]): each.profile
             for each in workers
             if message.env in each.profile.descriptions
         }.values()
-        awaited = not found and any(
+        awaited = not profiles and any(
             message.env in each.undescribed and each.state != "lost" for each in workers
         )
-        fingerprints = tuple(each.fingerprints[message.env] for each in found)
-        classes = tuple(each.classes[message.env] for each in found)
+        fingerprints = tuple(each.fingerprints[message.env] for each in profiles)
+        classes = tuple(each.classes[message.env] for each in profiles)
         if awaited:
             self.host.handle(DescriptionAwaited(stimulus_id=self._stimulus_of(message), env=message.env))
 
         def read() -> operator.EnvironmentState:
             row = self._reader.finished_run(message.run)
             return operator.EnvironmentState(
-                split_hashes=self._parser.split_hashes(message, row),
+                split_hashes=self._parser.runs.split_hashes(message, row),
                 knows_run=row is not None,
                 fingerprints=fingerprints,
                 classes=classes,
@@ -313,26 +303,6 @@ class Service:
             )
 
         return read
-
-    def _further_cases(self, message: operator.FurtherCasesRequest) -> operator.FurtherCases:
-        """Derives further hidden cases for a finished run."""
-        row, _ = self._reader.finished_with_result(message.run)
-        cases = self._parser.further_cases(message, row, self._reader.revealed())
-        return operator.FurtherCases(cases=cases.cases, epoch=cases.epoch)
-
-    def _serve_claim(self, core: Core, query: IncomingQuery, parsed: Parsed) -> None:
-        self._spawn(self._claim(query, parsed.message))
-
-    async def _claim(self, query: IncomingQuery, message: operator.Claim) -> None:
-        """Serves a claim without the core: claims change no run."""
-        with self._answering(query):
-            try:
-                answer: Message = await self._claims.ask(message, self.host.now())
-            except DamagedStoreError as error:
-                raise damaged(error) from error
-            except StorageError as error:
-                answer = Refused(status=Refusal.UNAVAILABLE, message=str(error))
-            query.reply(answer_bytes(answer))
 
     def _serve_put(self, core: Core, query: IncomingQuery, parsed: Parsed) -> None:
         message = parsed.message
@@ -343,7 +313,8 @@ class Service:
         elif parsed.subtree == "gw":
             run = core.state.runs.get(parsed.asker)
             if run is None or run.state.phase != "open":
-                raise RefusedError(*_over(core, parsed.asker))
+                reason = core.over(parsed.asker)
+                raise RefusedError(REFUSALS[reason.code], words(reason))
             run_id, submitted = run.id, frozenset(row.bundle for row in run.submits)
         answer = answer_to(query, parsed.asker)
         self._reader.put(f"{parsed.subtree}/{parsed.asker}", run_id, message, most, answer, submitted)
@@ -409,9 +380,9 @@ class Service:
         core = self.host.last_core
         if self.host.storage_error and self._parser.asks_for_change(query.key, query.payload):
             # The reason contains paths, which agents must not see.
-            why = _CANNOT_WRITE if self._parser.is_gateways(query.key) else self._trouble
+            why = _CANNOT_WRITE if self._parser.subtree(query.key) == "gw" else self._trouble
             query.reply(answer_bytes(Refused(status=Refusal.UNAVAILABLE, message=why)))
-        elif core is None or not self._parser.is_operators(query.key):
+        elif core is None or self._parser.subtree(query.key) != "ops":
             query.drop()
         else:
             self._serve_reader(core, query)
@@ -419,7 +390,7 @@ class Service:
     def _serve_reader(self, core: Core, query: IncomingQuery) -> None:
         """Answers an operator from the core that the store refused."""
         try:
-            message = self._parser.parse(query.key, query.payload, core).message
+            message = self._parser.parse(query.key, query.payload, core.state.capabilities.get).message
         except RefusedError as error:
             self._refuse(query, error)
             return
@@ -430,7 +401,7 @@ class Service:
             progress, _ = finished.progress(core.state, run)
             answer = answer_bytes(replace(progress, trouble=self._trouble))
             # As late as the operator allows: it asks again at once.
-            self._loop.call_later(min(finite_wait(message.wait_s), _LOOK_S), query.reply, answer)
+            self._loop.call_later(min(finite_wait(message.wait_s), _READ_AGAIN_S), query.reply, answer)
         else:
             query.drop()
 
@@ -458,32 +429,24 @@ class Service:
         if isinstance(effect, Reply | Refuse):
             pending = self._pending.take(effect.request)
             if pending is not None:
-                query, reply = pending.query, message(effect)
+                query, reply = pending.query, message(effect, self._reader.state)
                 self._refused_workers.answered(query.key, query.payload, reply, self.host.now())
                 query.reply(answer_bytes(reply), lane_of(pending.asker))
         elif isinstance(effect, ReadEffect):
             pending = self._pending.take(effect.request)
             if pending is not None:
-                self._reader.page(effect, answer_to(pending.query, pending.asker))
+                self._reader.read(effect, answer_to(pending.query, pending.asker))
         elif isinstance(effect, AuditEffect):
-            self._reader.audit(effect, self._audit_listener(self.host.incarnation))
+            tell = partial(self._loop.call_soon_threadsafe, self._audited, self.host.incarnation)
+            self._reader.audit(effect, tell)
         elif isinstance(effect, Log):
             getattr(log, effect.level)(effect.event, stimulus=effect.stimulus_id, **effect.fields)
 
-    def _audit_listener(self, incarnation: int) -> Callable[[AuditEvent], None]:
-        """Returns a callback that passes an audit's result to the core that requested it. A later core requests its
-        own."""
-
-        def arrived(event: AuditEvent) -> None:
-            if incarnation == self.host.incarnation and not self.host.stopping:
-                self.host.handle(event)
-                self.host.flush()
-
-        def tell(event: AuditEvent) -> None:
-            with contextlib.suppress(RuntimeError):  # the loop is closed: the process is ending
-                self._loop.call_soon_threadsafe(arrived, event)
-
-        return tell
+    def _audited(self, incarnation: int, event: AuditEvent) -> None:
+        """Passes an audit's result to the core that requested it. A later core requests its own."""
+        if incarnation == self.host.incarnation and not self.host.stopping:
+            self.host.handle(event)
+            self.host.flush()
 
     def _sweep(self) -> None:
         """Periodically drops queries without a waiter (queries of lost workers are never answered), and uploads of runs
@@ -491,7 +454,7 @@ class Service:
         self._sweeper = self._loop.call_later(_SWEEP_S, self._sweep)
         self._pending.let_go(_FORGET_S)
         self._tell_stalls()
-        self._spawn(self._look_at_disk())
+        self._spawn(self._measure_disk())
         core = self.host.core
         if core is not None:
             self._heard = {run: at for run, at in self._heard.items() if run in core.state.runs}
@@ -500,20 +463,17 @@ class Service:
             runs = core.state.runs
             self._reader.drop_uploads(lambda run: run not in runs or runs[run].state.phase != "open")
 
-    async def _look_at_disk(self) -> None:
+    async def _measure_disk(self) -> None:
         """Updates the figures of the disk, on a thread: a network disk may hang."""
         try:
-            self._disk = await asyncio.to_thread(self._reader.disk)
+            self._disk = await asyncio.to_thread(sizes, self._reader.state)
         except OSError as error:
-            log.warning("cannot look at the disk", error=str(error))
+            log.warning("cannot read the size of the disk", error=str(error))
 
     def _tell_stalls(self) -> None:
         """Logs jobs and groups that wait too long, as `evopolicy status` shows them."""
-        stalls = (
-            ()
-            if self.host.core is None
-            else self._stalls(self.host.core.status(self.host.now(), operator_words).stalls)
-        )
+        core, now = self.host.core, self.host.now()
+        stalls = () if core is None else self._stalls(core.status(now, operator_words).stalls)
         if stalls:
             log.warning("stalls", n=len(stalls), first=stalls[:_STALLS_LOGGED])
 
@@ -554,23 +514,18 @@ def _check_session(core: Core, name: str, session: str) -> Worker:
     return worker
 
 
-def _over(core: Core, run: str) -> tuple[Refusal, str]:
-    status, reason = core.over(run)
-    return status, words(reason)
-
-
 _PAGE_BYTES = 4 << 20
 
 
-def _page(found: list[operator.OfferedEnvironment], cursor: int) -> operator.EnvironmentsReply:
+def _page(offered: list[operator.OfferedEnvironment], cursor: int) -> operator.EnvironmentsReply:
     """Returns the offered environments from `cursor` on, in a page of at most `_PAGE_BYTES` unless one alone is
     larger."""
     page: list[operator.OfferedEnvironment] = []
     size = 0
-    for each in found[max(0, cursor) :]:
+    for each in offered[max(0, cursor) :]:
         size += len(msgspec.msgpack.encode(each))
         if page and size > _PAGE_BYTES:
             break
         page.append(each)
     end = max(0, cursor) + len(page)
-    return operator.EnvironmentsReply(environments=tuple(page), cursor=end, finished=end >= len(found))
+    return operator.EnvironmentsReply(environments=tuple(page), cursor=end, finished=end >= len(offered))

@@ -23,6 +23,7 @@ from evopolicy_common.errors import ConfigError, StorageError
 from evopolicy_common.records.blobs import BlobStore, fsync_directory, write_atomically
 from evopolicy_common.wire.credentials import no_state
 from evopolicy_coordinator.pki.identity import SIGNING_KEY
+from evopolicy_coordinator.storage.store import DATABASE
 from evopolicy_coordinator.worlds import JOURNAL
 
 KEPT_FILES = (
@@ -37,7 +38,6 @@ KEPT_FILES = (
     ),
 )
 """The cluster's identity, besides its database and blobs. A start creates everything else again."""
-DATABASE = "coordinator.sqlite"
 
 
 class Backup(msgspec.Struct, frozen=True, kw_only=True):

@@ -11,7 +11,6 @@ Rules:
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import os
 import shutil
 import sqlite3
@@ -21,6 +20,7 @@ from pathlib import Path
 
 import msgspec
 
+from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.status import DiskUse
 from evopolicy_common.records.blobs import BlobStore
 from evopolicy_common.wire.credentials import no_state
@@ -34,12 +34,12 @@ from evopolicy_coordinator.core.contract.records import (
     SubmitRow,
     evaluation_group,
 )
-from evopolicy_coordinator.storage.store import rows, storage_errors, stored_blobs
+from evopolicy_coordinator.storage.state_folder import lock
+from evopolicy_coordinator.storage.store import DATABASE, rows, storage_errors, stored_blobs
 
 Bounds = tuple[str, str]
 """Group ids from the first (inclusive) to the second (exclusive)."""
 
-DATABASE = "coordinator.sqlite"
 UNNAMED_S = 24 * 3600.0
 BUSY_TIMEOUT_S = 30.0
 GUESS_BYTES = 1 << 20
@@ -147,7 +147,7 @@ def sizes(state: Path) -> DiskUse:
 
 def use(state: Path) -> list[EnvironmentUse]:
     """Disk use of the stored runs by environment, largest first; runs whose episodes were collected are left out."""
-    found: dict[str, EnvironmentUse] = {}
+    by_env: dict[str, EnvironmentUse] = {}
     with _database(state) as db:
         blobs = BlobStore(state / "blobs")
         for run in rows(db, RunRow):
@@ -161,14 +161,14 @@ def use(state: Path) -> list[EnvironmentUse]:
             digests = db.execute("SELECT digest FROM train_blobs WHERE run = ?", (run.run,)).fetchall()
             size += sum(blobs.size(digest) for (digest,) in digests if blobs.has(digest))
             env = run.settings.env
-            before = found.get(env) or EnvironmentUse(env=env, runs=0, train_episodes=0, bytes=0)
-            found[env] = EnvironmentUse(
+            before = by_env.get(env) or EnvironmentUse(env=env, runs=0, train_episodes=0, bytes=0)
+            by_env[env] = EnvironmentUse(
                 env=env,
                 runs=before.runs + 1,
                 train_episodes=before.train_episodes + train,
                 bytes=before.bytes + size,
             )
-    return sorted(found.values(), key=lambda each: -each.bytes)
+    return sorted(by_env.values(), key=lambda each: -each.bytes)
 
 
 def estimate(state: Path, planned: dict[str, int]) -> Estimate:
@@ -225,17 +225,10 @@ def _delete(db: sqlite3.Connection, bounds: Bounds) -> None:
 def _named(db: sqlite3.Connection, old_runs: frozenset[str], old_evaluations: frozenset[str]) -> set[str]:
     """Digests of all blobs that the remaining rows name."""
     named = {row.bundle for row in rows(db, SubmitRow) if row.bundle is not None and row.run not in old_runs}
-    named |= {
-        row.bundle
-        for row in rows(db, EvaluationRow)
-        if row.bundle is not None and row.evaluation not in old_evaluations
-    }
-    named |= {
-        ref.digest
-        for row in rows(db, EvaluationRow)
-        if row.evaluation not in old_evaluations
-        for ref in row.replays
-    }
+    for evaluation in rows(db, EvaluationRow):
+        if evaluation.evaluation not in old_evaluations:
+            named.update(ref.digest for ref in evaluation.replays)
+            named.update(filter(None, (evaluation.bundle,)))
     named |= {
         digest for run, digest in db.execute("SELECT run, digest FROM train_blobs") if run not in old_runs
     }
@@ -258,14 +251,13 @@ def _age_s(blobs: BlobStore, digest: str, now: float) -> float:
 def _shrink(state: Path, db: sqlite3.Connection) -> bool:
     """Returns the file's free pages to the disk, unless a coordinator has the folder: it would have to wait
     meanwhile."""
-    lock = os.open(state / "lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
     try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
+        fd = lock(state)
+    except ConfigError:
         return False
-    else:
+    try:
         db.execute("VACUUM")
         db.execute("PRAGMA wal_checkpoint(TRUNCATE)")
-        return True
     finally:
-        os.close(lock)
+        os.close(fd)
+    return True

@@ -34,6 +34,7 @@ from evopolicy_common.processes.preflight import check_writable, refused
 from evopolicy_common.records.blobs import write_atomically
 from evopolicy_common.wire import credentials, keys
 from evopolicy_common.wire.credentials import Credentials, Role
+from evopolicy_coordinator.storage.store import DATABASE
 
 ROLES: tuple[Role, ...] = ("worker", "gateway", "operator")
 _SOCKET = "coordinator.sock"
@@ -57,6 +58,11 @@ class StateFolder:
     def __init__(self, root: Path, lock_fd: int, identity: Identity) -> None:
         self.root = root
         self.identity = identity
+        self.database = root / DATABASE
+        self.passwords = root / "passwords"
+        """The file that Zenoh's router reads: a line `user:password` for each role."""
+        self.credentials = root / "credentials"
+        """Folder of this machine's credentials, one file per role."""
         self._lock_fd = lock_fd
         self._link: Path | None = None
 
@@ -69,27 +75,12 @@ class StateFolder:
         """
         root = Path(os.path.abspath(root))
         _make_private(root, cluster)
-        lock_fd = _lock(root)
+        lock_fd = lock(root)
         try:
             return cls(root, lock_fd, _identity(root, cluster))
         except BaseException:
             os.close(lock_fd)
             raise
-
-    @property
-    def database(self) -> Path:
-        """Path of the database; see `store.py`."""
-        return self.root / "coordinator.sqlite"
-
-    @property
-    def passwords(self) -> Path:
-        """The file that Zenoh's router reads: a line `user:password` for each role."""
-        return self.root / "passwords"
-
-    @property
-    def credentials(self) -> Path:
-        """Folder of this machine's credentials, one file per role."""
-        return self.root / "credentials"
 
     @property
     def socket_endpoint(self) -> str:
@@ -155,7 +146,7 @@ def held(root: Path) -> Iterator[None]:
     """The folder, created if it is missing, while no coordinator and no other command changes it. Raises
     ConfigError as `StateFolder.open`."""
     _make_private(root, None)
-    lock_fd = _lock(root)
+    lock_fd = lock(root)
     try:
         yield
     finally:
@@ -178,7 +169,8 @@ def _make_private(root: Path, cluster: str | None) -> None:
         )
 
 
-def _lock(root: Path) -> int:
+def lock(root: Path) -> int:
+    """Locks the folder until the returned file descriptor is closed. Raises ConfigError when it is in use."""
     fd = os.open(root / "lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
     try:
         fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)

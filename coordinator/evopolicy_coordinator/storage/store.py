@@ -47,6 +47,8 @@ from evopolicy_coordinator.core.contract.records import (
 
 T = TypeVar("T")
 
+DATABASE = "coordinator.sqlite"
+"""Name of the file in a state folder."""
 BUSY_TIMEOUT_S = 10.0
 """How long to wait for another process's transaction: `evopolicy gc` runs beside a coordinator."""
 
@@ -229,15 +231,7 @@ class Store:
         live_runs = "SELECT run FROM run_states WHERE phase != 'finished'"
         submits = tuple(rows(db, SubmitRow, f"WHERE run IN ({live_runs})"))
         evaluations = tuple(rows(db, EvaluationRow))
-        groups = [
-            group
-            for submit in submits
-            for group in (
-                records.train_group(submit.run, submit.submit_index),
-                records.validation_group(submit.run, submit.submit_index),
-                records.heldout_group(submit.run, submit.submit_index),
-            )
-        ]
+        groups = [group(row.run, row.submit_index) for row in submits for group in records.GROUPS.values()]
         groups += [records.random_group(run) for (run,) in db.execute(live_runs)]
         groups += [records.evaluation_group(row.evaluation) for row in evaluations if not row.finished]
         return Snapshot(
@@ -270,14 +264,6 @@ class Store:
         self._db.close()
 
 
-class OutcomePage(msgspec.Struct, frozen=True):
-    """Some outcomes of a group, in order of arrival."""
-
-    rows: tuple[OutcomeRow, ...]
-    cursor: int
-    """One past the last row's `seq`; the requested cursor when there are no rows."""
-
-
 class Reader:
     """A reading connection for one thread; it sees durable rows."""
 
@@ -285,11 +271,10 @@ class Reader:
         self._path = path
         self._db = _connect(path, read_only=True)
 
-    def outcomes(self, group: str, cursor: int, upto: int, max_bytes: int) -> OutcomePage:
+    def outcomes(self, group: str, cursor: int, upto: int, max_bytes: int) -> tuple[OutcomeRow, ...]:
         """Outcomes with cursor ≤ seq < upto in order of `seq`, up to `max_bytes` of rows but at least one."""
         where = "WHERE grp = ? AND seq >= ? AND seq < ? ORDER BY seq"
-        page = self._page(OutcomeRow, where, (group, cursor, upto), max_bytes)
-        return OutcomePage(page, page[-1].seq + 1 if page else cursor)
+        return self._page(OutcomeRow, where, (group, cursor, upto), max_bytes)
 
     def outcome(self, group: str, index: int) -> OutcomeRow | None:
         """The outcome at `index` of its group; None when it is missing."""

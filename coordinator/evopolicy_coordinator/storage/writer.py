@@ -10,14 +10,11 @@ Rules that this module owns:
 from __future__ import annotations
 
 import asyncio
-import contextlib
-import queue
-import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Generic, TypeVar
+from concurrent.futures import ThreadPoolExecutor
+from typing import TypeVar
 
 from evopolicy_coordinator.core.contract.effects import Effect, Persist
 from evopolicy_coordinator.core.contract.records import Row
@@ -26,69 +23,21 @@ from evopolicy_coordinator.storage.store import Store
 T = TypeVar("T")
 
 
-@dataclass(slots=True)
-class _Work(Generic[T]):
-    """One operation on the store, and its callbacks."""
-
-    do: Callable[[Store], T]
-    succeeded: Callable[[T], None]
-    failed: Callable[[BaseException], None]
-
-    def run(self, store: Store) -> Callable[[], None]:
-        """Runs the operation; returns the callback for the event loop."""
-        try:
-            value = self.do(store)
-        except BaseException as error:
-            caught = error
-            return lambda: self.failed(caught)
-        return lambda: self.succeeded(value)
-
-
 class Writer:
     """Runs work on a store in a thread of its own. Construct it on the event loop that receives the results."""
 
     def __init__(self, store: Store) -> None:
         self._store = store
         self._loop = asyncio.get_running_loop()
-        self._work: queue.SimpleQueue[_Work[object] | None] = queue.SimpleQueue()
-        self._thread = threading.Thread(target=self._run, name="store-writer", daemon=True)
-        self._thread.start()
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix="store-writer")
 
-    def submit(
-        self,
-        do: Callable[[Store], T],
-        succeeded: Callable[[T], None],
-        failed: Callable[[BaseException], None],
-    ) -> None:
-        """Runs `do(store)` after all work submitted before, then calls back on the event loop."""
-        self._work.put(_Work(do, succeeded, failed))  # type: ignore[arg-type]
-
-    async def call(self, do: Callable[[Store], T]) -> T:
-        """Returns `do(store)`, run after all work submitted before; raises its exceptions."""
-        future: asyncio.Future[T] = self._loop.create_future()
-
-        def settle(value: T) -> None:
-            if not future.done():
-                future.set_result(value)
-
-        def fail(error: BaseException) -> None:
-            if not future.done():
-                future.set_exception(error)
-
-        self.submit(do, settle, fail)
-        return await future
+    def call(self, do: Callable[[Store], T]) -> asyncio.Future[T]:
+        """Returns the future result of `do(store)`, run after all work submitted before."""
+        return self._loop.run_in_executor(self._thread, do, self._store)
 
     async def close(self) -> None:
         """Ends the thread once all submitted work is done."""
-        self._work.put(None)
-        await asyncio.to_thread(self._thread.join)
-
-    def _run(self) -> None:
-        while (work := self._work.get()) is not None:
-            tell = work.run(self._store)
-            with contextlib.suppress(RuntimeError):  # the loop is closed: the process is ending
-                self._loop.call_soon_threadsafe(tell)
-            del work, tell
+        await asyncio.to_thread(self._thread.shutdown)
 
 
 class Outbox:
@@ -138,7 +87,7 @@ class Outbox:
         rows, self._rows = self._rows, []
         self._n_in_flight, self._n_waiting = self._n_waiting, 0
         self._writing_since = time.monotonic()
-        self._writer.submit(lambda store: store.write(rows), self._written, self._failed)
+        self._writer.call(lambda store: store.write(rows)).add_done_callback(self._ended)
 
     def discard(self) -> None:
         """Drops all waiting effects and rows for good."""
@@ -156,18 +105,18 @@ class Outbox:
         """Whether all effects are carried out and durable."""
         return not self._effects and not self._n_in_flight
 
-    def _written(self, _: None) -> None:
+    def _ended(self, write: asyncio.Future[None]) -> None:
+        error = write.exception()
         if self._dead:
+            return
+        if error is not None:
+            self.discard()
+            self._on_failure(error)
             return
         self.commits += 1
         self._n_durable += self._n_in_flight
         self._n_in_flight = 0
         self.flush()
-
-    def _failed(self, error: BaseException) -> None:
-        if not self._dead:
-            self.discard()
-            self._on_failure(error)
 
     def _drain(self) -> None:
         effects = self._effects

@@ -18,8 +18,11 @@ from evopolicy_common.messages.worker import Message
 from evopolicy_common.records.blobs import BlobStore
 from evopolicy_common.wire import codec, keys
 from evopolicy_coordinator.core.contract.settings import CoreSettings
+from evopolicy_coordinator.pki.machines import Machines
+from evopolicy_coordinator.server.definitions import Definitions
 from evopolicy_coordinator.server.reader import ServiceReader
 from evopolicy_coordinator.server.request_parser import RequestParser
+from evopolicy_coordinator.server.run_requests import RunRequests
 from evopolicy_coordinator.server.service import Service
 from evopolicy_coordinator.server.uploads import Uploads
 from evopolicy_coordinator.splits import SplitSource
@@ -82,14 +85,9 @@ class World:
         self.uploads = Uploads()
         self.reader = ServiceReader(root / "db", self.blobs, self.uploads)
         source = SplitSource(data=data, secret=b"s" * 32)
-        parser = RequestParser(
-            IDENTITY,
-            self.blobs,
-            source,
-            self.uploads,
-            allowed_imports=allowed_imports,
-            denied_imports=denied_imports,
-        )
+        imports = {"allowed_imports": tuple(allowed_imports), "denied_imports": tuple(denied_imports)}
+        runs = RunRequests(self.reader, self.blobs, source, **imports)
+        parser = RequestParser(IDENTITY, self.blobs, self.uploads, runs, Machines(root), Definitions())
         self.service = Service("c", self.store, self.reader, parser, settings)
         self.writes = 0
         self.full = False

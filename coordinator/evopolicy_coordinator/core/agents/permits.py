@@ -16,7 +16,6 @@ import msgspec
 
 from evopolicy_common.messages import gateway
 from evopolicy_common.messages.run_settings import ELSEWHERE
-from evopolicy_common.refusals import Refusal
 from evopolicy_coordinator.core.contract.reasons import Reason
 from evopolicy_coordinator.core.contract.records import PermitRow, RunRow, RunStateRow
 from evopolicy_coordinator.core.isolation import conflicts, kernels
@@ -132,12 +131,12 @@ def settle(state: State, step: Step) -> None:
         _grant(state, ask.row.run, ask.kernel, ask.case_set, step)
 
 
-def drop_asks(state: State, run: str, refusal: Refusal, reason: Reason, step: Step) -> None:
+def drop_asks(state: State, run: str, reason: Reason, step: Step) -> None:
     """Remove a run's permit requests and refuse its waiting polls."""
     for name, boot_id in [key for key in state.asks if key[0] == run]:
         forget_ask(state, name, boot_id, step)
         for poll in state.polls.take_all(poll_target(name, boot_id)):
-            step.refuse(poll.request, refusal, reason)
+            step.refuse(poll.request, reason)
 
 
 # ---- the end ----
@@ -203,12 +202,7 @@ def load(
 
 def agents(state: State, run: str) -> str:
     """The place of a run's agent, in words; empty for nowhere."""
-    return ", ".join(sorted(place_of(row) for _, row in held(state, run)))
-
-
-def place_of(row: PermitRow) -> str:
-    """A permit's place, in words."""
-    return row.host or row.boot_id or "everywhere"
+    return ", ".join(sorted(row.host or row.boot_id or "everywhere" for _, row in held(state, run)))
 
 
 def poll_target(run: str, boot_id: str) -> str:

@@ -47,14 +47,11 @@ def watch(state: State, lane: Lane, step: Step) -> None:
 
 
 def check_due(state: State, key: LaneKey, step: Step) -> None:
-    """A lane's deadline: check it."""
+    """A lane's deadline: reserve a kernel for hidden jobs that have waited for long, or release it; update the
+    held submits."""
     lane = state.lanes.get(key)
-    if lane is not None:
-        check(state, lane, step)
-
-
-def check(state: State, lane: Lane, step: Step) -> None:
-    """Reserve a kernel for hidden jobs that have waited for long, or release it; update which submits are held."""
+    if lane is None:
+        return
     passed_s = min(step.now - lane.checked_at, 2 * CHECK_S)
     lane.checked_at = step.now
     there = kernels.serving(state, lane)
@@ -132,7 +129,7 @@ def _reserve_kernel(state: State, lane: Lane, case_set: CaseSet, barred: list[Ke
     kernel = min(barred, key=in_the_way)
     reversal = lane.reversals[case_set] = Reversal(kernel, lane, case_set)
     case_set.users += 1
-    kernel.reversals.setdefault(case_set, {})[str(lane.key)] = reversal
+    kernels.put(kernel.reversals, case_set, str(lane.key), reversal)
     for occupancy in all_related(kernel.hidden, case_set):
         lease = occupancy.lease
         if lease is not None and lease.live and lease.job.priority == EARLY_VALIDATION:
@@ -145,10 +142,7 @@ def release_kernel(state: State, reversal: Reversal, step: Step, why: str) -> No
     """Release a reserved kernel: agents have precedence again."""
     kernel, case_set = reversal.kernel, reversal.case_set
     del reversal.lane.reversals[case_set]
-    there = kernel.reversals[case_set]
-    del there[str(reversal.lane.key)]
-    if not there:
-        del kernel.reversals[case_set]
+    kernels.take(kernel.reversals, case_set, str(reversal.lane.key))
     step.log("info", "agents_first", env=reversal.lane.key[0], boot_id=kernel.boot_id, why=why)
     kernels.freed(state, case_set, step)
     kernels.tidy(state, kernel)

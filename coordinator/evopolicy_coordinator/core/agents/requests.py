@@ -1,12 +1,10 @@
-"""Gateways' requests for permits, and an operator's statement that an agent is gone."""
+"""The runs that take requests, requests for permits, and an operator's statement that an agent is gone."""
 
 from __future__ import annotations
 
 from evopolicy_common.messages import gateway, operator
 from evopolicy_common.messages.run_settings import ELSEWHERE, HiddenIsolation
-from evopolicy_common.refusals import Refusal
 from evopolicy_coordinator.core.agents import permits
-from evopolicy_coordinator.core.agents.open_runs import over
 from evopolicy_coordinator.core.contract import events
 from evopolicy_coordinator.core.contract.reasons import Reason, because
 from evopolicy_coordinator.core.contract.records import PermitRow, RunRow
@@ -23,12 +21,35 @@ MAX_PLACES = 16
 hostile gateway could keep hidden jobs from every kernel, and add rows without end."""
 
 
+def live(state: State, request: events.RequestId, name: str, step: Step) -> Run | None:
+    """Returns the unfinished run of that name; otherwise refuses the request and returns None."""
+    run = state.runs.get(name)
+    if run is None:
+        step.refuse(request, over(state, name))
+    return run
+
+
+def over(state: State, name: str) -> Reason:
+    """Returns why a run that is not open refuses requests."""
+    last = state.finished.get(name)
+    if last is not None and last.cancelled:
+        return because("run_cancelled", run=name)
+    if last is not None:
+        return because("run_finished", run=name)
+    if name in state.runs:
+        return because("run_takes_no_more", run=name)
+    return because("unknown_run", run=name[:64])
+
+
+# ---- permits ----
+
+
 def requested(state: State, event: events.Requested[gateway.RequestPermit], step: Step) -> None:
     """A gateway requests that its agent may be alive on a kernel."""
     message = event.message
     run = state.runs.get(message.run)
     if run is None or run.state.phase != "open":
-        step.refuse(event.request, *over(state, message.run))
+        step.refuse(event.request, over(state, message.run))
         return
     kernel = permits.place(run, message.boot_id)
     if kernel is None:
@@ -36,7 +57,7 @@ def requested(state: State, event: events.Requested[gateway.RequestPermit], step
         return
     places = permits.places(state, run.id)
     if kernel not in places and len(places) >= MAX_PLACES:
-        step.refuse(event.request, Refusal.BAD_REQUEST, because("too_many_places", run=run.id, n=MAX_PLACES))
+        step.refuse(event.request, because("too_many_places", run=run.id, n=MAX_PLACES))
         return
     row = PermitRow(run=run.id, boot_id=kernel, host=message.host if kernel == message.boot_id else "")
     waits_for = permits.ask(state, run, row, step)
@@ -61,7 +82,7 @@ def without_permit(state: State, request: events.RequestId, run: Run, step: Step
     Returns whether it was refused."""
     waits_for = _implied(state, run, step) if run.state.phase == "open" else None
     if waits_for is not None:
-        step.refuse(request, Refusal.UNAVAILABLE, because("may_not_start", waits_for=waits_for))
+        step.refuse(request, because("may_not_start", waits_for=waits_for))
     return waits_for is not None
 
 
@@ -81,9 +102,9 @@ def agent_gone(state: State, event: events.Requested[operator.AgentGone], step: 
     """An operator confirms that a run's agent is no longer alive."""
     message = event.message
     if message.run not in state.capabilities:
-        step.refuse(event.request, Refusal.UNKNOWN_RUN, because("unknown_run", run=message.run))
+        step.refuse(event.request, because("unknown_run", run=message.run))
         return
-    permits.end(state, message.run, step, "by an operator's word", boot_id=message.boot_id)
+    permits.end(state, message.run, step, "by an operator's command", boot_id=message.boot_id)
     step.reply(event.request, operator.Done())
 
 

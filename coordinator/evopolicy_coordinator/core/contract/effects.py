@@ -18,7 +18,7 @@ import msgspec
 from evopolicy_common.messages.worker import Message
 from evopolicy_common.refusals import Refusal
 from evopolicy_coordinator.core.contract.events import RequestId
-from evopolicy_coordinator.core.contract.reasons import Reason
+from evopolicy_coordinator.core.contract.reasons import REFUSALS, Reason
 from evopolicy_coordinator.core.contract.records import Row
 
 
@@ -26,7 +26,6 @@ class Persist(msgspec.Struct, frozen=True, kw_only=True):
     """Write the rows in one transaction, durably (fsync), before carrying out the effects after it."""
 
     rows: tuple[Row, ...]
-    stimulus_id: str = ""
 
 
 class Reply(msgspec.Struct, frozen=True, kw_only=True):
@@ -36,16 +35,17 @@ class Reply(msgspec.Struct, frozen=True, kw_only=True):
     message: Message
     waits_for: Reason | None = None
     """The wait that the message describes in words; None for none."""
-    stimulus_id: str = ""
 
 
 class Refuse(msgspec.Struct, frozen=True, kw_only=True):
     """Answer the query `request` with `Refused`: the status, and the reason in words."""
 
     request: RequestId
-    status: Refusal
     reason: Reason
-    stimulus_id: str = ""
+
+    @property
+    def status(self) -> Refusal:
+        return REFUSALS[self.reason.code]
 
 
 class ReadResults(msgspec.Struct, frozen=True, kw_only=True):
@@ -65,7 +65,6 @@ class ReadResults(msgspec.Struct, frozen=True, kw_only=True):
     """None for a finished run: then the row's `released`. `Refused("unknown_submit")` when the row is missing."""
     waits_for: Reason | None = None
     held_s: float = 0.0
-    stimulus_id: str = ""
 
 
 class ReadEvaluation(msgspec.Struct, frozen=True, kw_only=True):
@@ -79,7 +78,6 @@ class ReadEvaluation(msgspec.Struct, frozen=True, kw_only=True):
     total: int
     finished: bool
     waits_for: Reason | None = None
-    stimulus_id: str = ""
 
 
 class ReadFinished(msgspec.Struct, frozen=True, kw_only=True):
@@ -87,7 +85,6 @@ class ReadFinished(msgspec.Struct, frozen=True, kw_only=True):
 
     request: RequestId
     run: str
-    stimulus_id: str = ""
 
 
 class PrepareAudit(msgspec.Struct, frozen=True, kw_only=True):

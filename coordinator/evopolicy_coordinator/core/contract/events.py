@@ -7,7 +7,7 @@ Rules that this module owns:
 - `request` is the shell's opaque handle of the query that waits for a reply. Every event that has one is answered by
   exactly one effect with that handle (`Reply`, `Refuse`, `ReadResults`, `ReadEvaluation` or `ReadFinished`), at once
   or, for long polls, later.
-- `stimulus_id` names the event in every effect and log line that follows from it.
+- `stimulus_id` names the event in every row and log line that follows from it.
 """
 
 from __future__ import annotations

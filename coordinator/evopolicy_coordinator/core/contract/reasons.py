@@ -2,70 +2,57 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
-Code = Literal[
-    # Refused: runs and evaluations.
-    "unknown_run",
-    "no_unfinished_run",
-    "unknown_evaluation",
-    "run_cancelled",
-    "run_finished",
-    "run_closed",
-    "run_takes_no_more",
-    "run_exists",
-    "budget_below_one",
-    "submit_bounds",
-    "minimum_over_budget",
-    "no_cases",
-    "evaluation_without_cases",
-    "epoch_revealed",
-    "epoch_in_use",
-    # Refused: submits.
-    "busy",
-    "key_used",
-    "no_bundle",
-    "unknown_submit",
-    "unknown_case",
-    "too_few",
-    "too_many",
-    "too_many_rejected",
-    "over_budget",
-    "no_worker_yet",
-    "may_not_start",
-    "too_many_places",
-    # Refused: workers.
-    "name_taken",
-    "no_room",
-    "unknown_session",
-    "forger",
-    "quarantined",
-    "unknown_class",
-    # Waits of a group, a permit or a run.
-    "workers",
-    "description",
-    "scoring",
-    "being_put_off",
-    "to_report",
-    "agent_alive",
-    "agent_starting",
-    "related_train",
-    "unknown_kernel",
-    "hand_back",
-    "adoption",
-    "own_fault",
-    "bench",
-    "free_slot",
-    "audits",
-]
+from evopolicy_common.refusals import Refusal
+
+REFUSALS: dict[str, Refusal] = {
+    # Runs and evaluations.
+    "unknown_run": Refusal.UNKNOWN_RUN,
+    "no_unfinished_run": Refusal.UNKNOWN_RUN,
+    "unknown_evaluation": Refusal.UNKNOWN_EVALUATION,
+    "run_cancelled": Refusal.RUN_CANCELLED,
+    "run_finished": Refusal.RUN_FINISHED,
+    "run_closed": Refusal.RUN_CLOSED,
+    "run_takes_no_more": Refusal.RUN_CLOSED,
+    "run_exists": Refusal.BAD_SETTINGS,
+    "budget_below_one": Refusal.BAD_SETTINGS,
+    "submit_bounds": Refusal.BAD_SETTINGS,
+    "minimum_over_budget": Refusal.BAD_SETTINGS,
+    "no_cases": Refusal.BAD_SETTINGS,
+    "evaluation_without_cases": Refusal.BAD_REQUEST,
+    "epoch_revealed": Refusal.BAD_SETTINGS,
+    "epoch_in_use": Refusal.BUSY,
+    # Submits.
+    "busy": Refusal.BUSY,
+    "key_used": Refusal.KEY_CONFLICT,
+    "no_bundle": Refusal.BAD_REQUEST,
+    "unknown_submit": Refusal.UNKNOWN_SUBMIT,
+    "unknown_case": Refusal.INVALID_ENV_INSTANCE,
+    "too_few": Refusal.BUDGET_INVALID,
+    "too_many": Refusal.BUDGET_INVALID,
+    "too_many_rejected": Refusal.BUDGET_INVALID,
+    "over_budget": Refusal.BUDGET_INVALID,
+    "no_worker_yet": Refusal.NO_WORKER,
+    "may_not_start": Refusal.UNAVAILABLE,
+    "too_many_places": Refusal.BAD_REQUEST,
+    # Workers.
+    "name_taken": Refusal.NAME_TAKEN,
+    "no_room": Refusal.TOO_LARGE,
+    "unknown_session": Refusal.UNKNOWN_WORKER,
+    "forger": Refusal.QUARANTINED,
+    "quarantined": Refusal.QUARANTINED,
+    "unknown_class": Refusal.UNKNOWN_CLASS,
+}
+"""The status of a refusal with that code."""
 
 
 class Reason(NamedTuple):
     """A code and its arguments by name; an argument may be another reason."""
 
-    code: Code
+    code: str
     about: dict[str, Any]
 
 
-def because(code: Code, **about: Any) -> Reason:
+def because(code: str, **about: Any) -> Reason:
     return Reason(code, about)

@@ -9,7 +9,8 @@ Rules that this module owns:
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from collections.abc import Callable
+from typing import Any, Literal, TypeVar
 
 import msgspec
 
@@ -29,6 +30,7 @@ from evopolicy_common.messages.operator import PlayedAs, RunFinished
 from evopolicy_common.messages.run_settings import HiddenIsolation, RunSettings
 from evopolicy_common.messages.worker import Fingerprint
 
+S = TypeVar("S", bound=msgspec.Struct)
 Phase = Literal["open", "closed", "finished"]
 
 
@@ -322,16 +324,12 @@ class OutcomeHead(msgspec.Struct, frozen=True, kw_only=True):
 def head_of(row: OutcomeRow) -> OutcomeHead:
     """The part of `row` that a snapshot holds."""
     outcome = row.outcome
-    return OutcomeHead(
-        group=row.group,
-        index=row.index,
-        seq=row.seq,
-        episode_return=outcome.episode_return,
-        length=outcome.length,
+    return shared(
+        OutcomeHead,
+        row,
+        outcome,
         failure=None if outcome.failure is None else outcome.failure.category,
         trajectory=None if outcome.trajectory is None else outcome.trajectory.digest,
-        worker=row.worker,
-        success=outcome.success,
     )
 
 
@@ -364,13 +362,21 @@ class Snapshot(msgspec.Struct, frozen=True, kw_only=True):
 
 def latest_time(snapshot: Snapshot) -> float:
     """The latest Unix time, seconds, in the runs, submits and evaluations of the snapshot; 0.0 for none."""
-    times: list[float | None] = [row.created_at for row in snapshot.runs]
-    times += [row.created_at for row in snapshot.evaluations]
-    times += [row.closed_at for row in snapshot.states]
-    times += [
-        at for row in snapshot.submits for at in (row.accepted_at, row.first_leased_at, row.completed_at)
-    ]
-    return max((at for at in times if at is not None), default=0.0)
+    times = [row.created_at for row in (*snapshot.runs, *snapshot.evaluations)]
+    times += [row.closed_at or 0.0 for row in snapshot.states]
+    for row in snapshot.submits:
+        times += (row.accepted_at, row.first_leased_at or 0.0, row.completed_at or 0.0)
+    return max(times, default=0.0)
+
+
+def shared(kind: type[S], *sources: msgspec.Struct, **others: Any) -> S:
+    """Returns a struct of that kind: each field is from `others`, or from the first source that has it."""
+    fields = {
+        name: getattr(source, name)
+        for source in reversed(sources)
+        for name in {*kind.__struct_fields__} & {*source.__struct_fields__}
+    }
+    return kind(**fields | others)
 
 
 def submit_done(row: SubmitRow) -> SubmitDone | None:
@@ -378,16 +384,12 @@ def submit_done(row: SubmitRow) -> SubmitDone | None:
     if row.status is None or row.completed_at is None:
         return None
     n = len(row.env_instances)
-    return SubmitDone(
-        status=row.status,
+    return shared(
+        SubmitDone,
+        row,
         n_episodes=0 if row.refunded else n,
-        env_instances=row.env_instances,
-        first_global_episode=row.first_global_episode,
         remaining_budget=row.remaining_budget + (n if row.refunded else 0),
         started_at=row.accepted_at,
-        completed_at=row.completed_at,
-        failure=row.failure,
-        n_kept=row.n_kept,
     )
 
 
@@ -404,6 +406,13 @@ def validation_group(run: str, submit_index: int) -> str:
 def heldout_group(run: str, submit_index: int) -> str:
     """Group id of a checkpoint's held-out episodes."""
     return f"{run}/s{submit_index}/heldout"
+
+
+GROUPS: dict[Split, Callable[[str, int], str]] = {
+    "train": train_group,
+    "validation": validation_group,
+    "heldout": heldout_group,
+}
 
 
 def random_group(run: str) -> str:

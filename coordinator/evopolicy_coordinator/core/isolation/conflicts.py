@@ -146,24 +146,16 @@ def goes_first(lease: Lease) -> bool:
 def to_clear(state: State, case_set: CaseSet | None) -> list[tuple[Kernel, list[Lease]]]:
     """The kernels where related hidden jobs bar a case set's train jobs, each with the live leases to stop there; those
     with the fewest first. The list of leases is empty where all were stopped but not all are released yet."""
-    found = []
+    barring = []
     kernels: dict[Kernel, None] = {}
     if state.isolates and case_set is not None:
         kernels = {kernel: None for each in case_set.relatives for kernel in each.hidden_on}
     for kernel in kernels:
         occupancies = all_related(kernel.hidden, case_set)
         if occupancies and not reversed_there(state, kernel, case_set):
-            found.append(
-                (
-                    kernel,
-                    [
-                        occupancy.lease
-                        for occupancy in occupancies
-                        if occupancy.lease is not None and occupancy.lease.live
-                    ],
-                )
-            )
-    return sorted(found, key=lambda each: len(each[1]))
+            playing = [each.lease for each in occupancies if each.lease is not None and each.lease.live]
+            barring.append((kernel, playing))
+    return sorted(barring, key=lambda each: len(each[1]))
 
 
 # ---- reasons ----

@@ -27,15 +27,8 @@ def kernel(state: State, boot_id: str) -> Kernel:
 
 def tidy(state: State, kernel: Kernel) -> None:
     """Forget a kernel without occupants."""
-    parts = (
-        kernel.workers,
-        kernel.permits,
-        kernel.asks,
-        kernel.hidden,
-        kernel.train,
-        kernel.reversals,
-    )
-    if kernel is not state.everywhere and not any(parts):
+    present = (kernel.workers, kernel.permits, kernel.asks, kernel.hidden, kernel.train, kernel.reversals)
+    if kernel is not state.everywhere and not any(present):
         state.kernels.pop(kernel.boot_id, None)
 
 

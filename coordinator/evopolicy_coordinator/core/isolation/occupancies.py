@@ -17,7 +17,7 @@ from evopolicy_common.messages.worker import HeldLease
 from evopolicy_coordinator.core.contract.records import KernelRow
 from evopolicy_coordinator.core.isolation import kernels
 from evopolicy_coordinator.core.isolation.kernels import put, related, take
-from evopolicy_coordinator.core.tables.model import Lease, Occupancy, Worker
+from evopolicy_coordinator.core.tables.model import Lease, Occupancies, Occupancy, Worker
 from evopolicy_coordinator.core.tables.state import State
 from evopolicy_coordinator.core.tables.step import Step
 
@@ -30,18 +30,9 @@ def leased(state: State, lease: Lease, worker: Worker, serial: int, step: Step) 
     group = lease.job.group
     if not (group.hidden or group.kind == "train"):
         return
-    occupancy = Occupancy(
-        lease.id,
-        worker.name,
-        worker.kernel,
-        worker.machine,
-        group.flow.case_set,
-        group.hidden,
-        lease,
-        serial,
-    )
-    lease.occupancy = occupancy
-    _enter(occupancy)
+    place = (worker.name, worker.kernel, worker.machine, group.flow.case_set)
+    lease.occupancy = Occupancy(lease.id, *place, group.hidden, lease, serial)
+    _enter(lease.occupancy)
 
 
 def _enter(occupancy: Occupancy) -> None:
@@ -50,12 +41,11 @@ def _enter(occupancy: Occupancy) -> None:
         case_set.users += 1
         if occupancy.hidden:
             case_set.hidden_on[occupancy.kernel] = case_set.hidden_on.get(occupancy.kernel, 0) + 1
-    put(
-        occupancy.kernel.hidden if occupancy.hidden else occupancy.kernel.train,
-        occupancy.case_set,
-        occupancy.key,
-        occupancy,
-    )
+    put(_index(occupancy), case_set, occupancy.key, occupancy)
+
+
+def _index(occupancy: Occupancy) -> Occupancies:
+    return occupancy.kernel.hidden if occupancy.hidden else occupancy.kernel.train
 
 
 def vacate(state: State, lease: Lease, worker: Worker, step: Step, *, sure: bool) -> None:
@@ -74,8 +64,7 @@ def vacate(state: State, lease: Lease, worker: Worker, step: Step, *, sure: bool
 
 def _gone(state: State, occupancy: Occupancy, step: Step) -> None:
     """Remove an ended occupancy, and mark the work that it barred."""
-    index = occupancy.kernel.hidden if occupancy.hidden else occupancy.kernel.train
-    case_set = occupancy.case_set
+    index, case_set = _index(occupancy), occupancy.case_set
     take(index, case_set, occupancy.key)
     if occupancy.hidden and case_set is not None:
         n_hidden = case_set.hidden_on[occupancy.kernel] - 1
@@ -139,11 +128,8 @@ def unknown(state: State, worker: Worker, item: HeldLease, step: Step) -> None:
     else:
         run = state.runs.get(item.job_id.partition("/")[0])
         case_set = None if run is None else run.flow.case_set
-    _linger(
-        state,
-        Occupancy(item.lease_id, worker.name, worker.kernel, worker.machine, case_set, not train, None),
-        step,
-    )
+    place = (worker.name, worker.kernel, worker.machine, case_set)
+    _linger(state, Occupancy(item.lease_id, *place, not train, None), step)
 
 
 def _linger(state: State, occupancy: Occupancy, step: Step) -> None:

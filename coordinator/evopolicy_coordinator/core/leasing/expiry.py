@@ -19,15 +19,10 @@ FORGET_S = 3600.0
 
 
 def check_due(state: State, name: str, step: Step) -> None:
-    """A worker's deadline: check it."""
-    worker = state.workers.get(name)
-    if worker is not None:
-        check(state, worker, step)
-
-
-def check(state: State, worker: Worker, step: Step) -> None:
-    """Give up a worker's expired leases, declare it lost if it was silent, and set its next deadline."""
-    settings, now = state.settings, step.now
+    """A worker's deadline: give up expired leases, declare a silent worker lost, and set the next deadline."""
+    worker, settings, now = state.workers.get(name), state.settings, step.now
+    if worker is None:
+        return
     if now < state.hold_until:
         state.timers.arm(("worker", worker.name), state.hold_until)
         return
@@ -72,27 +67,25 @@ def lose(state: State, worker: Worker, step: Step) -> None:
     running = {lease.id for lease in worker.running()}
     fleet.count_out(worker)
     step.log("warning", "worker_lost", worker=worker.name, held=len(worker.leases), running=len(running))
-    fleet.drop_poll(state, worker, step)
-    if worker.beat is not None:
-        fleet.answer_beat(state, worker, (), step)
-    for lease in list(worker.leases.values()):
-        live = lease.live
-        leases.release(state, worker, lease, step)
-        if live:
-            leases.give_back(state, lease.job, "worker_lost", worker, step, ran=lease.id in running)
+    _take_all(state, worker, "worker_lost", (), running, step)
     state.timers.arm(("forget", worker.name), step.now + FORGET_S)
 
 
 def take_away(state: State, name: str, step: Step) -> None:
     """Take all jobs back from a quarantined worker, without suspicion, and end its polls."""
     worker = state.workers.get(name)
-    if worker is None:
-        return
+    if worker is not None:
+        _take_all(state, worker, "returned", tuple(worker.leases), set(), step)
+
+
+def _take_all(
+    state: State, worker: Worker, failure: JobFailure, stop: tuple[str, ...], ran: set[str], step: Step
+) -> None:
+    """Answer a worker's poll and heartbeat, with the leases to stop, and put all its jobs back."""
     fleet.drop_poll(state, worker, step)
-    if worker.beat is not None:
-        fleet.answer_beat(state, worker, tuple(worker.leases), step)
+    fleet.answer_beat(state, worker, stop, step)
     for lease in list(worker.leases.values()):
         live = lease.live
         leases.release(state, worker, lease, step)
         if live:
-            leases.give_back(state, lease.job, "returned", worker, step, ran=False)
+            leases.give_back(state, lease.job, failure, worker, step, ran=lease.id in ran)

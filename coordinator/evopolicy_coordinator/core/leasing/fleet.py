@@ -180,10 +180,11 @@ def forget(state: State, worker: Worker) -> None:
 
 
 def answer_beat(state: State, worker: Worker, stop: tuple[str, ...], step: Step) -> None:
-    """Answer a worker's delayed heartbeat."""
+    """Answer a worker's delayed heartbeat, if there is one."""
     request, worker.beat = worker.beat, None
+    if request is None:
+        return
     state.timers.disarm(("beat", worker.name))
-    assert request is not None
     drain = state.out_of_service.get(worker.name) == "draining"
     step.reply(request, wire.HeartbeatReply(cancelled=stop, drain=drain, describe=_wanted(state, worker)))
 
@@ -232,7 +233,7 @@ def poll_ended(state: State, name: str, step: Step) -> None:
 def beat_ended(state: State, name: str, step: Step) -> None:
     """A heartbeat's delay is over."""
     worker = state.workers.get(name)
-    if worker is not None and worker.beat is not None:
+    if worker is not None:
         answer_beat(state, worker, (), step)
 
 

@@ -89,7 +89,9 @@ def _enter(state: State, job: JobState, worker: Worker, attempt: int, step: Step
     list_hidden(state, lease, worker, step)
     if group.first_leased_at is None:
         group.first_leased_at = now
-        _started(state, group, step)
+        limit_s = group.template.limits.submit_wall_s
+        if group.kind == "train" and limit_s is not None:
+            state.timers.arm(("submit", group.id), now + limit_s)
     if job.alone:
         worker.alone = lease
     state.timers.arm_once(("worker", worker.name), now + state.settings.lease_ttl_s)
@@ -112,14 +114,7 @@ def _check_again(state: State, worker: Worker, step: Step) -> None:
     from its heartbeat) may stop its hidden job without any further event."""
     for lane in worker.profile.busy:
         if lane.n_ready[TRAIN]:
-            state.timers.arm_once(("lane", lane.key), step.now + queue.LOOK_AGAIN_S)
-
-
-def _started(state: State, group: JobGroup, step: Step) -> None:
-    """Start the submit's time limit when the first lease of its group was granted."""
-    limit_s = group.template.limits.submit_wall_s
-    if group.kind == "train" and limit_s is not None:
-        state.timers.arm(("submit", group.id), step.now + limit_s)
+            state.timers.arm_once(("lane", lane.key), step.now + queue.RECHECK_S)
 
 
 def let_go(state: State, group: JobGroup, now: float) -> None:

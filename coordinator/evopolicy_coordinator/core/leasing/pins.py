@@ -7,35 +7,20 @@ Rules that this module owns:
 
 from __future__ import annotations
 
-from typing import Literal
-
 import msgspec
 
 from evopolicy_common.messages.environment import EnvironmentDescription
-from evopolicy_common.messages.episode import Tier
 from evopolicy_coordinator.core.leasing import fleet, queue
-from evopolicy_coordinator.core.tables.model import CaseSet, Flow, Profile, Run, Worker
+from evopolicy_coordinator.core.tables.model import Flow, Profile, Run, Worker
 from evopolicy_coordinator.core.tables.state import State
 from evopolicy_coordinator.core.tables.step import FlowPinned, Step
 
 
-def add_flow(
-    state: State,
-    name: str,
-    of: Literal["run", "evaluation"],
-    env: str,
-    tier: Tier,
-    secret: bytes,
-    case_set: CaseSet | None,
-    *,
-    closed: bool,
-    definition: str = "",
-) -> Flow:
-    """Create a flow for a run or an evaluation, not pinned to workers yet. `closed`: no agent works for it."""
+def add_flow(state: State, flow: Flow) -> None:
+    """Enter the flow of a run or an evaluation, not pinned to workers yet."""
     state.n_flows += 1
-    flow = Flow(name, env, tier, of, secret, state.n_flows, case_set, closed=closed, definition=definition)
-    state.unpinned[name] = flow
-    return flow
+    flow.seq = state.n_flows
+    state.unpinned[flow.id] = flow
 
 
 def drop_flow(state: State, flow: Flow) -> None:

@@ -24,7 +24,6 @@ from evopolicy_coordinator.core.tables.model import (
     HIDDEN_FIRST,
     N_PRIORITIES,
     RANKS,
-    TRAIN,
     Flow,
     JobState,
     Lane,
@@ -35,7 +34,7 @@ from evopolicy_coordinator.core.tables.model import (
 from evopolicy_coordinator.core.tables.state import State
 from evopolicy_coordinator.core.tables.step import Step
 
-LOOK_AGAIN_S = 1.0
+RECHECK_S = 1.0
 """A lane is checked again after this time when jobs wait although workers wait too (they avoid each other)."""
 
 SKIPS_MAX = 16
@@ -221,16 +220,11 @@ def leading(state: State, worker: Worker) -> tuple[Flow, int] | None:
 def may_serve(state: State, lane: Lane, worker: Worker) -> bool:
     """Whether any job that waits in the lane may be leased on the worker's kernel."""
     return any(
-        lane.n_ready[priority] and _open(state, lane, priority, worker) for priority in range(N_PRIORITIES)
+        lane.n_ready[priority] and open_to(state, lane, priority, worker) for priority in range(N_PRIORITIES)
     )
 
 
-def may_train(state: State, lane: Lane, worker: Worker) -> bool:
-    """Whether train jobs that wait in the lane may be leased to the worker."""
-    return _open(state, lane, TRAIN, worker)
-
-
-def _open(state: State, lane: Lane, priority: int, worker: Worker) -> bool:
+def open_to(state: State, lane: Lane, priority: int, worker: Worker) -> bool:
     """Whether jobs of some case set that waits in the lane may be leased on the worker's kernel."""
     there = lane.waiting[priority]
     if not there:
@@ -259,14 +253,14 @@ def _best(
         for priority in rank:
             if not lane.n_ready[priority] or not (heap := lane.heaps[priority]):
                 continue
-            if priority in concerned and not _open(state, lane, priority, worker):
+            if priority in concerned and not open_to(state, lane, priority, worker):
                 continue
             score, _, flow = heap[0]
             if flow.lane is not lane or not flow.n_ready[priority] or score != flow.served[priority]:
-                found = lane.top(priority)
-                if found is None:
+                first = lane.top(priority)
+                if first is None:
                     continue
-                flow, score = found, found.served[priority]
+                flow, score = first, first.served[priority]
             if warm and (flow.env in warm or (_next(flow, priority).group.template.bundle or "") in warm):
                 score -= state.settings.warm_bonus_s
             if best is None or score < best_score or (score == best_score and flow.seq < best[0].seq):

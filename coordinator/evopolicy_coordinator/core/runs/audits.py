@@ -19,21 +19,38 @@ from __future__ import annotations
 
 import hashlib
 import hmac
+from collections.abc import Iterator
 from typing import Any
 
 import msgspec
 
+from evopolicy_common.messages.audit import AuditFinding, AuditRecord
 from evopolicy_coordinator.core.contract import events
 from evopolicy_coordinator.core.contract.effects import CompareAudit, PrepareAudit
+from evopolicy_coordinator.core.contract.reasons import Reason, because
 from evopolicy_coordinator.core.contract.records import AuditRow, WorkerRow
+from evopolicy_coordinator.core.isolation import conflicts
 from evopolicy_coordinator.core.leasing import expiry, fleet, groups
 from evopolicy_coordinator.core.runs import templates
-from evopolicy_coordinator.core.tables.model import Run
+from evopolicy_coordinator.core.tables.model import Run, Worker
 from evopolicy_coordinator.core.tables.state import State
 from evopolicy_coordinator.core.tables.step import AuditsMoved, EpisodesDone, Step
 
 NOT_REPEATABLE = "the environment is marked as not deterministic"
 NO_STEPS = "no step was played"
+CHECK_S = 5.0
+"""Interval at which a run that waits for its audits checks whether a worker can still play them."""
+
+FINDINGS_MAX = 100
+"""Findings that a run's record keeps."""
+
+ONE_WORKER = "one worker only"
+ONE_MACHINE = "one machine only"
+OTHERS_DIFFER = "the other workers have other versions or processors"
+UNKNOWN_KERNEL = "the other workers' kernels are not known"
+TOO_LATE = "nobody played it again in time"
+CANCELLED = "the run was cancelled"
+FORGING_AUDITOR = "only a forger had played it again"
 MOST_INSTALLATIONS = 64
 """A run's record names no more: a worker may register as often as it wants, each time with another one."""
 
@@ -188,7 +205,7 @@ def settle(state: State, run: Run, row: AuditRow, step: Step, *, verdict: str, *
 
 def _play(state: State, run: Run, row: AuditRow, step: Step) -> None:
     """Queue the next replay of an audit, for a worker that has not played the episode."""
-    groups.open_group(state, templates.build("audit", run, row, step.now, step.stimulus_id), step)
+    groups.open_group(state, templates.audit(run, row, step), step)
 
 
 def resume(state: State, run: Run, step: Step) -> None:
@@ -229,7 +246,7 @@ def _name(state: State, name: str, row: AuditRow, step: Step) -> None:
     """Quarantine a worker, with its machine, whose report two others refute."""
     verb = "reported" if name == row.player else "played again"
     text = (
-        f"forged results: what it {verb} as {row.group}, episode {row.index}, two other workers refute"
+        f"forged results: two other workers refute what it {verb} as {row.group}, episode {row.index}"
         f" ({row.difference})"
     )
     if name in state.quarantined:
@@ -249,3 +266,135 @@ def _name(state: State, name: str, row: AuditRow, step: Step) -> None:
             if other.state == "open" and other.player == name and other.difference:
                 _refuted(state, run, other, step)
         step.tell(AuditsMoved(run))
+
+
+# ---- the end of a run's audits ----
+
+
+def holds_up(state: State, run: Run, step: Step) -> bool:
+    """Whether a run that is otherwise done still waits for audits; gives up the open ones when it no longer waits."""
+    waiting = [row for row in run.audits.values() if row.state == "open"]
+    if not waiting:
+        state.timers.disarm(("audits", run.id))
+        return False
+    if run.audits_checked_at is not None and all(_playable(state, run, row) for row in waiting):
+        run.audits_waited_s += step.now - run.audits_checked_at
+    run.audits_checked_at = step.now
+    remaining_s = state.settings.audit_wait_s - run.audits_waited_s
+    # After a start, or after the loop was blocked, workers may not have returned yet.
+    in_vain = step.now >= state.hold_until and all(_obstacle(state, run, row) for row in waiting)
+    if remaining_s > 0.0 and not in_vain:
+        state.timers.arm(("audits", run.id), step.now + min(remaining_s, CHECK_S))
+        return True
+    state.timers.disarm(("audits", run.id))
+    for row in waiting:
+        _give_up(state, run, row, _obstacle(state, run, row) or TOO_LATE, step)
+    return False
+
+
+def _give_up(state: State, run: Run, row: AuditRow, reason: str, step: Step) -> None:
+    if not row.difference:
+        settle(state, run, row, step, verdict="not_audited", reason=reason)
+    elif row.replayed_by[0] in state.quarantined:
+        settle(state, run, row, step, verdict="not_audited", reason=FORGING_AUDITOR)
+    else:
+        settle(state, run, row, step, verdict="disputed", reason="no third worker to decide")
+        dispute(state, words(row), step)
+
+
+def _obstacle(state: State, run: Run, row: AuditRow) -> str:
+    """Why no known worker can play the audit's next replay; empty when one can, or while the
+    shell stores or compares."""
+    if row.actions is None or len(row.replayed_by) > row.compared:
+        return ""
+    reason = ONE_WORKER
+    for _, why in _auditors(state, run, row):
+        if not why:
+            return ""
+        reason = why if reason == ONE_WORKER or why != ONE_MACHINE else reason
+    return reason
+
+
+def _playable(state: State, run: Run, row: AuditRow) -> bool:
+    """Whether waiting for the audit counts: a worker may play its next replay now, or none ever can, or the
+    shell stores or compares."""
+    if row.actions is None or len(row.replayed_by) > row.compared or row.kind not in templates.HIDDEN_SPLITS:
+        return True
+    able = [worker for worker, why in _auditors(state, run, row) if not why]
+    return (
+        not able
+        or not state.isolates
+        or any(conflicts.hidden_conflict(state, run.case_set, worker.kernel) is None for worker in able)
+    )
+
+
+def _auditors(state: State, run: Run, row: AuditRow) -> Iterator[tuple[Worker, str]]:
+    """Workers that have not played the episode, each with the reason why it cannot replay it; empty when it can."""
+    for worker in state.workers.values():
+        had = worker.name == row.player or worker.name in row.replayed_by
+        shut_out = worker.name in state.quarantined or worker.machine in state.quarantined_machines
+        if had or shut_out or run.flow.env not in worker.profile.descriptions:
+            continue
+        if worker.machine in row.machines:
+            yield worker, ONE_MACHINE
+        elif worker.numerics(run.flow.env) != row.numerics:
+            yield worker, OTHERS_DIFFER
+        elif state.isolates and row.kind in templates.HIDDEN_SPLITS and worker.kernel is state.everywhere:
+            yield worker, UNKNOWN_KERNEL
+        else:
+            yield worker, ""
+
+
+def cancel(state: State, run: Run, step: Step) -> None:
+    """Give up the open audits of a run that ends."""
+    for row in list(run.audits.values()):
+        if row.state == "open":
+            _give_up(state, run, row, CANCELLED, step)
+
+
+def waits_for(run: Run) -> Reason | None:
+    """The audits that a run, otherwise done, waits for; None for none."""
+    n = sum(row.state == "open" for row in run.audits.values())
+    return because("audits", n=n) if n else None
+
+
+def record(state: State, run: Run) -> AuditRecord | None:
+    """The record of a finished run's audits; None if no episode was to be audited and no forger played in it."""
+    rows = list(run.audits.values())
+    named = {
+        row.replayed_by[0] if row.state == "agreed" else row.forger for row in rows if _is_reported(row)
+    } - {""}
+    named |= {name for name in run.played if name in state.quarantined}
+    if not run.row.audit_share and not named:
+        return None
+    why: dict[str, int] = {}
+    for row in rows:
+        if row.state == "not_audited":
+            why[row.reason] = why.get(row.reason, 0) + 1
+    states = [row.state for row in rows]
+    return AuditRecord(
+        share=run.row.audit_share,
+        sampled=len(rows),
+        audited=states.count("agreed") + states.count("disputed"),
+        agreed=states.count("agreed"),
+        disputed=states.count("disputed"),
+        not_audited=dict(sorted(why.items())),
+        forgers={name: run.played.get(name, 0) for name in sorted(named)},
+        findings=tuple(_finding(row) for row in rows if _is_reported(row))[:FINDINGS_MAX],
+    )
+
+
+def _is_reported(row: AuditRow) -> bool:
+    return row.state == "disputed" or (row.state == "agreed" and bool(row.difference))
+
+
+def _finding(row: AuditRow) -> AuditFinding:
+    return AuditFinding(
+        split=row.kind,
+        submit_index=row.submit_index,
+        episode=row.index,
+        player=row.player,
+        auditors=row.replayed_by,
+        difference=row.difference or row.reason,
+        forger=row.replayed_by[0] if row.state == "agreed" else row.forger,
+    )

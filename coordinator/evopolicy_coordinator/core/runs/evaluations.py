@@ -10,15 +10,14 @@ from __future__ import annotations
 import msgspec
 
 from evopolicy_common.messages import operator
-from evopolicy_common.refusals import Refusal
 from evopolicy_coordinator.core.contract import events
 from evopolicy_coordinator.core.contract.effects import ReadEvaluation
-from evopolicy_coordinator.core.contract.reasons import because
+from evopolicy_coordinator.core.contract.reasons import Reason, because
 from evopolicy_coordinator.core.contract.records import EvaluationRow, evaluation_group
 from evopolicy_coordinator.core.leasing import groups, pins
 from evopolicy_coordinator.core.runs import templates, waits
 from evopolicy_coordinator.core.structures.polls import Poll
-from evopolicy_coordinator.core.tables.model import Ended, Evaluation, JobGroup
+from evopolicy_coordinator.core.tables.model import Evaluation, Flow, JobGroup
 from evopolicy_coordinator.core.tables.state import State
 from evopolicy_coordinator.core.tables.step import EnvironmentFailed, EpisodesDone, FlowPinned, Step
 
@@ -35,7 +34,7 @@ def request(state: State, event: events.EvaluationRequested, step: Step) -> None
         )
         return
     if not row.cases or len(row.cases) != len(row.case_ids):
-        step.refuse(event.request, Refusal.BAD_REQUEST, because("evaluation_without_cases"))
+        step.refuse(event.request, because("evaluation_without_cases"))
         return
     row = msgspec.structs.replace(row, created_at=step.now, stimulus_id=step.stimulus_id)
     step.persist(row)
@@ -52,26 +51,17 @@ def enter(state: State, row: EvaluationRow) -> Evaluation:
     """Add an evaluation to the core, with none of its jobs queued yet."""
     hidden = templates.hidden_evaluation(row)
     case_set = state.case_sets.join(row.env, (*row.cases, *row.related)) if hidden else None
-    name = row.evaluation
-    flow = pins.add_flow(
-        state,
-        name,
-        "evaluation",
-        row.env,
-        row.tier,
-        row.secret,
-        case_set,
-        closed=True,
-        definition=row.definition,
-    )
-    evaluation = state.evaluations[name] = Evaluation(row, flow)
-    state.evaluation_keys[row.key] = name
+    flow = Flow(row.evaluation, row.env, row.tier, "evaluation", row.secret)
+    flow.case_set, flow.closed, flow.definition = case_set, True, row.definition
+    pins.add_flow(state, flow)
+    evaluation = state.evaluations[row.evaluation] = Evaluation(row, flow)
+    state.evaluation_keys[row.key] = row.evaluation
     return evaluation
 
 
 def play(state: State, evaluation: Evaluation, step: Step) -> None:
     """Queue the episodes of an evaluation."""
-    group = templates.build("evaluation", evaluation, evaluation.row, step.now, step.stimulus_id)
+    group = templates.evaluation(evaluation, step)
     groups.open_group(state, group, step)
 
 
@@ -111,7 +101,7 @@ def end(state: State, group: JobGroup, error: str, step: Step) -> None:
     """End an evaluation: close its group and answer waiting polls. `error` is the reason of an early end."""
     evaluation = state.evaluations.pop(group.run)
     step.persist(msgspec.structs.replace(evaluation.row, finished=True, error=error))
-    state.ended_evaluations[group.run] = Ended(group.done)
+    state.ended_evaluations[group.run] = group.done
     groups.close_group(state, group, step)
     pins.drop_flow(state, evaluation.flow)
     _answer_polls(state, group, step, finished=True)
@@ -119,51 +109,47 @@ def end(state: State, group: JobGroup, error: str, step: Step) -> None:
 
 def _answer_polls(state: State, group: JobGroup, step: Step, *, finished: bool) -> None:
     for poll in state.polls.take_all(group.id):
-        step.add(_page(state, poll, group, step, finished=finished))
+        step.add(_page(state, poll, group, finished=finished))
 
 
 def polled(state: State, event: events.Requested[operator.EvaluationPoll], step: Step) -> None:
     """An operator polls for outcomes: answered at once, or when there are more than it has."""
     message = event.message
     poll = Poll(event.request, "evaluation", evaluation_group(message.evaluation), message.cursor)
-    ended = state.ended_evaluations.get(message.evaluation)
-    if ended is not None:
-        step.add(
-            ReadEvaluation(
-                request=event.request,
-                evaluation=message.evaluation,
-                cursor=max(0, message.cursor),
-                upto=ended.total,
-                total=ended.total,
-                finished=True,
-                stimulus_id=step.stimulus_id,
-            )
-        )
+    total = state.ended_evaluations.get(message.evaluation)
+    if total is not None:
+        step.add(_read(poll, message.evaluation, total, total, finished=True))
         return
     group = state.groups.get(poll.target)
     if group is None:
         step.refuse(
             event.request,
-            Refusal.UNKNOWN_EVALUATION,
             because("unknown_evaluation", evaluation=message.evaluation),
         )
     elif group.done > message.cursor or not state.polls.wait(poll, message.wait_s, step.now):
-        step.add(_page(state, poll, group, step, finished=False))
+        step.add(_page(state, poll, group, finished=False))
 
 
 def answer(state: State, poll: Poll, step: Step) -> None:
     """Answer a poll that has timed out."""
-    step.add(_page(state, poll, state.groups[poll.target], step, finished=False))
+    step.add(_page(state, poll, state.groups[poll.target], finished=False))
 
 
-def _page(state: State, poll: Poll, group: JobGroup, step: Step, *, finished: bool) -> ReadEvaluation:
+def _page(state: State, poll: Poll, group: JobGroup, *, finished: bool) -> ReadEvaluation:
+    total = group.done if finished else group.n
+    waits_for = None if finished else waits.waits_for(state, group)
+    return _read(poll, group.run, group.done, total, finished=finished, waits_for=waits_for)
+
+
+def _read(
+    poll: Poll, evaluation: str, upto: int, total: int, *, finished: bool, waits_for: Reason | None = None
+) -> ReadEvaluation:
     return ReadEvaluation(
         request=poll.request,
-        evaluation=group.run,
+        evaluation=evaluation,
         cursor=max(0, poll.cursor),
-        upto=group.done,
-        total=group.done if finished else group.n,
+        upto=upto,
+        total=total,
         finished=finished,
-        waits_for=None if finished else waits.waits_for(state, group),
-        stimulus_id=step.stimulus_id,
+        waits_for=waits_for,
     )

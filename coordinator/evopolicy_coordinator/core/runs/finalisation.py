@@ -10,16 +10,16 @@ Rules that this module owns:
   run whose selected policy fails in a held-out episode ends as an error.
 - A checkpoint that an earlier version found ineligible stays so; only the finished run's result reports it.
 - The selected checkpoint plays all held-out cases; uniform random actions play the same ones. Those actions follow from
-  split and case (`seeds.reference_seed`), except in runs of earlier versions, where they follow from the run's secret.
+  split and case (`jobs.reference_seed`), except in runs of earlier versions, where they follow from the run's secret.
 - The stage follows from stored rows: `advance` may be called any number of times.
 """
 
 from __future__ import annotations
 
 from evopolicy_common.messages import gateway, operator
-from evopolicy_common.refusals import Refusal
 from evopolicy_coordinator.core.agents import permits
 from evopolicy_coordinator.core.contract import events
+from evopolicy_coordinator.core.contract.effects import ReadFinished
 from evopolicy_coordinator.core.contract.reasons import because
 from evopolicy_coordinator.core.contract.records import (
     FinishedRow,
@@ -31,7 +31,7 @@ from evopolicy_coordinator.core.contract.records import (
 )
 from evopolicy_coordinator.core.leasing import groups, queue
 from evopolicy_coordinator.core.runs import (
-    audit_end,
+    audits,
     evaluations,
     finished,
     journal,
@@ -59,7 +59,7 @@ FAILED_VALIDATION = "its policy failed in a validation episode"
 def validate(state: State, run: Run, row: SubmitRow, step: Step) -> None:
     """Queue the validation of an ok checkpoint; in idle slots only while the run is open."""
     if validation_group(run.id, row.submit_index) not in state.groups:
-        _open(state, templates.build("validation", run, row, step.now, step.stimulus_id), step)
+        _open(state, templates.validation(run, row, step), step)
 
 
 def _open(state: State, group: JobGroup, step: Step) -> None:
@@ -113,10 +113,10 @@ def close(state: State, event: events.Requested[gateway.CloseRun], step: Step) -
     message = event.message
     run = state.runs.get(message.run)
     if run is None and message.run not in state.capabilities:
-        step.refuse(event.request, Refusal.UNKNOWN_RUN, because("unknown_run", run=message.run))
+        step.refuse(event.request, because("unknown_run", run=message.run))
         return
     permits.end(state, message.run, step, "its run was closed")
-    permits.drop_asks(state, message.run, Refusal.RUN_CLOSED, because("run_closed", run=message.run), step)
+    permits.drop_asks(state, message.run, because("run_closed", run=message.run), step)
     if run is not None and run.state.phase == "open":
         step.change_run(
             run, phase="closed", closed_at=step.now, close_reason=message.reason, agent=message.agent
@@ -138,7 +138,7 @@ def advance(state: State, run: Run, step: Step) -> None:
         random_group(run.id) in run.hidden_returns
     )  # groups that are opened here end in a later rule
     if not has_reference:
-        _open(state, templates.build("random", run, None, step.now, step.stimulus_id), step)
+        _open(state, templates.random(run, step), step)
     waiting = [row for row in finished.ok_submits(run) if row.val_mean is None and row.ineligible is None]
     for row in waiting:
         validate(state, run, row, step)
@@ -147,9 +147,9 @@ def advance(state: State, run: Run, step: Step) -> None:
         return
     best = finished.select(run)
     if best is not None and heldout_group(run.id, best.submit_index) not in run.hidden_returns:
-        _open(state, templates.build("heldout", run, best, step.now, step.stimulus_id), step)
+        _open(state, templates.heldout(run, best, step), step)
         return
-    if has_reference and not audit_end.holds_up(state, run, step):
+    if has_reference and not audits.holds_up(state, run, step):
         _finish(state, run, best, step)
 
 
@@ -161,7 +161,7 @@ def cancel(state: State, event: events.Requested[operator.CancelRun], step: Step
         if evaluations.cancel(state, message.run, step) or message.run in state.capabilities:
             step.reply(event.request, operator.Done())
         else:
-            step.refuse(event.request, Refusal.UNKNOWN_RUN, because("unknown_run", run=message.run))
+            step.refuse(event.request, because("unknown_run", run=message.run))
         return
     _cancel(state, run, step)
     step.reply(event.request, operator.Done())
@@ -199,7 +199,7 @@ def _cancel(state: State, run: Run, step: Step, *, error: str | None = None) -> 
     if run.state.phase == "open":
         step.change_run(run, phase="closed", closed_at=step.now, close_reason=gateway.CANCELLED)
         permits.cancelled(state, run.id, step)
-    permits.drop_asks(state, run.id, Refusal.RUN_CANCELLED, because("run_cancelled", run=run.id), step)
+    permits.drop_asks(state, run.id, because("run_cancelled", run=run.id), step)
     _finish(state, run, None, step, cancelled=True, unplayed=True, error=error)
 
 
@@ -215,7 +215,7 @@ def _finish(
 ) -> None:
     """End a run: its result becomes durable, and the core drops its state. `unplayed`: close its
     open groups unfinished. `error`: why it cannot be scored."""
-    audit_end.cancel(state, run, step)
+    audits.cancel(state, run, step)
     state.timers.disarm(("audits", run.id))
     for group in [group for group in state.groups.values() if group.run == run.id] if unplayed else []:
         groups.close_group(state, group, step)
@@ -225,5 +225,5 @@ def _finish(
     step.change_run(run, phase="finished", remaining_budget=run.ledger.available, n_submits=len(run.submits))
     runs.forget(state, run)
     for poll in state.polls.take_all(run.id):
-        step.add(result_polls.finished_effect(poll.request, run.id, step))
+        step.add(ReadFinished(request=poll.request, run=run.id))
     step.log("info", "run_finished", run=run.id, status=result.status, best=result.best_submit_index)

@@ -6,18 +6,18 @@ from typing import Literal
 
 from evopolicy_common.messages import operator
 from evopolicy_common.records.aggregates import best_validated, mean
-from evopolicy_common.refusals import Refusal
 from evopolicy_coordinator.core.contract import events
+from evopolicy_coordinator.core.contract.effects import ReadFinished
 from evopolicy_coordinator.core.contract.reasons import Reason, because
 from evopolicy_coordinator.core.contract.records import (
     SubmitRow,
     heldout_group,
     random_group,
-    submit_done,
+    shared,
     train_group,
     validation_group,
 )
-from evopolicy_coordinator.core.runs import audit_end, result_polls, waits
+from evopolicy_coordinator.core.runs import audits, waits
 from evopolicy_coordinator.core.structures.polls import Poll
 from evopolicy_coordinator.core.tables.model import Run
 from evopolicy_coordinator.core.tables.state import State
@@ -25,7 +25,7 @@ from evopolicy_coordinator.core.tables.step import Step
 
 
 def unspent(run: Run) -> int:
-    """Unspent episodes of a run that must spend its budget; 0 for other runs, or if fewer are left
+    """Unspent episodes of a run that must spend its budget; 0 for other runs, or if fewer remain
     than a submit's minimum."""
     available = run.ledger.available
     return (
@@ -95,13 +95,13 @@ def result(
         }
     description = stored.description
     closed_at = now if stored.closed_at is None else stored.closed_at
-    return operator.RunFinished(
-        run=run.id,
-        settings=row.settings,
+    return shared(
+        operator.RunFinished,
+        row,
+        stored,
         status=status,
         error=error,
         closed_reason=stored.close_reason,
-        agent=stored.agent,
         final_score=final_score,
         best_submit_index=None if best is None else best.submit_index,
         val_scores={each.submit_index: each.val_mean for each in ok if each.val_mean is not None},
@@ -112,47 +112,23 @@ def result(
         },
         policy_failures=failures,
         random_heldout_returns=run.hidden_returns.get(random_group(run.id), ()),
-        reference_by_case=row.reference_by_case,
         episode_budget=row.budget,
         budget_used=run.ledger.settled,
-        split_hashes=row.split_hashes,
-        split_secret=row.split_secret,
         env_version="" if description is None else description.env_version,
         deterministic=True if description is None else description.deterministic,
         env_title="" if description is None else description.title,
         env_family="" if description is None else description.family,
-        fingerprint=stored.fingerprint,
-        created_at=row.created_at,
         closed_at=closed_at,
         finished_at=now,
         submits=tuple(
-            _submit_record(each) for each in run.submits if each.env_instances and not each.refunded
+            shared(operator.SubmitRecord, each, started_at=each.accepted_at)
+            for each in run.submits
+            if each.env_instances and not each.refunded
         ),
         wall_s={"queue": run.queue_s, "rollout": run.rollout_s, "finalise": max(0.0, now - closed_at)},
-        infrastructure_retries=stored.infrastructure_retries,
-        nondeterministic_results=stored.nondeterministic_results,
-        audit=audit_end.record(state, run),
+        audit=audits.record(state, run),
         hidden_isolation=stored.isolation,
         fingerprint_overrides=stored.overrides,
-        installations=stored.installations,
-        committed=row.committed,
-    )
-
-
-def _submit_record(row: SubmitRow) -> operator.SubmitRecord:
-    done = submit_done(row)
-    assert done is not None
-    return operator.SubmitRecord(
-        submit_index=row.submit_index,
-        status=done.status,
-        bundle=row.bundle,
-        env_instances=row.env_instances,
-        remaining_budget=row.remaining_budget,
-        mean_return=row.mean_return,
-        val_mean=row.val_mean,
-        started_at=row.accepted_at,
-        completed_at=done.completed_at,
-        tree=row.tree,
     )
 
 
@@ -165,9 +141,9 @@ def waited(state: State, event: events.Requested[operator.WaitRun], step: Step) 
     run = state.runs.get(message.run)
     if run is None:
         if message.run in state.capabilities:
-            step.add(result_polls.finished_effect(event.request, message.run, step))
+            step.add(ReadFinished(request=event.request, run=message.run))
         else:
-            step.refuse(event.request, Refusal.UNKNOWN_RUN, because("unknown_run", run=message.run))
+            step.refuse(event.request, because("unknown_run", run=message.run))
         return
     poll = Poll(event.request, "run", run.id)
     if not state.polls.wait(poll, message.wait_s, step.now):
@@ -203,5 +179,5 @@ def progress(state: State, run: Run) -> tuple[operator.RunProgress, Reason | Non
         phase, group = "random", state.groups.get(random_group(run.id))
     total = len(run.row.heldout)
     if group is None:
-        return operator.RunProgress(phase=phase, done=total, total=total), audit_end.waits_for(run)
+        return operator.RunProgress(phase=phase, done=total, total=total), audits.waits_for(run)
     return operator.RunProgress(phase=phase, done=group.done, total=total), waits.waits_for(state, group)

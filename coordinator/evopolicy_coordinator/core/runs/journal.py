@@ -16,10 +16,9 @@ import msgspec
 from evopolicy_common.messages.journal import Committed
 from evopolicy_common.messages.operator import Done, RunFinished
 from evopolicy_common.records import journal
-from evopolicy_common.refusals import Refusal
 from evopolicy_coordinator.core.contract import events
 from evopolicy_coordinator.core.contract.reasons import Reason, because
-from evopolicy_coordinator.core.contract.records import DocumentRow, JournalRow, RunRow
+from evopolicy_coordinator.core.contract.records import DocumentRow, JournalRow, RunRow, shared
 from evopolicy_coordinator.core.tables.state import State
 from evopolicy_coordinator.core.tables.step import Step
 
@@ -35,22 +34,12 @@ def opened(state: State, row: RunRow, step: Step) -> RunRow:
     """Commit to a run that is about to be created. Returns its row with the commitment's place in the journal."""
     settings = row.settings
     document = journal.document(
-        journal.Opening(
-            run=row.run,
-            epoch=row.epoch,
+        shared(
+            journal.Opening,
+            row,
             # This document is published unchanged, so it leaves out the operator's private labels and machine.
             settings=msgspec.structs.replace(settings, notes={}, agent_host=""),
-            budget=row.budget,
-            min_episodes_per_submit=row.min_episodes_per_submit,
-            max_episodes_per_submit=row.max_episodes_per_submit,
-            max_steps=row.max_steps,
-            train=row.train,
-            validation=row.validation,
-            heldout=row.heldout,
             cases_secret=row.split_secret,
-            allowed_imports=row.allowed_imports,
-            denied_imports=row.denied_imports,
-            audit_share=row.audit_share,
             policy_seeds=hashlib.sha256(row.secret).hexdigest(),
         )
     )
@@ -58,19 +47,7 @@ def opened(state: State, row: RunRow, step: Step) -> RunRow:
     step.persist(DocumentRow(run=row.run, kind="opening", data=document))
     last = _append(
         state,
-        journal.Opened(
-            run=row.run,
-            commitment=commitment,
-            epoch=row.epoch,
-            entry=settings.entry,
-            model=settings.model,
-            env=settings.env,
-            exp_id=settings.exp_id,
-            repeat=settings.repeat,
-            attempt=settings.attempt,
-            at=step.now,
-            replay_of=settings.replay_of,
-        ),
+        shared(journal.Opened, row, settings, commitment=commitment, at=step.now),
         step,
     )
     place = Committed(commitment=commitment, epoch=row.epoch, opened=last.seq, opened_head=last.head)
@@ -97,7 +74,7 @@ def disclose(state: State, event: events.DisclosureRequested, step: Step) -> Non
     Revealed epochs stay so."""
     for run in state.runs.values():
         if run.row.epoch in event.epochs:
-            step.refuse(event.request, Refusal.BUSY, because("epoch_in_use", run=run.id))
+            step.refuse(event.request, because("epoch_in_use", run=run.id))
             return
     for epoch in event.epochs:
         if epoch not in state.revealed:

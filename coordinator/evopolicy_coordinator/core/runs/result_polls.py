@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from evopolicy_common.messages import gateway
-from evopolicy_common.refusals import Refusal
 from evopolicy_coordinator.core.contract import events
-from evopolicy_coordinator.core.contract.effects import ReadFinished, ReadResults
-from evopolicy_coordinator.core.contract.events import RequestId
-from evopolicy_coordinator.core.contract.reasons import Reason, because
+from evopolicy_coordinator.core.contract.effects import ReadResults
+from evopolicy_coordinator.core.contract.reasons import because
 from evopolicy_coordinator.core.contract.records import train_group
 from evopolicy_coordinator.core.runs import waits
 from evopolicy_coordinator.core.runs.runs import held_s
@@ -24,14 +22,20 @@ def results(state: State, event: events.Requested[gateway.ResultsRequest], step:
     if run is None:
         if message.run in state.capabilities:
             step.add(
-                _page(event.request, message.run, message.submit_index, message.cursor, None, None, 0.0, step)
+                ReadResults(
+                    request=event.request,
+                    run=message.run,
+                    submit_index=message.submit_index,
+                    cursor=max(0, message.cursor),
+                    upto=None,
+                )
             )
         else:
-            step.refuse(event.request, Refusal.UNKNOWN_RUN, because("unknown_run", run=message.run))
+            step.refuse(event.request, because("unknown_run", run=message.run))
         return
     if not 0 <= message.submit_index < len(run.submits):
         reason = because("unknown_submit", run=run.id, n=len(run.submits), submit=message.submit_index)
-        step.refuse(event.request, Refusal.UNKNOWN_SUBMIT, reason)
+        step.refuse(event.request, reason)
         return
     target = train_group(run.id, message.submit_index)
     poll = Poll(event.request, "results", target, message.cursor)
@@ -58,34 +62,15 @@ def answer(state: State, poll: Poll, step: Step) -> None:
     run = state.runs[poll.target.split("/")[0]]
     index = int(poll.target.split("/")[1][1:])
     row = run.submits[index]
-    waits_for = None if row.status is not None else waits.waits_for(state, state.groups[poll.target])
-    upto = row.released if row.status is not None else _released(state, poll.target)
-    held = held_s(state, run, step.now)
-    step.add(_page(poll.request, run.id, index, poll.cursor, upto, waits_for, held, step))
-
-
-def _page(
-    request: RequestId,
-    run: str,
-    index: int,
-    cursor: int,
-    upto: int | None,
-    waits_for: Reason | None,
-    held: float,
-    step: Step,
-) -> ReadResults:
-    return ReadResults(
-        request=request,
-        run=run,
-        submit_index=index,
-        cursor=max(0, cursor),
-        upto=upto,
-        waits_for=waits_for,
-        held_s=held,
-        stimulus_id=step.stimulus_id,
+    ended = row.status is not None
+    step.add(
+        ReadResults(
+            request=poll.request,
+            run=run.id,
+            submit_index=index,
+            cursor=max(0, poll.cursor),
+            upto=row.released if ended else _released(state, poll.target),
+            waits_for=None if ended else waits.waits_for(state, state.groups[poll.target]),
+            held_s=held_s(state, run, step.now),
+        )
     )
-
-
-def finished_effect(request: RequestId, run: str, step: Step) -> ReadFinished:
-    """Let the shell answer with the finished run."""
-    return ReadFinished(request=request, run=run, stimulus_id=step.stimulus_id)

@@ -14,16 +14,14 @@ from msgspec.structs import replace
 from evopolicy_common.messages import gateway, operator
 from evopolicy_common.messages.gateway import CANCELLED
 from evopolicy_common.messages.status import RetriedJobs
-from evopolicy_common.refusals import Refusal
 from evopolicy_coordinator.core.agents import requests
-from evopolicy_coordinator.core.agents.open_runs import live
 from evopolicy_coordinator.core.contract import events
 from evopolicy_coordinator.core.contract.reasons import Reason, because
-from evopolicy_coordinator.core.contract.records import RunRow, RunStateRow, train_group
+from evopolicy_coordinator.core.contract.records import RunRow, RunStateRow, shared, train_group
 from evopolicy_coordinator.core.leasing import pins
 from evopolicy_coordinator.core.runs import journal, waits
 from evopolicy_coordinator.core.structures.ledger import Ledger
-from evopolicy_coordinator.core.tables.model import Run
+from evopolicy_coordinator.core.tables.model import Flow, Run
 from evopolicy_coordinator.core.tables.state import State
 from evopolicy_coordinator.core.tables.step import FlowPinned, JobRetried, ResultsDiffered, Step
 
@@ -39,7 +37,7 @@ def create(state: State, event: events.RunCreated, step: Step) -> None:
     if fault is None and row.run in state.capabilities:
         fault = because("run_exists", run=row.run)
     if fault is not None:
-        step.refuse(event.request, Refusal.BAD_SETTINGS, fault)
+        step.refuse(event.request, fault)
         return
     row = msgspec.structs.replace(
         row,
@@ -60,13 +58,18 @@ def create(state: State, event: events.RunCreated, step: Step) -> None:
 
 def enter(state: State, row: RunRow, stored: RunStateRow) -> Run:
     """Add a run to the core, with its whole budget available."""
-    env, tier = row.settings.env, row.settings.sandbox_tier
-    case_set = state.case_sets.join(env, (*row.validation, *row.heldout, *row.related))
-    closed = stored.phase != "open"
-    definition = row.settings.definition
-    flow = pins.add_flow(
-        state, row.run, "run", env, tier, row.secret, case_set, closed=closed, definition=definition
+    settings = row.settings
+    flow = Flow(
+        row.run,
+        settings.env,
+        settings.sandbox_tier,
+        "run",
+        row.secret,
+        case_set=state.case_sets.join(settings.env, (*row.validation, *row.heldout, *row.related)),
+        closed=stored.phase != "open",
+        definition=settings.definition,
     )
+    pins.add_flow(state, flow)
     run = Run(row, stored, Ledger(row.budget), flow)
     state.runs[row.run] = run
     state.run_keys[row.key] = row.run
@@ -100,42 +103,28 @@ def _fault(row: RunRow) -> Reason | None:
 
 def opened(state: State, event: events.Requested[gateway.OpenRun], step: Step) -> None:
     """Send a gateway the fixed parameters of its run; refused until a worker has offered the environment."""
-    run = live(state, event.request, event.message.run, step)
+    run = requests.live(state, event.request, event.message.run, step)
     if run is None:
         return
     if run.flow.pin is None:
         pins.pin(state, run.flow, step)
     description = run.flow.description
-    row, settings = run.row, run.row.settings
     if description is None:
         missing = waits.waits_for_workers(state, run.flow)
-        step.refuse(event.request, Refusal.NO_WORKER, because("no_worker_yet", waits_for=missing))
+        step.refuse(event.request, because("no_worker_yet", waits_for=missing))
         return
     if not event.message.asks_permit and requests.without_permit(state, event.request, run, step):
         return
     current, waits_for = run_state(state, run, step.now)
     step.reply(
         event.request,
-        gateway.RunOpened(
+        shared(
+            gateway.RunOpened,
+            run.row,
+            run.row.settings,
             env=description,
-            n_env_instances=len(row.train),
-            episode_budget=row.budget,
-            min_episodes_per_submit=row.min_episodes_per_submit,
-            max_episodes_per_submit=row.max_episodes_per_submit,
-            policy_scope=settings.policy_scope,
-            observations=settings.observations,
-            sandbox_tier=settings.sandbox_tier,
-            video=settings.video,
-            limits=settings.limits,
-            allowed_imports=row.allowed_imports,
-            denied_imports=row.denied_imports,
-            simulation=settings.simulation,
-            finish=settings.finish,
-            feedback=settings.feedback,
-            failed_episodes=settings.failed_episodes,
-            hidden_evaluation=settings.hidden_evaluation,
-            profile=settings.profile,
-            max_steps=row.max_steps,
+            n_env_instances=len(run.row.train),
+            episode_budget=run.row.budget,
             state=current,
         ),
         waits_for,
@@ -148,7 +137,7 @@ def state_requested(state: State, event: events.Requested[gateway.StateRequest],
     if last is not None:
         step.reply(event.request, gateway.StateReply(state=last))
         return
-    run = live(state, event.request, event.message.run, step)
+    run = requests.live(state, event.request, event.message.run, step)
     if run is not None:
         current, waits_for = run_state(state, run, step.now)
         step.reply(event.request, gateway.StateReply(state=current), waits_for)

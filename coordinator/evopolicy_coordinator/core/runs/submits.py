@@ -18,9 +18,7 @@ from typing import cast
 from evopolicy_common.messages import gateway
 from evopolicy_common.messages.episode import NO_POLICY, PolicyFailure
 from evopolicy_common.messages.gateway import SubmitStatus
-from evopolicy_common.refusals import Refusal
 from evopolicy_coordinator.core.agents import requests
-from evopolicy_coordinator.core.agents.open_runs import live, over
 from evopolicy_coordinator.core.contract import events
 from evopolicy_coordinator.core.contract.reasons import because
 from evopolicy_coordinator.core.contract.records import SubmitRow
@@ -39,7 +37,7 @@ def submit(state: State, event: events.Requested[gateway.Submit], step: Step) ->
     """Accept a submit, or refuse it for the first cause in the protocol's order; a known key
     gets the earlier answer."""
     message = event.message
-    run = live(state, event.request, message.run, step)
+    run = requests.live(state, event.request, message.run, step)
     if run is None:
         return
     known = run.keys.get(message.key)
@@ -47,15 +45,15 @@ def submit(state: State, event: events.Requested[gateway.Submit], step: Step) ->
         _again(event, run.submits[known], step)
         return
     if run.state.phase != "open":
-        step.refuse(event.request, *over(state, run.id))
+        step.refuse(event.request, requests.over(state, run.id))
         return
     if run.open is not None:
-        step.refuse(event.request, Refusal.BUSY, because("busy", submit=run.open))
+        step.refuse(event.request, because("busy", submit=run.open))
         return
     if message.rejected is not None and run.row.settings.profile != "own":
         if len(run.submits) >= run.row.budget + MAX_REJECTED:
             reason = because("too_many_rejected", n=len(run.submits))
-            step.refuse(event.request, Refusal.BUDGET_INVALID, reason)
+            step.refuse(event.request, reason)
         elif not requests.without_permit(state, event.request, run, step):
             _accept(state, run, event, step)
         return
@@ -67,10 +65,10 @@ def submit(state: State, event: events.Requested[gateway.Submit], step: Step) ->
         available=run.ledger.available,
     )
     if refused is not None:
-        step.refuse(event.request, *refused)
+        step.refuse(event.request, refused)
         return
     if message.bundle is None and message.bundle_error is None:
-        step.refuse(event.request, Refusal.BAD_REQUEST, because("no_bundle"))
+        step.refuse(event.request, because("no_bundle"))
         return
     if requests.without_permit(state, event.request, run, step):
         return
@@ -82,7 +80,7 @@ def _again(event: events.Requested[gateway.Submit], row: SubmitRow, step: Step) 
     message = event.message
     if (message.env_instances, message.bundle) != (row.env_instances, row.bundle):
         reason = because("key_used", key=message.key, submit=row.submit_index)
-        step.refuse(event.request, Refusal.KEY_CONFLICT, reason)
+        step.refuse(event.request, reason)
         return
     step.reply(event.request, _accepted(row))
 
@@ -135,7 +133,7 @@ def _accept(state: State, run: Run, event: events.Requested[gateway.Submit], ste
 
 def play(state: State, run: Run, row: SubmitRow, step: Step) -> None:
     """Queue the unfinished jobs of an open submit."""
-    groups.open_group(state, templates.build("train", run, row, step.now, step.stimulus_id), step)
+    groups.open_group(state, templates.train(run, row, step), step)
 
 
 # ---- progress and end of a submit ----
@@ -150,14 +148,10 @@ def progressed(state: State, news: EpisodesDone, step: Step) -> None:
         if outcome.index == 0 and failure is not None and failure.category in NO_POLICY:
             end(state, run, group, cast(SubmitStatus, failure.category), failure, step)
             return
-    if group.done == group.n:
-        _all_done(state, run, group, step)
-    elif 0 in group.digests:
-        step.grown[group] = None
-
-
-def _all_done(state: State, run: Run, group: JobGroup, step: Step) -> None:
-    """End a submit whose episodes are all done."""
+    if group.done < group.n:
+        if 0 in group.digests:
+            step.grown[group] = None
+        return
     failed = group.first_failed()
     if failed is None or run.row.settings.failed_episodes == "play-on":
         end(state, run, group, "ok", None, step)
@@ -176,6 +170,9 @@ def limit_passed(state: State, name: str, step: Step) -> None:
     group = state.groups.get(name)
     if group is None:
         return
+    run = state.runs[group.run]
+    limit_s = run.row.settings.limits.submit_wall_s
+    assert limit_s is not None
     held_s = group.held(step.now) - group.held_counted_s
     if held_s > 0.0:
         group.held_counted_s += held_s
@@ -185,22 +182,12 @@ def limit_passed(state: State, name: str, step: Step) -> None:
     elif faulty := [job for job in group.jobs.values() if job.failures > job.failures_counted]:
         for job in faulty:
             job.failures_counted = job.failures
-        limit_s = state.runs[group.run].row.settings.limits.submit_wall_s
-        assert limit_s is not None
         state.timers.arm(("submit", name), step.now + limit_s)
     else:
-        _timed_out(state, group, step)
-
-
-def _timed_out(state: State, group: JobGroup, step: Step) -> None:
-    """End a submit that exceeded the operator's limit on its wall time."""
-    run = state.runs[group.run]
-    limit_s = run.row.settings.limits.submit_wall_s
-    text = (
-        f"the submit took longer than its limit of {limit_s} s; {group.done} of {group.n} episodes were done"
-    )
-    failure = PolicyFailure(category="episode_timeout", step_index=None, message=text, limit=limit_s)
-    end(state, run, group, "rollout_timeout", failure, step)
+        done = f"{group.done} of {group.n} episodes were done"
+        text = f"the submit took longer than its limit of {limit_s} s; {done}"
+        failure = PolicyFailure(category="episode_timeout", step_index=None, message=text, limit=limit_s)
+        end(state, run, group, "rollout_timeout", failure, step)
 
 
 def end(

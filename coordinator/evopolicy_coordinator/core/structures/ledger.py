@@ -9,9 +9,8 @@ Rules that this module owns:
 
 from __future__ import annotations
 
-from evopolicy_common.refusals import Refusal
 from evopolicy_coordinator.core.contract.reasons import Reason, because
-from evopolicy_coordinator.core.structures.faults import InvariantError
+from evopolicy_coordinator.core.structures import InvariantError
 
 
 class Ledger:
@@ -70,16 +69,16 @@ class Ledger:
 
 def refusal(
     env_instances: tuple[int, ...], *, n_cases: int, minimum: int, maximum: int, available: int
-) -> tuple[Refusal, Reason] | None:
+) -> Reason | None:
     """Returns why these train cases cannot be played, or None. Checks in the order that the protocol prescribes."""
     n = len(env_instances)
     for case_id in env_instances:
         if not 0 <= case_id < n_cases:
-            return Refusal.INVALID_ENV_INSTANCE, because("unknown_case", case=case_id, last=n_cases - 1)
+            return because("unknown_case", case=case_id, last=n_cases - 1)
     if n < minimum:
-        return Refusal.BUDGET_INVALID, because("too_few", n=n, least=minimum)
+        return because("too_few", n=n, least=minimum)
     if n > maximum:
-        return Refusal.BUDGET_INVALID, because("too_many", n=n, most=maximum)
+        return because("too_many", n=n, most=maximum)
     if n > available:
-        return Refusal.BUDGET_INVALID, because("over_budget", n=n, left=available)
+        return because("over_budget", n=n, remaining=available)
     return None

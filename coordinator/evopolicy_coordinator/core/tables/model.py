@@ -339,7 +339,7 @@ class Flow:
     of: Literal["run", "evaluation"]
     secret: bytes
     """Of the run or evaluation: part of its leases' names."""
-    seq: int
+    seq: int = 0
     """Order of creation: breaks ties."""
     case_set: CaseSet | None = None
     """Runs and evaluations with the same hidden cases; None if it has none."""
@@ -700,11 +700,3 @@ class Evaluation:
 
     row: EvaluationRow
     flow: Flow
-
-
-@dataclass(slots=True, frozen=True)
-class Ended:
-    """The remaining record of a finished evaluation."""
-
-    total: int
-    """Number of stored outcomes."""

@@ -23,7 +23,6 @@ from evopolicy_coordinator.core.tables.model import (
     RANKS,
     Ask,
     CaseSet,
-    Ended,
     Evaluation,
     Flow,
     JobGroup,
@@ -85,7 +84,8 @@ class State:
         """The state that a gateway of a finished run is still sent."""
         self.evaluations: dict[str, Evaluation] = {}
         self.evaluation_keys: dict[str, str] = {}
-        self.ended_evaluations: dict[str, Ended] = {}
+        self.ended_evaluations: dict[str, int] = {}
+        """Number of stored outcomes of each finished evaluation."""
         self.disputes: deque[str] = deque(maxlen=DISPUTES_MAX)
         """Disagreements between workers, in words, the latest last, since the core was loaded."""
 

@@ -19,7 +19,6 @@ import msgspec
 
 from evopolicy_common.messages.episode import EpisodeOutcome
 from evopolicy_common.messages.worker import JobResult, Message
-from evopolicy_common.refusals import Refusal
 from evopolicy_coordinator.core.contract.effects import Effect, Log, Persist, Refuse, Reply
 from evopolicy_coordinator.core.contract.events import RequestId
 from evopolicy_coordinator.core.contract.reasons import Reason
@@ -173,17 +172,15 @@ class Step:
 
     def reply(self, request: RequestId, message: Message, waits_for: Reason | None = None) -> None:
         """Answer a request; the shell puts `waits_for` into the message's words."""
-        effect = Reply(request=request, message=message, waits_for=waits_for, stimulus_id=self.stimulus_id)
-        self._out.append(effect)
+        self._out.append(Reply(request=request, message=message, waits_for=waits_for))
 
     def reply_last(self, request: RequestId, message: Message) -> None:
         """Answer a request after the effects of its news; at most one per step."""
-        self.last = Reply(request=request, message=message, stimulus_id=self.stimulus_id)
+        self.last = Reply(request=request, message=message)
 
-    def refuse(self, request: RequestId, status: Refusal, reason: Reason) -> None:
+    def refuse(self, request: RequestId, reason: Reason) -> None:
         """Answer a request with the reason why it is not carried out."""
-        effect = Refuse(request=request, status=status, reason=reason, stimulus_id=self.stimulus_id)
-        self._out.append(effect)
+        self._out.append(Refuse(request=request, reason=reason))
 
     def log(self, level: Literal["debug", "info", "warning", "error"], event: str, **fields: Any) -> None:
         """Log for operators."""
@@ -193,7 +190,7 @@ class Step:
         """All effects in order: the rows first."""
         if not self._rows:
             return self._out
-        first: Effect = Persist(rows=tuple(self._rows), stimulus_id=self.stimulus_id)
+        first: Effect = Persist(rows=tuple(self._rows))
         return [first, *self._out]
 
     # ---- durable changes ----

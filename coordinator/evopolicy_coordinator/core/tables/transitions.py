@@ -9,7 +9,7 @@ from collections.abc import Collection, Mapping
 from typing import Literal, get_args
 
 from evopolicy_common.messages.gateway import SubmitStatus
-from evopolicy_coordinator.core.structures.faults import InvariantError
+from evopolicy_coordinator.core.structures import InvariantError
 
 Table = Mapping[str, Collection[str]]
 """State to its allowed successors; a final state has none."""
@@ -36,20 +36,11 @@ JOB: Table = {
     "new": ("queued", "adopting"),  # adopting: it may have been running since before the core was loaded
     "queued": ("queued", "leased", "closed"),  # queued: at another priority
     "leased": ("queued", "parting", "backing_off", "closed"),
-    "parting": (
-        "queued",
-        "leased",
-        "closed",
-    ),  # its lease was stopped; it waits until its worker releases it
+    "parting": ("queued", "leased", "closed"),  # its lease was stopped; its worker has yet to release it
     "backing_off": ("queued", "leased", "closed"),  # leased: adopted from its worker's heartbeat
     "adopting": ("queued", "leased", "closed"),
     "closed": (),
 }
-
-
-def has_successor(table: Table, state: str) -> bool:
-    """Whether `state` has a successor."""
-    return bool(table[state])
 
 
 def check(table: Table, key: str, before: str, after: str) -> None:

@@ -16,7 +16,6 @@ from __future__ import annotations
 
 from evopolicy_common.messages import operator
 from evopolicy_common.messages import worker as wire
-from evopolicy_common.refusals import Refusal
 from evopolicy_coordinator.core.contract import events
 from evopolicy_coordinator.core.contract.reasons import because
 from evopolicy_coordinator.core.contract.records import WorkerRow
@@ -36,16 +35,15 @@ def registered(state: State, event: events.WorkerRegistered, step: Step) -> None
     old = state.workers.get(message.worker)
     if old is not None and old.state != "lost" and old.machine != event.machine:
         # Otherwise one machine could play under another's name, and the other would be blamed.
-        step.refuse(event.request, Refusal.NAME_TAKEN, because("name_taken", worker=message.worker))
+        step.refuse(event.request, because("name_taken", worker=message.worker))
         return
     if not fleet.has_room(state, event):
         reason = because("no_room", n=fleet.MAX_WORKERS, size=fleet.MAX_DESCRIBED_BYTES)
-        step.refuse(event.request, Refusal.TOO_LARGE, reason)
+        step.refuse(event.request, reason)
         return
     if old is not None:
         fleet.drop_poll(state, old, step)
-        if old.beat is not None:
-            fleet.answer_beat(state, old, (), step)
+        fleet.answer_beat(state, old, (), step)
     state.timers.disarm(("forget", message.worker))
     worker = fleet.register(state, event, kernels.kernel(state, message.boot_id), step)
     occupancies.joined(state, worker, step)
@@ -70,7 +68,7 @@ def _refused_as_forger(state: State, name: str, machine: str, request: events.Re
     if forger is None:
         return False
     reason = because("forger", worker=name, why=state.quarantined[forger], forger=forger)
-    step.refuse(request, Refusal.QUARANTINED, reason)
+    step.refuse(request, reason)
     return True
 
 
@@ -86,7 +84,7 @@ def worker_of(
     was_lost = known is not None and known.state == "lost"
     worker = fleet.of_session(state, message.worker, message.session, step.now)
     if worker is None:
-        step.refuse(event.request, Refusal.UNKNOWN_WORKER, because("unknown_session", worker=message.worker))
+        step.refuse(event.request, because("unknown_session", worker=message.worker))
     else:
         state.timers.arm_once(("worker", worker.name), step.now + state.settings.lease_ttl_s)
         if was_lost:
@@ -107,8 +105,7 @@ def heartbeat(state: State, event: events.Requested[wire.Heartbeat], step: Step)
     worker = worker_of(state, event, step)
     if worker is None:
         return
-    if worker.beat is not None:
-        fleet.answer_beat(state, worker, (), step)
+    fleet.answer_beat(state, worker, (), step)
     stop = leases.hear(state, worker, message.held, step, settled=message.settled)
     worker.beat = event.request
     if stop or not message.wait_s > 0.0:
@@ -140,7 +137,7 @@ def worker_state(state: State, event: events.Requested[operator.SetWorker], step
     message = event.message
     if message.state != "active" and message.worker in state.quarantined:
         reason = because("quarantined", worker=message.worker, why=state.quarantined[message.worker])
-        step.refuse(event.request, Refusal.QUARANTINED, reason)
+        step.refuse(event.request, reason)
         return
     step.persist(WorkerRow(worker=message.worker, state=message.state))
     worker = state.workers.get(message.worker)
@@ -148,8 +145,7 @@ def worker_state(state: State, event: events.Requested[operator.SetWorker], step
         fleet.drop_poll(state, worker, step)
     fleet.set_state(state, message.worker, message.state)
     if worker is not None:
-        if worker.beat is not None:
-            fleet.answer_beat(state, worker, (), step)
+        fleet.answer_beat(state, worker, (), step)
         state.freed[worker.name] = None
         pins.pin_waiting(state, worker, step)
         for lane in worker.profile.lanes.values():
@@ -166,10 +162,10 @@ def repinned(state: State, event: events.Requested[operator.RepinRun], step: Ste
     offered = {_class_of_worker(state, each): each for each in able}
     offered |= {each.classes[run.flow.env]: each for each in able if run is not None}
     if run is None:
-        step.refuse(event.request, Refusal.UNKNOWN_RUN, because("no_unfinished_run", run=message.run))
+        step.refuse(event.request, because("no_unfinished_run", run=message.run))
     elif message.fingerprint_class not in offered:
         reason = because("unknown_class", name=message.fingerprint_class, offered=tuple(offered))
-        step.refuse(event.request, Refusal.UNKNOWN_CLASS, reason)
+        step.refuse(event.request, reason)
     else:
         profile = offered[message.fingerprint_class]
         name = profile.classes[run.flow.env]

@@ -1,16 +1,20 @@
-"""Stops hidden jobs for train jobs that wait.
+"""Makes room: stops hidden jobs for train jobs that wait, and empties a worker for a suspect.
 
-Rule that this module owns: a waiting train job stops hidden jobs; a suspect stops those of the worker that is emptied
-for it. Audits and early validation are stopped without limit, others a bounded number of times. The hidden job goes
-back into the queue; its worker releases it and polls again.
+Rules that this module owns:
+- A waiting train job stops hidden jobs; a suspect stops those of the worker that is emptied for it. Audits and
+  early validation are stopped without limit, others a bounded number of times. The hidden job goes back into the
+  queue; its worker releases it and polls again.
+- A suspect is a job that may crash workers. It runs alone, on an idle worker or on one that is emptied for it;
+  that worker gets no other job in the meantime.
 """
 
 from __future__ import annotations
 
 from itertools import islice
 
+from evopolicy_common.messages import worker as wire
 from evopolicy_coordinator.core.isolation import conflicts
-from evopolicy_coordinator.core.leasing import leases, queue
+from evopolicy_coordinator.core.leasing import fleet, leases, queue
 from evopolicy_coordinator.core.tables.model import (
     AUDIT,
     EARLY_VALIDATION,
@@ -22,6 +26,7 @@ from evopolicy_coordinator.core.tables.model import (
     JobState,
     Lane,
     Lease,
+    Worker,
 )
 from evopolicy_coordinator.core.tables.state import State
 from evopolicy_coordinator.core.tables.step import Step
@@ -32,6 +37,9 @@ VICTIMS_MAX = 256
 CASE_SETS_MAX = 8
 """Most case sets of waiting train jobs that hidden jobs are stopped for in one step."""
 
+SUSPECTS_MAX = 16
+"""Most suspects checked in one step."""
+
 
 def preempt(state: State, lane: Lane, step: Step) -> None:
     """Stop hidden jobs for the train jobs that wait in the lane.
@@ -41,7 +49,7 @@ def preempt(state: State, lane: Lane, step: Step) -> None:
     if any(any(profile.hidden) for profile in lane.profiles):
         # Hidden jobs that are spared now may have to be stopped later without any further event: a worker is no longer
         # avoided, or one that was to release a hidden job is lost.
-        state.timers.arm_once(("lane", lane.key), step.now + queue.LOOK_AGAIN_S)
+        state.timers.arm_once(("lane", lane.key), step.now + queue.RECHECK_S)
     wanted = lane.n_ready[TRAIN] - lane.stopping
     avoided = queue.avoided(lane, TRAIN, step.now)
     for case_set in list(islice(lane.waiting[TRAIN], CASE_SETS_MAX)):
@@ -56,7 +64,7 @@ def preempt(state: State, lane: Lane, step: Step) -> None:
                 worker = state.workers[lease.worker]
                 if lease.worker == avoided or conflicts.goes_first(lease):
                     continue
-                if not queue.may_train(state, lane, worker):
+                if not queue.open_to(state, lane, TRAIN, worker):
                     continue
                 if not may_stop(state, job):
                     del hidden[lease]
@@ -101,3 +109,57 @@ def stop_hidden(state: State, lease: Lease, step: Step) -> None:
     """Stop a hidden job for train jobs; it goes back into the queue."""
     lease.job.preemptions += 1
     leases.put_off(state, lease, step)
+
+
+# ---- suspects ----
+
+
+def next_suspect(state: State, worker: Worker, step: Step) -> wire.Lease | None:
+    """Lease a suspect to an idle worker; a busy worker may be reserved for one instead (returns None)."""
+    idle = not worker.leases
+    if worker.reserved is not None:
+        job = worker.reserved
+        if not job.queued or _barred(state, job, worker):
+            worker.reserved = job.reserved = None
+        elif not idle:
+            return None
+        else:
+            return _alone(state, job, worker, step)
+    for job in list(islice(state.suspects, SUSPECTS_MAX)):
+        lane = job.group.flow.lane
+        if lane is None or worker.profile not in lane.profiles:
+            continue
+        if job.reserved is not None and not idle:
+            continue
+        if job.avoid == worker.name and step.now < job.avoid_until and lane.workers() > 1:
+            continue
+        if job.priority >= EARLY_VALIDATION and (lane.n_ready[TRAIN] or not idle):
+            continue
+        if job.group.excludes(worker) or _barred(state, job, worker):
+            continue
+        if idle:
+            return _alone(state, job, worker, step)
+        _reserve(state, job, worker, step)
+        return None
+    return None
+
+
+def _barred(state: State, job: JobState, worker: Worker) -> bool:
+    return conflicts.conflict(state, job.priority, job.group.flow.case_set, worker)
+
+
+def _reserve(state: State, job: JobState, worker: Worker, step: Step) -> None:
+    """Start to empty a busy worker for a suspect; a train job stops the hidden jobs there rather than wait for them."""
+    job.reserved = worker.name
+    worker.reserved = job
+    if job.priority == TRAIN:
+        for lease in list(worker.leases.values()):
+            first = conflicts.goes_first(lease)
+            if lease.live and lease.job.priority != TRAIN and not first and may_stop(state, lease.job):
+                stop_hidden(state, lease, step)
+
+
+def _alone(state: State, job: JobState, worker: Worker, step: Step) -> wire.Lease:
+    fleet.unreserve(state, job)
+    queue.withdraw(state, job)
+    return leases.grant(state, job, worker, step)

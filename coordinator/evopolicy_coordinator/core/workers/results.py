@@ -103,7 +103,7 @@ def _closed(
         live = lease.live
         leases.release(state, worker, lease, step, sure=True)
         if live:
-            error = f"its result is said to be of {result.job_id[:80]!r}, attempt {result.attempt}"
+            error = f"its result names {result.job_id[:80]!r}, attempt {result.attempt}"
             fleet.failed(state, worker, step)
             leases.give_back(state, lease.job, "failed", worker, step, ran=True, error=error)
     group = state.groups.get(result.job_id.rpartition("/")[0])

@@ -24,7 +24,7 @@ from evopolicy_coordinator.core.leasing import fleet, leases, queue
 from evopolicy_coordinator.core.tables.model import TRAIN, Lane, LeasePoll, Worker
 from evopolicy_coordinator.core.tables.state import State
 from evopolicy_coordinator.core.tables.step import Step
-from evopolicy_coordinator.core.workers import preemption, suspects
+from evopolicy_coordinator.core.workers import preemption
 
 PREFETCH_BELOW_S = 1.0
 """Longer episodes are leased to free slots only: the time to fetch them is negligible beside their play time."""
@@ -32,7 +32,7 @@ PREFETCH_BELOW_S = 1.0
 TRIES_MAX = 4
 """Most parked workers tried for a lane in one step; the rest waits for the next step."""
 
-LOOKS_MAX = 64
+SKIPPED_MAX = 64
 """Most parked workers on kernels barred to a lane that are skipped in one step."""
 
 LEASES_MAX = 256
@@ -72,15 +72,15 @@ def _park(state: State, worker: Worker, step: Step) -> None:
         return
     fleet.park(worker)
     for lane in worker.profile.busy:
-        state.timers.arm_once(("lane", lane.key), step.now + queue.LOOK_AGAIN_S)
+        state.timers.arm_once(("lane", lane.key), step.now + queue.RECHECK_S)
 
 
 def _serve(state: State, worker: Worker, step: Step) -> bool:
     """Answer a worker's poll if there are leases for it; returns whether it was answered."""
-    found = _fill(state, worker, step)
-    if found:
-        fleet.answer_poll(state, worker, tuple(found), step)
-    return bool(found)
+    granted = _fill(state, worker, step)
+    if granted:
+        fleet.answer_poll(state, worker, tuple(granted), step)
+    return bool(granted)
 
 
 def _fill(state: State, worker: Worker, step: Step) -> list[wire.Lease]:
@@ -89,7 +89,7 @@ def _fill(state: State, worker: Worker, step: Step) -> list[wire.Lease]:
         return []
     if step.now > poll.until + state.settings.late_s:
         return []
-    if state.suspects and (suspect := suspects.next_of(state, worker, step)) is not None:
+    if state.suspects and (suspect := preemption.next_suspect(state, worker, step)) is not None:
         return [suspect]
     if worker.reserved is not None:
         return []
@@ -112,11 +112,11 @@ def _limit(state: State, worker: Worker, n: int, free: int) -> int:
     Leases beyond the free slots are of short episodes only, only while the worker holds no lease of lower priority, and
     no more than the worker's share of the waiting jobs.
     """
-    settings, found = state.settings, queue.leading(state, worker)
-    if found is None or found[0].lane is None:
+    settings, leader = state.settings, queue.leading(state, worker)
+    if leader is None or leader[0].lane is None:
         return 0
     at_least = min(n, max(0, free))
-    flow, priority = found
+    flow, priority = leader
     assert flow.lane is not None
     episode_s = flow.episode_s
     behind_hidden = any(worker.held[priority + 1 :])
@@ -162,7 +162,7 @@ def dispatch(state: State, step: Step) -> None:
 
 def _place_suspects(state: State, step: Step) -> None:
     """Let hidden jobs make room for waiting suspects, and offer the suspects to idle workers."""
-    for job in list(islice(state.suspects, suspects.SUSPECTS_MAX)):
+    for job in list(islice(state.suspects, preemption.SUSPECTS_MAX)):
         lane = job.group.flow.lane
         if lane is not None and job.queued:
             if job.priority == TRAIN:
@@ -210,7 +210,7 @@ def _feed(state: State, lane: Lane, step: Step) -> None:
             tries += 1
             _to_the_back(state, worker, step)
     if any(lane.n_ready):
-        state.timers.arm_once(("lane", lane.key), step.now + queue.LOOK_AGAIN_S)
+        state.timers.arm_once(("lane", lane.key), step.now + queue.RECHECK_S)
 
 
 def _try_parked(state: State, lane: Lane, step: Step, tries: int) -> None:
@@ -234,11 +234,11 @@ def _parked(state: State, lane: Lane) -> Worker | None:
     workers = state.workers
     for item in following:
         for profile in lane.profiles if item is not None else ():
-            for name in islice(profile.warm.get(item or "", ()), LOOKS_MAX):
+            for name in islice(profile.warm.get(item or "", ()), SKIPPED_MAX):
                 if queue.may_serve(state, lane, workers[name]):
                     return workers[name]
     for profile in lane.profiles:
-        for name in islice(profile.parked, LOOKS_MAX):
+        for name in islice(profile.parked, SKIPPED_MAX):
             if queue.may_serve(state, lane, workers[name]):
                 return workers[name]
     return None

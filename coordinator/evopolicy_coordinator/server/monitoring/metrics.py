@@ -1,4 +1,5 @@
 """Metrics in Prometheus' text format: counters from the core's effects, and the status at the time of each scrape.
+`metrics_server` serves them (`--metrics ADDRESS`) on the coordinator's event loop.
 
 Names and units follow Prometheus' conventions: a prefix, base units (seconds, bytes), `_total` for counters. No label
 names a run, an agent or a worker: their number is unbounded, and hidden results must not appear here.
@@ -7,15 +8,23 @@ names a run, an agent or a worker: their number is unbounded, and hidden results
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Mapping
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 from prometheus_client import CollectorRegistry, Counter, Histogram, ProcessCollector, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, InfoMetricFamily, Metric
 from prometheus_client.registry import Collector
+from starlette.applications import Starlette
+from starlette.requests import Request
+from starlette.responses import PlainTextResponse, Response
+from starlette.routing import Route
 
+from evopolicy_common.errors import ConfigError
 from evopolicy_common.messages.status import StatusReply
 from evopolicy_common.messages.worker import Leases
+from evopolicy_common.wire.http import bound, serving
 from evopolicy_coordinator.core.contract.effects import Effect, Log, Persist, Reply
 from evopolicy_coordinator.core.contract.records import OutcomeRow, SubmitRow
 from evopolicy_coordinator.core.machine import Core
@@ -37,39 +46,24 @@ class Meter:
         ProcessCollector(registry=self.registry)
         self.registry.register(StatusCollector(status))
         self.registry.register(_StoreCollector(state))
-        self._episodes = Counter(
-            "evopolicy_episodes",
-            "Episodes whose result was stored.",
-            ("split", "verdict"),
-            registry=self.registry,
+        counter = partial(Counter, registry=self.registry)
+        histogram = partial(Histogram, buckets=_SECONDS, registry=self.registry)
+        self._episodes = counter(
+            "evopolicy_episodes", "Episodes whose result was stored.", ("split", "verdict")
         )
-        self._repeated = Counter(
-            "evopolicy_episode_retries",
-            "Further attempts that stored episodes had needed.",
-            registry=self.registry,
+        self._repeated = counter(
+            "evopolicy_episode_retries", "Further attempts that stored episodes had needed."
         )
-        self._submits = Counter(
-            "evopolicy_submits", "Submits that ended, by verdict.", ("verdict",), registry=self.registry
+        self._submits = counter("evopolicy_submits", "Submits that ended, by verdict.", ("verdict",))
+        self._latency = histogram(
+            "evopolicy_submit_duration_seconds", "From a submit's acceptance to its verdict."
         )
-        self._latency = Histogram(
-            "evopolicy_submit_duration_seconds",
-            "From a submit's acceptance to its verdict.",
-            buckets=_SECONDS,
-            registry=self.registry,
+        self._wait = histogram(
+            "evopolicy_lease_wait_seconds", "From a submit's acceptance to the lease of its first job."
         )
-        self._wait = Histogram(
-            "evopolicy_lease_wait_seconds",
-            "From a submit's acceptance to the lease of its first job.",
-            buckets=_SECONDS,
-            registry=self.registry,
-        )
-        self._leases = Counter("evopolicy_leases", "Leases that were granted.", registry=self.registry)
-        self._events = Counter(
-            "evopolicy_events",
-            "Events of the core, as the log names them.",
-            ("event", "level"),
-            registry=self.registry,
-        )
+        self._leases = counter("evopolicy_leases", "Leases that were granted.")
+        text = "Events of the core, as the log names them."
+        self._events = counter("evopolicy_events", text, ("event", "level"))
         self._open: set[tuple[str, int]] = set()
         """Submits without a verdict. A submit's row may be stored again after its end, and must count once."""
 
@@ -130,65 +124,40 @@ class StatusCollector(Collector):
 
     def collect(self) -> Iterator[Metric]:
         status = self._status()
-        up = GaugeMetricFamily("evopolicy_up", "1 while the coordinator answers.")
-        up.add_metric((), float(status is not None))
-        yield up
+        yield _gauge("evopolicy_up", "1 while the coordinator answers.", status is not None)
         if status is None:
             return
-        yield InfoMetricFamily(
-            "evopolicy_build", "What serves.", {"version": status.version, "cluster": status.cluster}
-        )
+        about = {"version": status.version, "cluster": status.cluster}
+        yield InfoMetricFamily("evopolicy_build", "What serves.", about)
         yield _gauge("evopolicy_uptime_seconds", "Since the coordinator started.", status.uptime_s)
-        total = CounterMetricFamily(
+        yield CounterMetricFamily(
             "evopolicy_cluster_episodes",
             "Episodes that the cluster has played since its coordinator started.",
+            status.episodes_done,
         )
-        total.add_metric((), status.episodes_done)
-        yield total
         yield _gauge("evopolicy_episodes_per_second", "Over the last minute.", status.episodes_per_s)
-        workers = GaugeMetricFamily("evopolicy_workers", "Workers by state.", labels=("state",))
-        slots = GaugeMetricFamily("evopolicy_slots", "Slots of workers by state.", labels=("state",))
-        for state in _STATES:
-            there = [worker for worker in status.workers if worker.state == state]
-            workers.add_metric((state,), len(there))
-            slots.add_metric((state,), sum(worker.slots for worker in there))
-        yield workers
-        yield slots
-        yield _gauge(
-            "evopolicy_slots_busy", "Slots that play now.", sum(worker.running for worker in status.workers)
-        )
-        runs = GaugeMetricFamily("evopolicy_open_runs", "Unfinished runs by phase.", labels=("phase",))
-        queue = GaugeMetricFamily(
-            "evopolicy_queue_jobs", "Jobs that wait, by phase and environment.", labels=("phase", "env")
-        )
-        for phase in _PHASES:
-            runs.add_metric((phase,), sum(run.phase == phase for run in status.runs))
-        depth: dict[tuple[str, str], int] = {}
+        workers = {state: [each for each in status.workers if each.state == state] for state in _STATES}
+        n_workers = {(state,): len(there) for state, there in workers.items()}
+        yield _gauges("evopolicy_workers", "Workers by state.", ("state",), n_workers)
+        slots = {(state,): sum(each.slots for each in there) for state, there in workers.items()}
+        yield _gauges("evopolicy_slots", "Slots of workers by state.", ("state",), slots)
+        busy = sum(worker.running for worker in status.workers)
+        yield _gauge("evopolicy_slots_busy", "Slots that play now.", busy)
+        phases = {(phase,): sum(run.phase == phase for run in status.runs) for phase in _PHASES}
+        yield _gauges("evopolicy_open_runs", "Unfinished runs by phase.", ("phase",), phases)
+        depth: dict[tuple[str, ...], int] = {}
         for run in status.runs:
             depth[run.phase, run.env] = depth.get((run.phase, run.env), 0) + run.queued
-        for labels, n in sorted(depth.items()):
-            queue.add_metric(labels, n)
-        yield runs
-        yield queue
-        yield _gauge(
-            "evopolicy_runs_waiting",
-            "Runs that wait for something.",
-            sum(bool(run.waits_for) for run in status.runs),
-        )
-        yield _gauge(
-            "evopolicy_stalls", "Jobs and groups that wait longer than they should.", len(status.stalls)
-        )
-        yield _gauge(
-            "evopolicy_quarantined_workers",
-            "Workers that audits have put into quarantine.",
-            len(status.quarantined),
-        )
-        audits = GaugeMetricFamily(
-            "evopolicy_audits", "Audited episodes of unfinished runs.", labels=("state",)
-        )
-        for name, n in sorted(status.audits.items()):
-            audits.add_metric((name,), n)
-        yield audits
+        text = "Jobs that wait, by phase and environment."
+        yield _gauges("evopolicy_queue_jobs", text, ("phase", "env"), dict(sorted(depth.items())))
+        waiting = sum(bool(run.waits_for) for run in status.runs)
+        yield _gauge("evopolicy_runs_waiting", "Runs that wait for something.", waiting)
+        text = "Jobs and groups that wait longer than they should."
+        yield _gauge("evopolicy_stalls", text, len(status.stalls))
+        text = "Workers that audits have put into quarantine."
+        yield _gauge("evopolicy_quarantined_workers", text, len(status.quarantined))
+        audits = {(state,): n for state, n in sorted(status.audits.items())}
+        yield _gauges("evopolicy_audits", "Audited episodes of unfinished runs.", ("state",), audits)
 
 
 class _StoreCollector(Collector):
@@ -200,13 +169,47 @@ class _StoreCollector(Collector):
     def collect(self) -> Iterator[Metric]:
         with contextlib.suppress(OSError):
             disk = sizes(self._state)
-            yield _gauge(
-                "evopolicy_store_database_bytes", "Database files in the state folder.", disk.database
-            )
+            text = "Database files in the state folder."
+            yield _gauge("evopolicy_store_database_bytes", text, disk.database)
             yield _gauge("evopolicy_store_free_bytes", "Free on the state folder's disk.", disk.free)
 
 
 def _gauge(name: str, text: str, value: float) -> Metric:
-    made = GaugeMetricFamily(name, text)
-    made.add_metric((), value)
+    return _gauges(name, text, (), {(): value})
+
+
+def _gauges(name: str, text: str, labels: tuple[str, ...], values: Mapping[Any, float]) -> Metric:
+    """A gauge with the value of each combination of labels."""
+    made = GaugeMetricFamily(name, text, labels=labels)
+    for each, value in values.items():
+        made.add_metric(each, value)
     return made
+
+
+@contextlib.asynccontextmanager
+async def metrics_server(address: str, meter: Meter, healthy: Callable[[], bool]) -> AsyncIterator[int]:
+    """Serves inside the `async with`; yields the port.
+
+    Raises ConfigError for an invalid address, or one that cannot be listened on.
+    """
+    host, colon, port = address.rpartition(":")
+    host = host.removeprefix("[").removesuffix("]")
+    if not colon or not host or not port.isdecimal() or int(port) >= 1 << 16:
+        raise ConfigError(f"--metrics {address!r}: use the form HOST:PORT, such as 127.0.0.1:9464")
+
+    async def metrics(_: Request) -> Response:
+        return Response(meter.text(), media_type=CONTENT_TYPE)
+
+    async def health(_: Request) -> Response:
+        return PlainTextResponse("ok\n") if healthy() else PlainTextResponse("no core is loaded\n", 503)
+
+    app = Starlette(routes=[Route("/metrics", metrics), Route("/healthz", health)])
+    try:
+        sock = bound(host, int(port))
+    except OSError as error:
+        raise ConfigError(
+            f"--metrics {address}: {error.strerror or error}; choose another address"
+        ) from error
+    number: int = sock.getsockname()[1]
+    async with serving(app, sock):
+        yield number

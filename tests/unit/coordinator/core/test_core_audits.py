@@ -14,7 +14,7 @@ from rigs.core_rig import BUNDLE, outcome_of, result
 from evopolicy_common.messages import operator
 from evopolicy_common.messages import worker as wire
 from evopolicy_coordinator.core.leasing.leases import lease_id
-from evopolicy_coordinator.core.runs import audit_end, audits
+from evopolicy_coordinator.core.runs import audits
 
 # ---- who plays what again ----
 
@@ -48,7 +48,7 @@ def test_a_lone_worker_is_not_waited_for() -> None:
     fleet.rig.pass_time(20.0)
     fleet.work_off()
     found = audit_state(fleet.rig.finished())
-    assert found.not_audited == {audit_end.ONE_WORKER: found.sampled}
+    assert found.not_audited == {audits.ONE_WORKER: found.sampled}
     assert not found.in_question
 
 
@@ -72,7 +72,7 @@ def test_a_run_waits_for_a_busy_second_worker_up_to_its_bound() -> None:
     beat_for(WAIT_S - 10.0)
     assert "r1" in rig.core.state.runs
     beat_for(20.0)
-    assert audit_state(rig.finished()).not_audited == {audit_end.TOO_LATE: 2 + 2 + 2 + 2}
+    assert audit_state(rig.finished()).not_audited == {audits.TOO_LATE: 2 + 2 + 2 + 2}
 
 
 def test_a_lone_worker_after_a_restart_is_given_time_to_find_company() -> None:
@@ -104,7 +104,7 @@ def test_workers_that_may_honestly_come_to_other_bits_do_not_audit(other: str) -
     fleet.rig.close()
     fleet.work_off()
     fleet.rig.pass_time(30.0)
-    assert list(audit_state(fleet.rig.finished()).not_audited) == [audit_end.OTHERS_DIFFER]
+    assert list(audit_state(fleet.rig.finished()).not_audited) == [audits.OTHERS_DIFFER]
 
 
 def test_an_environment_that_does_not_repeat_itself_is_not_audited() -> None:
@@ -121,7 +121,7 @@ def test_a_cancelled_run_plays_no_more_audits() -> None:
     fleet.train(0, 1)
     fleet.turn("w1")
     fleet.rig.tell(asked(operator.CancelRun, request="c", run="r1"))
-    assert audit_state(fleet.rig.finished()).not_audited == {audit_end.CANCELLED: 2}
+    assert audit_state(fleet.rig.finished()).not_audited == {audits.CANCELLED: 2}
     assert not fleet.rig.core.state.groups
 
 

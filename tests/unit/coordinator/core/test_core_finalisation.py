@@ -19,7 +19,7 @@ from evopolicy_common.messages.operator import EvaluationStarted, RunProgress
 from evopolicy_common.messages.run_settings import PUBLISHED
 from evopolicy_coordinator.core.contract.effects import ReadEvaluation
 from evopolicy_coordinator.core.contract.records import EvaluationRow, RunRow, SubmitRow
-from evopolicy_coordinator.core.leasing.seeds import policy_seed
+from evopolicy_coordinator.core.leasing.jobs import policy_seed
 from evopolicy_coordinator.server.reason_texts import words
 
 

@@ -14,7 +14,7 @@ from evopolicy_common.messages import operator
 from evopolicy_common.messages import worker as wire
 from evopolicy_coordinator.core.contract import events
 from evopolicy_coordinator.core.contract.records import OutcomeRow, WorkerRow
-from evopolicy_coordinator.core.runs import audit_end
+from evopolicy_coordinator.core.runs import audits
 
 
 def test_a_forger_among_three_is_named_and_gets_no_more_leases() -> None:
@@ -177,7 +177,7 @@ def test_two_workers_of_one_machine_audit_nothing() -> None:
     fleet.join("f1", machine="bad")
     fleet.join("f2", machine="bad")
     found = audit_state(fleet.whole_run(0, 1))
-    assert found.not_audited == {audit_end.ONE_MACHINE: found.sampled}
+    assert found.not_audited == {audits.ONE_MACHINE: found.sampled}
 
 
 def test_a_machine_cannot_play_under_the_name_of_anothers_worker() -> None:

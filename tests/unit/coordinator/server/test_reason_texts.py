@@ -6,7 +6,6 @@ import ast
 import inspect
 import string
 from pathlib import Path
-from typing import get_args
 
 import pytest
 
@@ -16,39 +15,37 @@ from evopolicy_common.messages.operator import RunProgress
 from evopolicy_common.messages.worker import Refused
 from evopolicy_common.refusals import Refusal
 from evopolicy_coordinator.core.contract.effects import Refuse, Reply
-from evopolicy_coordinator.core.contract.reasons import Code, because
+from evopolicy_coordinator.core.contract.reasons import REFUSALS, because
 from evopolicy_coordinator.server.reason_texts import TEXTS, message, words
 
 CORE = Path(evopolicy_coordinator.core.__file__).parent
 
 
 def given() -> list[tuple[str, set[str]]]:
-    """Codes that the core's rules give, each with the names of what it is about."""
+    """Codes that the core's rules give, each with the names of its arguments."""
     found = []
     for path in sorted(CORE.rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "because":
                 about = {keyword.arg or "" for keyword in node.keywords}
                 found += [
-                    (each.value, about)
-                    for each in ast.walk(node.args[0])
-                    if isinstance(each, ast.Constant) and each.value in get_args(Code)
+                    (each.value, about) for each in ast.walk(node.args[0]) if isinstance(each, ast.Constant)
                 ]
     return found
 
 
 def test_every_code_has_words_and_is_given_somewhere() -> None:
-    assert set(TEXTS) == set(get_args(Code)) == {code for code, _ in given()}
+    assert set(REFUSALS) < set(TEXTS) == {code for code, _ in given()}
 
 
 @pytest.mark.parametrize(("code", "about"), given())
-def test_words_name_exactly_what_a_reason_is_about(code: Code, about: set[str]) -> None:
+def test_words_name_exactly_what_a_reason_is_about(code: str, about: set[str]) -> None:
     text = TEXTS[code]
     if isinstance(text, str):
         wanted = {name for _, name, _, _ in string.Formatter().parse(text) if name}
     else:
         wanted = set(inspect.signature(text).parameters)
-    assert about == wanted
+    assert about == wanted - {"state"}
 
 
 def test_a_reason_about_another_is_put_into_one_sentence() -> None:
@@ -106,7 +103,7 @@ def test_why_an_environment_failed_is_told_to_operators_alone() -> None:
 
 
 def test_a_refusal_is_answered_with_its_status_and_words() -> None:
-    text = message(Refuse(request=1, status=Refusal.BUSY, reason=because("busy", submit=3)))
+    text = message(Refuse(request=1, reason=because("busy", submit=3)))
     assert text == Refused(status=Refusal.BUSY, message="submit 3 is still running; one runs at a time")
 
 

@@ -15,7 +15,7 @@ from rigs.finished_run import finished
 from rigs.store_rows import blob
 
 from evopolicy_common.catalogue import worlds
-from evopolicy_common.errors import ProtocolError, RefusedError
+from evopolicy_common.errors import ConfigError, ProtocolError, RefusedError
 from evopolicy_common.messages import gateway, operator, worker
 from evopolicy_common.messages.environment import Case
 from evopolicy_common.messages.episode import BlobRef, EpisodeOutcome, PolicyFailure, ResourceLimits
@@ -24,23 +24,24 @@ from evopolicy_common.messages.status import StatusRequest
 from evopolicy_common.messages.worker import Message
 from evopolicy_common.records.blobs import BlobStore
 from evopolicy_common.wire import codec, keys
-from evopolicy_coordinator.core.contract.records import RunRow
+from evopolicy_coordinator.core.contract.records import FinishedRow, JournalRow, RunRow
+from evopolicy_coordinator.pki.machines import Machines
 from evopolicy_coordinator.server import request_checks
+from evopolicy_coordinator.server.definitions import Definitions
+from evopolicy_coordinator.server.reader import ServiceReader
 from evopolicy_coordinator.server.request_parser import REQUESTS, RequestParser
+from evopolicy_coordinator.server.run_requests import RunRequests
 from evopolicy_coordinator.server.uploads import Uploads
 from evopolicy_coordinator.splits import SplitSource
 from evopolicy_coordinator.storage.state_folder import ROLES, Identity
+from evopolicy_coordinator.storage.store import Store
 
 IDENTITY = Identity(
     cluster="c", passwords=dict.fromkeys(ROLES, "p"), worker_token="join", operator_token="operate"
 )
 
 
-class OneRun:
-    """Rights of a coordinator that has the run `r`."""
-
-    def capability(self, run: str) -> str | None:
-        return "capable" if run == "r" else None
+CAPABILITIES = {"r": "capable"}
 
 
 @pytest.fixture
@@ -54,21 +55,25 @@ def uploads() -> Uploads:
 
 
 @pytest.fixture
-def parser(blobs: BlobStore, uploads: Uploads) -> RequestParser:
-    return make_parser(blobs, uploads)
+def parser(tmp_path: Path, blobs: BlobStore, uploads: Uploads) -> RequestParser:
+    return make_parser(tmp_path, blobs, uploads)
 
 
-def make_parser(blobs: BlobStore, uploads: Uploads | None = None) -> RequestParser:
-    source = SplitSource(data=None, secret=b"s" * 32)
-    return RequestParser(
-        *(IDENTITY, blobs, source, uploads or Uploads()),
-        allowed_imports=("numpy",),
-        denied_imports=("gymnasium",),
+def make_parser(
+    state: Path, blobs: BlobStore | None = None, uploads: Uploads | None = None, data: Path | None = None
+) -> RequestParser:
+    source, blobs, uploads = (
+        SplitSource(data=data, secret=b"s" * 32),
+        blobs or BlobStore(state),
+        uploads or Uploads(),
     )
+    reader = ServiceReader(state / "db", blobs, uploads)
+    runs = RunRequests(reader, blobs, source, allowed_imports=("numpy",), denied_imports=("gymnasium",))
+    return RequestParser(IDENTITY, blobs, uploads, runs, Machines(state), Definitions())
 
 
 def event(parser: RequestParser, key: str, message: Message) -> Any:
-    return parser.event(parser.parse(key, codec.encode(message), OneRun()), 7, "stimulus")
+    return parser.event(parser.parse(key, codec.encode(message), CAPABILITIES.get), 7, "stimulus")
 
 
 def refused(parser: RequestParser, key: str, message: Message) -> RefusedError:
@@ -328,7 +333,7 @@ def test_wrong_registration_is_refused(parser: RequestParser, changes: dict[str,
 def test_waits_and_cursors_become_numbers_that_can_be_worked_with(
     tmp_path_factory: pytest.TempPathFactory, wait: float, cursor: int
 ) -> None:
-    parser = make_parser(BlobStore(tmp_path_factory.getbasetemp()))
+    parser = make_parser(tmp_path_factory.getbasetemp())
     message = gateway.ResultsRequest(run="r", token="capable", submit_index=0, cursor=cursor, wait_s=wait)
     made = event(parser, keys.gateway_key("c", "r", "results"), message)
     assert 0 <= made.message.wait_s <= 60
@@ -355,16 +360,16 @@ def test_submit_index_that_cannot_be_is_unknown(parser: RequestParser, index: in
 )
 def test_message_on_a_wrong_key_is_refused(parser: RequestParser, key: str) -> None:
     with pytest.raises((RefusedError, ProtocolError)):
-        parser.parse(key, codec.encode(submit()), OneRun())
+        parser.parse(key, codec.encode(submit()), CAPABILITIES.get)
 
 
 @given(payload=st.binary(max_size=200), room=st.sampled_from(["work/lease", "gw/r/submit", "ops/any"]))
 def test_any_bytes_are_refused_without_a_stumble(
     tmp_path_factory: pytest.TempPathFactory, payload: bytes, room: str
 ) -> None:
-    parser = make_parser(BlobStore(tmp_path_factory.getbasetemp()))
+    parser = make_parser(tmp_path_factory.getbasetemp())
     with pytest.raises((RefusedError, ProtocolError)):
-        parser.parse(f"evopolicy/v1/c/{room}", payload, OneRun())
+        parser.parse(f"evopolicy/v1/c/{room}", payload, CAPABILITIES.get)
 
 
 def test_only_what_makes_something_new_asks_for_change(parser: RequestParser) -> None:
@@ -399,10 +404,9 @@ def published_tree(root: Path, n_train: int) -> Path:
     return root
 
 
-def test_profile_published_plays_published_files_or_not_at_all(blobs: BlobStore, tmp_path: Path) -> None:
+def test_profile_published_plays_published_files_or_not_at_all(tmp_path: Path) -> None:
     def at(data: Path | None) -> RequestParser:
-        source = SplitSource(data=data, secret=b"s" * 32)
-        return RequestParser(IDENTITY, blobs, source, Uploads(), allowed_imports=(), denied_imports=())
+        return make_parser(tmp_path, data=data)
 
     published = {**PUBLISHED, "profile": "published", "n_validation": 16, "n_heldout": 32}
     whole = at(published_tree(tmp_path / "whole", 1024))
@@ -420,8 +424,11 @@ def test_profile_published_plays_published_files_or_not_at_all(blobs: BlobStore,
     assert (len(made.row.validation), len(made.row.heldout)) == (64, 256)
 
 
-def finished_pair(parser: RequestParser, **settings: Any) -> tuple[RunRow, operator.RunFinished]:
+def finished_pair(
+    parser: RequestParser, blobs: BlobStore, **settings: Any
+) -> tuple[RunRow, operator.RunFinished]:
     """A run with one ok submit, whose policy is stored."""
+    blobs.put(b"policy")
     row = event(parser, OPS, create(n_validation=2, n_heldout=3, **settings)).row
     submit = finished().submits[0]
     submits = (
@@ -431,26 +438,27 @@ def finished_pair(parser: RequestParser, **settings: Any) -> tuple[RunRow, opera
     return row, finished(run=row.run, submits=submits)
 
 
-def test_a_rescore_takes_all_but_its_cases_from_the_run(blobs: BlobStore, parser: RequestParser) -> None:
-    ref = blob(b"policy")
-    blobs.put(b"policy")
-    row, result = finished_pair(parser)
+def test_a_rescore_takes_all_but_its_cases_from_the_run(
+    tmp_path: Path, blobs: BlobStore, parser: RequestParser
+) -> None:
+    ref, store = blob(b"policy"), Store(tmp_path / "db")
+    row, result = finished_pair(parser, blobs)
+    store.write([row, FinishedRow(run=row.run, result=result)])
     wanted = operator.FurtherCasesRequest(token="operate", run=row.run, name="more", n=4)
-    found = parser.further_cases(wanted, row, frozenset())
-    assert (
-        len({case.seed for case in (*row.train, *row.validation, *row.heldout, *found.cases)})
-        == 64 + 2 + 3 + 4
-    )
-    assert parser.further_cases(wanted, row, frozenset()) == found
+    found = parser.runs.further_cases(wanted)
+    seeds = {case.seed for case in (*row.train, *row.validation, *row.heldout, *found.cases)}
+    assert len(seeds) == 64 + 2 + 3 + 4
+    assert parser.runs.further_cases(wanted) == found
     other = msgspec.structs.replace(wanted, name="others")
-    assert parser.further_cases(other, row, frozenset()).cases != found.cases
-    with pytest.raises(RefusedError, match="epoch new"):
-        parser.further_cases(wanted, row, frozenset({found.epoch}))
+    assert parser.runs.further_cases(other).cases != found.cases
+    store.write([JournalRow(seq=0, head="", entry=b"", reveals=found.epoch)])
+    with pytest.raises(RefusedError, match=f"epoch new --state {tmp_path}`"):
+        parser.runs.further_cases(wanted)
 
     message = operator.Rescore(
         token="operate", key="k", run=row.run, submit_index=0, cases=found.cases, indexes=(1, 3)
     )
-    made = parser.rescore_requested(message, 7, "s", row, result).row  # type: ignore[attr-defined]
+    made = parser.runs.rescore(message, row, result)
     assert (made.bundle, made.split, made.secret, made.record) == (
         ref.digest,
         "heldout",
@@ -463,9 +471,9 @@ def test_a_rescore_takes_all_but_its_cases_from_the_run(blobs: BlobStore, parser
     assert made.as_in.modulo == len(result.submits[0].env_instances)
 
     def refused_for(**changes: Any) -> str:
-        with pytest.raises(RefusedError) as caught:
-            parser.rescore_requested(msgspec.structs.replace(message, **changes), 7, "s", row, result)
-        return caught.value.message
+        with pytest.raises((RefusedError, ConfigError)) as caught:
+            parser.runs.rescore(msgspec.structs.replace(message, **changes), row, result)
+        return str(caught.value)
 
     assert "not disjoint" in refused_for(cases=(*found.cases[:3], row.train[5]))
     assert "not disjoint" in refused_for(cases=(*found.cases[:3], found.cases[0]))
@@ -478,8 +486,7 @@ def test_a_rescore_takes_all_but_its_cases_from_the_run(blobs: BlobStore, parser
 @pytest.mark.parametrize("wrong", ["ab", "bb", "a-", "--"])
 def test_a_rescore_of_a_world_keeps_the_runs_key(blobs: BlobStore, parser: RequestParser, wrong: str) -> None:
     """A letter stands for a case with that key, `-` for one without."""
-    blobs.put(b"policy")
-    row, result = finished_pair(parser, env="gym/acrobot@w1")
+    row, result = finished_pair(parser, blobs, env="gym/acrobot@w1")
 
     def cases(letters: str, first_seed: int) -> tuple[Case, ...]:
         given = [None if letter == "-" else {worlds.OPTION: letter * 32} for letter in letters]
@@ -489,23 +496,22 @@ def test_a_rescore_of_a_world_keeps_the_runs_key(blobs: BlobStore, parser: Reque
     message = operator.Rescore(
         token="operate", key="k", run=row.run, submit_index=0, cases=cases("aa", 7), indexes=(0, 1)
     )
-    parser.rescore_requested(message, 7, "s", row, result)
-    with pytest.raises(RefusedError, match=f"another world than run {row.run}"):
-        parser.rescore_requested(msgspec.structs.replace(message, cases=cases(wrong, 7)), 7, "s", row, result)
+    parser.runs.rescore(message, row, result)
+    with pytest.raises(ConfigError, match=f"another world than run {row.run}"):
+        parser.runs.rescore(msgspec.structs.replace(message, cases=cases(wrong, 7)), row, result)
 
 
 def test_a_rescore_by_policies_of_whole_submits_plays_all_cases_at_once(
     blobs: BlobStore, parser: RequestParser
 ) -> None:
-    blobs.put(b"policy")
-    row, result = finished_pair(parser, policy_scope="submit")
+    row, result = finished_pair(parser, blobs, policy_scope="submit")
     cases = tuple(Case(seed=seed) for seed in range(3))
     message = operator.Rescore(
         token="operate", key="k", run=row.run, submit_index=0, cases=cases, indexes=(0, 1)
     )
     with pytest.raises(RefusedError, match="all cases are played at once"):
-        parser.rescore_requested(message, 7, "s", row, result)
-    parser.rescore_requested(msgspec.structs.replace(message, indexes=(0, 1, 2)), 7, "s", row, result)
+        parser.runs.rescore(message, row, result)
+    parser.runs.rescore(msgspec.structs.replace(message, indexes=(0, 1, 2)), row, result)
 
 
 def test_every_kind_of_request_has_one_row() -> None:

@@ -49,7 +49,7 @@ class World:
     def hold(self) -> None:
         """The writer's thread waits until the gate opens."""
         self.gate.clear()
-        self.writer.submit(lambda store: self.gate.wait(10), lambda _: None, self.failures.append)
+        self.writer.call(lambda store: self.gate.wait(10))
 
     async def settle(self) -> None:
         while not self.outbox.idle and not self.failures:

@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
-from evopolicy_coordinator.core.structures.faults import InvariantError
+from evopolicy_coordinator.core.contract.reasons import REFUSALS
+from evopolicy_coordinator.core.structures import InvariantError
 from evopolicy_coordinator.core.structures.ledger import Ledger, refusal
 
 GRANTED = 40
@@ -67,7 +68,7 @@ def test_a_request_is_refused_exactly_when_it_breaks_a_bound(ids: list[int], ava
     fits = 2 <= len(ids) <= min(8, available)
     assert (refused is None) == (inside and fits)
     if refused is not None:
-        assert refused[0] == ("budget_invalid" if inside else "invalid_env_instance")
+        assert REFUSALS[refused.code] == ("budget_invalid" if inside else "invalid_env_instance")
 
 
 def test_a_budget_that_does_not_add_up_is_a_bug() -> None:
