@@ -15,7 +15,6 @@ import sys
 import time
 import tracemalloc
 from collections import deque
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -43,22 +42,6 @@ SLOTS = 2
 EPISODE_S = 2.0
 """Simulated; long enough that leases are granted one by one, the most expensive case."""
 BEAT_S = 2.0
-
-
-@dataclass
-class Row:
-    """One line of the table."""
-
-    workers: int
-    jobs: int
-    cpu_us_per_job: float
-    events_per_job: float
-    longest_ms: float
-    """Longest processing time of one event."""
-    kib_early: float
-    """Memory after two fifths of the second pass."""
-    kib_late: float
-    """Memory at its end."""
 
 
 class Load:
@@ -102,9 +85,13 @@ class Load:
             elif isinstance(effect, ReadResults):
                 self._accepted[int(effect.request)] = 1
 
-    def request(self) -> int:
+    def _ask(self, kind: type[wire.Message], **fields: Any) -> int:
         self._requests += 1
+        self.tell(asked(kind, request=self._requests, **fields))
         return self._requests
+
+    def _ask_as(self, worker: int, kind: type[wire.Message], **fields: Any) -> None:
+        self._ask(kind, worker=self._names[worker], session=self._sessions[worker], **fields)
 
     # ---- clients ----
 
@@ -117,19 +104,8 @@ class Load:
         )
         fingerprint = wire.Fingerprint(code_version="1", python="3", packages={}, cpu="")
         for index, name in enumerate(self._names):
-            self.tell(
-                asked(
-                    wire.Register,
-                    request=self.request(),
-                    worker=name,
-                    session=self._sessions[index],
-                    slots=SLOTS,
-                    tiers=("bwrap",),
-                    environments=descriptions,
-                    fingerprint=fingerprint,
-                    boot_id=f"kernel-of-{name}",
-                )
-            )
+            offered = {"tiers": ("bwrap",), "environments": descriptions, "fingerprint": fingerprint}
+            self._ask_as(index, wire.Register, slots=SLOTS, boot_id=f"kernel-of-{name}", **offered)
         for _ in range(self._runs):
             self._create()
         for index in range(len(self._names)):
@@ -141,97 +117,51 @@ class Load:
         run = f"run-{self._created}"
         # The first runs are staggered, so that at any time about as many runs train as are scored.
         self._submitted[run] = self._created % SUBMITS if self._created <= self._runs else 0
-        self.tell(
-            asked(
-                operator.CreateRun,
-                request=self.request(),
-                run=run,
-                key=f"key-{run}",
-                capability="c",
-                secret=b"s" * 32,
-                settings=RunSettings(env=ENVS[self._created % len(ENVS)], entry="e", model="m", exp_id="x"),
-                budget=SUBMITS * EPISODES,
-                min_episodes_per_submit=1,
-                max_episodes_per_submit=EPISODES,
-                train=tuple(Case(seed=seed) for seed in range(EPISODES)),
-                validation=tuple(Case(seed=900 + seed) for seed in range(16)),
-                heldout=tuple(Case(seed=950 + seed) for seed in range(32)),
-                split_hashes={},
-                split_secret=True,
-            )
+        self._ask(
+            operator.CreateRun,
+            run=run,
+            key=f"key-{run}",
+            capability="c",
+            secret=b"s" * 32,
+            settings=RunSettings(env=ENVS[self._created % len(ENVS)], entry="e", model="m", exp_id="x"),
+            budget=SUBMITS * EPISODES,
+            min_episodes_per_submit=1,
+            max_episodes_per_submit=EPISODES,
+            train=tuple(Case(seed=seed) for seed in range(EPISODES)),
+            validation=tuple(Case(seed=900 + seed) for seed in range(16)),
+            heldout=tuple(Case(seed=950 + seed) for seed in range(32)),
+            split_hashes={},
+            split_secret=True,
         )
-        self.tell(asked(gateway.RequestPermit, request=self.request(), run=run, boot_id=f"agent-of-{run}"))
+        self._ask(gateway.RequestPermit, run=run, boot_id=f"agent-of-{run}")
         self._submit(run)
 
     def _submit(self, run: str) -> None:
         index = self._submitted[run]
         self._submitted[run] = index + 1
-        self.tell(
-            asked(
-                gateway.Submit,
-                request=self.request(),
-                run=run,
-                key=f"submit-{index}",
-                env_instances=tuple(range(EPISODES)),
-                bundle=f"{run}-{index}",
-            )
-        )
+        played = {"env_instances": tuple(range(EPISODES)), "bundle": f"{run}-{index}"}
+        self._ask(gateway.Submit, run=run, key=f"submit-{index}", **played)
 
     def _poll(self, worker: int) -> None:
-        request = self.request()
-        self._polls[request] = worker
-        self.tell(
-            asked(
-                wire.LeaseRequest,
-                request=request,
-                worker=self._names[worker],
-                session=self._sessions[worker],
-                n=SLOTS,
-                wait_s=30.0,
-            )
-        )
+        self._polls[self._requests + 1] = worker
+        self._ask_as(worker, wire.LeaseRequest, n=SLOTS, wait_s=30.0)
 
     def _beat(self, worker: int) -> None:
-        held = tuple(self._held[worker].values())
-        self.tell(
-            asked(
-                wire.Heartbeat,
-                request=self.request(),
-                worker=self._names[worker],
-                session=self._sessions[worker],
-                held=held,
-            )
-        )
+        self._ask_as(worker, wire.Heartbeat, held=tuple(self._held[worker].values()))
 
     def _report_results(self, worker: int, lease: wire.Lease) -> None:
         self._held[worker].pop(lease.lease_id, None)
-        outcomes = tuple(
-            EpisodeOutcome(
-                index=spec.index,
-                episode_return=1.0,
-                length=1,
-                terminated=True,
-                truncated=False,
-                wall_s=EPISODE_S,
-            )
-            for spec in lease.job.episodes
-        )
-        result = wire.JobResult(
-            lease_id=lease.lease_id,
-            job_id=lease.job.job_id,
-            attempt=lease.attempt,
-            kind="done",
-            episodes=outcomes,
-        )
-        self.tell(
-            asked(
-                wire.ReportResults,
-                request=self.request(),
-                worker=self._names[worker],
-                session=self._sessions[worker],
-                results=(result,),
-            )
-        )
+        ended = {
+            "episode_return": 1.0,
+            "length": 1,
+            "terminated": True,
+            "truncated": False,
+            "wall_s": EPISODE_S,
+        }
+        outcomes = tuple(EpisodeOutcome(index=spec.index, **ended) for spec in lease.job.episodes)
+        named = {"lease_id": lease.lease_id, "job_id": lease.job.job_id, "attempt": lease.attempt}
+        result = wire.JobResult(kind="done", episodes=outcomes, **named)
+        self._ask_as(worker, wire.ReportResults, results=(result,))
         self.done += 1
         run, _, rest = lease.job.job_id.partition("/")
         group = f"{run}/{rest.rpartition('/')[0]}"
@@ -246,7 +176,7 @@ class Load:
         if self._submitted[run] < SUBMITS:
             self._submit(run)
         else:
-            self.tell(asked(gateway.CloseRun, request=self.request(), run=run, reason="budget_spent"))
+            self._ask(gateway.CloseRun, run=run, reason="budget_spent")
 
     def run(self) -> None:
         """Run until `jobs` jobs are done, train and hidden; each worker sends a heartbeat every `BEAT_S`
@@ -285,36 +215,10 @@ class Load:
                     gc.collect()
                     self.memory.append(tracemalloc.get_traced_memory()[0])
             elif not self._ready:
-                times = [next_beat]
-                if playing:
-                    times.append(playing[0][0])
-                due = self.core.next_deadline()
-                if due is not None:
-                    times.append(due)
-                self.now = max(self.now, min(times))
+                times = (next_beat, playing[0][0] if playing else None, self.core.next_deadline())
+                self.now = max(self.now, min(at for at in times if at is not None))
         if self._measure:
             tracemalloc.stop()
-
-
-def measure(workers: int, jobs: int) -> Row:
-    """One row: CPU time in one pass, memory in another, since tracing memory is slow."""
-    load = Load(workers, jobs, memory=False)
-    load.start()
-    gc.collect()
-    load.run()
-    watched = Load(workers, jobs, memory=True)
-    watched.start()
-    watched.run()
-    early, late = watched.memory
-    return Row(
-        workers=workers,
-        jobs=load.done,
-        cpu_us_per_job=1e6 * load.cpu_s / load.done,
-        events_per_job=load.handled / load.done,
-        longest_ms=1e3 * load.longest_s,
-        kib_early=early / 1024,
-        kib_late=late / 1024,
-    )
 
 
 def main() -> int:
@@ -323,16 +227,21 @@ def main() -> int:
     parser.add_argument("--workers", default="10,100,1000,2000", help="fleets to try (10,100,1000,2000)")
     options = parser.parse_args()
     print("workers    jobs  core µs/job  events/job  longest event ms  memory early KiB  late KiB")
-    rows = []
+    costs = []
     for workers in [int(each) for each in options.workers.split(",")]:
-        row = measure(workers, options.jobs)
-        rows.append(row)
+        # CPU time in one pass, memory in another, since tracing memory is slow.
+        load, watched = (Load(workers, options.jobs, memory=memory) for memory in (False, True))
+        for each in (load, watched):
+            each.start()
+            gc.collect()
+            each.run()
+        costs.append(1e6 * load.cpu_s / load.done)
+        early, late = (size / 1024 for size in watched.memory)
         print(
-            f"{row.workers:7d} {row.jobs:7d} {row.cpu_us_per_job:12.1f} {row.events_per_job:11.2f} "
-            f"{row.longest_ms:17.2f} {row.kib_early:17.0f} {row.kib_late:9.0f}",
+            f"{workers:7d} {load.done:7d} {costs[-1]:12.1f} {load.handled / load.done:11.2f} "
+            f"{1e3 * load.longest_s:17.2f} {early:17.0f} {late:9.0f}",
             flush=True,
         )
-    costs = [row.cpu_us_per_job for row in rows]
     print(f"dearest / cheapest per job: {max(costs) / min(costs):.2f} (wanted: at most 1.5)")
     return 0 if max(costs) <= 1.5 * min(costs) else 1
 

@@ -34,6 +34,8 @@ class Bug:
     name: str
     old: str
     new: str
+    seed: int = 0
+    """To try first, for a bug that few seeds detect. After a change of the core other seeds may detect it."""
 
 
 @contextmanager
@@ -83,23 +85,25 @@ BUGS = (
         "live = lease is not None and lease.live and job.lease is lease",
         "live = True",
     ),
-    Bug("count late limit verdicts", results, "_done", "if silent and", "if False and"),
-    Bug(
-        "keep a job open when it is done",
-        results,
-        "_commit",
-        "groups.close_job(state, job, step)",
-        "pass",
-    ),
+    Bug("count late limit verdicts", results, "_done", "if silent and", "if False and", seed=332),
+    Bug("keep a job open when it is done", results, "_commit", "groups.close_job(state, job, step)", "pass"),
     Bug("answer for outcomes that were not stored", results, "_commit", "step.persist(row)", "pass"),
     Bug("count attempts from one after a restart", State, "__init__", "(incarnation - 1) *", "0 *"),
-    Bug("show episodes before the gate", result_polls, "_released", "if 0 in group.digests", "if True"),
+    Bug(
+        "show episodes before the gate",
+        result_polls,
+        "_released",
+        "if 0 in group.digests",
+        "if True",
+        seed=15,
+    ),
     Bug(
         "let ties go to the earlier submit",
         finished,
         "select",
         "best_validated(means, run.row.settings.profile)",
         "max(means, key=lambda index: (means[index], -index), default=None)",
+        seed=68,
     ),
     Bug("select before all are validated", finalisation, "advance", "if waiting:", "if False:"),
     Bug(
@@ -108,17 +112,19 @@ BUGS = (
         "_run",
         "run.keys[row.key] = row.submit_index",
         "pass",
+        seed=49,
     ),
     Bug("take a second submit while one runs", submits, "submit", "if run.open is not None:", "if False:"),
-    Bug("take submits of a closed run", submits, "submit", 'run.state.phase != "open"', "False"),
+    Bug("take submits of a closed run", submits, "submit", 'run.state.phase != "open"', "False", seed=47),
     Bug("accept the same key twice", submits, "submit", "known is not None", "False"),
-    Bug("never preempt", scheduler, "dispatch", "if lane.n_ready[TRAIN]:", "if False:"),
+    Bug("never preempt", scheduler, "dispatch", "if lane.n_ready[TRAIN]:", "if False:", seed=8),
     Bug(
         "forget the hidden jobs that train jobs wait behind",
         leases,
         "_check_again",
         "if lane.n_ready[TRAIN]:",
         "if False:",
+        seed=25,
     ),
     Bug(
         "lease to a poll that was given up unread",
@@ -126,6 +132,7 @@ BUGS = (
         "poll",
         "event.waited_s > message.wait_s + state.settings.late_s",
         "False",
+        seed=150,
     ),
     Bug(
         "leave runs unpinned when a lost worker is back", membership, "worker_of", "if was_lost:", "if False:"
@@ -136,6 +143,7 @@ BUGS = (
         "worker_state",
         "pins.pin_waiting(state, worker, step)",
         "pass",
+        seed=15,
     ),
     Bug("let a lease expire under heartbeats", leases, "hear", "lease.renewed = now", "pass"),
     Bug(
@@ -144,6 +152,7 @@ BUGS = (
         "liveness_lost",
         "worker.doubted_at = step.now",
         "__import__('evopolicy_coordinator.core.leasing.expiry', fromlist=['lose']).lose(state, worker, step)",
+        seed=14,
     ),
     Bug(
         "expire leases after the loop stood still",
@@ -151,6 +160,7 @@ BUGS = (
         "_watch",
         "now - due > state.settings.late_s",
         "False",
+        seed=121,
     ),
     Bug(
         "play what is done again after a restart",
@@ -167,18 +177,23 @@ BUGS = (
         '"active"',
     ),
     Bug("mix fingerprint classes", Profile, "serves", "and fingerprint_class == self.classes[env]", ""),
-    Bug("adopt a job that is leased elsewhere", leases, "_adopt", "or job.lease is not None", ""),
-    Bug("forget to tell a worker to stop", leases, "hear", "stop.append(item.lease_id)", "pass"),
-    Bug("leave a lost worker's leases with it", expiry, "_take_all", "list(worker.leases.values())", "[]"),
+    Bug("adopt a job that is leased elsewhere", leases, "_adopt", "or job.lease is not None", "", seed=60),
+    Bug("forget to tell a worker to stop", leases, "hear", "stop.append(item.lease_id)", "pass", seed=13),
+    Bug(
+        "leave a lost worker's leases with it",
+        expiry,
+        "_take_all",
+        "list(worker.leases.values())",
+        "[]",
+        seed=26,
+    ),
     Bug("refuse a worker that comes back", fleet, "of_session", 'if worker.state == "lost":', "if False:"),
     Bug("let a worker audit itself", JobGroup, "excludes", "worker.name in self.not_on or", ""),
-    Bug("forget at a restart what is to be audited", audits, "resume", 'row.state != "open"', "True"),
     Bug(
-        "wait for audits that nobody can play",
-        finalisation,
-        "check_audits",
-        "if run is not None",
-        "if False",
+        "forget at a restart what is to be audited", audits, "resume", 'row.state != "open"', "True", seed=16
+    ),
+    Bug(
+        "wait for audits that nobody can play", finalisation, "check_audits", "if run is not None", "if False"
     ),
     Bug(
         "call a forger who one other contradicts",
@@ -193,6 +208,7 @@ BUGS = (
         "set_state",
         "state.quarantined[name] = reason",
         "pass",
+        seed=68,
     ),
     Bug(
         "play hidden episodes beside an agent",
@@ -214,6 +230,7 @@ BUGS = (
         "train_conflict",
         "if related(kernel.hidden, case_set) or related(state.everywhere.hidden, case_set):",
         "if False:",
+        seed=12,
     ),
     Bug(
         "play hidden episodes on a kernel that is not known",
@@ -235,23 +252,26 @@ BUGS = (
         "permit_conflict",
         "if not occupancies:",
         "if not any(occupancy.lease is not None and occupancy.lease.live for occupancy in occupancies):",
+        seed=19,
     ),
     Bug("take siblings for strangers", CaseSets, "join", "(env, case.seed,", "(len(self._known), case.seed,"),
-    Bug("forget permits at a restart", permits, "load", "row.ended_at is not None", "True"),
+    Bug("forget permits at a restart", permits, "load", "row.ended_at is not None", "True", seed=13),
     Bug(
         "take a lease on its way for one that was let go of",
         occupancies,
         "surely",
         "if settled == 0:",
         "if True:",
+        seed=200,
     ),
-    Bug("forget what a silent worker may still play", occupancies, "vacate", "if sure:", "if True:"),
+    Bug("forget what a silent worker may still play", occupancies, "vacate", "if sure:", "if True:", seed=19),
     Bug(
         "take all kernels for free after a restart",
         occupancies,
         "load",
         "for hidden in (True, False):",
         "for hidden in ():",
+        seed=107,
     ),
     Bug("keep a closed run's permit", finalisation, "close", "permits.end(", "(lambda *_: None)("),
     Bug(
@@ -281,6 +301,7 @@ BUGS = (
         "put_off",
         "job.group.template.bundle is None",
         "True",
+        seed=68,
     ),
     Bug("keep what was handed back in memory only", results, "_keep_begun", "step.persist(", "str("),
     Bug(
@@ -300,6 +321,7 @@ BUGS = (
         " [permits._end(state, there, row, step, '') for each in list(state.permits)"
         " for there, row in permits.held(state, each)"
         " if row.host == message.host and row.boot_id != message.boot_id]",
+        seed=9,
     ),
     Bug(
         "end permits when a worker names another kernel of their machine",
@@ -311,6 +333,7 @@ BUGS = (
         " [permits._end(state, there, row, step, '') for each in list(state.permits)"
         " for there, row in permits.held(state, each)"
         " if row.host == worker.host and row.boot_id != message.boot_id]",
+        seed=19,
     ),
     Bug(
         "let a worker free the kernel of another of its name",
@@ -318,6 +341,7 @@ BUGS = (
         "surely",
         "(occupancy.kernel, occupancy.machine) != (worker.kernel, worker.machine)",
         "False",
+        seed=19,
     ),
     Bug(
         "let an agent keep others waiting for ever",
@@ -325,6 +349,7 @@ BUGS = (
         "_hidden",
         "_end_overdue(state, reversal, step)",
         "pass",
+        seed=25,
     ),
     Bug(
         "cancel a run that keeps others waiting at once",
@@ -332,6 +357,7 @@ BUGS = (
         "_end_overdue",
         ">= state.settings.agent_wait_s",
         ">= 0.0",
+        seed=9,
     ),
     Bug(
         "believe in kernels on which nobody works",
@@ -339,6 +365,7 @@ BUGS = (
         "_hidden",
         "_at_work(state, kernel)",
         "True",
+        seed=25,
     ),
     Bug("draw episodes anew at a restart", audits, "sample", "run.row.audit_share", "0.5"),
 )

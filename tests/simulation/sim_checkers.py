@@ -49,7 +49,7 @@ class ViolationError(AssertionError):
     """A checked property does not hold."""
 
 
-def want(holds: bool, what: str, *about: Any) -> None:
+def want(holds: object, what: str, *about: Any) -> None:
     if not holds:
         raise ViolationError(f"{what}: {'; '.join(str(each)[:600] for each in about)}")
 
@@ -124,12 +124,7 @@ class Checkers:
         want(row.index not in group, "an episode is committed once", row)
         want(row.seq == len(group) + arrived, "arrivals are numbered one by one", row, len(group), arrived)
         granted = self._granted_to.get((row.job_id, row.attempt))
-        want(
-            granted is not None and granted[0] == row.worker,
-            "what is committed was leased to its player",
-            row,
-            granted,
-        )
+        want(granted and granted[0] == row.worker, "outcomes come from the leased player", row, granted)
         if "/audit-" in row.group:
             return
         parts = row.group.split("/")
@@ -163,21 +158,13 @@ class Checkers:
         else:
             want(old.status in (None, row.status), "a verdict is final", old, row)
             want(
-                (old.key, old.env_instances) == (row.key, row.env_instances),
-                "a submit stays what it was",
-                old,
-                row,
+                (old.key, old.env_instances) == (row.key, row.env_instances), "a submit is constant", old, row
             )
         if row.status == "ok":
             group = train_group(row.run, row.submit_index)
             new = {each.index for each in rows if isinstance(each, OutcomeRow) and each.group == group}
             have = new | set(self._disk.outcomes.get(group, {}))
-            want(
-                have == set(range(len(row.env_instances))),
-                "an ok submit has all its outcomes",
-                row,
-                sorted(have),
-            )
+            want(have == set(range(len(row.env_instances))), "an ok submit is complete", row, sorted(have))
 
     # ---- requests and answers ----
 
@@ -203,7 +190,10 @@ class Checkers:
             ]
             gone = message.status in ("run_finished", "run_closed")
             want(
-                gone or (message.status == "busy") == bool(running), "one submit at a time", message, running
+                gone or (message.status == "busy") == bool(running),
+                "submits do not overlap",
+                message,
+                running,
             )
         elif isinstance(message, operator.RunCreated):
             want(message.run in disk.runs, "a created run is durable", message)
@@ -273,12 +263,7 @@ class Checkers:
         run = group.split("/")[0]
         pin = disk.states[run].fingerprint_class
         mine = None if core is None else core.state.workers[worker].profile.classes[job.env]
-        want(
-            mine in (None, pin),
-            "a run's episodes are played by its fingerprint class",
-            worker,
-            lease.lease_id,
-        )
+        want(mine in (None, pin), "a run is played by its fingerprint class", worker, lease.lease_id)
 
     def _thrown_once(self, lease: wire.Lease) -> None:
         """A hidden episode resumes from the actions that its policy had returned, unless its worker
@@ -302,9 +287,7 @@ class Checkers:
             for lease_id in [*(each.lease_id for each in reported if each.begun != job.begun), *played]:
                 known = self._granted[lease_id][1] == self._disk.incarnation
                 heard = now - last <= HEARD_S and since < self._granted_at[lease_id]
-                want(
-                    not (known and heard), "no dice are thrown while a worker can hand back", lease, lease_id
-                )
+                want(not (known and heard), "a hidden episode is played once", lease, lease_id)
 
     def refused(self, message: Any) -> None:
         """Check the reply to a submit that must be refused."""
@@ -322,27 +305,13 @@ class Checkers:
         if plan.cancel_at is not None:
             return
         expected = self._expected[plan.name].submits[index]
-        want(
-            done.status == expected.status,
-            "a verdict is what it must be",
-            plan.name,
-            index,
-            done,
-            expected.status,
-        )
+        want(done.status == expected.status, "a verdict is right", plan.name, index, done, expected.status)
         indexes = [row.index for row in rows]
         want(len(set(indexes)) == len(indexes), "an episode is shown once", indexes)
         if expected.status == "ok":
             seen = {row.index: row.outcome.episode_return for row in rows}
             wanted = {place: each.episode_return for place, each in enumerate(expected.episodes)}
-            want(
-                seen == wanted,
-                "a gateway sees each episode as without faults",
-                plan.name,
-                index,
-                seen,
-                wanted,
-            )
+            want(seen == wanted, "a gateway sees the right episodes", plan.name, index, seen, wanted)
         if expected.status == "init_error":
             want(not rows, "nothing is shown of a bundle without a Policy", indexes)
 
@@ -363,7 +332,6 @@ class Checkers:
             want(
                 (reported.mean_return, reported.val_mean) == (each.mean, each.val_mean),
                 "means",
-                plan.name,
                 reported,
                 each,
             )
@@ -400,15 +368,9 @@ class Checkers:
         quiet_s = self._simulation.world.now - max(self._moved_at, self._simulation.world.calm_at)
         if quiet_s > QUIET_S:
             status = core.status(self._simulation.world.now, words)
-            want(
-                False, "it goes on", f"nothing was committed for {quiet_s:.0f} s", status.runs, status.stalls
-            )
+            want(False, "it goes on", f"no commit for {quiet_s:.0f} s", status.runs, status.stalls)
         for flow in core.state.unpinned.values():
-            want(
-                fleet.offer(core.state, flow) is None,
-                "a run is unpinned only while nobody could serve it",
-                flow.id,
-            )
+            want(fleet.offer(core.state, flow) is None, "only runs without workers are unpinned", flow.id)
         if self._steps % VALIDATE_EVERY == 0:
             core.validate()
             self._preempted(core)
@@ -445,12 +407,7 @@ class Checkers:
     def playing(self, worker: str, lease: wire.Lease) -> None:
         """A worker starts to play a lease."""
         granted = self._granted.get(lease.lease_id)
-        want(
-            granted is not None and granted[0] == worker,
-            "a worker plays what is leased to it",
-            worker,
-            lease.lease_id,
-        )
+        want(granted and granted[0] == worker, "a worker plays its own leases", worker, lease.lease_id)
 
     # ---- the end ----
 

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
+from rigs.core_rig import key_of
+
 from evopolicy_coordinator.core.contract.records import (
     AuditRow,
     BegunRow,
+    DocumentRow,
     EvaluationRow,
     FinishedRow,
     JournalRow,
     KernelRow,
-    OutcomeHead,
     OutcomeRow,
     PermitRow,
     Row,
@@ -23,6 +25,19 @@ from evopolicy_coordinator.core.contract.records import (
     evaluation_group,
     head_of,
 )
+
+_TABLES: dict[type, str] = {
+    RunRow: "runs",
+    RunStateRow: "states",
+    SubmitRow: "submits",
+    BegunRow: "begun",
+    FinishedRow: "finished",
+    EvaluationRow: "evaluations",
+    WorkerRow: "workers",
+    AuditRow: "audits",
+    PermitRow: "permits",
+    KernelRow: "kernels",
+}
 
 
 class Disk:
@@ -45,32 +60,14 @@ class Disk:
 
     def write(self, rows: Iterable[Row]) -> None:
         for row in rows:
-            match row:
-                case OutcomeRow():
-                    self.outcomes.setdefault(row.group, {})[row.index] = row
-                case SubmitRow():
-                    self.submits[row.run, row.submit_index] = row
-                case RunStateRow():
-                    self.states[row.run] = row
-                case RunRow():
-                    self.runs[row.run] = row
-                case BegunRow():
-                    self.begun[row.group, row.first] = row
-                case EvaluationRow():
-                    self.evaluations[row.evaluation] = row
-                case FinishedRow():
-                    self.finished[row.run] = row
-                case WorkerRow():
-                    self.workers[row.worker] = row
-                case AuditRow():
-                    self.audits[row.audit] = row
-                case PermitRow():
-                    self.permits[row.run, row.boot_id] = row
-                case KernelRow():
-                    self.kernels[row.worker] = row
-                case JournalRow():
-                    assert row.seq == len(self.journal), "the journal has no gaps and is never changed"
-                    self.journal.append(row)
+            if isinstance(row, OutcomeRow):
+                self.outcomes.setdefault(row.group, {})[row.index] = row
+            elif isinstance(row, JournalRow):
+                assert row.seq == len(self.journal), "the journal has no gaps and is never changed"
+                self.journal.append(row)
+            elif not isinstance(row, DocumentRow):
+                _, *key = key_of(row)
+                getattr(self, _TABLES[type(row)])[key[0] if len(key) == 1 else tuple(key)] = row
 
     def outcome(self, group: str, index: int) -> OutcomeRow | None:
         return self.outcomes.get(group, {}).get(index)
@@ -89,8 +86,8 @@ class Disk:
         def wanted(group: str) -> bool:
             return group in groups or group.split("/")[0] in live
 
-        heads: list[OutcomeHead] = [
-            head_of(row) for group, rows in self.outcomes.items() if wanted(group) for row in rows.values()
+        heads = [
+            head_of(row) for group in self.outcomes if wanted(group) for row in self.outcomes[group].values()
         ]
         return Snapshot(
             incarnation=self.incarnation,

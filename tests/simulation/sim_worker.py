@@ -232,12 +232,7 @@ class SimWorker(Asker):
             "wait_s": self.beat_wait_s,
         }
         self.world.send(
-            self.name,
-            self.simulation.coordinator.receive,
-            self.name,
-            wire.Heartbeat,
-            fields,
-            answered,
+            self.name, self.simulation.coordinator.receive, self.name, wire.Heartbeat, fields, answered
         )
 
     def _look_at_silence(self) -> None:

@@ -154,7 +154,9 @@ def check_registration(message: worker.Register) -> None:
     require(valid, Refusal.BAD_MESSAGE, text)
     size = sum(map(len, failed.values()))
     most = worker.REASON_CHARACTERS
-    text = f"the reasons of failed environments have {size:,} characters; {most['environments']:,} are the limit"
+    text = (
+        f"the reasons of failed environments have {size:,} characters; {most['environments']:,} are the limit"
+    )
     require(size <= most["environments"], Refusal.BAD_MESSAGE, text)
     tiers = message.missing_tiers
     require(

@@ -7,6 +7,7 @@ import random
 import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,14 @@ from evopolicy_common.messages.operator import RunCreated, RunFinished
 from evopolicy_common.wire.transport import connect
 
 SUBMITS = (((0, 1, 1, 5), "# one"), ((2, 3), "# two"), ((7, 7, 7, 7, 8, 9), "# three"))
+
+
+@pytest.fixture
+def holder(tmp_path: Path) -> Iterator[list[Coordinator]]:
+    """The coordinator that runs now."""
+    holder = [Coordinator(tmp_path / "state")]
+    yield holder
+    holder[0].kill()
 
 
 async def whole_run(coordinator: Coordinator) -> RunFinished:
@@ -106,15 +115,8 @@ def test_a_run_goes_on_from_a_backup_on_another_machine(tmp_path: Path) -> None:
                 await lost.register()
                 await gateway.submit(bundle_of(SUBMITS[1][1]), SUBMITS[1][0], "submit-1")
                 assert await lost.lease(1, 10.0)
-                program = [
-                    sys.executable,
-                    "-m",
-                    "evopolicy_coordinator.cli",
-                    "backup",
-                    backup,
-                    "--state",
-                    state,
-                ]
+                words = f"-m evopolicy_coordinator.cli backup {backup} --state {state}".split()
+                program = [sys.executable, *words]
                 await asyncio.to_thread(subprocess.run, program, check=True)
             return created
 
@@ -154,9 +156,7 @@ def test_a_run_goes_on_from_a_backup_on_another_machine(tmp_path: Path) -> None:
         third.kill()
 
 
-def test_accepted_submit_survives_kill_before_any_result(tmp_path: Path) -> None:
-    holder = [Coordinator(tmp_path / "state")]
-
+def test_accepted_submit_survives_kill_before_any_result(tmp_path: Path, holder: list[Coordinator]) -> None:
     async def scenario() -> None:
         async with operator_of(holder[0]) as operator:
             created = await operator.create()
@@ -171,15 +171,12 @@ def test_accepted_submit_survives_kill_before_any_result(tmp_path: Path) -> None
                 assert (await gateway.state()).remaining_budget == 14
             assert (await operator.create()) == created
 
-    try:
-        run(scenario, 120)
-    finally:
-        holder[0].kill()
+    run(scenario, 120)
 
 
-def test_results_handed_in_twice_over_a_restart_are_taken_once(tmp_path: Path) -> None:
-    holder = [Coordinator(tmp_path / "state")]
-
+def test_results_handed_in_twice_over_a_restart_are_taken_once(
+    tmp_path: Path, holder: list[Coordinator]
+) -> None:
     async def scenario() -> None:
         async with operator_of(holder[0]) as operator, connect(holder[0].credentials("worker")) as link:
             worker = InstantWorker(link)
@@ -198,15 +195,10 @@ def test_results_handed_in_twice_over_a_restart_are_taken_once(tmp_path: Path) -
                 episodes, _ = await gateway.results(0)
                 assert sorted(episode.index for episode in episodes) == [0, 1]
 
-    try:
-        run(scenario, 120)
-    finally:
-        holder[0].kill()
+    run(scenario, 120)
 
 
-def test_finished_run_is_reported_after_a_restart(tmp_path: Path) -> None:
-    holder = [Coordinator(tmp_path / "state")]
-
+def test_finished_run_is_reported_after_a_restart(tmp_path: Path, holder: list[Coordinator]) -> None:
     async def scenario() -> None:
         async with working(holder[0]):
             finished = await whole_run(holder[0])
@@ -221,10 +213,7 @@ def test_finished_run_is_reported_after_a_restart(tmp_path: Path) -> None:
                 assert (len(episodes), done.status) == (2, "ok")
                 assert (await gateway.state()).is_finalized
 
-    try:
-        run(scenario, 120)
-    finally:
-        holder[0].kill()
+    run(scenario, 120)
 
 
 def test_workers_find_the_same_coordinator_after_an_orderly_restart(tmp_path: Path) -> None:
@@ -252,9 +241,9 @@ def test_workers_find_the_same_coordinator_after_an_orderly_restart(tmp_path: Pa
         holder[0].kill()
 
 
-def test_a_request_under_way_is_answered_by_the_next_coordinator(tmp_path: Path) -> None:
-    holder = [Coordinator(tmp_path / "state")]
-
+def test_a_request_under_way_is_answered_by_the_next_coordinator(
+    tmp_path: Path, holder: list[Coordinator]
+) -> None:
     async def scenario() -> None:
         async with operator_of(holder[0]) as operator:
             created = await operator.create()
@@ -268,7 +257,4 @@ def test_a_request_under_way_is_answered_by_the_next_coordinator(tmp_path: Path)
                 async with working(holder[0]):
                     assert (await waiting).status == "no_ok_submit"
 
-    try:
-        run(scenario, 120)
-    finally:
-        holder[0].kill()
+    run(scenario, 120)

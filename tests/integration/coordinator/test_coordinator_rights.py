@@ -37,6 +37,13 @@ def coordinator(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Coordinato
     coordinator.kill()
 
 
+async def status_of(request: Awaitable[object]) -> str:
+    """The status with which a request is refused."""
+    with pytest.raises(RefusedError) as refused:
+        await request
+    return refused.value.status
+
+
 async def refusal(link: Link, key: str, payload: bytes) -> str:
     reply = codec.decode(codec.gateway_replies, await link.ask(key, payload, 10))
     assert isinstance(reply, Refused), reply
@@ -45,9 +52,7 @@ async def refusal(link: Link, key: str, payload: bytes) -> str:
 
 async def test_wrong_join_token_is_refused(coordinator: Coordinator) -> None:
     async with connect(coordinator.credentials("worker")) as link:
-        with pytest.raises(RefusedError) as refused:
-            await InstantWorker(link).register(token="guess")
-        assert refused.value.status == "bad_token"
+        assert await status_of(InstantWorker(link).register(token="guess")) == "bad_token"
 
 
 async def test_worker_of_another_wire_version_is_told_what_to_do(coordinator: Coordinator) -> None:
@@ -81,17 +86,13 @@ async def test_unknown_session_is_refused_for_every_request_of_a_worker(coordina
                 worker.BlobPut(sender="w-known", token=session, digest="0" * 64, size=1, offset=0, data=b"x"),
             ),
         ):
-            with pytest.raises(RefusedError) as refused:
-                await instant.ask.once(verb, message, worker.Leases)
-            assert refused.value.status == "unknown_worker"
+            assert await status_of(instant.ask.once(verb, message, worker.Leases)) == "unknown_worker"
 
 
 async def test_wrong_operator_token_is_refused(coordinator: Coordinator) -> None:
     async with operator_of(coordinator) as client:
         client.token = "guess"
-        with pytest.raises(RefusedError) as refused:
-            await client.status()
-        assert refused.value.status == "bad_token"
+        assert await status_of(client.status()) == "bad_token"
 
 
 async def test_gateway_of_one_run_can_do_nothing_with_another(coordinator: Coordinator) -> None:
@@ -110,9 +111,7 @@ async def test_gateway_of_one_run_can_do_nothing_with_another(coordinator: Coord
                 lambda: thief.ask.once("blob", worker.BlobPut(**blob, size=1, data=b"x"), worker.BlobAck),
             ]
             for ask in asks:
-                with pytest.raises(RefusedError) as refused:
-                    await ask()
-                assert refused.value.status == "bad_token"
+                assert await status_of(ask()) == "bad_token"
         async with gateway_of(coordinator, other) as owner:
             assert not (await owner.state()).is_finalized
 
@@ -153,9 +152,7 @@ async def test_router_lets_a_role_ask_on_its_own_keys_only(coordinator: Coordina
     async with connect(coordinator.credentials(speaker)) as link:  # type: ignore[arg-type]
         with pytest.raises(TransportError):
             await link.ask(
-                keys.operator_key("local", "status"),
-                codec.encode(StatusRequest(token=operator_token)),
-                3,
+                keys.operator_key("local", "status"), codec.encode(StatusRequest(token=operator_token)), 3
             )
         client = OperatorClient(link)
         client.token = operator_token
@@ -200,27 +197,23 @@ async def test_gateway_fetches_blobs_that_its_own_train_feedback_names_and_no_ot
             await owner.submit(bundle, (0,), "key")
             (lease,) = [lease for lease in await instant.lease(4, 10) if lease.job.record == "full"]
             assert await instant.ask.download(instant.name, instant.session, bundle.digest) == bundle.packed
-            with pytest.raises(RefusedError) as refused:
-                await instant.ask.download(instant.name, instant.session, "1" * 64)
-            assert refused.value.status == "unknown_blob"
+            assert (
+                await status_of(instant.ask.download(instant.name, instant.session, "1" * 64))
+                == "unknown_blob"
+            )
             result = instant.result(lease)
-            with pytest.raises(RefusedError) as refused:
-                await instant.report_results((result,))
-            assert refused.value.status == "missing_blob"
+            assert await status_of(instant.report_results((result,))) == "missing_blob"
             ((digest, data),) = stored.items()
             await instant.ask.upload(instant.name, instant.session, digest, data)
             await instant.report_results((result,))
             ((episode,), _) = await owner.results(0)
             assert episode.trajectory.digest == digest
             assert await owner.ask.download(owner.run, owner.token, digest) == data
-            for client_, wanted in (
-                (stranger, digest),
-                (owner, bundle.digest),
-                (stranger, bundle.digest),
-            ):
-                with pytest.raises(RefusedError) as refused:
-                    await client_.ask.download(client_.run, client_.token, wanted)
-                assert refused.value.status == "unknown_blob"
+            for client_, wanted in ((stranger, digest), (owner, bundle.digest), (stranger, bundle.digest)):
+                assert (
+                    await status_of(client_.ask.download(client_.run, client_.token, wanted))
+                    == "unknown_blob"
+                )
 
 
 async def test_uploaded_bytes_must_be_the_blob_they_are_named_after(coordinator: Coordinator) -> None:
@@ -229,9 +222,12 @@ async def test_uploaded_bytes_must_be_the_blob_they_are_named_after(coordinator:
     async with gateway_of(coordinator, created) as owner:
         put = {"sender": owner.run, "token": owner.token, "offset": 0, "data": b"xx"}
         for digest, size in (("0" * 64, 2), ("../../secret", 2), ("0" * 64, 1 << 40), ("0" * 64, -1)):
-            with pytest.raises(RefusedError) as refused:
-                await owner.ask.once("blob", worker.BlobPut(**put, digest=digest, size=size), worker.BlobAck)
-            assert refused.value.status == "bad_blob"
+            assert (
+                await status_of(
+                    owner.ask.once("blob", worker.BlobPut(**put, digest=digest, size=size), worker.BlobAck)
+                )
+                == "bad_blob"
+            )
 
 
 async def test_closed_run_takes_no_more_bundles(coordinator: Coordinator) -> None:
@@ -240,9 +236,10 @@ async def test_closed_run_takes_no_more_bundles(coordinator: Coordinator) -> Non
     async with gateway_of(coordinator, created) as owner:
         await owner.close()
         bundle = bundle_of("# too late")
-        with pytest.raises(RefusedError) as refused:
-            await owner.ask.upload(owner.run, owner.token, bundle.digest, bundle.packed)
-        assert refused.value.status == "run_closed"
+        assert (
+            await status_of(owner.ask.upload(owner.run, owner.token, bundle.digest, bundle.packed))
+            == "run_closed"
+        )
 
 
 async def test_bundle_that_arrives_in_many_chunks_is_whole(coordinator: Coordinator) -> None:

@@ -40,27 +40,10 @@ def worker(tmp_path: Path, coordinator: Coordinator) -> Iterator[subprocess.Pope
     home = tmp_path / "worker"
     home.mkdir()
     (home / "glider.toml").write_text(FILE)
-    command = [
-        sys.executable,
-        "-P",
-        "-m",
-        "evopolicy_worker.cli",
-        "--env",
-        "glider.toml",
-        "--env",
-        "toy/line",
-    ]
+    words = "-P -m evopolicy_worker.cli --env glider.toml --env toy/line --slots 1 --grace 1 --credentials"
     with (home / "log").open("wb") as log:
         process = subprocess.Popen(
-            [
-                *command,
-                "--slots",
-                "1",
-                "--grace",
-                "1",
-                "--credentials",
-                coordinator.ready["credentials"]["worker"],
-            ],
+            [sys.executable, *words.split(), coordinator.ready["credentials"]["worker"]],
             cwd=home,
             env={**os.environ, "PYTHONPATH": str(PACKAGE)},
             stdout=log,

@@ -9,14 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from coordinator_harness import (
-    Coordinator,
-    GatewayClient,
-    bundle_of,
-    gateway_of,
-    operator_of,
-    working,
-)
+from coordinator_harness import Coordinator, GatewayClient, bundle_of, gateway_of, operator_of, working
 from coordinator_harness import OperatorClient as HarnessOperator
 
 from evopolicy_common.errors import RefusedError

@@ -27,6 +27,8 @@ pytestmark = [pytest.mark.system, pytest.mark.slow, pytest.mark.timeout(400)]
 class Cluster:
     """A coordinator that trusts nobody, and a worker."""
 
+    program = (sys.executable, "-P", "-m", "evopolicy_gateway.cli")
+
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.coordinator = Coordinator(folder / "state", trust_workers=False)
@@ -35,17 +37,10 @@ class Cluster:
 
     def start(self) -> None:
         credentials = self.coordinator.ready["credentials"]["worker"]
-        command = [sys.executable, "-P", "-m", "evopolicy_worker.cli", "--slots", "1", "--grace", "1"]
-        command += [
-            "--env",
-            "classic_control",
-            "--env",
-            "toy_text",
-            "--env",
-            "mujoco",
-            "--credentials",
-            credentials,
-        ]
+        words = (
+            "-P -m evopolicy_worker.cli --slots 1 --grace 1 --env classic_control --env toy_text --env mujoco"
+        )
+        command = [sys.executable, *words.split(), "--credentials", credentials]
         variables = {**os.environ, "XDG_CACHE_HOME": str(self.folder / "cache")}
         with self.log.open("wb") as log:
             self.worker = subprocess.Popen(command, env=variables, stdout=log, stderr=log)
@@ -58,16 +53,7 @@ class Cluster:
     def says(self, *words: str) -> Any:
         credentials = self.coordinator.ready["credentials"]["operator"]
         done = subprocess.run(
-            [
-                sys.executable,
-                "-P",
-                "-m",
-                "evopolicy_gateway.cli",
-                *words,
-                "--json",
-                "--credentials",
-                credentials,
-            ],
+            [*self.program, *words, "--json", "--credentials", credentials],
             cwd=self.folder,
             capture_output=True,
             text=True,

@@ -12,11 +12,7 @@ from evopolicy_common.errors import RefusedError
 from evopolicy_common.messages import gateway, operator
 from evopolicy_common.refusals import RUN_OVER, Refusal
 
-WORDS = {
-    "closed": Refusal.RUN_CLOSED,
-    "finished": Refusal.RUN_FINISHED,
-    "cancelled": Refusal.RUN_CANCELLED,
-}
+WORDS = {"closed": Refusal.RUN_CLOSED, "finished": Refusal.RUN_FINISHED, "cancelled": Refusal.RUN_CANCELLED}
 
 
 @pytest.mark.parametrize("end", WORDS)

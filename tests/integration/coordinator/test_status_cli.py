@@ -94,9 +94,7 @@ async def test_worker_out_of_service_gets_no_work_until_it_is_taken_back(
             assert [job for job in worker.jobs if created.run in job.job_id]
 
 
-async def test_workers_and_runs_are_listed_and_unknown_workers_refused(
-    coordinator: Coordinator,
-) -> None:
+async def test_workers_and_runs_are_listed_and_unknown_workers_refused(coordinator: Coordinator) -> None:
     async with operator_of(coordinator) as operator, working(coordinator, "w-listed"):
         created = await operator.create("listed")
         await worker_shown(operator, "w-listed")
@@ -123,9 +121,7 @@ async def test_cancelled_run_is_finished_without_a_score(coordinator: Coordinato
         assert finished.final_score is None
 
 
-async def test_a_run_continues_on_another_class_after_an_operators_repin(
-    coordinator: Coordinator,
-) -> None:
+async def test_a_run_continues_on_another_class_after_an_operators_repin(coordinator: Coordinator) -> None:
     async with operator_of(coordinator) as operator:
         created = await operator.create("repin", n_validation=1, n_heldout=1)
         async with gateway_of(coordinator, created) as gateway:

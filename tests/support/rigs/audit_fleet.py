@@ -13,7 +13,6 @@ from evopolicy_common.messages.episode import BlobRef
 from evopolicy_coordinator.core.contract import events
 from evopolicy_coordinator.core.contract.effects import PrepareAudit
 from evopolicy_coordinator.core.contract.records import OutcomeRow
-from rigs.asking import asked
 from rigs.core_rig import ENV, Rig, describe, fingerprint, outcome_of, result
 
 WAIT_S = 100.0
@@ -32,29 +31,20 @@ class Fleet:
             self.join(name)
 
     def join(
-        self,
-        name: str,
-        *,
-        cpu: str = "x",
-        deterministic: bool = True,
-        slots: int = 2,
-        machine: str = "",
+        self, name: str, *, cpu: str = "x", deterministic: bool = True, slots: int = 2, machine: str = ""
     ) -> None:
         self.adds.setdefault(name, 0.0)
         session = f"{name}-s{self.rig.request()}"
-        reply = self.rig.tell(
-            asked(
-                wire.Register,
-                request=self.rig.request(),
-                worker=name,
-                session=session,
-                slots=slots,
-                tiers=("bwrap",),
-                environments=(msgspec.structs.replace(describe(ENV), deterministic=deterministic),),
-                fingerprint=msgspec.structs.replace(fingerprint(), cpu=cpu),
-                machine=machine,
-                boot_id=f"kernel-of-{name}",
-            )
+        reply = self.rig.ask(
+            wire.Register,
+            worker=name,
+            session=session,
+            slots=slots,
+            tiers=("bwrap",),
+            environments=(msgspec.structs.replace(describe(ENV), deterministic=deterministic),),
+            fingerprint=msgspec.structs.replace(fingerprint(), cpu=cpu),
+            machine=machine,
+            boot_id=f"kernel-of-{name}",
         )
         if not isinstance(reply, wire.Registered):
             raise RefusedError(reply.status, reply.message)
@@ -126,9 +116,13 @@ class Fleet:
         """A run from its creation to its end; every worker works."""
         self.train(*(ids or tuple(range(8))))
         self.work_off()
+        return self.end(WAIT_S + 60.0)
+
+    def end(self, wait_s: float = 0.0) -> operator.RunFinished:
+        """Close the run, work off the rest, and let `wait_s` seconds pass."""
         self.rig.close()
         self.work_off()
-        self.rig.pass_time(WAIT_S + 60.0)
+        self.rig.pass_time(wait_s)
         return self.rig.finished()
 
     @property

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from operator import attrgetter
 from typing import Any, TypeVar
 
 from evopolicy_common.messages import gateway, operator
@@ -16,6 +17,7 @@ from evopolicy_common.messages.episode import (
 )
 from evopolicy_common.messages.operator import RunFinished
 from evopolicy_common.messages.run_settings import RunSettings
+from evopolicy_common.messages.worker import Message
 from evopolicy_coordinator.core.contract import events
 from evopolicy_coordinator.core.contract.effects import (
     AuditEffect,
@@ -33,7 +35,6 @@ from evopolicy_coordinator.core.contract.effects import (
 from evopolicy_coordinator.core.contract.records import (
     AuditRow,
     BegunRow,
-    DocumentRow,
     EvaluationRow,
     FinishedRow,
     JournalRow,
@@ -52,6 +53,7 @@ from evopolicy_coordinator.core.contract.settings import CoreSettings
 from evopolicy_coordinator.core.machine import Core
 from evopolicy_coordinator.core.status import CoreStatus
 from evopolicy_coordinator.server.reason_texts import message, words
+from evopolicy_coordinator.storage.store import _PLACES, _VALUES
 from rigs.asking import asked
 
 ENV = "toy/line"
@@ -85,29 +87,9 @@ def outcome_of(index: int, value: float = 1.0, failure: FailureCategory | None =
 
 
 def key_of(row: Row) -> tuple[Any, ...]:
-    match row:
-        case SubmitRow():
-            return (SubmitRow, row.run, row.submit_index)
-        case OutcomeRow():
-            return (OutcomeRow, row.group, row.index)
-        case BegunRow():
-            return (BegunRow, row.group, row.first)
-        case EvaluationRow():
-            return (EvaluationRow, row.evaluation)
-        case WorkerRow():
-            return (WorkerRow, row.worker)
-        case AuditRow():
-            return (AuditRow, row.audit)
-        case PermitRow():
-            return (PermitRow, row.run, row.boot_id)
-        case KernelRow():
-            return (KernelRow, row.worker)
-        case JournalRow():
-            return (JournalRow, row.seq)
-        case DocumentRow():
-            return (DocumentRow, row.run, row.kind)
-        case _:
-            return (type(row), row.run)
+    """The row's kind and the values of its key in the database."""
+    names = _PLACES[type(row)].key
+    return (type(row), *(_VALUES.get(name, attrgetter(name))(row) for name in names))
 
 
 class Rig:
@@ -164,6 +146,10 @@ class Rig:
         self.core.validate()
         return self.replies.get(getattr(event, "request", None))  # type: ignore[arg-type]
 
+    def ask(self, kind: type[Message], **fields: Any) -> Any:
+        """Send a message with the fields that the shell adds; gives the answer, None while it waits."""
+        return self.tell(asked(kind, request=self.request(), **fields))
+
     def pass_time(self, seconds: float, step_s: float = 0.5) -> None:
         """Let time pass, serving every deadline when it is due."""
         until = self.now + seconds
@@ -199,28 +185,25 @@ class Rig:
                budget: int = 16, env: str = ENV, most: int = 16, least: int = 1, agent: str | None = "agents",
                hidden_from: int = 1000, max_steps: int = 0, epoch: str = "e1", split_secret: bool = True, **settings: Any) -> Any:  # fmt: skip  # noqa: E501
         """Create a run; its agent gets a permit on kernel `agent`, of its own unless told otherwise, None for none."""
-        reply = self.tell(
-            asked(
-                operator.CreateRun,
-                request=self.request(),
-                stimulus_id=f"create-{run}",
-                run=run,
-                key=key or f"key-{run}",
-                capability=f"cap-{run}",
-                secret=b"s" * 32,
-                settings=RunSettings(env=env, entry="e", model="m", exp_id="x", **settings),
-                budget=budget,
-                min_episodes_per_submit=least,
-                max_episodes_per_submit=most,
-                train=tuple(Case(seed=seed) for seed in range(train)),
-                validation=tuple(Case(seed=hidden_from + seed) for seed in range(n_valid)),
-                heldout=tuple(Case(seed=1000 + hidden_from + seed) for seed in range(n_held)),
-                split_hashes={},
-                split_secret=split_secret,
-                epoch=epoch,
-                salt=b"n" * 32,
-                max_steps=max_steps,
-            )
+        reply = self.ask(
+            operator.CreateRun,
+            stimulus_id=f"create-{run}",
+            run=run,
+            key=key or f"key-{run}",
+            capability=f"cap-{run}",
+            secret=b"s" * 32,
+            settings=RunSettings(env=env, entry="e", model="m", exp_id="x", **settings),
+            budget=budget,
+            min_episodes_per_submit=least,
+            max_episodes_per_submit=most,
+            train=tuple(Case(seed=seed) for seed in range(train)),
+            validation=tuple(Case(seed=hidden_from + seed) for seed in range(n_valid)),
+            heldout=tuple(Case(seed=1000 + hidden_from + seed) for seed in range(n_held)),
+            split_hashes={},
+            split_secret=split_secret,
+            epoch=epoch,
+            salt=b"n" * 32,
+            max_steps=max_steps,
         )
         if agent is not None and run in self.core.state.runs:
             self.permit(run, agent)
@@ -228,11 +211,7 @@ class Rig:
 
     def permit(self, run: str = "r1", boot_id: str = "agents", wait_s: float = 0.0, **more: Any) -> Any:
         """Ask for a permit; None while it waits."""
-        return self.tell(
-            asked(
-                gateway.RequestPermit, request=self.request(), run=run, boot_id=boot_id, wait_s=wait_s, **more
-            )
-        )
+        return self.ask(gateway.RequestPermit, run=run, boot_id=boot_id, wait_s=wait_s, **more)
 
     def register(
         self,
@@ -244,22 +223,19 @@ class Rig:
         **more: Any,
     ) -> str:
         session = f"{worker}-s{self.request()}"
-        reply = self.tell(
-            asked(
-                wire.Register,
-                request=self.request(),
-                worker=worker,
-                session=session,
-                slots=slots,
-                tiers=more.get("tiers", ("bwrap",)),
-                environments=more.get("described", tuple(describe(env) for env in envs)),
-                fingerprint=fingerprint(version, more.get("packages")),
-                boot_id=more.get("boot_id", f"kernel-of-{worker}"),
-                machine=more.get("machine", ""),
-                undescribed=more.get("undescribed", ()),
-                failed_environments=more.get("failed", {}),
-                installation=more.get("installation", ""),
-            )
+        reply = self.ask(
+            wire.Register,
+            worker=worker,
+            session=session,
+            slots=slots,
+            tiers=more.get("tiers", ("bwrap",)),
+            environments=more.get("described", tuple(describe(env) for env in envs)),
+            fingerprint=fingerprint(version, more.get("packages")),
+            boot_id=more.get("boot_id", f"kernel-of-{worker}"),
+            machine=more.get("machine", ""),
+            undescribed=more.get("undescribed", ()),
+            failed_environments=more.get("failed", {}),
+            installation=more.get("installation", ""),
         )
         assert isinstance(reply, wire.Registered)
         if self.incarnation > 1 and more.get("beats", True):
@@ -269,31 +245,30 @@ class Rig:
     def submit(
         self, *ids: int, run: str = "r1", key: str = "k0", bundle: str | None = BUNDLE, **more: Any
     ) -> Any:
-        return self.tell(
-            asked(
-                gateway.Submit,
-                request=self.request(),
-                stimulus_id=f"submit-{key}",
-                run=run,
-                key=key,
-                env_instances=ids,
-                bundle=bundle,
-                **more,
-            )
+        return self.ask(
+            gateway.Submit,
+            stimulus_id=f"submit-{key}",
+            run=run,
+            key=key,
+            env_instances=ids,
+            bundle=bundle,
+            **more,
         )
+
+    def begin(
+        self, *ids: int, worker: dict[str, Any] | None = None, run: dict[str, Any] | None = None
+    ) -> str:
+        """Register worker w1, create run r1, submit these episodes, if any. Returns the session."""
+        session = self.register(**worker or {})
+        self.create(**run or {})
+        if ids:
+            self.submit(*ids)
+        return session
 
     def poll(self, session: str, n: int = 2, wait_s: float = 0.0, **more: Any) -> Any:
         """The leases that a poll gets; None while it waits."""
-        reply = self.tell(
-            asked(
-                wire.LeaseRequest,
-                request=self.request(),
-                worker=session.split("-")[0],
-                session=session,
-                n=n,
-                wait_s=wait_s,
-                **more,
-            )
+        reply = self.ask(
+            wire.LeaseRequest, worker=session.split("-")[0], session=session, n=n, wait_s=wait_s, **more
         )
         if reply is None and wait_s == 0.0:
             request = self._requests
@@ -301,34 +276,17 @@ class Rig:
             reply = self.replies.get(request)
         return list(reply.leases) if isinstance(reply, wire.Leases) else reply
 
+    def held(self, lease: wire.Lease, *, running: bool = True) -> wire.HeldLease:
+        name, job = lease.lease_id, lease.job.job_id
+        return wire.HeldLease(lease_id=name, job_id=job, attempt=lease.attempt, running=running)
+
     def beat(self, session: str, *held: wire.Lease, running: bool = True, wait_s: float = 0.0) -> Any:
-        leases = tuple(
-            wire.HeldLease(
-                lease_id=each.lease_id, job_id=each.job.job_id, attempt=each.attempt, running=running
-            )
-            for each in held
-        )
-        return self.tell(
-            asked(
-                wire.Heartbeat,
-                request=self.request(),
-                worker=session.split("-")[0],
-                session=session,
-                held=leases,
-                wait_s=wait_s,
-            )
-        )
+        leases = tuple(self.held(each, running=running) for each in held)
+        worker = session.split("-")[0]
+        return self.ask(wire.Heartbeat, worker=worker, session=session, held=leases, wait_s=wait_s)
 
     def report_results(self, session: str, *results: wire.JobResult) -> Any:
-        return self.tell(
-            asked(
-                wire.ReportResults,
-                request=self.request(),
-                worker=session.split("-")[0],
-                session=session,
-                results=results,
-            )
-        )
+        return self.ask(wire.ReportResults, worker=session.split("-")[0], session=session, results=results)
 
     def play(
         self, session: str, *leases: wire.Lease, value: float = 1.0, failure: FailureCategory | None = None
@@ -337,19 +295,12 @@ class Rig:
         return self.report_results(session, *(done(lease, value, failure) for lease in leases))
 
     def results(self, submit_index: int = 0, cursor: int = 0, wait_s: float = 0.0, run: str = "r1") -> Any:
-        return self.tell(
-            asked(
-                gateway.ResultsRequest,
-                request=self.request(),
-                run=run,
-                submit_index=submit_index,
-                cursor=cursor,
-                wait_s=wait_s,
-            )
+        return self.ask(
+            gateway.ResultsRequest, run=run, submit_index=submit_index, cursor=cursor, wait_s=wait_s
         )
 
     def close(self, run: str = "r1") -> Any:
-        return self.tell(asked(gateway.CloseRun, request=self.request(), run=run, reason="budget_spent"))
+        return self.ask(gateway.CloseRun, run=run, reason="budget_spent")
 
     def work_off(self, session: str, values: Any = lambda job: 1.0, rounds: int = 10_000) -> int:
         """Let one worker play all there is; gives the number of jobs."""
@@ -362,7 +313,13 @@ class Rig:
             self.report_results(session, *(done(lease, values(lease.job)) for lease in leases))
         raise AssertionError("there is no end to the work")
 
-    # ---- looking ----
+    def finish(self, session: str, values: Any = lambda job: 1.0) -> RunFinished:
+        """Close run r1, let one worker play all there is, and give the run's result."""
+        self.close()
+        self.work_off(session, values)
+        return self.finished()
+
+    # ---- reading ----
 
     def status(self) -> CoreStatus:
         """An operator's view of the status."""

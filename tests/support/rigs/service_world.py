@@ -14,6 +14,7 @@ from evopolicy_common.messages import gateway, operator, worker
 from evopolicy_common.messages.environment import EnvironmentDescription
 from evopolicy_common.messages.episode import PolicyFailure
 from evopolicy_common.messages.run_settings import RunSettings
+from evopolicy_common.messages.status import StatusRequest
 from evopolicy_common.messages.worker import Message
 from evopolicy_common.records.blobs import BlobStore
 from evopolicy_common.wire import codec, keys
@@ -105,13 +106,21 @@ class World:
         """One tick."""
         self.service.on_queries(list(asked))  # type: ignore[arg-type]
 
+    async def answer(self, *asked: Requested) -> Any:
+        """One tick; gives the answer to the last query."""
+        self.ask(*asked)
+        return await asked[-1].message()
+
+    async def status(self, **more: Any) -> Any:
+        message = StatusRequest(token="operate", **more)
+        return await self.answer(Requested(keys.operator_key("c", "status"), message))
+
     async def create(self, key: str = "run") -> operator.RunCreated:
         settings = RunSettings(env="toy/line", entry="e", model="m", exp_id="x", budget=100)
         asked = Requested(
             keys.operator_key("c", "create"), operator.CreateRun(token="operate", key=key, settings=settings)
         )
-        self.ask(asked)
-        created = await asked.message()
+        created = await self.answer(asked)
         assert isinstance(created, operator.RunCreated), created
         return created
 

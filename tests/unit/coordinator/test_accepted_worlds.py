@@ -34,11 +34,7 @@ def candidate(number: int, *, accepted: bool, epoch: str = BASE.epoch) -> worlds
 
 @pytest.mark.parametrize(
     ("canonical", "ceiling", "loses", "reaches"),
-    [
-        (-300.0, -180.0, True, True),
-        (-299.0, -180.5, False, False),
-        (-600.0, 0.0, True, True),
-    ],
+    [(-300.0, -180.0, True, True), (-299.0, -180.5, False, False), (-600.0, 0.0, True, True)],
 )
 def test_half_of_the_distance_is_lost_and_four_fifths_are_reached(
     canonical: float, ceiling: float, loses: bool, reaches: bool

@@ -7,7 +7,6 @@ import hashlib
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from rigs.asking import asked
 from rigs.audit_fleet import WAIT_S, Fleet, audit_state
 from rigs.core_rig import BUNDLE, outcome_of, result
 
@@ -67,7 +66,7 @@ def test_a_run_waits_for_a_busy_second_worker_up_to_its_bound() -> None:
             rig.pass_time(1.0)
             rig.beat(fleet.sessions["w2"])
 
-    waits = rig.tell(asked(operator.WaitRun, request="w", run="r1", wait_s=0.0))
+    waits = rig.ask(operator.WaitRun, run="r1", wait_s=0.0)
     assert "audits" in waits.waits_for
     beat_for(WAIT_S - 10.0)
     assert "r1" in rig.core.state.runs
@@ -120,7 +119,7 @@ def test_a_cancelled_run_plays_no_more_audits() -> None:
     fleet = Fleet(w1=0.0, w2=0.0)
     fleet.train(0, 1)
     fleet.turn("w1")
-    fleet.rig.tell(asked(operator.CancelRun, request="c", run="r1"))
+    fleet.rig.ask(operator.CancelRun, run="r1")
     assert audit_state(fleet.rig.finished()).not_audited == {audits.CANCELLED: 2}
     assert not fleet.rig.core.state.groups
 
@@ -183,15 +182,8 @@ def test_no_restart_lets_a_player_audit_its_own_episode() -> None:
     fleet.join("w1")
     name = lease_id(job.group.flow.secret, job.job_id, 1, "w1")
     claimed = wire.HeldLease(lease_id=name, job_id=job.job_id, attempt=1, running=True)
-    reply = fleet.rig.tell(
-        asked(
-            wire.Heartbeat,
-            request="beat",
-            worker="w1",
-            session=fleet.sessions["w1"],
-            held=(claimed,),
-            wait_s=0.0,
-        )
+    reply = fleet.rig.ask(
+        wire.Heartbeat, worker="w1", session=fleet.sessions["w1"], held=(claimed,), wait_s=0.0
     )
     assert reply.cancelled == (claimed.lease_id,)
     forged = wire.JobResult(

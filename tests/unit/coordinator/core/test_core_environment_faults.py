@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import pytest
-from rigs.core_rig import Rig, asked, done, result, split_of
+from rigs.core_rig import Rig, done, result, split_of
 
 from evopolicy_common.messages import operator
 from evopolicy_common.messages import worker as wire
@@ -42,11 +42,8 @@ def failing(
 
 
 @pytest.mark.parametrize("where", ["train", "validation", "heldout", "random"])
-def test_an_environment_that_ends_every_attempt_ends_the_run_with_an_error(where: str) -> None:
-    rig = Rig()
-    session = rig.register(slots=1)
-    rig.create(n_valid=1, n_held=1)
-    rig.submit(0, 1)
+def test_an_environment_that_ends_every_attempt_ends_the_run_with_an_error(rig: Rig, where: str) -> None:
+    session = rig.begin(0, 1, worker={"slots": 1}, run={"n_valid": 1, "n_held": 1})
     if where != "train":
         failing(rig, session, where="none", ends=lambda: rig.core.state.runs["r1"].open is None)
         rig.close()
@@ -65,11 +62,8 @@ def test_an_environment_that_ends_every_attempt_ends_the_run_with_an_error(where
     assert rig.core.state.jobs == {}
 
 
-def test_an_environment_that_fails_now_and_then_is_not_given_up() -> None:
-    rig = Rig()
-    session = rig.register(slots=1)
-    rig.create(n_valid=1)
-    rig.submit(0)
+def test_an_environment_that_fails_now_and_then_is_not_given_up(rig: Rig) -> None:
+    session = rig.begin(0, worker={"slots": 1}, run={"n_valid": 1})
     # Fast failures, as of a full disk, end no run as long as they may pass.
     early = rig.settings.environment_wait_s - 100.0
     attempts = failing(rig, session, where="train", ends=lambda: False, most_s=early)
@@ -79,8 +73,7 @@ def test_an_environment_that_fails_now_and_then_is_not_given_up() -> None:
 
 
 @pytest.mark.parametrize("machine", ["", "rack-1"])
-def test_one_machine_alone_ends_no_run_that_another_can_play(machine: str) -> None:
-    rig = Rig()
+def test_one_machine_alone_ends_no_run_that_another_can_play(rig: Rig, machine: str) -> None:
     liars = [rig.register(name, machine=machine and "liar") for name in ("w1", "w2")[: 2 if machine else 1]]
     honest = rig.register("w3", machine=machine)
     rig.create(n_valid=1)
@@ -92,25 +85,21 @@ def test_one_machine_alone_ends_no_run_that_another_can_play(machine: str) -> No
     assert rig.row(SubmitRow, "r1", 0).status == "ok"
 
 
-def test_an_evaluation_of_an_environment_that_fails_ends_with_the_reason() -> None:
-    rig = Rig()
+def test_an_evaluation_of_an_environment_that_fails_ends_with_the_reason(rig: Rig) -> None:
     session = rig.register()
-    rig.tell(
-        asked(
-            operator.Evaluate,
-            request=rig.request(),
-            evaluation="ev",
-            key="e",
-            env="toy/line",
-            bundle=None,
-            split="train",
-            case_ids=(4, 4),
-            cases=(Case(seed=4), Case(seed=4)),
-            secret=b"x",
-            record="full",
-            sandbox_tier="bwrap",
-            limits=ResourceLimits(),
-        )
+    rig.ask(
+        operator.Evaluate,
+        evaluation="ev",
+        key="e",
+        env="toy/line",
+        bundle=None,
+        split="train",
+        case_ids=(4, 4),
+        cases=(Case(seed=4), Case(seed=4)),
+        secret=b"x",
+        record="full",
+        sandbox_tier="bwrap",
+        limits=ResourceLimits(),
     )
     failing(rig, session, where="", ends=lambda: not rig.core.state.evaluations)
     assert rig.row(EvaluationRow, "ev").error.startswith(WHY)

@@ -61,11 +61,8 @@ def test_a_failed_heldout_episode_leaves_the_run_without_a_score() -> None:
     assert "3 of 3 held-out episodes" in (finished.error or "")
 
 
-def test_an_excluded_checkpoint_stays_excluded_after_a_restart() -> None:
-    rig = Rig()
-    session = rig.register()
-    rig.create(failed_episodes="end-submit", budget=2)
-    rig.submit(0, 1)
+def test_an_excluded_checkpoint_stays_excluded_after_a_restart(rig: Rig) -> None:
+    session = rig.begin(0, 1, run={"failed_episodes": "end-submit", "budget": 2})
     play_off(rig, session, lambda job: (1.0, split_of(job) == "validation"))
     rig.load()
     session = rig.register()
@@ -126,8 +123,7 @@ def test_selection_in_an_invented_run_is_that_of_the_published_rule(seed: int) -
     assert finished.status == ("no_ok_submit" if best is None else "completed")
 
 
-def test_a_rejected_request_takes_an_index_without_a_charge_across_restarts() -> None:
-    rig = Rig()
+def test_a_rejected_request_takes_an_index_without_a_charge_across_restarts(rig: Rig) -> None:
     session = rig.register()
     rig.create(budget=2, **PROFILE)
     first = rig.submit(bundle=None, key="a", rejected="budget_invalid")
@@ -145,8 +141,7 @@ def test_a_rejected_request_takes_an_index_without_a_charge_across_restarts() ->
     assert (finished.status, finished.best_submit_index, finished.budget_used) == ("completed", 1, 2)
 
 
-def test_rejected_requests_count_up_to_a_limit_in_published_profiles_only() -> None:
-    rig = Rig()
+def test_rejected_requests_count_up_to_a_limit_in_published_profiles_only(rig: Rig) -> None:
     rig.register()
     rig.create(budget=1, **PROFILE)
     answers = [

@@ -39,13 +39,11 @@ def two_submits(rig: Rig, session: str) -> None:
     rig.submit(2, bundle="c" * 64, key="k2")
 
 
-def test_the_best_on_hidden_validation_is_selected() -> None:
-    rig = Rig()
+def test_the_best_on_hidden_validation_is_selected(rig: Rig) -> None:
     session = rig.register()
     two_submits(rig, session)
     rig.work_off(session, value_of)
-    rig.close()
-    rig.work_off(session, value_of)
+    rig.finish(session, value_of)
     assert rig.finished().best_submit_index == 1
     assert rig.finished().policy_failures == {"validation": 0, "heldout": 0}
 
@@ -63,13 +61,10 @@ def test_a_run_tells_whether_its_environment_repeats_itself(monkeypatch: pytest.
         rig.create()
         rig.submit(0)
         rig.work_off(session)
-        rig.close()
-        rig.work_off(session)
-        assert rig.finished().deterministic is mark
+        assert rig.finish(session).deterministic is mark
 
 
-def test_closing_with_a_submit_in_flight_waits_for_it() -> None:
-    rig = Rig()
+def test_closing_with_a_submit_in_flight_waits_for_it(rig: Rig) -> None:
     session = rig.register()
     two_submits(rig, session)
     rig.close()
@@ -78,13 +73,9 @@ def test_closing_with_a_submit_in_flight_waits_for_it() -> None:
     assert [each.status for each in rig.finished().submits] == ["ok", "ok", "ok"]
 
 
-def test_a_run_without_an_ok_submit_has_its_random_reference() -> None:
-    rig = Rig()
-    session = rig.register()
-    rig.create()
-    rig.close()
-    rig.work_off(session, lambda job: -2.0)
-    finished = rig.finished()
+def test_a_run_without_an_ok_submit_has_its_random_reference(rig: Rig) -> None:
+    session = rig.begin()
+    finished = rig.finish(session, lambda job: -2.0)
     assert (finished.status, finished.best_submit_index, finished.final_score) == ("no_ok_submit", None, None)
     assert finished.random_heldout_returns == (-2.0,) * 3
 
@@ -104,8 +95,7 @@ def random_seeds(rig: Rig, session: str, run: str) -> list[bytes]:
     return [found[index] for index in sorted(found)]
 
 
-def test_runs_on_one_split_play_the_same_random_reference() -> None:
-    rig = Rig()
+def test_runs_on_one_split_play_the_same_random_reference(rig: Rig) -> None:
     session = rig.register()
     first = random_seeds(rig, session, "r1")
     assert first == random_seeds(rig, session, "r2")
@@ -113,8 +103,7 @@ def test_runs_on_one_split_play_the_same_random_reference() -> None:
     assert rig.finished("r2").reference_by_case
 
 
-def test_a_run_of_an_earlier_version_keeps_its_random_reference() -> None:
-    rig = Rig()
+def test_a_run_of_an_earlier_version_keeps_its_random_reference(rig: Rig) -> None:
     rig.create()
     row = rig.row(RunRow, "r1")
     rig.rows[RunRow, "r1"] = msgspec.structs.replace(row, reference_by_case=False)
@@ -126,14 +115,12 @@ def test_a_run_of_an_earlier_version_keeps_its_random_reference() -> None:
         found.extend(spec.policy_seed for spec in job.episodes if split_of(job) == "random")
         return 1.0
 
-    rig.close()
-    rig.work_off(session, value)
+    rig.finish(session, value)
     assert sorted(found) == sorted(policy_seed(row.secret, -1, "random", case, 0) for case in range(3))
     assert not rig.finished().reference_by_case
 
 
-def test_random_actions_outside_a_run_are_the_reference_of_their_split() -> None:
-    rig = Rig()
+def test_random_actions_outside_a_run_are_the_reference_of_their_split(rig: Rig) -> None:
     session = rig.register(slots=3)
     reference = random_seeds(rig, session, "r1")
     heldout = rig.row(RunRow, "r1").heldout
@@ -149,39 +136,28 @@ def found_ineligible(rig: Rig, index: int) -> None:
     rig.load()
 
 
-def test_a_checkpoint_found_ineligible_earlier_stays_so_and_only_the_end_tells() -> None:
-    rig = Rig()
-    session = rig.register(slots=8)
-    rig.create(n_valid=1)
-    rig.submit(0)
+def test_a_checkpoint_found_ineligible_earlier_stays_so_and_only_the_end_tells(rig: Rig) -> None:
+    session = rig.begin(0, worker={"slots": 8}, run={"n_valid": 1})
     rig.play(session, *rig.poll(session, 8))
-    before = rig.tell(asked(gateway.StateRequest, request="s1", run="r1"))
+    before = rig.ask(gateway.StateRequest, run="r1")
     found_ineligible(rig, 0)
-    assert rig.tell(asked(gateway.StateRequest, request="s2", run="r1")) == before
-    rig.close()
-    rig.work_off(rig.register(slots=8))
-    finished = rig.finished()
+    assert rig.ask(gateway.StateRequest, run="r1") == before
+    finished = rig.finish(rig.register(slots=8))
     assert (finished.status, list(finished.validation_ineligible)) == ("error", [0])
 
 
-def test_a_checkpoint_found_ineligible_on_held_out_gives_way_to_the_next() -> None:
-    rig = Rig()
+def test_a_checkpoint_found_ineligible_on_held_out_gives_way_to_the_next(rig: Rig) -> None:
     session = rig.register(slots=8)
     two_submits(rig, session)
     rig.work_off(session, value_of)
     found_ineligible(rig, 1)
-    rig.close()
-    rig.work_off(rig.register(slots=8), value_of)
-    finished = rig.finished()
+    finished = rig.finish(rig.register(slots=8), value_of)
     assert (finished.status, finished.best_submit_index) == ("completed", 2)
     assert list(finished.validation_ineligible) == [1]
 
 
-def test_hidden_jobs_tell_a_policy_nothing_of_the_split_they_are_from() -> None:
-    rig = Rig()
-    session = rig.register(slots=8)
-    rig.create(n_valid=5)
-    rig.submit(0, 1)
+def test_hidden_jobs_tell_a_policy_nothing_of_the_split_they_are_from(rig: Rig) -> None:
+    session = rig.begin(0, 1, worker={"slots": 8}, run={"n_valid": 5})
     train = rig.poll(session, 8)
     rig.play(session, *train)
     hidden = rig.poll(session, 8)
@@ -191,14 +167,12 @@ def test_hidden_jobs_tell_a_policy_nothing_of_the_split_they_are_from() -> None:
     assert {each.job.video for each in hidden} == {False}
 
 
-def test_progress_tells_an_operator_which_phase_a_run_is_in() -> None:
-    rig = Rig()
-    session = rig.register(slots=8)
-    rig.create()
+def test_progress_tells_an_operator_which_phase_a_run_is_in(rig: Rig) -> None:
+    session = rig.begin(worker={"slots": 8})
     seen = []
 
     def look() -> None:
-        progress = rig.tell(asked(operator.WaitRun, request=rig.request(), run="r1", wait_s=0.0))
+        progress = rig.ask(operator.WaitRun, run="r1", wait_s=0.0)
         assert isinstance(progress, RunProgress)
         seen.append((progress.phase, progress.done, progress.total))
 
@@ -275,15 +249,12 @@ def ask(rig: Rig, key: str = "e", **changes: Any) -> object:
 
 
 def page(rig: Rig, cursor: int, wait_s: float = 0.0) -> ReadEvaluation:
-    answer = rig.tell(
-        asked(operator.EvaluationPoll, request=rig.request(), evaluation="ev-e", cursor=cursor, wait_s=wait_s)
-    )
+    answer = rig.ask(operator.EvaluationPoll, evaluation="ev-e", cursor=cursor, wait_s=wait_s)
     assert isinstance(answer, ReadEvaluation)
     return answer
 
 
-def test_an_evaluation_plays_cases_outside_any_run() -> None:
-    rig = Rig()
+def test_an_evaluation_plays_cases_outside_any_run(rig: Rig) -> None:
     assert ask(rig) == EvaluationStarted(evaluation="ev-e", episodes=2)
     assert ask(rig) == EvaluationStarted(evaluation="ev-e", episodes=2)
     assert "a worker that offers" in words(page(rig, 0).waits_for)
@@ -304,14 +275,12 @@ def test_an_evaluation_plays_cases_outside_any_run() -> None:
     assert not rig.core.state.groups
 
 
-def test_an_unknown_evaluation_is_refused() -> None:
-    rig = Rig()
-    answer = rig.tell(asked(operator.EvaluationPoll, request="p", evaluation="none", cursor=0, wait_s=0.0))
+def test_an_unknown_evaluation_is_refused(rig: Rig) -> None:
+    answer = rig.ask(operator.EvaluationPoll, evaluation="none", cursor=0, wait_s=0.0)
     assert answer.status == "unknown_evaluation"
 
 
-def test_a_run_that_cannot_be_is_refused() -> None:
-    rig = Rig()
+def test_a_run_that_cannot_be_is_refused(rig: Rig) -> None:
     wrongs: tuple[dict[str, Any], ...] = (
         {"budget": 0},
         {"least": 0},
@@ -327,19 +296,15 @@ def test_a_run_that_cannot_be_is_refused() -> None:
 
 
 @pytest.mark.parametrize("again", [False, True])
-def test_the_same_key_gives_the_same_run(again: bool) -> None:
-    rig = Rig()
+def test_the_same_key_gives_the_same_run(rig: Rig, again: bool) -> None:
     first = rig.create("r1", key="same")
     if again:
         rig.load()
     assert rig.create("r2", key="same") == first
 
 
-def test_an_unspent_run_that_must_spend_is_an_error() -> None:
-    rig = Rig()
-    session = rig.register()
-    rig.create(budget=4, finish="budget")
-    rig.submit(0, 1)
+def test_an_unspent_run_that_must_spend_is_an_error(rig: Rig) -> None:
+    session = rig.begin(0, 1, run={"budget": 4, "finish": "budget"})
     rig.work_off(session)
     rig.submit(0, key="k1")
     rig.close()
@@ -356,22 +321,14 @@ def test_an_unspent_run_that_must_spend_is_an_error() -> None:
 
 
 @pytest.mark.parametrize("left", [0, 2])
-def test_a_run_that_has_spent_what_it_can_is_scored(left: int) -> None:
-    rig = Rig()
-    session = rig.register()
-    rig.create(budget=3 + left, least=3, finish="budget")
-    rig.submit(0, 1, 2)
+def test_a_run_that_has_spent_what_it_can_is_scored(rig: Rig, left: int) -> None:
+    session = rig.begin(0, 1, 2, run={"budget": 3 + left, "least": 3, "finish": "budget"})
     rig.work_off(session)
-    rig.close()
-    rig.work_off(session)
-    assert rig.finished().status == "completed"
+    assert rig.finish(session).status == "completed"
 
 
-def test_every_episode_of_a_run_is_cut_where_its_policy_is_told() -> None:
-    rig = Rig()
-    session = rig.register()
-    rig.create(max_steps=7)
-    rig.submit(0)
+def test_every_episode_of_a_run_is_cut_where_its_policy_is_told(rig: Rig) -> None:
+    session = rig.begin(0, run={"max_steps": 7})
     kinds = {}
     for closing in (False, True):
         if closing:
@@ -389,11 +346,8 @@ def test_every_episode_of_a_run_is_cut_where_its_policy_is_told() -> None:
 
 
 @pytest.mark.parametrize("reload", [False, True])
-def test_held_out_success_is_in_the_result_after_a_restart(reload: bool) -> None:
-    rig = Rig()
-    session = rig.register()
-    rig.create()
-    rig.submit(0)
+def test_held_out_success_is_in_the_result_after_a_restart(rig: Rig, reload: bool) -> None:
+    session = rig.begin(0)
     rig.play(session, *rig.poll(session))
     rig.close()
     for _ in range(100):
@@ -416,9 +370,8 @@ def test_held_out_success_is_in_the_result_after_a_restart(reload: bool) -> None
 
 @pytest.mark.parametrize("settings_", [{"policy_scope": "submit"}, {**PUBLISHED, "profile": "published"}])
 def test_arguments_tell_a_policy_hidden_cases_in_published_profiles_only(
-    settings_: dict[str, str],
+    rig: Rig, settings_: dict[str, str]
 ) -> None:
-    rig = Rig()
     session = rig.register()
     rig.create(budget=4, n_valid=5, n_held=7, **settings_)
     seen: dict[str, list[Job]] = {}
@@ -431,8 +384,7 @@ def test_arguments_tell_a_policy_hidden_cases_in_published_profiles_only(
     rig.work_off(session, value)
     rig.submit(2, 0, key="k1")
     rig.work_off(session, value)
-    rig.close()
-    rig.work_off(session, value)
+    rig.finish(session, value)
     (first, _), hidden = seen["train"], [*seen["validation"], *seen["heldout"]]
     assert (first.env_meta["remaining_budget_after"], first.env_meta["n_episodes_this_submit"]) == (2, 2)
     indices = [[spec.episode_index for spec in job.episodes] for job in hidden]

@@ -6,7 +6,6 @@ import msgspec
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from rigs.asking import asked
 from rigs.audit_fleet import WAIT_S, Fleet, audit_state
 
 from evopolicy_common.errors import RefusedError
@@ -57,10 +56,7 @@ def test_two_workers_that_disagree_are_both_in_dispute_and_nobody_is_named() -> 
     fleet.train(0, 1, 2, 3)
     fleet.work_off()
     assert any("a third is to decide" in text for text in fleet.rig.status().disputes)
-    fleet.rig.close()
-    fleet.work_off()
-    fleet.rig.pass_time(WAIT_S)
-    found = audit_state(fleet.rig.finished())
+    found = audit_state(fleet.end(WAIT_S))
     assert found.disputed == found.audited > 0
     assert found.forgers == {}
     assert not fleet.rig.core.state.quarantined
@@ -88,9 +84,7 @@ def test_a_forging_auditor_is_named_and_the_player_confirmed() -> None:
     fleet.turn("w2")
     fleet.join("w3")
     fleet.work_off()
-    fleet.rig.close()
-    fleet.work_off()
-    found = audit_state(fleet.rig.finished())
+    found = audit_state(fleet.end())
     assert found.forgers == {"w2": 0}
     assert found.disputed == 0
     assert not found.in_question
@@ -117,20 +111,16 @@ def test_a_recording_that_is_none_is_in_dispute() -> None:
             run=effect.run, audit=effect.audit, actions=None, error="it cannot be read", at_fault=True
         )
     )
-    fleet.rig.close()
-    fleet.work_off()
-    assert audit_state(fleet.rig.finished()).disputed == 1
+    assert audit_state(fleet.end()).disputed == 1
 
 
 def test_an_operator_takes_a_quarantined_worker_back() -> None:
     fleet = Fleet(w1=0.0, w2=5.0, w3=0.0)
     fleet.whole_run()
     rig = fleet.rig
-    drained = rig.tell(asked(operator.SetWorker, request="d", worker="w2", state="draining"))
+    drained = rig.ask(operator.SetWorker, worker="w2", state="draining")
     assert isinstance(drained, wire.Refused)
-    assert isinstance(
-        rig.tell(asked(operator.SetWorker, request="a", worker="w2", state="active")), operator.Done
-    )
+    assert isinstance(rig.ask(operator.SetWorker, worker="w2", state="active"), operator.Done)
     fleet.join("w2")
     assert rig.core.state.quarantined == {}
 

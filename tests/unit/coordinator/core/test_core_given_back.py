@@ -16,9 +16,7 @@ LONGER = BlobRef(digest="c" * 64, size=6000)
 
 def playing(rig: Rig, *, n_valid: int = 1) -> tuple[str, wire.Lease]:
     """A worker that plays hidden validation of an open run, whose agent is on another kernel."""
-    session = rig.register()
-    rig.create(n_valid=n_valid)
-    rig.submit(0)
+    session = rig.begin(0, run={"n_valid": n_valid})
     rig.play(session, *rig.poll(session))
     (lease,) = rig.poll(session, n=1)
     assert split_of(lease.job) == "validation"
@@ -41,11 +39,8 @@ def the_hidden_one(rig: Rig, session: str) -> wire.Lease:
 
 
 @pytest.mark.parametrize("restart", [False, True])
-def test_a_stopped_job_continues_from_its_policys_actions(restart: bool) -> None:
-    rig = Rig()
-    session = rig.register(slots=1)
-    rig.create(n_valid=1)
-    rig.submit(0)
+def test_a_stopped_job_continues_from_its_policys_actions(rig: Rig, restart: bool) -> None:
+    session = rig.begin(0, worker={"slots": 1}, run={"n_valid": 1})
     rig.play(session, *rig.poll(session))
     (lease,) = rig.poll(session, n=1)
     for number, begun in enumerate((BEGUN, LONGER)):
@@ -63,8 +58,7 @@ def test_a_stopped_job_continues_from_its_policys_actions(restart: bool) -> None
     assert rig.row(BegunRow, "r1/s0/validation", 0).begun is None
 
 
-def test_a_job_stopped_by_a_permit_waits_for_its_worker() -> None:
-    rig = Rig()
+def test_a_job_stopped_by_a_permit_waits_for_its_worker(rig: Rig) -> None:
     session, lease = playing(rig)
     other = rig.register("w2")
     rig.create("r2", agent=None)
@@ -78,8 +72,7 @@ def test_a_job_stopped_by_a_permit_waits_for_its_worker() -> None:
     assert [each.job.begun for each in rig.poll(other)] == [BEGUN]
 
 
-def test_a_worker_that_no_longer_names_a_job_holds_nothing() -> None:
-    rig = Rig()
+def test_a_worker_that_no_longer_names_a_job_holds_nothing(rig: Rig) -> None:
     session, lease = playing(rig)
     other = rig.register("w2")
     rig.create("r2", agent=None)
@@ -111,8 +104,7 @@ def test_a_silent_or_clinging_worker_delays_a_job_only_briefly() -> None:
         assert (waited_s > 100.0) == beats
 
 
-def test_an_earlier_attempt_does_not_replace_what_a_later_one_handed_back() -> None:
-    rig = Rig()
+def test_an_earlier_attempt_does_not_replace_what_a_later_one_handed_back(rig: Rig) -> None:
     session, lease = playing(rig)
     rig.create("r2", agent=None)
     rig.permit("r2", HERE, wait_s=20.0)
@@ -121,8 +113,7 @@ def test_an_earlier_attempt_does_not_replace_what_a_later_one_handed_back() -> N
     assert rig.core.state.jobs[lease.job.job_id].begun == BEGUN
 
 
-def test_another_worker_cannot_hand_back_what_it_was_not_given() -> None:
-    rig = Rig()
+def test_another_worker_cannot_hand_back_what_it_was_not_given(rig: Rig) -> None:
     _, lease = playing(rig)
     other = rig.register("w2")
     given_back(rig, other, lease, BEGUN)
@@ -130,24 +121,21 @@ def test_another_worker_cannot_hand_back_what_it_was_not_given() -> None:
 
 
 @pytest.mark.parametrize("limit", [False, True])
-def test_a_long_silent_workers_limit_verdict_is_not_believed(limit: bool) -> None:
-    rig = Rig()
+def test_a_long_silent_workers_limit_verdict_is_not_believed(rig: Rig, limit: bool) -> None:
     session, lease = playing(rig)
     rig.pass_time(rig.settings.silence_s + 1.0)
     given_back(rig, session, lease, BEGUN, limit_verdict=limit)
     assert (rig.core.state.jobs[lease.job.job_id].begun is None) == limit
 
 
-def test_what_a_worker_in_trouble_can_still_tell_stands_too() -> None:
-    rig = Rig()
+def test_what_a_worker_in_trouble_can_still_tell_stands_too(rig: Rig) -> None:
     session, lease = playing(rig)
     rig.report_results(session, result(lease, "failed", begun=BEGUN))
     rig.pass_time(10.0)
     assert [each.job.begun for each in rig.poll(session)] == [BEGUN]
 
 
-def test_a_job_that_was_done_when_it_was_stopped_is_done() -> None:
-    rig = Rig()
+def test_a_job_that_was_done_when_it_was_stopped_is_done(rig: Rig) -> None:
     session, lease = playing(rig)
     rig.create("r2", agent=None)
     rig.permit("r2", HERE, wait_s=20.0)
@@ -157,9 +145,7 @@ def test_a_job_that_was_done_when_it_was_stopped_is_done() -> None:
 
 def test_random_actions_are_not_waited_for() -> None:
     rig = Rig(hidden_isolation="off")
-    session = rig.register(slots=4)
-    rig.create(n_valid=1)
-    rig.submit(0)
+    session = rig.begin(0, worker={"slots": 4}, run={"n_valid": 1})
     rig.play(session, *rig.poll(session))
     rig.create("r2", agent=None)
     rig.close("r1")

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import msgspec
 import pytest
-from rigs.asking import asked
 from rigs.core_rig import Rig
 
 from evopolicy_common.messages import operator
@@ -33,15 +34,15 @@ def disclose(rig: Rig, *runs: str, epochs: tuple[str, ...] = ("e1",)) -> object:
     return rig.tell(events.DisclosureRequested(request=request, message=message, epochs=epochs))
 
 
-def finish(rig: Rig, session: str, run: str = "r1") -> None:
-    rig.submit(0, run=run)
+def finish(rig: Rig, session: str = "", **run: Any) -> None:
+    """Play run r1 to its end; begin it first where no session is given."""
+    session = session or rig.begin(run=run)
+    rig.submit(0)
     rig.work_off(session)
-    rig.close(run)
-    rig.work_off(session)
+    rig.finish(session)
 
 
-def test_a_run_is_committed_to_in_the_transaction_that_makes_it() -> None:
-    rig = Rig()
+def test_a_run_is_committed_to_in_the_transaction_that_makes_it(rig: Rig) -> None:
     rig.create(agent=None)
     row = rig.row(RunRow, "r1")
     document = rig.row(DocumentRow, "r1", "opening").data
@@ -54,8 +55,7 @@ def test_a_run_is_committed_to_in_the_transaction_that_makes_it() -> None:
     assert (opening.train, opening.validation, opening.heldout) == (row.train, row.validation, row.heldout)
 
 
-def test_what_is_committed_to_tells_nothing_of_the_operators_own() -> None:
-    rig = Rig()
+def test_what_is_committed_to_tells_nothing_of_the_operators_own(rig: Rig) -> None:
     rig.create(agent=None, notes={"invoice": "4711"}, agent_host="boot-of-mine")
     document = rig.row(DocumentRow, "r1", "opening").data
     assert b"4711" not in document
@@ -63,12 +63,10 @@ def test_what_is_committed_to_tells_nothing_of_the_operators_own() -> None:
 
 
 @pytest.mark.parametrize("cancelled", [False, True])
-def test_whatever_becomes_of_a_run_its_result_is_fixed(cancelled: bool) -> None:
-    rig = Rig()
-    session = rig.register()
-    rig.create()
+def test_whatever_becomes_of_a_run_its_result_is_fixed(rig: Rig, cancelled: bool) -> None:
+    session = rig.begin()
     if cancelled:
-        rig.tell(asked(operator.CancelRun, request=rig.request(), run="r1"))
+        rig.ask(operator.CancelRun, run="r1")
     else:
         finish(rig, session)
     opened, ended = entries_of(rig)
@@ -83,25 +81,21 @@ def test_whatever_becomes_of_a_run_its_result_is_fixed(cancelled: bool) -> None:
     assert (finished.committed.ended, finished.committed.ended_head) == (1, journal.heads(entries(rig))[1])
 
 
-def test_a_run_that_is_asked_for_twice_is_entered_once() -> None:
-    rig = Rig()
+def test_a_run_that_is_asked_for_twice_is_entered_once(rig: Rig) -> None:
     rig.create(key="k", agent=None)
     rig.create("r2", key="k", agent=None)
     assert len(entries(rig)) == 1
 
 
-def test_the_journal_goes_on_after_a_restart_where_it_was() -> None:
-    rig = Rig()
+def test_the_journal_goes_on_after_a_restart_where_it_was(rig: Rig) -> None:
     rig.create(agent=None)
     rig.load()
     rig.create("r2", agent=None)
     assert [entry.run for entry in entries_of(rig) if isinstance(entry, Opened)] == ["r1", "r2"]
 
 
-def test_runs_of_an_earlier_version_end_without_an_entry() -> None:
-    rig = Rig()
-    session = rig.register()
-    rig.create()
+def test_runs_of_an_earlier_version_end_without_an_entry(rig: Rig) -> None:
+    session = rig.begin()
     row = rig.row(RunRow, "r1")
     rig.rows = {key: each for key, each in rig.rows.items() if not isinstance(each, JournalRow | DocumentRow)}
     rig.rows[RunRow, "r1"] = msgspec.structs.replace(row, committed=None, salt=b"", epoch="")
@@ -112,25 +106,20 @@ def test_runs_of_an_earlier_version_end_without_an_entry() -> None:
     assert entries(rig) == []
 
 
-def test_no_cases_are_revealed_while_a_run_of_their_epoch_is_open() -> None:
-    rig = Rig()
-    session = rig.register()
-    rig.create(hidden_from=0)
+def test_no_cases_are_revealed_while_a_run_of_their_epoch_is_open(rig: Rig) -> None:
+    session = rig.begin(run={"hidden_from": 0})
     rig.create("r2", hidden_from=5000)
     finish(rig, session)
     answer = disclose(rig, "r1")
     assert isinstance(answer, Refused)
     assert "run 'r2' is not finished" in answer.message
-    rig.tell(asked(operator.CancelRun, request=rig.request(), run="r2"))
+    rig.ask(operator.CancelRun, run="r2")
     assert disclose(rig, "r1") == Done()
     assert isinstance(entries_of(rig)[-1], Revealed)
 
 
-def test_no_new_run_gets_a_revealed_epoch_after_a_restart() -> None:
-    rig = Rig()
-    session = rig.register()
-    rig.create()
-    finish(rig, session)
+def test_no_new_run_gets_a_revealed_epoch_after_a_restart(rig: Rig) -> None:
+    finish(rig)
     disclose(rig, "r1")
     for _ in range(2):
         answer = rig.create("r2", agent=None)
@@ -140,30 +129,22 @@ def test_no_new_run_gets_a_revealed_epoch_after_a_restart() -> None:
     assert isinstance(rig.create("r3", agent=None, epoch="next"), operator.RunCreated)
 
 
-def test_cases_that_are_public_anyway_may_be_played_on() -> None:
-    rig = Rig()
-    session = rig.register()
-    rig.create(split_secret=False)
-    finish(rig, session)
+def test_cases_that_are_public_anyway_may_be_played_on(rig: Rig) -> None:
+    finish(rig, split_secret=False)
     disclose(rig, "r1")
     assert isinstance(rig.create("r2", agent=None, split_secret=False), operator.RunCreated)
 
 
-def test_what_is_revealed_already_gets_no_second_entry() -> None:
-    rig = Rig()
-    session = rig.register()
-    rig.create()
-    finish(rig, session)
+def test_what_is_revealed_already_gets_no_second_entry(rig: Rig) -> None:
+    finish(rig)
     disclose(rig, "r1")
     before = entries(rig)
     assert disclose(rig, "r1") == Done()
     assert entries(rig) == before
 
 
-def test_epochs_are_listed_with_their_runs() -> None:
-    rig = Rig()
-    session = rig.register()
-    rig.create(epoch="a")
+def test_epochs_are_listed_with_their_runs(rig: Rig) -> None:
+    session = rig.begin(run={"epoch": "a"})
     finish(rig, session)
     disclose(rig, "r1", epochs=("a",))
     rig.create("r2", epoch="b", agent=None)

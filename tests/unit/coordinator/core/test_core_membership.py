@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from rigs.asking import asked
 from rigs.core_rig import Rig, describe, fingerprint
 
 from evopolicy_common.messages import worker as wire
@@ -14,20 +13,17 @@ from evopolicy_coordinator.core.leasing.expiry import FORGET_S
 
 
 def join(rig: Rig, name: str, *, version: str = "1", machine: str = "", size: int = 0, **more: Any) -> Any:
-    return rig.tell(
-        asked(
-            wire.Register,
-            request=rig.request(),
-            worker=name,
-            session=f"{name}-s{rig.request()}",
-            slots=1,
-            tiers=("bwrap",),
-            environments=(describe(),),
-            fingerprint=fingerprint(version),
-            machine=machine,
-            size=size,
-            **more,
-        )
+    return rig.ask(
+        wire.Register,
+        worker=name,
+        session=f"{name}-s{rig.request()}",
+        slots=1,
+        tiers=("bwrap",),
+        environments=(describe(),),
+        fingerprint=fingerprint(version),
+        machine=machine,
+        size=size,
+        **more,
     )
 
 

@@ -21,25 +21,33 @@ from evopolicy_coordinator.core.isolation import kernels
 HERE = "kernel-of-w1"
 
 
-def scored(rig: Rig, session: str, run: str = "r0") -> None:
-    """A run that is closed and has hidden cases to play."""
-    rig.create(run, agent=None)
-    rig.permit(run, "agents")
-    rig.submit(0, run=run)
+def scored(rig: Rig, **worker: Any) -> str:
+    """A worker, and run r0 that is closed and has hidden cases to play. Returns the worker's session."""
+    session = rig.register(slots=8, **worker)
+    rig.create("r0")
+    rig.submit(0, run="r0")
     rig.play(session, *rig.poll(session))
-    rig.close(run)
+    rig.close("r0")
+    return session
+
+
+def played(rig: Rig) -> tuple[str, list[wire.Lease]]:
+    """The same while its hidden cases are played, and run r1 whose agent has no permit yet."""
+    session = scored(rig)
+    leases = rig.poll(session, 8)
+    rig.create("r1", agent=None)
+    return session, leases
 
 
 def gone(rig: Rig, run: str = "r1", boot_id: str = "") -> Any:
-    return rig.tell(asked(operator.AgentGone, request=rig.request(), run=run, boot_id=boot_id))
+    return rig.ask(operator.AgentGone, run=run, boot_id=boot_id)
 
 
 def splits(leases: list[wire.Lease]) -> set[str]:
     return {split_of(lease.job) for lease in leases}
 
 
-def test_a_permit_is_durable_and_asked_for_again_at_no_cost() -> None:
-    rig = Rig()
+def test_a_permit_is_durable_and_asked_for_again_at_no_cost(rig: Rig) -> None:
     rig.register()
     rig.create(agent=None)
     for _ in range(2):
@@ -51,10 +59,8 @@ def test_a_permit_is_durable_and_asked_for_again_at_no_cost() -> None:
 
 
 @pytest.mark.parametrize("restart", [False, True])
-def test_nothing_hidden_is_leased_where_a_related_agent_may_be_alive(restart: bool) -> None:
-    rig = Rig()
-    session = rig.register(slots=8)
-    scored(rig, session)
+def test_nothing_hidden_is_leased_where_a_related_agent_may_be_alive(rig: Rig, restart: bool) -> None:
+    session = scored(rig)
     rig.create("r1", agent=HERE)
     if restart:
         rig.load()
@@ -66,17 +72,27 @@ def test_nothing_hidden_is_leased_where_a_related_agent_may_be_alive(restart: bo
     assert splits(rig.poll(other, 8)) == {"validation"}
 
 
-def test_an_unrelated_agent_is_no_obstacle_unless_strict() -> None:
-    for rule, wanted in (("related", {"random", "validation"}), ("strict", {"random"})):
-        rig = Rig(hidden_isolation=rule)
-        session = rig.register(slots=8)
-        scored(rig, session)
-        rig.create("r1", agent=HERE, hidden_from=5000)
-        assert splits(rig.poll(session, 8)) == wanted
+@pytest.mark.parametrize(
+    ("rule", "agent", "wanted"),
+    [
+        ("related", {"agent": HERE, "hidden_from": 5000}, {"random", "validation"}),
+        ("strict", {"agent": HERE, "hidden_from": 5000}, {"random"}),
+        ("related", {"agent": HERE, "hidden_from": 1001}, {"random"}),  # one case is shared
+        ("related", {"agent": ""}, {"random"}),  # it may be anywhere
+        ("off", {"agent": ""}, {"random", "validation"}),
+    ],
+)
+def test_agents_keep_the_hidden_cases_of_related_runs_from_their_kernels(
+    rule: str, agent: dict[str, Any], wanted: set[str]
+) -> None:
+    rig = Rig(hidden_isolation=rule)
+    session = scored(rig)
+    rig.create("r1", **agent)
+    assert splits(rig.poll(session, 8)) == wanted
+    assert rig.status().runs[-1].agent_host == (agent["agent"] or "everywhere")
 
 
-def test_an_agent_gone_from_one_kernel_is_not_ended_elsewhere() -> None:
-    rig = Rig()
+def test_an_agent_gone_from_one_kernel_is_not_ended_elsewhere(rig: Rig) -> None:
     rig.register()
     rig.create("r1", agent="lost")
     rig.permit("r1", HERE)
@@ -87,10 +103,8 @@ def test_an_agent_gone_from_one_kernel_is_not_ended_elsewhere() -> None:
     assert rig.row(PermitRow, "r1", HERE).ended_at is not None
 
 
-def test_an_agent_that_asks_again_stops_hidden_jobs() -> None:
-    rig = Rig()
-    session = rig.register(slots=8)
-    scored(rig, session)
+def test_an_agent_that_asks_again_stops_hidden_jobs(rig: Rig) -> None:
+    session = scored(rig)
     rig.create("r1", agent=HERE)
     gone(rig)
     leases = rig.poll(session, 8)
@@ -102,37 +116,16 @@ def test_an_agent_that_asks_again_stops_hidden_jobs() -> None:
     assert rig.permit("r1", HERE).granted
 
 
-def test_one_shared_case_makes_runs_related() -> None:
-    rig = Rig()
-    session = rig.register(slots=8)
-    scored(rig, session)
-    rig.create("r1", agent=HERE, hidden_from=1001)
-    assert splits(rig.poll(session, 8)) == {"random"}
-
-
-def test_an_agent_whose_kernel_is_not_known_keeps_hidden_cases_from_all() -> None:
-    rig = Rig()
-    session = rig.register(slots=8)
-    scored(rig, session)
-    rig.create("r1", agent="")
-    assert splits(rig.poll(session, 8)) == {"random"}
-    assert [run.agent_host for run in rig.status().runs] == ["", "everywhere"]
-
-
-def test_a_worker_on_an_unknown_kernel_plays_nothing_hidden() -> None:
-    rig = Rig()
-    session = rig.register(slots=8, boot_id="")
-    scored(rig, session)
+def test_a_worker_on_an_unknown_kernel_plays_nothing_hidden(rig: Rig) -> None:
+    session = scored(rig, boot_id="")
     assert splits(rig.poll(session, 8)) == {"random"}
     registered = next(reply for reply in rig.replies.values() if isinstance(reply, wire.Registered))
     assert "boot id" in registered.hidden_bar
     assert registered.hidden_bar == rig.status().workers[0].hidden_bar
 
 
-def test_a_permit_stops_hidden_jobs_and_waits_for_their_worker() -> None:
-    rig = Rig()
-    session = rig.register(slots=8)
-    scored(rig, session)
+def test_a_permit_stops_hidden_jobs_and_waits_for_their_worker(rig: Rig) -> None:
+    session = scored(rig)
     leases = rig.poll(session, 8)
     hidden = [lease for lease in leases if split_of(lease.job) == "validation"]
     rig.create("r1", agent=None)
@@ -147,12 +140,8 @@ def test_a_permit_stops_hidden_jobs_and_waits_for_their_worker() -> None:
     assert rig.core.state.runs["r0"].state.infrastructure_retries == 0
 
 
-def test_a_late_permit_names_its_wait_and_bars_hidden_jobs() -> None:
-    rig = Rig()
-    session = rig.register(slots=8)
-    scored(rig, session)
-    leases = rig.poll(session, 8)
-    rig.create("r1", agent=None)
+def test_a_late_permit_names_its_wait_and_bars_hidden_jobs(rig: Rig) -> None:
+    session, leases = played(rig)
     assert rig.permit("r1", HERE, wait_s=3.0) is None
     request = rig._requests
     rig.beat(session, *leases)
@@ -164,12 +153,8 @@ def test_a_late_permit_names_its_wait_and_bars_hidden_jobs() -> None:
     assert rig.permit("r1", HERE).granted
 
 
-def test_a_request_that_is_never_sent_again_is_forgotten() -> None:
-    rig = Rig()
-    session = rig.register(slots=8)
-    scored(rig, session)
-    leases = rig.poll(session, 8)
-    rig.create("r1", agent=None)
+def test_a_request_that_is_never_sent_again_is_forgotten(rig: Rig) -> None:
+    session, leases = played(rig)
     assert not rig.permit("r1", HERE).granted
     rig.report_results(session, *(result(lease, "returned") for lease in leases[:0]))
     rig.pass_time(11.0)
@@ -178,12 +163,8 @@ def test_a_request_that_is_never_sent_again_is_forgotten() -> None:
     assert kernels.kernel(rig.core.state, HERE).asks == {}
 
 
-def test_a_silent_workers_kernel_stays_barred_until_it_has_surely_stopped() -> None:
-    rig = Rig()
-    session = rig.register(slots=8)
-    scored(rig, session)
-    rig.poll(session, 8)
-    rig.create("r1", agent=None)
+def test_a_silent_workers_kernel_stays_barred_until_it_has_surely_stopped(rig: Rig) -> None:
+    played(rig)
     rig.pass_time(20.0)  # the worker is lost, its leases are given up
     assert rig.core.state.workers["w1"].state == "lost"
     assert not rig.permit("r1", HERE).granted
@@ -195,12 +176,8 @@ def test_a_silent_workers_kernel_stays_barred_until_it_has_surely_stopped() -> N
     assert rig.replies[request].granted
 
 
-def test_a_returning_worker_without_leases_frees_its_kernel() -> None:
-    rig = Rig()
-    session = rig.register(slots=8)
-    scored(rig, session)
-    leases = rig.poll(session, 8)
-    rig.create("r1", agent=None)
+def test_a_returning_worker_without_leases_frees_its_kernel(rig: Rig) -> None:
+    session, leases = played(rig)
     rig.pass_time(20.0)
     rig.beat(session, *leases)
     assert not rig.permit("r1", HERE).granted
@@ -208,27 +185,18 @@ def test_a_returning_worker_without_leases_frees_its_kernel() -> None:
     assert rig.permit("r1", HERE).granted
 
 
-def test_a_lease_in_transit_is_not_taken_for_a_released_one() -> None:
-    rig = Rig()
-    session = rig.register(slots=8)
-    scored(rig, session)
+def test_a_lease_in_transit_is_not_taken_for_a_released_one(rig: Rig) -> None:
+    session = scored(rig)
     rig.poll(session, 8, serial=7)
     rig.create("r1", agent=None)
     assert not rig.permit("r1", HERE).granted
-    before = asked(wire.Heartbeat, request=rig.request(), worker="w1", session=session, held=(), settled=6)
-    rig.tell(before)
-    assert not rig.permit("r1", HERE).granted
-    after = asked(wire.Heartbeat, request=rig.request(), worker="w1", session=session, held=(), settled=7)
-    rig.tell(after)
-    assert rig.permit("r1", HERE).granted
+    for settled in (6, 7):
+        rig.ask(wire.Heartbeat, worker="w1", session=session, held=(), settled=settled)
+        assert rig.permit("r1", HERE).granted is (settled == 7)
 
 
-def test_known_workers_count_as_playing_after_a_restart_until_heard() -> None:
-    rig = Rig()
-    session = rig.register(slots=8)
-    scored(rig, session)
-    leases = rig.poll(session, 8)
-    rig.create("r1", agent=None)
+def test_known_workers_count_as_playing_after_a_restart_until_heard(rig: Rig) -> None:
+    session, leases = played(rig)
     rig.load()
     assert not rig.permit("r1", HERE).granted
     assert rig.permit("r1", "another-machine").granted
@@ -239,10 +207,8 @@ def test_known_workers_count_as_playing_after_a_restart_until_heard() -> None:
     assert rig.permit("r1", HERE).granted
 
 
-def test_a_hidden_lease_is_not_adopted_where_an_agent_may_be_alive() -> None:
-    rig = Rig()
-    session = rig.register(slots=8)
-    scored(rig, session)
+def test_a_hidden_lease_is_not_adopted_where_an_agent_may_be_alive(rig: Rig) -> None:
+    session = scored(rig)
     leases = rig.poll(session, 8)
     hidden = {lease.lease_id for lease in leases if split_of(lease.job) == "validation"}
     rig.load()
@@ -252,11 +218,8 @@ def test_a_hidden_lease_is_not_adopted_where_an_agent_may_be_alive() -> None:
     assert set(rig.beat(session, *leases).cancelled) == hidden
 
 
-def test_a_permit_ends_with_its_run() -> None:
-    rig = Rig()
-    session = rig.register(slots=8)
-    rig.create("r1", agent=HERE)
-    rig.submit(0)
+def test_a_permit_ends_with_its_run(rig: Rig) -> None:
+    session = rig.begin(0, worker={"slots": 8}, run={"agent": HERE})
     rig.play(session, *rig.poll(session))
     assert rig.poll(session, 8) == []
     rig.close()
@@ -266,12 +229,12 @@ def test_a_permit_ends_with_its_run() -> None:
 
 @pytest.mark.parametrize("restart", [False, True])
 @pytest.mark.parametrize("confirmed", [False, True])
-def test_a_cancelled_runs_permit_ends_by_its_gateway_or_time(restart: bool, confirmed: bool) -> None:
-    rig = Rig()
-    session = rig.register(slots=8)
-    scored(rig, session)
+def test_a_cancelled_runs_permit_ends_by_its_gateway_or_time(
+    rig: Rig, restart: bool, confirmed: bool
+) -> None:
+    session = scored(rig)
     rig.create("r1", agent=HERE)
-    rig.tell(asked(operator.CancelRun, request=rig.request(), run="r1"))
+    rig.ask(operator.CancelRun, run="r1")
     if restart:
         rig.load()
         session = rig.register(slots=8)
@@ -292,10 +255,8 @@ def test_a_cancelled_runs_permit_ends_by_its_gateway_or_time(restart: bool, conf
     assert permits.held(rig.core.state, "r1") == []
 
 
-def test_an_operators_word_ends_a_permit_and_silence_does_not() -> None:
-    rig = Rig()
-    session = rig.register(slots=8)
-    scored(rig, session)
+def test_an_operators_word_ends_a_permit_and_silence_does_not(rig: Rig) -> None:
+    session = scored(rig)
     rig.create("r1", agent=HERE)
     rig.play(session, *rig.poll(session, 8))
     for _ in range(100):
@@ -319,10 +280,8 @@ def earlier_version(rig: Rig, message: type[wire.Message], **fields: Any) -> Any
 
 
 @pytest.mark.parametrize("by", ["its own gateway", "another gateway", "another worker", "its own worker"])
-def test_no_report_of_another_boot_id_ends_a_permit(by: str) -> None:
-    rig = Rig()
-    session = rig.register(slots=8)
-    scored(rig, session)
+def test_no_report_of_another_boot_id_ends_a_permit(rig: Rig, by: str) -> None:
+    session = scored(rig)
     for run in ("r1", "r2"):
         rig.create(run, agent=None)
     earlier_version(rig, gateway.RequestPermit, run="r1", boot_id=HERE, host="lab")
@@ -340,10 +299,8 @@ def test_no_report_of_another_boot_id_ends_a_permit(by: str) -> None:
     assert "validation" not in splits(rig.poll(session, 8))
 
 
-def test_a_permit_on_a_kernel_that_no_worker_names_bars_nothing() -> None:
-    rig = Rig()
-    session = rig.register(slots=8)
-    scored(rig, session)
+def test_a_permit_on_a_kernel_that_no_worker_names_bars_nothing(rig: Rig) -> None:
+    session = scored(rig)
     rig.create("r1", agent=HERE)
     assert splits(rig.poll(session, 8)) == {"random"}
     session = rig.register(slots=8, boot_id="another")  # the machine was restarted
@@ -352,10 +309,8 @@ def test_a_permit_on_a_kernel_that_no_worker_names_bars_nothing() -> None:
 
 @pytest.mark.parametrize("restart", [False, True])
 @pytest.mark.parametrize("there", [HERE, "another"])
-def test_a_stranger_under_a_lost_workers_name_frees_no_kernel(there: str, restart: bool) -> None:
-    rig = Rig()
-    session = rig.register(slots=8, machine="m1")
-    scored(rig, session)
+def test_a_stranger_under_a_lost_workers_name_frees_no_kernel(rig: Rig, there: str, restart: bool) -> None:
+    session = scored(rig, machine="m1")
     leases = rig.poll(session, 8)
     assert "validation" in splits(leases)
     if restart:
@@ -370,13 +325,10 @@ def test_a_stranger_under_a_lost_workers_name_frees_no_kernel(there: str, restar
     assert rig.permit("r1", HERE).granted
 
 
-def test_a_worker_on_another_kernel_speaks_for_no_earlier_one() -> None:
-    rig = Rig()
-    session = rig.register(slots=8)
-    scored(rig, session)
+def test_a_worker_on_another_kernel_speaks_for_no_earlier_one(rig: Rig) -> None:
+    session = scored(rig)
     assert "validation" in splits(rig.poll(session, 8))
-    session = rig.register(slots=8, boot_id="another")
-    rig.create("r1", agent=None)
+    session = rig.begin(worker={"slots": 8, "boot_id": "another"}, run={"agent": None})
     for _ in range(10):
         rig.pass_time(2.0)
         rig.beat(session)
@@ -386,8 +338,7 @@ def test_a_worker_on_another_kernel_speaks_for_no_earlier_one() -> None:
     assert rig.permit("r1", HERE).granted
 
 
-def test_a_takeover_by_another_host_keeps_the_first_permit() -> None:
-    rig = Rig()
+def test_a_takeover_by_another_host_keeps_the_first_permit(rig: Rig) -> None:
     rig.register()
     rig.create("r1", agent=None)
     rig.permit("r1", HERE, host="first")
@@ -398,17 +349,15 @@ def test_a_takeover_by_another_host_keeps_the_first_permit() -> None:
 
 
 @pytest.mark.parametrize("by", ["open", "submit"])
-def test_an_agent_whose_gateway_asks_for_no_permit_may_be_anywhere(by: str) -> None:
-    rig = Rig()
-    session = rig.register(slots=8)
-    scored(rig, session)
+def test_an_agent_whose_gateway_asks_for_no_permit_may_be_anywhere(rig: Rig, by: str) -> None:
+    session = scored(rig)
     hidden = rig.poll(session, 8)
     rig.create("r1", agent=None)
 
     def speak() -> Any:
         if by == "submit":
             return rig.submit(0, run="r1")
-        return rig.tell(asked(gateway.OpenRun, request=rig.request(), run="r1"))
+        return rig.ask(gateway.OpenRun, run="r1")
 
     assert speak().status == Refusal.UNAVAILABLE
     rig.report_results(session, *(result(lease, "returned") for lease in hidden))
@@ -416,32 +365,26 @@ def test_an_agent_whose_gateway_asks_for_no_permit_may_be_anywhere(by: str) -> N
     assert rig.status().runs[1].agent_host == "everywhere"
 
 
-def test_a_gateway_that_asks_for_permits_opens_its_run_without_one() -> None:
-    rig = Rig()
+def test_a_gateway_that_asks_for_permits_opens_its_run_without_one(rig: Rig) -> None:
     rig.register()
     rig.create("r1", agent=None)
-    opened = rig.tell(asked(gateway.OpenRun, request=rig.request(), run="r1", asks_permit=True))
+    opened = rig.ask(gateway.OpenRun, run="r1", asks_permit=True)
     assert isinstance(opened, gateway.RunOpened)
     assert permits.held(rig.core.state, "r1") == []
 
 
-def test_a_remote_agents_stated_place_replaces_its_gateways_host() -> None:
-    rig = Rig()
+def test_a_remote_agents_stated_place_replaces_its_gateways_host(rig: Rig) -> None:
     rig.register()
     rig.create("r1", agent="gateway", agent_host="remote")
     assert [row.boot_id for _, row in permits.held(rig.core.state, "r1")] == ["remote"]
 
 
-def test_a_vouched_agent_needs_no_permit_and_is_stamped() -> None:
-    rig = Rig()
-    session = rig.register(slots=8)
-    rig.create("r1", agent="", agent_host=ELSEWHERE)
+def test_a_vouched_agent_needs_no_permit_and_is_stamped(rig: Rig) -> None:
+    session = rig.begin(worker={"slots": 8}, run={"agent": "", "agent_host": ELSEWHERE})
     assert permits.held(rig.core.state, "r1") == []
     rig.submit(0)
     rig.work_off(session)
-    rig.close()
-    rig.work_off(session)
-    assert rig.finished().hidden_isolation == "waived"
+    assert rig.finish(session).hidden_isolation == "waived"
 
 
 @pytest.mark.parametrize(
@@ -458,36 +401,23 @@ def test_a_run_is_stamped_with_what_held_all_its_life(rules: str, stamp: str) ->
     session = rig.register()
     rig.submit(0)
     rig.work_off(session)
-    rig.close()
-    rig.work_off(session)
-    assert rig.finished().hidden_isolation == stamp
+    assert rig.finish(session).hidden_isolation == stamp
 
 
-def test_with_the_rule_off_nothing_waits() -> None:
-    rig = Rig(hidden_isolation="off")
-    session = rig.register(slots=8, boot_id="")
-    scored(rig, session)
-    rig.create("r1", agent="")
-    assert splits(rig.poll(session, 8)) == {"random", "validation"}
-
-
-def test_closed_runs_and_cancelled_ones_get_no_permit() -> None:
-    rig = Rig()
-    session = rig.register(slots=8)
-    scored(rig, session)
+def test_closed_runs_and_cancelled_ones_get_no_permit(rig: Rig) -> None:
+    session = scored(rig)
     assert rig.permit("r0").status == Refusal.RUN_CLOSED
     leases = rig.poll(session, 8)
     rig.create("r1", agent=None)
     assert rig.permit("r1", HERE, wait_s=9.0) is None
     request = rig._requests
-    rig.tell(asked(operator.CancelRun, request=rig.request(), run="r1"))
+    rig.ask(operator.CancelRun, run="r1")
     assert rig.replies[request].status == Refusal.RUN_CANCELLED
     rig.report_results(session, *(result(lease, "returned") for lease in leases))
     assert splits(rig.poll(session, 8)) == {"random", "validation"}
 
 
-def test_case_sets_are_forgotten_with_their_last_user() -> None:
-    rig = Rig()
+def test_case_sets_are_forgotten_with_their_last_user(rig: Rig) -> None:
     session = rig.register()
     for name in ("r1", "r2"):
         rig.create(name, agent=HERE)
@@ -500,8 +430,7 @@ def test_case_sets_are_forgotten_with_their_last_user() -> None:
     assert (case_sets._known, case_sets._of_case) == ({}, {})
 
 
-def test_a_gateway_may_name_only_so_many_kernels() -> None:
-    rig = Rig()
+def test_a_gateway_may_name_only_so_many_kernels(rig: Rig) -> None:
     rig.register()
     rig.create(agent=None)
     answers = [rig.permit("r1", f"kernel-{n}") for n in range(20)]

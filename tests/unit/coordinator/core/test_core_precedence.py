@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import pytest
-from rigs.asking import asked
 from rigs.audit_fleet import WAIT_S as AUDIT_WAIT_S
 from rigs.audit_fleet import Fleet
 from rigs.core_rig import BUNDLE, Rig, split_of
@@ -37,18 +36,18 @@ def keep_alive(rig: Rig, session: str, seconds: float, *held: wire.Lease) -> Non
         rig.beat(session, *held)
 
 
-def waiting(rig: Rig, session: str) -> None:
-    """A closed run `r0` whose hidden cases wait for the agent of `r1`, and have waited for long."""
+def waiting(rig: Rig, slots: int = 8) -> str:
+    """A worker, and a closed run `r0` whose hidden cases have waited for long for the agent of `r1`."""
+    session = rig.register(slots=slots)
     closed(rig, session, "r0")
     rig.create("r1", agent=HERE)
     rig.play(session, *rig.poll(session, 8))  # the random reference
     keep_alive(rig, session, WAIT_S + 4.0)
+    return session
 
 
-def test_long_waiting_hidden_cases_keep_new_agents_away() -> None:
-    rig = Rig()
-    session = rig.register(slots=8)
-    waiting(rig, session)
+def test_long_waiting_hidden_cases_keep_new_agents_away(rig: Rig) -> None:
+    session = waiting(rig)
     rig.create("r2", agent=None)
     assert not rig.permit("r2", HERE).granted
     assert rig.permit("r2", "another").granted
@@ -62,10 +61,8 @@ def test_long_waiting_hidden_cases_keep_new_agents_away() -> None:
     assert splits(hidden) == ["random", "validation"]
 
 
-def test_the_order_is_turned_back_when_nothing_hidden_is_left() -> None:
-    rig = Rig()
-    session = rig.register(slots=8)
-    waiting(rig, session)
+def test_the_order_is_turned_back_when_nothing_hidden_is_left(rig: Rig) -> None:
+    session = waiting(rig)
     rig.create("r2", agent=None)
     assert rig.permit("r2", HERE, wait_s=30.0) is None
     request = rig._requests
@@ -76,8 +73,7 @@ def test_the_order_is_turned_back_when_nothing_hidden_is_left() -> None:
     assert rig.replies[request].granted
 
 
-def test_before_that_new_agents_stop_hidden_cases() -> None:
-    rig = Rig()
+def test_before_that_new_agents_stop_hidden_cases(rig: Rig) -> None:
     session = rig.register(slots=8)
     closed(rig, session, "r0")
     rig.play(session, *[lease for lease in rig.poll(session, 8) if split_of(lease.job) == "random"])
@@ -97,8 +93,7 @@ def test_before_that_new_agents_stop_hidden_cases() -> None:
 
 def test_with_agents_elsewhere_train_and_hidden_jobs_take_turns() -> None:
     rig = Rig(hidden_wait_s=20.0)
-    session = rig.register(slots=1)
-    rig.create("r1", agent="remote", budget=64, train=64, most=64)
+    session = rig.begin(worker={"slots": 1}, run={"agent": "remote", "budget": 64, "train": 64, "most": 64})
     closed(rig, session, "r0")
     rig.submit(*range(60), run="r1")
     trace: list[str] = []
@@ -116,8 +111,7 @@ def test_with_agents_elsewhere_train_and_hidden_jobs_take_turns() -> None:
     assert trace[-1] == "random" or rig.finished("r0").status == "completed"
 
 
-def test_submits_that_wait_for_hidden_cases_say_so() -> None:
-    rig = Rig()
+def test_submits_that_wait_for_hidden_cases_say_so(rig: Rig) -> None:
     session = rig.register(slots=1)
     closed(rig, session, "r0")
     rig.create("r1", agent="remote")
@@ -134,7 +128,7 @@ def test_submits_that_wait_for_hidden_cases_say_so() -> None:
     (hidden,) = rig.poll(session, 1)
     assert split_of(hidden.job) == "validation"
     keep_alive(rig, session, 10.0, hidden)
-    state = rig.tell(asked(gateway.StateRequest, request=rig.request(), run="r1")).state
+    state = rig.ask(gateway.StateRequest, run="r1").state
     assert state.in_flight.waits_for == "hidden cases of another run to be scored"
     assert 7.0 <= state.in_flight.held_s <= 11.0
     assert state.held_s == state.in_flight.held_s
@@ -148,11 +142,10 @@ def test_submits_that_wait_for_hidden_cases_say_so() -> None:
     assert held_s >= 7.0
     rig.load()
     rig.register(slots=1)
-    assert rig.tell(asked(gateway.StateRequest, request=rig.request(), run="r1")).state.held_s == held_s
+    assert rig.ask(gateway.StateRequest, run="r1").state.held_s == held_s
 
 
-def test_the_time_a_submit_is_held_counts_against_no_limit() -> None:
-    rig = Rig()
+def test_the_time_a_submit_is_held_counts_against_no_limit(rig: Rig) -> None:
     session = rig.register(slots=1)
     rig.create("r1", agent="remote", limits=ResourceLimits(submit_wall_s=20.0))
     closed(rig, session, "r0")
@@ -185,8 +178,7 @@ def test_the_time_a_submit_is_held_counts_against_no_limit() -> None:
 @pytest.mark.parametrize("restart", [False, True])
 def test_a_run_that_keeps_others_waiting_for_too_long_is_cancelled(where: str, restart: bool) -> None:
     rig = Rig(agent_wait_s=600.0)
-    session = rig.register(slots=8)
-    rig.create("r1", agent=where)
+    session = rig.begin(worker={"slots": 8}, run={"agent": where})
     rig.create("r2", agent="remote")
     rig.create("r3", agent=HERE, hidden_from=9000)  # shares no hidden case
     keep_alive(rig, session, 700.0)
@@ -222,8 +214,7 @@ def test_an_agent_that_delays_others_is_named_until_its_limit() -> None:
     assert "r1" not in rig.core.state.runs
 
 
-def test_an_idle_worker_does_not_prevent_a_reservation() -> None:
-    rig = Rig()
+def test_an_idle_worker_does_not_prevent_a_reservation(rig: Rig) -> None:
     session = rig.register(slots=8)
     closed(rig, session, "r0")
     rig.create("r1", agent=HERE)
@@ -237,8 +228,7 @@ def test_an_idle_worker_does_not_prevent_a_reservation() -> None:
     assert turned == [HERE]
 
 
-def test_early_validation_never_keeps_an_agent_away() -> None:
-    rig = Rig()
+def test_early_validation_never_keeps_an_agent_away(rig: Rig) -> None:
     session = rig.register(slots=8)
     rig.create("r0", agent=HERE)
     rig.submit(0, run="r0")
@@ -250,13 +240,11 @@ def test_early_validation_never_keeps_an_agent_away() -> None:
 
 
 @pytest.mark.parametrize("why", ["draining", "lost"])
-def test_a_kernel_whose_workers_are_gone_is_turned_back(why: str) -> None:
-    rig = Rig()
-    session = rig.register(slots=8)
-    waiting(rig, session)
+def test_a_kernel_whose_workers_are_gone_is_turned_back(rig: Rig, why: str) -> None:
+    session = waiting(rig)
     assert kernels.kernel(rig.core.state, HERE).reversals
     if why == "draining":
-        rig.tell(asked(operator.SetWorker, request=rig.request(), worker="w1", state="draining"))
+        rig.ask(operator.SetWorker, worker="w1", state="draining")
         keep_alive(rig, session, 4.0)
     else:
         rig.pass_time(20.0)
@@ -264,8 +252,7 @@ def test_a_kernel_whose_workers_are_gone_is_turned_back(why: str) -> None:
     assert rig.permit("r2", HERE).granted
 
 
-def test_the_kernel_with_the_fewest_related_agents_is_reserved() -> None:
-    rig = Rig()
+def test_the_kernel_with_the_fewest_related_agents_is_reserved(rig: Rig) -> None:
     sessions = [rig.register(name, slots=8) for name in ("w1", "w2")]
     closed(rig, sessions[0], "r0")
     for number, where in enumerate((HERE, HERE, "kernel-of-w2"), 1):
@@ -280,10 +267,8 @@ def test_the_kernel_with_the_fewest_related_agents_is_reserved() -> None:
     assert turned == ["kernel-of-w2"]
 
 
-def test_a_closed_runs_hidden_cases_precede_others_train_jobs() -> None:
-    rig = Rig()
-    session = rig.register(slots=1)
-    waiting(rig, session)
+def test_a_closed_runs_hidden_cases_precede_others_train_jobs(rig: Rig) -> None:
+    session = waiting(rig, slots=1)
     rig.create("r2", agent="remote", hidden_from=9000)
     rig.submit(0, 1, run="r2")
     rig.close("r1")
@@ -358,8 +343,7 @@ def test_one_host_one_slot_and_four_runs_come_to_an_end() -> None:
     assert {rig.finished(run).hidden_isolation for run in runs} == {"exclusive"}
 
 
-def test_related_train_and_hidden_jobs_never_share_a_kernel() -> None:
-    rig = Rig()
+def test_related_train_and_hidden_jobs_never_share_a_kernel(rig: Rig) -> None:
     first, second = rig.register("w1", slots=4, boot_id="one"), rig.register("w2", slots=4, boot_id="one")
     closed(rig, first, "r0")
     rig.play(first, *[lease for lease in rig.poll(first, 8) if split_of(lease.job) == "random"])
@@ -379,31 +363,26 @@ def test_related_train_and_hidden_jobs_never_share_a_kernel() -> None:
     assert splits(rig.poll(first, 4)) == ["validation"]
 
 
-def test_a_rescore_waits_for_agents_of_related_runs() -> None:
-    rig = Rig()
-    session = rig.register(slots=8)
-    rig.create("r1", agent=HERE)
+def test_a_rescore_waits_for_agents_of_related_runs(rig: Rig) -> None:
+    session = rig.begin(worker={"slots": 8}, run={"agent": HERE})
     hidden = rig.core.state.runs["r1"].row.heldout
 
     def rescore(key: str, related: tuple[Case, ...]) -> None:
         new = (Case(seed=77_000),)
-        rig.tell(
-            asked(
-                operator.Evaluate,
-                request=rig.request(),
-                evaluation=key,
-                key=key,
-                env="toy/line",
-                bundle=BUNDLE,
-                split="heldout",
-                case_ids=(40,),
-                cases=new,
-                secret=b"x",
-                record="actions",
-                sandbox_tier="bwrap",
-                limits=ResourceLimits(),
-                related=related,
-            )
+        rig.ask(
+            operator.Evaluate,
+            evaluation=key,
+            key=key,
+            env="toy/line",
+            bundle=BUNDLE,
+            split="heldout",
+            case_ids=(40,),
+            cases=new,
+            secret=b"x",
+            record="actions",
+            sandbox_tier="bwrap",
+            limits=ResourceLimits(),
+            related=related,
         )
 
     rescore("of-another-epoch", ())

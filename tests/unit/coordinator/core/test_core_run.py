@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from rigs.asking import asked
 from rigs.core_rig import Rig, split_of
 
 from evopolicy_common.messages import gateway, operator
@@ -11,11 +10,10 @@ from evopolicy_coordinator.core.contract.effects import ReadFinished, ReadResult
 from evopolicy_coordinator.core.contract.records import SubmitRow, submit_done
 
 
-def test_a_run_plays_its_submits_validates_selects_and_is_scored() -> None:
-    rig = Rig()
+def test_a_run_plays_its_submits_validates_selects_and_is_scored(rig: Rig) -> None:
     session = rig.register()
     assert isinstance(rig.create(), operator.RunCreated)
-    opened = rig.tell(asked(gateway.OpenRun, request="open", run="r1"))
+    opened = rig.ask(gateway.OpenRun, run="r1")
     assert isinstance(opened, gateway.RunOpened)
     assert opened.state.remaining_budget == 16
 
@@ -34,11 +32,10 @@ def test_a_run_plays_its_submits_validates_selects_and_is_scored() -> None:
     rig.work_off(session, lambda job: 5.0)
     rig.submit(4, key="k2")
     rig.work_off(session, lambda job: 5.0)
-    waiting = rig.tell(asked(operator.WaitRun, request="wait", run="r1", wait_s=60.0))
-    assert waiting is None
-    rig.close()
-    rig.work_off(session, lambda job: {"heldout": 7.0, "random": -1.0}[split_of(job)])
-    assert isinstance(rig.replies["wait"], ReadFinished)
+    assert rig.ask(operator.WaitRun, run="r1", wait_s=60.0) is None
+    waiting = rig._requests
+    rig.finish(session, lambda job: {"heldout": 7.0, "random": -1.0}[split_of(job)])
+    assert isinstance(rig.replies[waiting], ReadFinished)
     finished = rig.finished()
     assert finished.status == "completed"
     assert finished.best_submit_index == 2  # a tie goes to the later submit
@@ -50,13 +47,7 @@ def test_a_run_plays_its_submits_validates_selects_and_is_scored() -> None:
     assert not rig.core.state.jobs
 
 
-def test_a_request_of_an_unknown_run_is_refused() -> None:
-    rig = Rig()
-    for answer in (
-        rig.submit(0),
-        rig.results(),
-        rig.close(),
-        rig.tell(asked(gateway.StateRequest, request="s", run="r1")),
-    ):
+def test_a_request_of_an_unknown_run_is_refused(rig: Rig) -> None:
+    for answer in (rig.submit(0), rig.results(), rig.close(), rig.ask(gateway.StateRequest, run="r1")):
         assert isinstance(answer, Refused)
         assert answer.status == "unknown_run"

@@ -9,7 +9,6 @@ from typing import Any, Literal
 
 import msgspec
 import pytest
-from rigs.asking import asked
 from rigs.core_rig import BUNDLE, ENV, Rig, describe, outcome_of, result, split_of
 
 from evopolicy_common.messages import operator
@@ -30,8 +29,7 @@ def validating(rig: Rig, session: str, n: int = 1) -> None:
         rig.play(session, lease)
 
 
-def test_train_goes_before_early_validation_of_any_run() -> None:
-    rig = Rig()
+def test_train_goes_before_early_validation_of_any_run(rig: Rig) -> None:
     session = rig.register(slots=4)
     validating(rig, session)
     rig.create("r2")
@@ -42,8 +40,7 @@ def test_train_goes_before_early_validation_of_any_run() -> None:
     assert {split_of(lease.job) for lease in rig.poll(session, 4)} == {"validation"}
 
 
-def test_a_closed_runs_validation_goes_before_early_validation() -> None:
-    rig = Rig()
+def test_a_closed_runs_validation_goes_before_early_validation(rig: Rig) -> None:
     session = rig.register(slots=1)
     validating(rig, session)
     rig.create("r2")
@@ -53,10 +50,8 @@ def test_a_closed_runs_validation_goes_before_early_validation() -> None:
     assert rig.poll(session, 1)[0].job.job_id.startswith("r2/")
 
 
-def test_two_runs_share_the_slots_whatever_they_have_waiting() -> None:
-    rig = Rig()
-    session = rig.register(slots=2)
-    rig.create("r1", budget=64, most=64)
+def test_two_runs_share_the_slots_whatever_they_have_waiting(rig: Rig) -> None:
+    session = rig.begin(worker={"slots": 2}, run={"budget": 64, "most": 64})
     rig.create("r2", budget=64, most=64)
     rig.submit(*range(40), run="r1")
     rig.submit(*range(8), run="r2", key="x")
@@ -68,10 +63,8 @@ def test_two_runs_share_the_slots_whatever_they_have_waiting() -> None:
     assert got == {"r1": 8, "r2": 8}
 
 
-def test_a_worker_cannot_forge_the_fair_shares_time() -> None:
-    rig = Rig()
-    session = rig.register(slots=2)
-    rig.create("r1", budget=64, most=64)
+def test_a_worker_cannot_forge_the_fair_shares_time(rig: Rig) -> None:
+    session = rig.begin(worker={"slots": 2}, run={"budget": 64, "most": 64})
     rig.create("r2", budget=64, most=64)
     rig.submit(*range(40), run="r1")
     rig.submit(*range(40), run="r2", key="x")
@@ -88,8 +81,7 @@ def test_a_worker_cannot_forge_the_fair_shares_time() -> None:
     assert got == {"r1": 8, "r2": 8}
 
 
-def test_a_run_that_was_idle_earns_nothing_by_it() -> None:
-    rig = Rig()
+def test_a_run_that_was_idle_earns_nothing_by_it(rig: Rig) -> None:
     session = rig.register(slots=2)
     rig.create("r1", budget=64, most=64)
     rig.submit(*range(40), run="r1")
@@ -105,8 +97,7 @@ def test_a_run_that_was_idle_earns_nothing_by_it() -> None:
     assert abs(got["r1"] - got["r2"]) <= 2
 
 
-def test_a_submit_spreads_over_all_waiting_workers() -> None:
-    rig = Rig()
+def test_a_submit_spreads_over_all_waiting_workers(rig: Rig) -> None:
     sessions = [rig.register(f"w{index}", slots=2) for index in range(3)]
     rig.create()
     for session in sessions:
@@ -117,8 +108,7 @@ def test_a_submit_spreads_over_all_waiting_workers() -> None:
     assert given == [2, 2, 2]
 
 
-def test_short_episodes_come_in_batches_and_no_idle_worker_goes_without() -> None:
-    rig = Rig()
+def test_short_episodes_come_in_batches_and_no_idle_worker_goes_without(rig: Rig) -> None:
     first, second = rig.register("w1", slots=1), rig.register("w2", slots=1)
     rig.create(budget=128, most=128)
     rig.core.state.runs["r1"].flow.episode_s = 0.005
@@ -127,11 +117,8 @@ def test_short_episodes_come_in_batches_and_no_idle_worker_goes_without() -> Non
     assert len(rig.poll(second, 2)) > 1
 
 
-def test_long_episodes_are_leased_to_free_slots_only() -> None:
-    rig = Rig()
-    session = rig.register(slots=2)
-    rig.create()
-    rig.submit(*range(8))
+def test_long_episodes_are_leased_to_free_slots_only(rig: Rig) -> None:
+    session = rig.begin(*range(8), worker={"slots": 2})
     leases = rig.poll(session, 4)
     assert len(leases) == 2
     assert rig.poll(session, 2, wait_s=9.0) is None
@@ -140,8 +127,7 @@ def test_long_episodes_are_leased_to_free_slots_only() -> None:
     assert len(rig.replies[request].leases) == 1
 
 
-def test_new_work_goes_to_the_worker_that_has_its_bundle_warm() -> None:
-    rig = Rig()
+def test_new_work_goes_to_the_worker_that_has_its_bundle_warm(rig: Rig) -> None:
     cold, warm = rig.register("w1"), rig.register("w2")
     rig.create()
     rig.poll(cold, 2, wait_s=9.0)
@@ -151,8 +137,7 @@ def test_new_work_goes_to_the_worker_that_has_its_bundle_warm() -> None:
     assert len(rig.replies[request].leases) == 1
 
 
-def test_a_waiting_train_job_stops_early_validation_for_a_while() -> None:
-    rig = Rig()
+def test_a_waiting_train_job_stops_early_validation_for_a_while(rig: Rig) -> None:
     session = rig.register(slots=1)
     validating(rig, session)
     (hidden,) = rig.poll(session, 1)
@@ -169,8 +154,7 @@ def test_a_waiting_train_job_stops_early_validation_for_a_while() -> None:
     assert rig.core.state.runs["r1"].state.infrastructure_retries == 0
 
 
-def test_a_waiting_poll_is_told_at_once_what_to_stop() -> None:
-    rig = Rig()
+def test_a_waiting_poll_is_told_at_once_what_to_stop(rig: Rig) -> None:
     session = rig.register(slots=2)
     validating(rig, session)
     hidden = rig.poll(session, 2)
@@ -182,8 +166,7 @@ def test_a_waiting_poll_is_told_at_once_what_to_stop() -> None:
     assert [split_of(lease.job) for lease in rig.poll(session, 2)] == ["train", "train"]
 
 
-def test_batched_early_validation_still_leaves_train_its_slot() -> None:
-    rig = Rig()
+def test_batched_early_validation_still_leaves_train_its_slot(rig: Rig) -> None:
     session = rig.register(slots=2)
     validating(rig, session)
     rig.core.state.runs["r1"].flow.episode_s = 0.01
@@ -199,8 +182,7 @@ def test_batched_early_validation_still_leaves_train_its_slot() -> None:
     assert split_of(rig.poll(session, 2)[0].job) == "train"
 
 
-def test_a_retried_train_job_stops_hidden_jobs_on_its_worker() -> None:
-    rig = Rig()
+def test_a_retried_train_job_stops_hidden_jobs_on_its_worker(rig: Rig) -> None:
     session = rig.register("w1", slots=1)
     validating(rig, session)
     other = rig.register("w2", slots=1)
@@ -217,11 +199,8 @@ def test_a_retried_train_job_stops_hidden_jobs_on_its_worker() -> None:
     assert rig.beat(session, hidden).cancelled == (hidden.lease_id,)
 
 
-def test_a_waiting_train_job_stops_an_adopted_hidden_job() -> None:
-    rig = Rig()
-    session = rig.register(slots=1)
-    rig.create(n_valid=1)
-    rig.submit(0)
+def test_a_waiting_train_job_stops_an_adopted_hidden_job(rig: Rig) -> None:
+    session = rig.begin(0, worker={"slots": 1}, run={"n_valid": 1})
     rig.play(session, *rig.poll(session, 1))
     (hidden,) = rig.poll(session, 1)
     rig.load()
@@ -235,9 +214,7 @@ def test_a_waiting_train_job_stops_an_adopted_hidden_job() -> None:
 
 def test_a_closed_runs_hidden_job_is_preempted_a_bounded_number_of_times() -> None:
     rig = Rig(preemptions_max=2)
-    session = rig.register(slots=1)
-    rig.create(n_valid=1, n_held=1)
-    rig.submit(0)
+    session = rig.begin(0, worker={"slots": 1}, run={"n_valid": 1, "n_held": 1})
     rig.work_off(session)
     rig.close()
     rig.create("r2")
@@ -259,8 +236,7 @@ def test_a_closed_runs_hidden_job_is_preempted_a_bounded_number_of_times() -> No
     assert all(job.preemptions <= 2 for job in rig.core.state.jobs.values() if job.group.run == "r1")
 
 
-def test_a_worker_gets_only_what_it_can_play() -> None:
-    rig = Rig()
+def test_a_worker_gets_only_what_it_can_play(rig: Rig) -> None:
     rig.register("w1", envs=("toy/line",))
     other = rig.register("w2", envs=("toy/maze",))
     weak = rig.register("w3", tiers=("none",))
@@ -270,8 +246,7 @@ def test_a_worker_gets_only_what_it_can_play() -> None:
     assert rig.poll(weak) == []
 
 
-def test_a_run_stays_with_its_fingerprint_class_until_an_operator_says_otherwise() -> None:
-    rig = Rig()
+def test_a_run_stays_with_its_fingerprint_class_until_an_operator_says_otherwise(rig: Rig) -> None:
     rig.register("w1", version="1")
     rig.create()
     rig.submit(0)
@@ -284,22 +259,16 @@ def test_a_run_stays_with_its_fingerprint_class_until_an_operator_says_otherwise
     worker = next(each for each in rig.status().workers if each.worker == "w2")
     assert "r1" in worker.refused
     named = worker.fingerprint
-    wrong = rig.tell(asked(operator.RepinRun, request="a", run="r1", fingerprint_class="nope", reason="x"))
+    wrong = rig.ask(operator.RepinRun, run="r1", fingerprint_class="nope", reason="x")
     assert wrong.status == "unknown_class"
-    rig.tell(
-        asked(
-            operator.RepinRun, request="b", run="r1", fingerprint_class=named, reason="the old host is gone"
-        )
-    )
+    rig.ask(operator.RepinRun, run="r1", fingerprint_class=named, reason="the old host is gone")
     rig.play(other, *rig.poll(other))
-    rig.close()
-    rig.work_off(other)
+    rig.finish(other)
     (override,) = rig.finished().fingerprint_overrides
     assert override.endswith(f" → {named}: the old host is gone")
 
 
-def test_a_run_names_the_installations_that_played_it_and_only_those() -> None:
-    rig = Rig()
+def test_a_run_names_the_installations_that_played_it_and_only_those(rig: Rig) -> None:
     workers = [
         rig.register(f"w{k}", slots=1, installation=name) for k, name in enumerate(("base@1", "atari@2"))
     ]
@@ -353,9 +322,8 @@ def versioned(env: str = "toy/line", **more: Any) -> EnvironmentDescription:
     ],
 )
 def test_what_plays_other_environments_makes_no_other_class_of_this_one(
-    more: dict[str, Any], described: tuple[EnvironmentDescription, ...]
+    rig: Rig, more: dict[str, Any], described: tuple[EnvironmentDescription, ...]
 ) -> None:
-    rig = Rig()
     rig.register("w1", described=(versioned(),))
     rig.create()
     rig.submit(0)
@@ -372,8 +340,9 @@ def test_what_plays_other_environments_makes_no_other_class_of_this_one(
         ({"task_text": "easier"}, "task_text  there, easier here"),
     ],
 )
-def test_two_definitions_of_one_environment_are_two_classes(changed: dict[str, Any], named: str) -> None:
-    rig = Rig()
+def test_two_definitions_of_one_environment_are_two_classes(
+    rig: Rig, changed: dict[str, Any], named: str
+) -> None:
     rig.register("w1", described=(versioned(),))
     rig.create()
     rig.submit(0)
@@ -381,14 +350,11 @@ def test_two_definitions_of_one_environment_are_two_classes(changed: dict[str, A
     assert rig.poll(other) == []
     (worker,) = (each for each in rig.status().workers if each.worker == "w2")
     assert named in worker.refused["r1"]
-    reply = rig.tell(
-        asked(
-            operator.RepinRun,
-            request="b",
-            run="r1",
-            fingerprint_class=worker.classes["toy/line"],
-            reason="the old host is gone",
-        )
+    reply = rig.ask(
+        operator.RepinRun,
+        run="r1",
+        fingerprint_class=worker.classes["toy/line"],
+        reason="the old host is gone",
     )
     assert reply == operator.Done()
     assert len(rig.poll(other)) == 1
@@ -402,14 +368,11 @@ def test_a_definition_is_the_same_whoever_plays_it_and_whatever_its_defaults() -
 
 @pytest.mark.parametrize(("state", "ends"), [("draining", True), ("paused", False)])
 def test_a_worker_out_of_service_gets_no_work_after_restarts(
-    state: Literal["draining", "paused"], ends: bool
+    rig: Rig, state: Literal["draining", "paused"], ends: bool
 ) -> None:
-    rig = Rig()
-    session = rig.register()
-    rig.create()
-    rig.submit(0, 1)
+    session = rig.begin(0, 1)
     (lease, _) = rig.poll(session, 2)
-    answer = rig.tell(asked(operator.SetWorker, request="out", worker="w1", state=state))
+    answer = rig.ask(operator.SetWorker, worker="w1", state=state)
     assert isinstance(answer, operator.Done)
     assert rig.beat(session, lease).drain is ends
     rig.play(session, lease)
@@ -420,18 +383,17 @@ def test_a_worker_out_of_service_gets_no_work_after_restarts(
     assert rig.beat(session).drain is ends
     assert rig.poll(session) == []
     assert [each.state for each in rig.status().workers] == [state]
-    rig.tell(asked(operator.SetWorker, request="back", worker="w1", state="active"))
+    rig.ask(operator.SetWorker, worker="w1", state="active")
     assert len(rig.poll(session)) == 1
 
 
 @pytest.mark.parametrize("how", ["paused", "lost"])
 def test_a_run_opened_without_workers_is_played_on_their_return(
-    how: Literal["paused", "lost"],
+    rig: Rig, how: Literal["paused", "lost"]
 ) -> None:
-    rig = Rig()
     session = rig.register()
     if how == "paused":
-        rig.tell(asked(operator.SetWorker, request="out", worker="w1", state="paused"))
+        rig.ask(operator.SetWorker, worker="w1", state="paused")
     else:
         rig.pass_time(60.0)
     assert [each.state for each in rig.status().workers] == [how]
@@ -439,12 +401,11 @@ def test_a_run_opened_without_workers_is_played_on_their_return(
     rig.submit(0)
     if how == "paused":
         assert rig.poll(session) == []
-        rig.tell(asked(operator.SetWorker, request="back", worker="w1", state="active"))
+        rig.ask(operator.SetWorker, worker="w1", state="active")
     assert len(rig.poll(session)) == 1
 
 
-def test_a_second_poll_answers_the_first_with_no_leases() -> None:
-    rig = Rig()
+def test_a_second_poll_answers_the_first_with_no_leases(rig: Rig) -> None:
     session = rig.register()
     assert rig.poll(session, wait_s=9.0) is None
     first = rig._requests
@@ -465,8 +426,7 @@ def test_what_waits_too_long_is_named_with_what_it_waits_for() -> None:
     assert "a worker that offers toy/line" in stall
 
 
-def test_a_run_waits_for_its_connected_workers_description_only() -> None:
-    rig = Rig()
+def test_a_run_waits_for_its_connected_workers_description_only(rig: Rig) -> None:
     rig.create()
     flow = rig.core.state.runs["r1"].flow
     rig.register("w1", envs=(), undescribed=(ENV,), tiers=("none",))
@@ -475,14 +435,13 @@ def test_a_run_waits_for_its_connected_workers_description_only() -> None:
     assert words(waits_for_workers(rig.core.state, flow)) == (
         f"a connected worker to describe {ENV}, as it does before its first episode"
     )
-    rig.tell(asked(operator.SetWorker, request="away", worker="w2", state="paused"))
+    rig.ask(operator.SetWorker, worker="w2", state="paused")
     assert words(waits_for_workers(rig.core.state, flow)).endswith(": those that do are paused")
     rig.register("w3")
     assert waits_for_workers(rig.core.state, flow) is None
 
 
-def test_a_run_learns_why_its_environment_failed_until_a_worker_offers_it() -> None:
-    rig = Rig()
+def test_a_run_learns_why_its_environment_failed_until_a_worker_offers_it(rig: Rig) -> None:
     rig.create()
     flow = rig.core.state.runs["r1"].flow
     rig.register("w1", envs=("toy/maze",), failed={ENV: "step 3: it raised KeyError"})
@@ -499,9 +458,7 @@ def test_a_run_learns_why_its_environment_failed_until_a_worker_offers_it() -> N
 
 def test_jobs_waiting_after_faults_are_named_with_the_last() -> None:
     rig = Rig(stall_s=0.1, retry_base_s=10.0)
-    session = rig.register()
-    rig.create()
-    rig.submit(0)
+    session = rig.begin(0)
     rig.report_results(session, result(rig.poll(session)[0], "failed", error="no space left on device"))
     rig.pass_time(1.0)
     (stall,) = rig.status().stalls
@@ -509,19 +466,14 @@ def test_jobs_waiting_after_faults_are_named_with_the_last() -> None:
     assert stall.endswith("after 1 faults, the last: failed on w1: no space left on device")
 
 
-def test_a_poll_read_after_its_worker_gave_up_gets_no_lease() -> None:
-    rig = Rig()
-    session = rig.register()
-    rig.create()
-    rig.submit(0, 1)
+def test_a_poll_read_after_its_worker_gave_up_gets_no_lease(rig: Rig) -> None:
+    session = rig.begin(0, 1)
     assert rig.poll(session, 1, wait_s=10.0, waited_s=12.0) == []
     assert len(rig.poll(session, 1, wait_s=10.0, waited_s=9.0)) == 1
 
 
-def test_a_parked_poll_given_up_during_a_block_gets_no_lease() -> None:
-    rig = Rig()
-    session = rig.register()
-    rig.create()
+def test_a_parked_poll_given_up_during_a_block_gets_no_lease(rig: Rig) -> None:
+    session = rig.begin()
     assert rig.poll(session, 1, wait_s=10.0) is None
     request = rig._requests
     rig.now += 14.0
@@ -531,8 +483,7 @@ def test_a_parked_poll_given_up_during_a_block_gets_no_lease() -> None:
     assert len(rig.poll(session, 1)) == 1
 
 
-def test_a_late_read_poll_is_answered_while_its_worker_waits() -> None:
-    rig = Rig()
+def test_a_late_read_poll_is_answered_while_its_worker_waits(rig: Rig) -> None:
     session = rig.register()
     assert rig.poll(session, 1, wait_s=10.0, waited_s=8.0) is None
     request = rig._requests
@@ -540,8 +491,7 @@ def test_a_late_read_poll_is_answered_while_its_worker_waits() -> None:
     assert rig.replies[request] == wire.Leases(leases=())
 
 
-def test_one_answer_holds_no_more_leases_than_fit_into_a_message() -> None:
-    rig = Rig()
+def test_one_answer_holds_no_more_leases_than_fit_into_a_message(rig: Rig) -> None:
     session = rig.register(slots=4096)
     rig.create(train=64, budget=2000, most=1000)
     rig.submit(*(k % 64 for k in range(1000)))
@@ -552,9 +502,7 @@ def test_one_answer_holds_no_more_leases_than_fit_into_a_message() -> None:
 def test_a_worker_holds_no_more_leases_than_its_heartbeat_can_name(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(scheduler, "HELD_MAX", 20)
     rig = Rig()
-    session = rig.register(slots=4096)
-    rig.create(train=64, budget=100, most=100)
-    rig.submit(*range(50))
+    session = rig.begin(*range(50), worker={"slots": 4096}, run={"train": 64, "budget": 100, "most": 100})
     first = rig.poll(session, 4096)
     assert (len(first), rig.poll(session, 4096)) == (20, [])
     rig.play(session, first[0])

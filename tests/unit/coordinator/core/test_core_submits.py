@@ -6,7 +6,6 @@ from typing import Any
 
 import msgspec
 import pytest
-from rigs.asking import asked
 from rigs.core_rig import BUNDLE, Rig, done, outcome_of, result
 from rigs.store_rows import blob
 
@@ -17,11 +16,9 @@ from evopolicy_coordinator.core.contract.effects import ReadResults
 from evopolicy_coordinator.core.contract.records import OutcomeRow, SubmitRow, submit_done
 
 
-def started(**settings: Any) -> tuple[Rig, str]:
+def started(*ids: int, **settings: Any) -> tuple[Rig, str]:
     rig = Rig()
-    session = rig.register(slots=8)
-    rig.create(**settings)
-    return rig, session
+    return rig, rig.begin(*ids, worker={"slots": 8}, run=settings)
 
 
 @pytest.mark.parametrize(
@@ -38,7 +35,7 @@ def test_rejected_request_costs_no_budget(ids: tuple[int, ...], status: str) -> 
     answer = rig.submit(*ids)
     assert isinstance(answer, Refused)
     assert answer.status == status
-    state = rig.tell(asked(gateway.StateRequest, request="state", run="r1")).state
+    state = rig.ask(gateway.StateRequest, run="r1").state
     assert (state.remaining_budget, state.n_submits) == (16, 0)
     assert not [row for row in rig.rows.values() if isinstance(row, SubmitRow)]
 
@@ -55,48 +52,40 @@ def test_one_key_is_one_submit_and_another_request_a_conflict() -> None:
 
 
 def test_a_second_submit_while_one_runs_is_refused_and_names_the_first() -> None:
-    rig, _ = started()
-    rig.submit(0)
+    rig, _ = started(0)
     answer = rig.submit(1, key="k1")
     assert (answer.status, "submit 0" in answer.message) == ("busy", True)
 
 
-def test_a_run_without_a_worker_waits_to_be_opened() -> None:
-    rig = Rig()
+def test_a_run_without_a_worker_waits_to_be_opened(rig: Rig) -> None:
     rig.create()
-    assert rig.tell(asked(gateway.OpenRun, request="early", run="r1")).status == "no_worker"
+    assert rig.ask(gateway.OpenRun, run="r1").status == "no_worker"
     rig.register()
-    assert isinstance(rig.tell(asked(gateway.OpenRun, request="late", run="r1")), gateway.RunOpened)
+    assert isinstance(rig.ask(gateway.OpenRun, run="r1"), gateway.RunOpened)
 
 
 def test_nothing_is_released_before_the_episode_at_index_0_shows_a_policy() -> None:
-    rig, session = started()
-    rig.submit(0, 1, 2)
+    rig, session = started(0, 1, 2)
     leases = {lease.job.episodes[0].index: lease for lease in rig.poll(session, 8)}
     rig.play(session, leases[1])
     assert rig.results().upto == 0
-    poll = rig.request()
-    waiting = asked(gateway.ResultsRequest, request=poll, run="r1", submit_index=0, cursor=0, wait_s=9.0)
-    assert rig.tell(waiting) is None
+    assert rig.ask(gateway.ResultsRequest, run="r1", submit_index=0, cursor=0, wait_s=9.0) is None
+    poll = rig._requests
     rig.play(session, leases[0])
-    page = rig.replies[poll]
-    assert isinstance(page, ReadResults)
-    assert page.upto == 2
+    assert rig.replies[poll].upto == 2
 
 
 def test_one_page_has_all_results_of_a_report() -> None:
-    rig, session = started()
-    rig.submit(0, 1, 2, 3)
+    rig, session = started(0, 1, 2, 3)
     leases = rig.poll(session, 8)
-    poll = rig.request()
-    rig.tell(asked(gateway.ResultsRequest, request=poll, run="r1", submit_index=0, cursor=0, wait_s=9.0))
+    rig.ask(gateway.ResultsRequest, run="r1", submit_index=0, cursor=0, wait_s=9.0)
+    poll = rig._requests
     rig.play(session, *leases[:3])
     assert rig.replies[poll].upto == 3
 
 
 def test_a_bundle_without_a_policy_is_charged_in_full() -> None:
-    rig, session = started()
-    rig.submit(0, 1, 2)
+    rig, session = started(0, 1, 2)
     leases = {lease.job.episodes[0].index: lease for lease in rig.poll(session, 8)}
     rig.play(session, leases[1], failure="import_error")
     assert rig.row(SubmitRow, "r1", 0).status is None
@@ -110,8 +99,7 @@ def test_a_bundle_without_a_policy_is_charged_in_full() -> None:
 
 
 def test_a_later_episode_without_a_policy_is_only_that_episodes_failure() -> None:
-    rig, session = started()
-    rig.submit(0, 1)
+    rig, session = started(0, 1)
     for lease in rig.poll(session, 8):
         rig.play(session, lease, failure="init_error" if lease.job.episodes[0].index else None)
     assert rig.row(SubmitRow, "r1", 0).status == "ok"
@@ -133,8 +121,7 @@ def test_a_snapshot_that_could_not_be_made_is_a_verdict_and_charged() -> None:
 
 
 def test_an_earlier_versions_dead_slot_is_played_again() -> None:
-    rig, session = started()
-    rig.submit(0)
+    rig, session = started(0)
     for attempt in range(4):
         rig.pass_time(60.0)
         session = rig.register(slots=8)
@@ -163,8 +150,7 @@ def test_a_submit_limit_keeps_episodes_before_the_first_unfinished() -> None:
 
 
 def test_a_fault_of_ours_costs_neither_limit_nor_budget() -> None:
-    rig, session = started(limits=ResourceLimits(submit_wall_s=30.0))
-    rig.submit(0)
+    rig, session = started(0, limits=ResourceLimits(submit_wall_s=30.0))
     for _ in range(4):
         (lease,) = rig.poll(session, 8, wait_s=1.0)
         rig.report_results(session, result(lease, "failed", error="environment my/env, step 3: it hangs"))
@@ -184,8 +170,7 @@ def test_a_fault_of_ours_costs_neither_limit_nor_budget() -> None:
 
 
 def test_a_fault_counts_after_an_episode_with_more_is_done() -> None:
-    rig, session = started(limits=ResourceLimits(submit_wall_s=30.0))
-    rig.submit(0, 1)
+    rig, session = started(0, 1, limits=ResourceLimits(submit_wall_s=30.0))
     leases = {lease.job.episodes[0].index: lease for lease in rig.poll(session, 8)}
     rig.report_results(session, result(leases[0], "failed", error="environment my/env: it hangs"))
     for _ in range(12):  # the limit begins again
@@ -201,8 +186,7 @@ def test_a_fault_counts_after_an_episode_with_more_is_done() -> None:
 
 
 def test_scope_submit_plays_hidden_cases_in_equal_chunks() -> None:
-    rig, session = started(policy_scope="submit", n_valid=5)
-    rig.submit(4, 4, 9)
+    rig, session = started(4, 4, 9, policy_scope="submit", n_valid=5)
     (lease,) = rig.poll(session, 8)
     assert [spec.case.seed for spec in lease.job.episodes] == [4, 4, 9]
     assert len({spec.policy_seed for spec in lease.job.episodes}) == 3
@@ -214,8 +198,7 @@ def test_scope_submit_plays_hidden_cases_in_equal_chunks() -> None:
 
 
 def test_outcomes_that_do_not_fit_the_job_are_the_workers_failure() -> None:
-    rig, session = started()
-    rig.submit(0)
+    rig, session = started(0)
     endless = PolicyFailure(category="act_error", step_index=0, message="", used=float("inf"))
     wordy = PolicyFailure(category="act_error", step_index=0, message="", traceback="x" * (3 << 20))
     bad = [
@@ -245,8 +228,7 @@ def test_outcomes_that_do_not_fit_the_job_are_the_workers_failure() -> None:
 
 
 def test_stored_returns_with_an_infinite_sum_have_a_mean() -> None:
-    rig, session = started()
-    rig.submit(0, 1, 2)
+    rig, session = started(0, 1, 2)
     for lease in rig.poll(session, 2):
         rig.report_results(session, done(lease))
     for index in range(2):
@@ -262,13 +244,12 @@ def test_stored_returns_with_an_infinite_sum_have_a_mean() -> None:
 
 
 def test_a_cancelled_run_refunds_its_open_submit_and_answers_who_waits() -> None:
-    rig, session = started()
-    rig.submit(0, 1)
+    rig, session = started(0, 1)
     (first, _) = rig.poll(session, 2)
-    waiting = asked(gateway.ResultsRequest, request="page", run="r1", submit_index=0, cursor=0, wait_s=9.0)
-    assert rig.tell(waiting) is None
-    rig.tell(asked(operator.CancelRun, request="cancel", run="r1"))
-    assert isinstance(rig.replies["page"], ReadResults)
+    assert rig.ask(gateway.ResultsRequest, run="r1", submit_index=0, cursor=0, wait_s=9.0) is None
+    poll = rig._requests
+    rig.ask(operator.CancelRun, run="r1")
+    assert isinstance(rig.replies[poll], ReadResults)
     assert (rig.finished().status, rig.finished().budget_used) == ("cancelled", 0)
     row = rig.row(SubmitRow, "r1", 0)
     assert (row.status, row.refunded) == ("cancelled", True)
@@ -276,5 +257,5 @@ def test_a_cancelled_run_refunds_its_open_submit_and_answers_who_waits() -> None
     assert (done.n_episodes, done.remaining_budget) == (0, 16)
     assert rig.beat(session, first).cancelled == (first.lease_id,)
     assert rig.submit(0, bundle=BUNDLE, key="k9").status == "run_cancelled"
-    state = rig.tell(asked(gateway.StateRequest, request="state", run="r1")).state
+    state = rig.ask(gateway.StateRequest, run="r1").state
     assert (state.is_finalized, state.cancelled, state.remaining_budget) == (True, True, 16)

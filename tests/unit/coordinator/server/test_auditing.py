@@ -167,9 +167,7 @@ def test_a_third_opinion_is_held_against_both(shelf: Shelf) -> None:
     assert compared.with_first is None
 
 
-def test_audits_of_unfinished_runs_survive_restarts_and_collection(
-    tmp_path: Path,
-) -> None:
+def test_audits_of_unfinished_runs_survive_restarts_and_collection(tmp_path: Path) -> None:
     root = tmp_path / "state"
     root.mkdir()
     store = Store(root / "coordinator.sqlite")

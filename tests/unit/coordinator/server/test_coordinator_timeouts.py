@@ -27,9 +27,7 @@ async def test_a_query_that_nobody_waits_for_any_more_is_let_go(
     async with started(tmp_path) as world:
         created = await world.create()
         wait = operator.WaitRun(token="operate", run=created.run, wait_s=60)
-        waiting = Requested(keys.operator_key("c", "wait"), wait)
-        world.ask(waiting)
-        assert await waiting.message() is None
+        assert await world.answer(Requested(keys.operator_key("c", "wait"), wait)) is None
 
 
 def test_a_database_that_another_keeps_locked_is_reported(

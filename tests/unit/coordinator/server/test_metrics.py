@@ -55,8 +55,7 @@ def test_episodes_submits_and_leases_of_a_whole_run_are_counted_once(rig: Metere
     rig.work_off(session)
     rig.submit(3, key="k1")
     rig.report_results(session, *(done(lease, failure="step_error") for lease in rig.poll(session)))
-    rig.close()
-    rig.work_off(session)
+    rig.finish(session)
     metrics_text = rig.read()
     assert metrics_text["evopolicy_episodes_total train ok"] == 3
     assert metrics_text["evopolicy_episodes_total train step_error"] == 1

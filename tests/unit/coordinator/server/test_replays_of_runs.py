@@ -24,15 +24,12 @@ async def create(world: World, key: str, proof: str = "", **settings: Any) -> An
     known = {"env": "toy/line", "entry": "e", "model": "m", "exp_id": "x", **settings}
     wanted = RunSettings(**known)
     message = operator.CreateRun(token="operate", key=key, settings=wanted, replay_key=proof)
-    asked = Requested(keys.operator_key("c", "create"), message)
-    world.ask(asked)
-    return await asked.message()
+    return await world.answer(Requested(keys.operator_key("c", "create"), message))
 
 
 async def cancel(world: World, run: str) -> None:
     asked = Requested(keys.operator_key("c", "cancel"), operator.CancelRun(token="operate", run=run))
-    world.ask(asked)
-    assert isinstance(await asked.message(), operator.Done)
+    assert isinstance(await world.answer(asked), operator.Done)
 
 
 def row(world: World, run: str) -> RunRow:

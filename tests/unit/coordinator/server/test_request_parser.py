@@ -164,9 +164,7 @@ def test_run_with_impossible_settings_is_refused(
     assert message in error.message
 
 
-def test_a_bounded_agent_report_still_closes_its_run(
-    parser: RequestParser,
-) -> None:
+def test_a_bounded_agent_report_still_closes_its_run(parser: RequestParser) -> None:
     key = keys.gateway_key("c", "r", "close")
     for facts in ({"turns": 3}, {"turns": 3, "notes": ["x" * 1000] * 300}):
         made = event(

@@ -205,8 +205,7 @@ def test_what_a_run_has_sent_is_remembered_within_bounds(monkeypatch: pytest.Mon
 
 
 @pytest.mark.parametrize(
-    "changes",
-    [{"digest": "../../etc/passwd"}, {"size": -1}, {"size": 1 << 40}, {"digest": "0" * 64}],
+    "changes", [{"digest": "../../etc/passwd"}, {"size": -1}, {"size": 1 << 40}, {"digest": "0" * 64}]
 )
 def test_blob_that_cannot_be_is_refused(rig: Rig, changes: dict[str, Any]) -> None:
     answer = rig.put(put(b"data", **changes))

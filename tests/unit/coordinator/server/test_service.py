@@ -45,28 +45,20 @@ async def test_what_was_answered_is_there_after_a_restart(tmp_path: Path) -> Non
 
     async with started(tmp_path) as world:
         kept.append(await world.create())
-        asked = world.submit(kept[0], "key")
-        world.ask(asked)
-        assert (await asked.message()).remaining_budget == 98
+        assert (await world.answer(world.submit(kept[0], "key"))).remaining_budget == 98
     async with started(tmp_path) as world:
         assert await world.create() == kept[0]
-        asked = world.state(kept[0])
-        world.ask(asked)
-        assert (await asked.message()).state.remaining_budget == 98
+        assert (await world.answer(world.state(kept[0]))).state.remaining_budget == 98
 
 
 async def test_an_unwritten_request_did_not_happen_and_may_be_repeated(tmp_path: Path) -> None:
     async def asked_again(world: World, created: operator.RunCreated) -> Any:
-        asked = world.submit(created, "key")
-        world.ask(asked)
-        return await asked.message()
+        return await world.answer(world.submit(created, "key"))
 
     async with started(tmp_path) as world:
         created = await world.create()
         world.full = True
-        lost = world.submit(created, "key")
-        world.ask(lost)
-        assert await lost.message() is None
+        assert await world.answer(world.submit(created, "key")) is None
         waiting, submitted = world.state(created), world.submit(created, "key")
         world.ask(waiting, submitted)
         assert await waiting.message() is None
@@ -79,8 +71,7 @@ async def test_an_unwritten_request_did_not_happen_and_may_be_repeated(tmp_path:
             keys.operator_key("c", "create"),
             operator.CreateRun(token="operate", key="other", settings=settings),
         )
-        world.ask(creating)
-        assert "disk is full" in (await creating.message()).message
+        assert "disk is full" in (await world.answer(creating)).message
         world.full = False
         while (answer := await asked_again(world, created)) is None or isinstance(answer, worker.Refused):
             await asyncio.sleep(0.02)
@@ -93,9 +84,7 @@ async def test_operators_are_answered_while_the_store_cannot_write(tmp_path: Pat
     async with started(tmp_path) as world:
         created = await world.create()
         world.full = True
-        lost = world.submit(created, "key")
-        world.ask(lost)
-        assert await lost.message() is None
+        assert await world.answer(world.submit(created, "key")) is None
         asked = Requested(keys.operator_key("c", "status"), StatusRequest(token="operate"))
         wait = operator.WaitRun(token="operate", run=created.run, wait_s=0.0)
         following = Requested(keys.operator_key("c", "wait"), wait)
@@ -112,9 +101,7 @@ async def test_operators_are_answered_while_the_store_cannot_write(tmp_path: Pat
         assert isinstance(await stranger.message(), worker.Refused)
         world.full = False
         while status.trouble:
-            asked = Requested(keys.operator_key("c", "status"), StatusRequest(token="operate"))
-            world.ask(asked)
-            status = await asked.message()
+            status = await world.status()
             await asyncio.sleep(0.02)
 
 
@@ -123,9 +110,7 @@ async def test_an_open_run_without_a_gateway_for_an_hour_is_abandoned(tmp_path: 
         created, other = await world.create(), await world.create("other")
         now = world.service.host.now
         world.service.host.now = lambda: now() + 3601.0  # type: ignore[method-assign]
-        asked = world.state(other)
-        world.ask(asked)
-        await asked.message()
+        await world.answer(world.state(other))
         status = world.service.status()
         assert status is not None
         assert {run.run: run.abandoned for run in status.runs} == {created.run: True, other.run: False}
@@ -148,13 +133,10 @@ async def test_core_that_fails_is_loaded_anew_and_others_are_served_on(
 
     async with started(tmp_path) as world:
         created = await world.create()
-        poison = world.submit(created, "poison")
-        world.ask(poison)
-        assert await poison.message() is None
+        assert await world.answer(world.submit(created, "poison")) is None
         while True:
             asked = world.submit(created, "good")
-            world.ask(asked)
-            if isinstance(answer := await asked.message(), gateway.SubmitAccepted):
+            if isinstance(answer := await world.answer(asked), gateway.SubmitAccepted):
                 break
             await asyncio.sleep(0.02)
         assert answer.remaining_budget == 98
@@ -170,9 +152,7 @@ async def test_stopping_answers_what_was_handled_and_ends_every_wait(tmp_path: P
         await world.service.stop()
         assert isinstance(await accepted.message(), gateway.SubmitAccepted)
         assert await waiting.message() is None
-        late = world.state(created)
-        world.ask(late)
-        assert await late.message() is None
+        assert await world.answer(world.state(created)) is None
 
 
 async def test_a_stuck_disk_is_named_in_status_and_log(
@@ -193,9 +173,7 @@ async def test_a_stuck_disk_is_named_in_status_and_log(
         world.ask(created)
         stalls: tuple[str, ...] = ()
         while not stalls:
-            status = Requested(keys.operator_key("c", "status"), StatusRequest(token="operate"))
-            world.ask(status)
-            stalls = (await status.message()).stalls
+            stalls = (await world.status()).stalls
             await asyncio.sleep(0.01)
         assert re.fullmatch("1 requests wait for the disk: it has been writing for .* s", stalls[0])
         with capture_logs() as logs:
@@ -211,10 +189,7 @@ async def test_any_number_of_watchers_costs_one_status(tmp_path: Path) -> None:
     async with started(tmp_path) as world:
 
         async def shown(max_age_s: float) -> tuple[float, int]:
-            message = StatusRequest(token="operate", max_age_s=max_age_s)
-            asked = Requested(keys.operator_key("c", "status"), message)
-            world.ask(asked)
-            reply = await asked.message()
+            reply = await world.status(max_age_s=max_age_s)
             return reply.uptime_s, len(reply.runs)
 
         first = await shown(60.0)
@@ -228,9 +203,7 @@ async def test_any_number_of_watchers_costs_one_status(tmp_path: Path) -> None:
 async def test_the_status_tells_of_the_disk(tmp_path: Path) -> None:
     async with started(tmp_path) as world:
         while True:
-            asked = Requested(keys.operator_key("c", "status"), StatusRequest(token="operate"))
-            world.ask(asked)
-            if (disk := (await asked.message()).disk) is not None:
+            if (disk := (await world.status()).disk) is not None:
                 break
             await asyncio.sleep(0.01)
         assert 0 < disk.free < disk.total
@@ -241,11 +214,9 @@ async def test_long_poll_ends_by_itself(tmp_path: Path) -> None:
         registering = register(world)
         session = (await registering.message()).session
         polling = Requested(
-            keys.worker_key("c", "lease"),
-            worker.LeaseRequest(worker="w", session=session, n=1, wait_s=0.05),
+            keys.worker_key("c", "lease"), worker.LeaseRequest(worker="w", session=session, n=1, wait_s=0.05)
         )
-        world.ask(polling)
-        assert await polling.message() == worker.Leases(leases=())
+        assert await world.answer(polling) == worker.Leases(leases=())
 
 
 async def test_a_clock_set_back_between_two_starts_ends_nothing_before_it_began(
@@ -305,9 +276,7 @@ async def test_an_unloadable_state_ends_the_service_with_the_reason(
         world.ask(world.submit(created, "key"))
         assert await failed(world) == "loading the state failed: KeyError: 'a row that is not there'"
         # Who asks meanwhile hears at once, and asks again.
-        asked = world.state(created)
-        world.ask(asked)
-        assert await asked.message() is None
+        assert await world.answer(world.state(created)) is None
 
 
 async def test_a_state_that_cannot_be_loaded_at_the_start_is_reported(
@@ -365,9 +334,7 @@ async def test_a_core_that_fails_now_and_then_is_loaded_each_time(
             monkeypatch.setattr(Core, "handle", stumble)
             answer = None
             while answer is None:
-                asked = world.state(created)
-                world.ask(asked)
-                answer = await asked.message()
+                answer = await world.answer(world.state(created))
                 await asyncio.sleep(0.01)
             assert isinstance(answer, gateway.StateReply)
 
@@ -418,14 +385,10 @@ async def test_a_request_for_unreadable_data_is_refused_and_others_served(tmp_pa
         message = gateway.ResultsRequest(
             run=created.run, token=created.capability, submit_index=0, cursor=0, wait_s=1.0
         )
-        results = Requested(keys.gateway_key("c", created.run, "results"), message)
-        world.ask(results)
-        refused = await results.message()
+        refused = await world.answer(Requested(keys.gateway_key("c", created.run, "results"), message))
         assert refused.status == "damaged"
         assert str(tmp_path) not in refused.message
-        state = world.state(created)
-        world.ask(state)
-        assert isinstance(await state.message(), gateway.StateReply)
+        assert isinstance(await world.answer(world.state(created)), gateway.StateReply)
 
 
 async def test_the_process_ends_when_its_service_cannot_go_on(tmp_path: Path) -> None:
@@ -506,8 +469,7 @@ async def test_uploads_that_no_submit_named_are_deleted_once_their_run_is_over(
                 data=sent,
             )
             asked = Requested(keys.gateway_key("c", created.run, "blob"), message)
-            world.ask(asked)
-            assert (await asked.message()).have == len(sent)
+            assert (await world.answer(asked)).have == len(sent)
 
         kept_before = b"stored before by someone else"
         world.blobs.put(kept_before)
@@ -527,13 +489,11 @@ async def test_uploads_that_no_submit_named_are_deleted_once_their_run_is_over(
             bundle=digest_of(b"named"),
         )
         submitted = Requested(keys.gateway_key("c", one.run, "submit"), named)
-        world.ask(submitted)
-        assert isinstance(await submitted.message(), gateway.SubmitAccepted)
+        assert isinstance(await world.answer(submitted), gateway.SubmitAccepted)
         cancelled = Requested(
             keys.operator_key("c", "cancel"), operator.CancelRun(token="operate", run=one.run)
         )
-        world.ask(cancelled)
-        await cancelled.message()
+        await world.answer(cancelled)
         async with asyncio.timeout(20):
             while world.blobs.has(digest_of(b"left behind")) or list((tmp_path / "blobs/parts").iterdir()):
                 await asyncio.sleep(0.02)

@@ -25,9 +25,7 @@ async def create(world: World, key: str, start: Start | None = None, **settings:
     known = {"env": "toy/line", "entry": "e", "model": "m", "exp_id": "x", "budget": 100, **settings}
     wanted = RunSettings(**known, start=start)
     message = operator.CreateRun(token="operate", key=key, settings=wanted)
-    asked = Requested(keys.operator_key("c", "create"), message)
-    world.ask(asked)
-    return await asked.message()
+    return await world.answer(Requested(keys.operator_key("c", "create"), message))
 
 
 async def parent(
@@ -44,9 +42,7 @@ async def parent(
             "token": created.capability,
         }
     )
-    asked = Requested(asked.key, message)
-    world.ask(asked)
-    assert isinstance(await asked.message(), gateway.SubmitAccepted)
+    assert isinstance(await world.answer(Requested(asked.key, message)), gateway.SubmitAccepted)
     return created
 
 
@@ -110,8 +106,7 @@ async def test_a_start_from_an_ended_run_hands_its_stamp_on(tmp_path: Path) -> N
         before = await parent(world)
         message = gateway.CloseRun(run=before.run, token=before.capability, reason="agent_stopped", agent={})
         closed = Requested(keys.gateway_key("c", before.run, "close"), message)
-        world.ask(closed)
-        assert isinstance(await closed.message(), gateway.RunClosed)
+        assert isinstance(await world.answer(closed), gateway.RunClosed)
         child = await parent(world, key="child", start=Start(run=before.run, submit_index=0, tree=TREE))
         assert start_of(world, child).parent_scored
         # The child is open: no result of its own chose the place, but one of its parent's did.

@@ -120,14 +120,16 @@ def test_port_0_becomes_a_free_port() -> None:
     "endpoint",
     [
         "",
-        "7447",
-        "tcp",
-        "tcp/host",
-        "tcp/:7447",
-        "tcp/host:x",
-        "tcp/host:70000",
-        "udp/host:1",
-        "tcp/no.such.host.invalid:0",
+        *[
+            "7447",
+            "tcp",
+            "tcp/host",
+            "tcp/:7447",
+            "tcp/host:x",
+            "tcp/host:70000",
+            "udp/host:1",
+            "tcp/no.such.host.invalid:0",
+        ],
     ],
 )
 def test_endpoint_that_cannot_be_listened_on_is_reported(endpoint: str) -> None:

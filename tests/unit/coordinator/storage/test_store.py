@@ -229,11 +229,7 @@ def test_pages_hold_outcomes_in_order_of_arrival_as_many_as_fit(store: Store, pa
 
 
 def test_a_run_may_fetch_the_blobs_of_its_own_train_feedback_only(store: Store, path: Path) -> None:
-    stored, inline, hidden = (
-        blob(b"stored", inline=False),
-        blob(b"inline"),
-        blob(b"hidden", inline=False),
-    )
+    stored, inline, hidden = (blob(b"stored", inline=False), blob(b"inline"), blob(b"hidden", inline=False))
     store.write(
         [
             outcome_row(TRAIN, 0, 0, stored),
