@@ -23,7 +23,7 @@ import pytest
 from attacks.golden_run import GoldenCluster
 from attacks.whereabouts import heard_by, met, moments
 from programs.signalling_policy import LEVELS
-from waiting import TIMEOUT_S
+from waiting import TIMEOUT_S, wait_until
 
 from evopolicy_common.records.run_record import RunRecord, decode_run_record
 from evopolicy_gateway.run_folder.layout import RunFolder
@@ -44,28 +44,18 @@ QUIET_S = 6.0
 class Listening:
     """`evopolicy run` with an agent that listens."""
 
-    def __init__(self, cluster: GoldenCluster, name: str, agent: str, *options: str) -> None:
-        self.cluster = cluster
+    def __init__(self, cluster: GoldenCluster, name: str, process: subprocess.Popen[bytes]) -> None:
         self.root = cluster.root / "runs" / "e" / "toy_line" / name
         self.folder = RunFolder(self.root)
         self.log = cluster.root / f"{name}-log"
-        words = ["run", "--env", "toy/line", "--agent", agent, "--entry", "e", "--exp-id", name, *options]
-        words += ["--credentials", cluster.files["operator"], "--runs", str(cluster.root / "runs")]
-        with self.log.open("wb") as log:
-            self.process = subprocess.Popen(
-                [sys.executable, "-m", "evopolicy_gateway.cli", *words, "--budget", "8"],
-                env=cluster.environment,
-                cwd=cluster.root,
-                stdout=log,
-                stderr=log,
-            )
+        self.process = process
 
     def wait_for(self, condition: Callable[[], object]) -> None:
-        deadline = time.monotonic() + 2 * TIMEOUT_S
-        while not condition():
+        def holds() -> object:
             assert self.process.poll() is None, self.log.read_text()
-            assert time.monotonic() < deadline, self.log.read_text()
-            time.sleep(0.05)
+            return condition()
+
+        wait_until(holds, self.log.read_text)
 
     @property
     def run(self) -> str:
@@ -90,15 +80,16 @@ class Listening:
 
 
 @contextlib.contextmanager
-def listening(cluster: GoldenCluster, name: str, n_submits: int, *options: str) -> Iterator[Listening]:
-    agent = f"command:{sys.executable} {PROGRAMS / 'hearing_agent.py'} {POLICY} {n_submits}"
-    found = Listening(cluster, name, agent, "--jail", "none", "--tier", "none", *options)
-    try:
-        yield found
-    finally:
-        if found.process.poll() is None:
-            found.process.terminate()
-        found.process.wait(timeout=TIMEOUT_S)
+def listening(
+    cluster: GoldenCluster, name: str, n_submits: int, *options: str, agent: str = ""
+) -> Iterator[Listening]:
+    """`agent`: another one than that which makes `n_submits` and listens."""
+    agent = agent or f"command:{sys.executable} {PROGRAMS / 'hearing_agent.py'} {POLICY} {n_submits}"
+    words = ("--agent", agent, "--tier", "none", "--credentials", cluster.files["operator"], *options)
+    with cluster.command(
+        name, *words, "--budget", "8", *(["--jail", "none"] * (agent != "remote"))
+    ) as running:
+        yield Listening(cluster, name, running)
 
 
 @contextlib.contextmanager
@@ -224,8 +215,7 @@ def test_hidden_episodes_are_not_played_beside_train_episodes_whose_agent_is_els
     """The policy that plays a hidden case would tell one that plays a train case, whose feedback goes anywhere."""
     kernel = str(uuid.uuid4())
     words = ("--http", "127.0.0.1:0", "--agent-host", kernel)
-    far = Listening(isolated, "far", "remote", "--tier", "none", *words)
-    try:
+    with listening(isolated, "far", 0, *words, agent="remote") as far:
         far.wait_for(lambda: far.folder.bearer.exists() and "served at" in far.log.read_text())
         elsewhere = run_of(far)
         (far.folder.system / "policy.py").write_bytes(POLICY.read_bytes())
@@ -237,12 +227,8 @@ def test_hidden_episodes_are_not_played_beside_train_episodes_whose_agent_is_els
             for _ in range(4):
                 assert submitted(far, [0, 1]) == "ok"
             near.record()
-        (far.folder.finish).touch()
+        far.folder.finish.touch()
         far.record()
-    finally:
-        if far.process.poll() is None:
-            far.process.terminate()
-        far.process.wait(timeout=TIMEOUT_S)
     assert met(isolated, moments(isolated), [elsewhere]) == []
 
 

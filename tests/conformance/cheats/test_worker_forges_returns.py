@@ -10,12 +10,12 @@ from __future__ import annotations
 import asyncio
 import json
 import subprocess
-import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import pytest
+from commands import evopolicy, process
 from coordinator_harness import Coordinator, OperatorClient, bundle_of, gateway_of, operator_of
 from typer.testing import CliRunner
 from waiting import eventually
@@ -26,7 +26,6 @@ from evopolicy_coordinator.cli.status import status_app
 
 pytestmark = pytest.mark.system
 
-TIMEOUT_S = 150.0
 EPISODES = 6
 HIDDEN = 2
 
@@ -52,15 +51,14 @@ class Workers:
         self._coordinator = coordinator
         self._root = root
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
+        self.running = ExitStack()
 
     def start(self, name: str, how: str = "honest") -> None:
         script = Path(__file__).with_name("programs") / "cheating_worker.py"
         options = ["--env", "toy/line", "--slots", "1", "--grace", "1", "--name", name]
         options += ["--credentials", self._coordinator.ready["credentials"]["worker"]]
-        with (self._root / f"{name}.log").open("ab") as log:
-            self._processes[name] = subprocess.Popen(
-                [sys.executable, str(script), how, *options], stdout=log, stderr=log
-            )
+        running = process(self._root / f"{name}.log", str(script), how, *options)
+        self._processes[name] = self.running.enter_context(running)
 
     def log_of(self, name: str) -> str:
         return (self._root / f"{name}.log").read_text()
@@ -70,25 +68,15 @@ class Workers:
         await eventually(lambda: self._processes[name].poll() is not None, f"{name} ends")
         return self._processes[name].wait()
 
-    def stop(self) -> None:
-        for process in self._processes.values():
-            process.terminate()
-        for process in self._processes.values():
-            try:
-                process.wait(30)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
-
 
 @contextmanager
 def cluster(root: Path, *args: str) -> Iterator[tuple[Coordinator, Workers]]:
     coordinator = Coordinator(root / "state", *args)
     workers = Workers(coordinator, root)
     try:
-        yield coordinator, workers
+        with workers.running:
+            yield coordinator, workers
     finally:
-        workers.stop()
         coordinator.stop()
 
 
@@ -112,8 +100,10 @@ async def shown(coordinator: Coordinator) -> str:
 
 
 @pytest.mark.parametrize("how", ["rewards", "return"])
-def test_forger_among_three_workers_is_caught_named_and_gets_no_more_work(tmp_path: Path, how: str) -> None:
-    async def scenario(coordinator: Coordinator, workers: Workers) -> None:
+async def test_forger_among_three_workers_is_caught_named_and_gets_no_more_work(
+    tmp_path: Path, how: str
+) -> None:
+    with cluster(tmp_path, "--audit", "1") as (coordinator, workers):
         async with operator_of(coordinator) as client:
             run = await created(client, "forged")
             async with gateway_of(coordinator, run) as gateway:
@@ -152,12 +142,9 @@ def test_forger_among_three_workers_is_caught_named_and_gets_no_more_work(tmp_pa
         ]
         assert {event["worker"] for event in events if event["event"] == "forger_named"} == {"forger"}
 
+
+async def test_honest_workers_with_a_policy_that_reads_clocks_are_not_accused(tmp_path: Path) -> None:
     with cluster(tmp_path, "--audit", "1") as (coordinator, workers):
-        asyncio.run(scenario(coordinator, workers))
-
-
-def test_honest_workers_with_a_policy_that_reads_clocks_are_not_accused(tmp_path: Path) -> None:
-    async def scenario(coordinator: Coordinator, workers: Workers) -> None:
         async with operator_of(coordinator) as client:
             run = await created(client, "honest")
             async with gateway_of(coordinator, run) as gateway:
@@ -176,12 +163,9 @@ def test_honest_workers_with_a_policy_that_reads_clocks_are_not_accused(tmp_path
             reply = await client.status()
             assert (reply.quarantined, reply.disputes) == ({}, ())
 
+
+async def test_two_workers_of_which_one_forges_are_both_in_dispute(tmp_path: Path) -> None:
     with cluster(tmp_path, "--audit", "1") as (coordinator, workers):
-        asyncio.run(scenario(coordinator, workers))
-
-
-def test_two_workers_of_which_one_forges_are_both_in_dispute(tmp_path: Path) -> None:
-    async def scenario(coordinator: Coordinator, workers: Workers) -> None:
         async with operator_of(coordinator) as client:
             run = await created(client, "disputed")
             async with gateway_of(coordinator, run) as gateway:
@@ -199,9 +183,6 @@ def test_two_workers_of_which_one_forges_are_both_in_dispute(tmp_path: Path) -> 
             assert found.in_question
             assert (await client.status()).quarantined == {}
             assert "forger and honest disagree" in await shown(coordinator)
-
-    with cluster(tmp_path, "--audit", "1") as (coordinator, workers):
-        asyncio.run(scenario(coordinator, workers))
 
 
 def test_audits_go_on_after_the_coordinator_was_killed(tmp_path: Path) -> None:
@@ -236,20 +217,14 @@ def test_audits_go_on_after_the_coordinator_was_killed(tmp_path: Path) -> None:
         try:
             asyncio.run(after(second, workers, run))
         finally:
-            workers.stop()
+            workers.running.close()
             second.stop()
 
 
 def test_audits_of_a_local_run_are_in_its_run_json(tmp_path: Path) -> None:
     command = ["local", "--env", "toy/line", "--agent", "random", "--entry", "tester", "--exp-id", "audited"]
     command += ["--budget", "2", "--validation", "1", "--heldout", "1", "--audit", "1"]
-    done = subprocess.run(
-        [sys.executable, "-m", "evopolicy_gateway.cli", *command, "--runs", str(tmp_path / "runs")],
-        capture_output=True,
-        text=True,
-        cwd=tmp_path,
-        timeout=TIMEOUT_S,
-    )
+    done = evopolicy(tmp_path, *command, "--runs", "runs")
     assert done.returncode == 0, done.stderr
     folder = tmp_path / "runs" / "tester" / "toy_line" / "audited"
     found = decode_run_record((folder / "run.json").read_bytes()).audit
@@ -263,8 +238,8 @@ def test_audits_of_a_local_run_are_in_its_run_json(tmp_path: Path) -> None:
     assert warnings == [], "an agent is told nothing of audits"
 
 
-def test_worker_of_an_old_protocol_is_refused_with_the_reason(tmp_path: Path) -> None:
-    async def scenario(coordinator: Coordinator, workers: Workers) -> None:
+async def test_worker_of_an_old_protocol_is_refused_with_the_reason(tmp_path: Path) -> None:
+    with cluster(tmp_path) as (coordinator, workers):
         workers.start("ancient", "old-protocol")
         assert await workers.ended("ancient") == 1
         assert "speaks wire version 0, the coordinator" in workers.log_of("ancient").splitlines()[-1]
@@ -276,12 +251,9 @@ def test_worker_of_an_old_protocol_is_refused_with_the_reason(tmp_path: Path) ->
         assert "ancient" in text
         assert "speaks wire version 0" in text
 
+
+async def test_a_worker_of_old_code_gets_no_work_and_is_told_why(tmp_path: Path) -> None:
     with cluster(tmp_path) as (coordinator, workers):
-        asyncio.run(scenario(coordinator, workers))
-
-
-def test_a_worker_of_old_code_gets_no_work_and_is_told_why(tmp_path: Path) -> None:
-    async def scenario(coordinator: Coordinator, workers: Workers) -> None:
         async with operator_of(coordinator) as client:
             run = await created(client, "versions")
             async with gateway_of(coordinator, run) as gateway:
@@ -302,6 +274,3 @@ def test_a_worker_of_old_code_gets_no_work_and_is_told_why(tmp_path: Path) -> No
             assert finished.fingerprint is not None
             assert finished.fingerprint.code_version == "cheats"
             assert finished.audit is None
-
-    with cluster(tmp_path) as (coordinator, workers):
-        asyncio.run(scenario(coordinator, workers))

@@ -4,19 +4,21 @@ when all of them are done but the gateway has not yet been let go."""
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import os
 import random
 import signal
 import subprocess
 import sys
-import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import msgspec
-from coordinator_harness import TIMEOUT_S, OperatorClient
+from commands import process, worker_of
+from coordinator_harness import TIMEOUT_S, Coordinator, OperatorClient
+from waiting import wait_until
 
 from attacks.leak_search import memory_of
 from attacks.wiretap import Wiretap
@@ -76,28 +78,20 @@ class GoldenCluster:
         self.tap = root / "tap"
         self.leak = root / "leak"
         self.cases = _write_cases(root / "data" / "toy_line")
-        self._log = (root / "log").open("wb")
-        self._processes: list[subprocess.Popen[bytes]] = []
-        self.environment = {**os.environ, "XDG_STATE_HOME": str(root / "xdg")}
-        ready = root / "ready.json"
-        self._start(
-            *(str(TAPPED), str(self.tap), str(self.leak), "--state", str(root / "st")),
-            *("--data", str(root / "data"), "--listen", "tcp/127.0.0.1:0", "--ready-file", str(ready)),
-            *options,
-        )
-        self.wait_for(ready.exists)
-        document = json.loads(ready.read_text())
-        self.files: dict[str, str] = document["credentials"]
-        (endpoint,) = [one for one in document["endpoints"] if one.startswith("tcp/")]
+        self._stack = contextlib.ExitStack()
+        options = ("--data", str(root / "data"), "--listen", "tcp/127.0.0.1:0", *options)
+        program = (str(TAPPED), str(self.tap), str(self.leak))
+        self._coordinator = Coordinator(root / "st", *options, trust_workers=False, program=program)
+        self._stack.callback(self._coordinator.stop)
+        self.files: dict[str, str] = self._coordinator.ready["credentials"]
+        (endpoint,) = [one for one in self._coordinator.ready["endpoints"] if one.startswith("tcp/")]
         host, _, port = endpoint.removeprefix("tcp/").rpartition(":")
         self.address = (host, int(port))
         self.worker_tap = Wiretap(*self.address)
+        self._stack.callback(self.worker_tap.close)
         through = self.through(self.worker_tap, "worker", root / "worker.json")
-        self._start(
-            *("-m", "evopolicy_worker.cli", "--env", "toy", "--slots", str(slots), "--grace", "0"),
-            *("--credentials", str(through)),
-            *worker,
-        )
+        words = ("--env", "toy", "--slots", str(slots), *worker)
+        self._stack.enter_context(worker_of(self._coordinator, *words, "--credentials", str(through)))
 
     def through(self, wiretap: Wiretap, role: credentials.Role, file: Path) -> Path:
         """The role's credentials with the wiretap in the coordinator's place."""
@@ -148,27 +142,20 @@ class GoldenCluster:
         return asyncio.run(asyncio.wait_for(main(), 2 * TIMEOUT_S))
 
     def close(self) -> None:
-        for process in self._processes[::-1]:
-            process.terminate()
-            try:
-                process.wait(timeout=TIMEOUT_S)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
-        self.worker_tap.close()
-        self._log.close()
-
-    def _start(self, *words: str) -> None:
-        command = [sys.executable, *words]
-        self._processes.append(
-            subprocess.Popen(command, env=self.environment, stdout=self._log, stderr=self._log)
-        )
+        self._stack.close()
 
     def wait_for(self, condition: Callable[[], object]) -> None:
-        deadline = time.monotonic() + 2 * TIMEOUT_S
-        while not condition():
-            assert time.monotonic() < deadline, (self.root / "log").read_text()
-            time.sleep(0.05)
+        wait_until(condition, self._coordinator.log.read_text)
+
+    @contextlib.contextmanager
+    def command(self, name: str, *words: str) -> Iterator[subprocess.Popen[bytes]]:
+        """`evopolicy run` of that name, with its output in `NAME-log`, until the `with` is left."""
+        options = ["run", "--env", "toy/line", "--entry", "e", "--exp-id", name, *words]
+        options += ["--runs", str(self.root / "runs")]
+        state = {"XDG_STATE_HOME": str(self.root / "xdg")}
+        log = self.root / f"{name}-log"
+        with process(log, "evopolicy_gateway.cli", *options, cwd=self.root, **state) as running:
+            yield running
 
 
 class GoldenRun:
@@ -192,26 +179,13 @@ class GoldenRun:
         self.folder = cluster.root / "runs" / "e" / "toy_line" / name
         self.workspace = self.folder / "workspace"
         budget = N_SUBMITS * len(EPISODES) + 1
-        words = ["run", "--env", "toy/line", "--agent", f"command:{sys.executable} {agent}", "--entry", "e"]
-        words += ["--exp-id", name, "--credentials", str(operator), "--budget", str(budget)]
-        words += ["--runs", str(cluster.root / "runs")]
+        words = ["--agent", f"command:{sys.executable} {agent}", "--credentials", str(operator)]
         self.log = cluster.root / f"{name}-log"
-        with self.log.open("wb") as log:
-            process = subprocess.Popen(
-                [sys.executable, "-m", "evopolicy_gateway.cli", *words],
-                env=cluster.environment,
-                cwd=cluster.root,
-                stdout=log,
-                stderr=log,
-            )
-        try:
-            self._follow(process)
-        finally:
-            self._go_on()
-            if process.poll() is None:
-                process.terminate()
-            process.wait(timeout=TIMEOUT_S)
-            self.wiretap.close()
+        with contextlib.ExitStack() as stack:
+            stack.callback(self.wiretap.close)
+            running = stack.enter_context(cluster.command(name, *words, "--budget", str(budget)))
+            stack.callback(self._go_on)
+            self._follow(running)
 
     def _follow(self, process: subprocess.Popen[bytes]) -> None:
         cluster = self.cluster
