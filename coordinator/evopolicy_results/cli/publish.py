@@ -69,7 +69,9 @@ def publish(
             help="Publish this line as it is, though it looks like a secret; may be repeated.",
         ),
     ] = None,
-    licence: Annotated[str, typer.Option(help="Licence of the file, such as CC-BY-4.0, for its card.")] = "",
+    licence: Annotated[
+        str, typer.Option(help="Licence of the file, such as CC-BY-4.0, for its card.", show_default=False)
+    ] = "",
     card: Annotated[
         Path | None,
         typer.Option(
