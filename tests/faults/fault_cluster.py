@@ -16,18 +16,17 @@ import sys
 import threading
 import time
 from collections.abc import Collection, Iterator, Mapping
-from functools import partial
 from pathlib import Path
 from typing import IO, Any, Literal
 
+from coordinator_harness import OperatorClient
 from host_faults import Cable, Clock, Disks
 from machines.own_processes import only_what_starts_inside
 from weak_link import WeakLink
 
 from evopolicy_common.messages import operator
 from evopolicy_common.processes import proc
-from evopolicy_common.wire import codec, credentials, keys
-from evopolicy_common.wire.requests import Requester
+from evopolicy_common.wire import credentials
 from evopolicy_common.wire.transport import connect
 from evopolicy_gateway.processes import trees as processes
 
@@ -243,9 +242,7 @@ class FaultCluster:
         actions, self.afterwards = self.afterwards, []
         if actions:
             async with connect(self.operators) as link:
-                ask = Requester(
-                    link, partial(keys.operator_key, link.credentials.cluster), codec.operator_replies
-                )
+                ask = OperatorClient(link).ask
                 for message in actions:
                     await ask.until_answered("cancel", message, operator.Done)
 

@@ -24,10 +24,10 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field
-from functools import partial
 from pathlib import Path
 
 import chaos
+from coordinator_harness import OperatorClient
 from fault_cluster import EPISODES, SUBMITS, TIMEOUT_S, TOTAL, FaultCluster, Site, fault_cluster, record
 from host_faults import enter_namespaces, full_file_system, out_of_memory, read_only_mount
 from machines.cgroups import NoCgroupError
@@ -39,8 +39,6 @@ from evopolicy_common.messages.run_settings import RunSettings
 from evopolicy_common.messages.status import StatusReply, StatusRequest
 from evopolicy_common.processes import proc
 from evopolicy_common.records.run_difference import differences
-from evopolicy_common.wire import codec, keys
-from evopolicy_common.wire.requests import Requester
 from evopolicy_common.wire.transport import connect
 
 FREEZE_S = 0.7
@@ -273,8 +271,7 @@ async def refusals(cluster: FaultCluster, name: str) -> list[str]:
     wrong = [f"with a full disk it took {TIMEOUT_S:g} s of new runs"]
     deadline = time.monotonic() + TIMEOUT_S
     async with connect(cluster.operators) as link:
-        ask = Requester(link, partial(keys.operator_key, link.credentials.cluster), codec.operator_replies)
-        token = link.credentials.token
+        ask, token = OperatorClient(link).ask, link.credentials.token
         while time.monotonic() < deadline:
             message = operator.CreateRun(token=token, key=f"{name} {len(taken)}", settings=settings)
             try:
@@ -322,13 +319,13 @@ async def play_until(
 ) -> tuple[subprocess.Popen[str], str]:
     """Starts a run, and comes back once `wanted` episodes of it are done or it has ended, with its phase."""
     async with connect(cluster.operators) as link:
-        ask = Requester(link, partial(keys.operator_key, link.credentials.cluster), codec.operator_replies)
-        message = StatusRequest(token=link.credentials.token)
-        before = (await ask.until_answered("status", message, StatusReply)).episodes_done
+        client = OperatorClient(link)
+        message = StatusRequest(token=client.token)
+        before = (await client.status()).episodes_done
         command = cluster.command(name)
         while wanted is not None and command.poll() is None:
             with contextlib.suppress(TransportError):
-                status = await ask.once("status", message, StatusReply)
+                status = await client.ask.once("status", message, StatusReply)
                 if status.runs and status.episodes_done - before >= wanted:
                     return command, status.runs[0].phase
             await asyncio.sleep(0.01)

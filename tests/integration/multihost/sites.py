@@ -21,15 +21,14 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from functools import partial
 from pathlib import Path
 
+from coordinator_harness import OperatorClient
 from machines.hosts import Host, Network
 
 from evopolicy_common.errors import TransportError
 from evopolicy_common.messages.status import StatusReply, StatusRequest
-from evopolicy_common.wire import codec, credentials, keys
-from evopolicy_common.wire.requests import Requester
+from evopolicy_common.wire import credentials
 from evopolicy_common.wire.transport import connect
 
 TIMEOUT_S = 240.0
@@ -141,13 +140,7 @@ class Sites:
     def start_worker(self, name: str, credentials_at: Path, slots: int = 1) -> subprocess.Popen[bytes]:
         program = [str(_FAULTS / "fixed_worker.py"), "--env", TOY, "--env", REAL, "--slots", str(slots)]
         program += [
-            "--need-tier",
-            "bwrap",
-            "--grace",
-            "1",
-            "--name",
-            name,
-            "--credentials",
+            *("--need-tier", "bwrap", "--grace", "1", "--name", name, "--credentials"),
             str(credentials_at),
         ]
         return self.start(name, program, "worker")
@@ -202,13 +195,11 @@ class Sites:
         async def ask() -> StatusReply:
             deadline = time.monotonic() + TIMEOUT_S
             async with connect(credentials.read(Path(self.own["operator"]))) as link:
-                requester = Requester(
-                    link, partial(keys.operator_key, link.credentials.cluster), codec.operator_replies
-                )
-                message = StatusRequest(token=link.credentials.token)
+                client = OperatorClient(link)
+                message = StatusRequest(token=client.token)
                 while time.monotonic() < deadline:
                     with contextlib.suppress(TransportError):
-                        reply = await requester.once("status", message, StatusReply)
+                        reply = await client.ask.once("status", message, StatusReply)
                         if fits(reply):
                             return reply
                     assert process is None or process.poll() is None, "it ended before"
