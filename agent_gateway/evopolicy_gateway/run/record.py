@@ -324,9 +324,12 @@ def _outcome(
     }
     random = None
     if reference:
-        known = {"mean_return": mean(reference), "std_return": std(reference), "returns": reference}
-        seeded_by = "case" if finished.reference_by_case else "run"
-        random = schema.ReferenceScore(**known, seeded_by=seeded_by)
+        random = schema.ReferenceScore(
+            mean_return=mean(reference),
+            std_return=std(reference),
+            returns=reference,
+            seeded_by="case" if finished.reference_by_case else "run",
+        )
     # As published: a run without an ok submit has the score 0.0.
     scored: dict[str, Any] = {"final_score": 0.0} if finished.status == "no_ok_submit" else {}
     if completed:

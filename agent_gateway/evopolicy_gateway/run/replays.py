@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import asyncio
 from pathlib import Path
+from typing import Any
 
 from evopolicy_common.errors import RefusedError
 from evopolicy_common.messages.operator import RunFinished
@@ -41,7 +42,7 @@ async def fetch(root: Path, finished: RunFinished, operations: Operations) -> tu
                 continue
             target.parent.mkdir(parents=True, exist_ok=True)
             await asyncio.to_thread(write_atomically, target, data)
-        known = {"episode_return": outcome.episode_return, "length": outcome.length}
+        known: dict[str, Any] = {"episode_return": outcome.episode_return, "length": outcome.length}
         recordings.append(
             Replay(path=path, split="heldout", episode=outcome.index, submit_index=index, **known)
         )

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
@@ -31,7 +32,7 @@ class Texts(msgspec.Struct, frozen=True, kw_only=True):
     """Skills and MCP servers."""
 
     @property
-    def digests(self) -> dict[str, str]:
+    def digests(self) -> dict[str, Any]:
         """By their names in `RunSettings`: SHA-256, hex; empty for a standard text."""
         text = hashlib.sha256(self.agents_md.encode()).hexdigest() if self.agents_md else ""
         return {"agents_md": text, "prompts": self.prompts.digest, "inputs": inputs_digest(self.inputs)}

@@ -56,6 +56,7 @@ class CoordinatorClient:
     def __init__(self, link: Link, run: str, scratch: Path | None = None) -> None:
         """`scratch`: folder of temporary files; None: the system's."""
         self._scratch = scratch
+        self._sender = run, link.credentials.token
         self._known: dict[str, Any] = {"run": run, "token": link.credentials.token}
         self._requests: Requester[messages.GatewayReply] = Requester(
             link, partial(keys.gateway_key, link.credentials.cluster, run), codec.gateway_replies
@@ -111,7 +112,7 @@ class CoordinatorClient:
 
     async def upload(self, digest: str, data: bytes) -> None:
         """Uploads a bundle to the coordinator."""
-        await self._requests.upload(*self._known.values(), digest, data)
+        await self._requests.upload(*self._sender, digest, data)
 
     async def submit(self, request: Requested) -> messages.SubmitAccepted:
         """Requests an evaluation. The same request gets the same answer however often it is sent."""
@@ -126,7 +127,7 @@ class CoordinatorClient:
         self, submit_index: int, cursor: int, wait_s: float = RESULTS_WAIT_S
     ) -> messages.ResultsPage:
         """Returns the submit's results since `cursor`, within `wait_s` seconds; the page may be empty."""
-        asked = {"submit_index": submit_index, "cursor": cursor, "wait_s": wait_s}
+        asked: dict[str, Any] = {"submit_index": submit_index, "cursor": cursor, "wait_s": wait_s}
         question = messages.ResultsRequest(**self._known, **asked)
         return await self._ask("results", question, messages.ResultsPage, wait_s=wait_s)
 
@@ -134,9 +135,9 @@ class CoordinatorClient:
         """Returns the bytes that `ref` names, verified. Large ones are in an unnamed temporary file, not in
         memory."""
         if ref.inline is not None or ref.size <= LARGE_BYTES:
-            return await self._requests.fetch(*self._known.values(), ref)
+            return await self._requests.fetch(*self._sender, ref)
         with tempfile.TemporaryFile(dir=self._scratch) as file:
-            await self._requests.download_to(file, *self._known.values(), ref.digest, ref.size)
+            await self._requests.download_to(file, *self._sender, ref.digest, ref.size)
             file.flush()
             return cast(bytes, memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)))
 

@@ -146,7 +146,7 @@ def as_published(files: dict[str, bytes]) -> dict[str, bytes]:
     rows = [_rows.decode(line) for line in files[ROWS].splitlines()]
     beside = files.get(OBSERVATIONS)
     if beside is None:
-        columns = _columns([msgspec.json.decode(row["obs"]) for row in rows])
+        columns: dict[str, Any] = _columns([msgspec.json.decode(row["obs"]) for row in rows])
     else:
         columns = read_arrays(beside, MAX_OBSERVATIONS_BYTES)
     if not rows or not columns:
