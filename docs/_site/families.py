@@ -38,7 +38,7 @@ def table() -> str:
     ]
     for suite in families:
         ids = suite.environments
-        deterministic, found = _deterministic(suite), [each for each in ids if each in _tables()[0]]
+        deterministic, n_played = _deterministic(suite), sum(each in _tables()[0] for each in ids)
         family = installs.family_of(ids[0])
         row = installs.installs()[family]
         how = f"`evopolicy-worker setup {family}`" if row.pins or row.apart else f"extra `{row.extra}`"
@@ -47,7 +47,7 @@ def table() -> str:
             f"{len(ids):,}",
             named.get(suite.name, "-"),
             "all" if deterministic == len(ids) else f"{deterministic:,}",
-            "all" if len(found) == len(ids) else f"{len(found):,}",
+            "all" if n_played == len(ids) else f"{n_played:,}",
             *_cost(suite),
             how + (" and Chromium" if row.browser else ""),
         )

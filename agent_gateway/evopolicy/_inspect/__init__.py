@@ -221,10 +221,10 @@ def improve(reminders: int = _REMINDERS) -> Solver:
     async def solve(state: TaskState, generate: Generate) -> TaskState:
         for count in itertools.count():
             state = await generate(state)
-            left = await anyio.to_thread.run_sync(_left)
-            if left == 0 or state.completed or count == reminders:
+            remaining = await anyio.to_thread.run_sync(_remaining)
+            if remaining == 0 or state.completed or count == reminders:
                 return state
-            state.messages.append(ChatMessageUser(content=Prompts().stopped(left)))
+            state.messages.append(ChatMessageUser(content=Prompts().stopped(remaining)))
         raise AssertionError("the count has no end")
 
     return solve
@@ -384,7 +384,7 @@ def _inside(path: str, below: str) -> Path:
     return place
 
 
-def _left() -> int:
+def _remaining() -> int:
     """Episodes left; 0 once the run is closed."""
     try:
         state = _of_sample().client.info()["state"]

@@ -131,9 +131,9 @@ class AnswerReader:
         if not self._events:
             return b""
         out, at = [], 0
-        for found in _EVENT_END.finditer(self._held, searched):
-            event = bytes(self._held[at : found.end()])
-            at = found.end()
+        for match in _EVENT_END.finditer(self._held, searched):
+            event = bytes(self._held[at : match.end()])
+            at = match.end()
             if not (self._read_event(event) and self._drops_usage):
                 out.append(event)
         del self._held[:at]
@@ -152,26 +152,26 @@ class AnswerReader:
 
     def metered(self, request_bytes: int) -> Metered:
         """The counts so far. `request_bytes`: of the request, for an estimate of the input."""
-        found, guessed = dict(self._counts), set(self._wrong)
-        told = self.complete or (self._shape.last == frozenset() and "output" in found)
-        if "input" not in found:
-            found["input"] = request_bytes // CHARS_PER_TOKEN
+        tokens, guessed = dict(self._counts), set(self._wrong)
+        told = self.complete or (self._shape.last == frozenset() and "output" in tokens)
+        if "input" not in tokens:
+            tokens["input"] = request_bytes // CHARS_PER_TOKEN
             guessed.add("input")
-        if "output" not in found or not told:
-            found["output"] = max(found.get("output", 0), self._chars // CHARS_PER_TOKEN)
+        if "output" not in tokens or not told:
+            tokens["output"] = max(tokens.get("output", 0), self._chars // CHARS_PER_TOKEN)
             guessed.add("output")
-        cached = found.get("cache_read", 0)
-        fresh = found["input"] - cached if self._shape.input_includes_cached else found["input"]
+        cached = tokens.get("cache_read", 0)
+        fresh = tokens["input"] - cached if self._shape.input_includes_cached else tokens["input"]
         if fresh < 0:
-            fresh, cached = 0, found["input"]
+            fresh, cached = 0, tokens["input"]
             guessed.add("cache_read")
-        reasoning = found.get("reasoning")
+        reasoning = tokens.get("reasoning")
         usage = Usage(
             input_noncached=fresh,
             cache_read=cached,
-            cache_creation=found.get("cache_creation", 0),
-            output=found["output"],
-            reasoning=None if reasoning is None else min(reasoning, found["output"]),
+            cache_creation=tokens.get("cache_creation", 0),
+            output=tokens["output"],
+            reasoning=None if reasoning is None else min(reasoning, tokens["output"]),
         )
         return Metered(usage=usage, estimated=bool(guessed), model=self._model)
 

@@ -139,9 +139,9 @@ class Search:
             for family in list(sources):
                 # A small opening shows every family once before any twice.
                 share = family.weight if n > 2 * len(self._families) else 1
-                found = self._drawn(family, share)
-                drawn += found
-                if len(found) < share:
+                batch = self._drawn(family, share)
+                drawn += batch
+                if len(batch) < share:
                     sources.remove(family)
         return self._joined(drawn[:n])
 
