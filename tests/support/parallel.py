@@ -81,6 +81,8 @@ class Parallel:
             _serve(self._session, name, there)
             atexit._run_exitfuncs()
             status = 0
+        except BrokenPipeError:
+            pass  # the first process was interrupted, which tells why
         except BaseException:
             traceback.print_exc()
         finally:
