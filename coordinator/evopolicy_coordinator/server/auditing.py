@@ -28,7 +28,7 @@ _LOST = "its record is not in the store any more"
 def carry_out(effect: AuditEffect, reader: Reader, blobs: BlobStore) -> AuditEvent:
     """Carries out an audit's effect: reads, stores, compares. Never raises for a bad report of a worker or a store
     error."""
-    about = {"stimulus_id": effect.stimulus_id, "run": effect.run, "audit": effect.audit}
+    about: dict[str, Any] = {"stimulus_id": effect.stimulus_id, "run": effect.run, "audit": effect.audit}
     if isinstance(effect, CompareAudit):
         return _compare(effect, reader, blobs, about)
     try:

@@ -204,8 +204,9 @@ class RunRequests:
         fits = bool(m.indexes) and n <= MAX_EPISODES_PER_SUBMIT and set(m.indexes) <= set(range(n))
         text = f"a re-score names positions in its list of cases; here are {n:,} cases"
         require(fits, Refusal.BAD_REQUEST, text)
-        splits = {"train": of.train, "validation": of.validation, "heldout": (*of.heldout, *m.cases)}
-        if repeated := overlaps(splits):
+        if repeated := overlaps(
+            {"train": of.train, "validation": of.validation, "heldout": (*of.heldout, *m.cases)}
+        ):
             raise ConfigError(f"the new cases are not disjoint from those of run {of.run}: {repeated[0]}")
         worlds = {(case.options or {}).get(OPTION) for case in (*of.train, *m.cases)}
         if unchanged(settings.env) != settings.env and len(worlds) > 1:

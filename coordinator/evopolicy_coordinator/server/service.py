@@ -17,7 +17,6 @@ import contextlib
 import hmac
 import time
 from collections.abc import Awaitable, Callable, Coroutine, Iterator
-from functools import partial
 from importlib import metadata
 
 import msgspec
@@ -437,8 +436,8 @@ class Service:
             if pending is not None:
                 self._reader.read(effect, answer_to(pending.query, pending.asker))
         elif isinstance(effect, AuditEffect):
-            tell = partial(self._loop.call_soon_threadsafe, self._audited, self.host.incarnation)
-            self._reader.audit(effect, tell)
+            soon, incarnation = self._loop.call_soon_threadsafe, self.host.incarnation
+            self._reader.audit(effect, lambda event: soon(self._audited, incarnation, event))
         elif isinstance(effect, Log):
             getattr(log, effect.level)(effect.event, stimulus=effect.stimulus_id, **effect.fields)
 

@@ -362,7 +362,7 @@ class Snapshot(msgspec.Struct, frozen=True, kw_only=True):
 
 def latest_time(snapshot: Snapshot) -> float:
     """The latest Unix time, seconds, in the runs, submits and evaluations of the snapshot; 0.0 for none."""
-    times = [row.created_at for row in (*snapshot.runs, *snapshot.evaluations)]
+    times = [run.created_at for run in snapshot.runs] + [each.created_at for each in snapshot.evaluations]
     times += [row.closed_at or 0.0 for row in snapshot.states]
     for row in snapshot.submits:
         times += (row.accepted_at, row.first_leased_at or 0.0, row.completed_at or 0.0)
