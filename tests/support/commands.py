@@ -15,6 +15,7 @@ from typing import NamedTuple
 from coordinator_harness import Coordinator
 from waiting import TIMEOUT_S, wait_until
 
+from evopolicy_common.processes import proc
 from evopolicy_common.records.run_record import RunRecord, decode_run_record
 
 MARK = "EVOTEST_MARK"
@@ -152,6 +153,16 @@ class Command:
         (pid,) = [pid for pid in self.alive() if module.encode() in Path(f"/proc/{pid}/cmdline").read_bytes()]
         return pid
 
+    def kill_below(self, words: bytes) -> bool:
+        """Kills a Python process below it with these words in its command line; False when there is none just now."""
+        for pid in proc.descendants(self.process.pid):
+            with contextlib.suppress(OSError):
+                line = Path(f"/proc/{pid}/cmdline").read_bytes()
+                if words in line and b"python" in line.partition(b"\0")[0]:
+                    os.kill(pid, signal.SIGKILL)
+                    return True
+        return False
+
     def kill(self) -> None:
         """Sends SIGKILL to the command alone, and waits until the processes that it started have noticed."""
         self.process.kill()
@@ -238,6 +249,16 @@ def run_on(operator_file: Path, cwd: Path, agent_name: str, *more: str) -> tuple
 def run_arguments(operator_file: Path, agent_name: str) -> list[str]:
     arguments = ["run", "--env", "toy/line", "--agent", agent_name, "--exp-id", "t", *SMALL]
     return [*arguments, "--credentials", str(operator_file)]
+
+
+def played_here(
+    cwd: Path, agent_name: str, *more: str, timeout_s: float = TIMEOUT_S
+) -> tuple[RunRecord, str]:
+    """The record of a short run named `t` on a cluster of its own, and what the command said."""
+    arguments = ["local", "--env", "toy/line", "--agent", agent_name, "--exp-id", "t", "--budget", "4"]
+    with command(cwd, *arguments, "--validation", "1", "--heldout", "1", "--slots", "1", *more) as running:
+        assert running.wait(timeout_s) == 0, running.text
+        return record_in(run_dir(cwd)), running.text
 
 
 def run_dir(cwd: Path, env: str = "toy_line", exp_id: str = "t") -> Path:

@@ -10,7 +10,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 import pytest
-from commands import agent, ended, record_in, run_dir
+from commands import agent, ended, played_here, record_in, run_dir
 
 import evopolicy as evp
 from evopolicy_common.records.run_record import RunRecord
@@ -56,10 +56,8 @@ answer = submit([0, 1])
 assert answer["status"] == "ok", answer
 assert answer["policy_failures"] == 0, answer["warning"]
 """
-    arguments = ("--env", "toy/line", "--agent", agent(folder, code), "--exp-id", "t", "--budget", "2")
-    small = ("--validation", "1", "--heldout", "1", "--slots", "1", "--policy-package", "scipy")
     shown = ("--jail-bind", str(folder / "policy.py"), "--state", "state")
-    ended(folder, "local", *arguments, *small, *shown)
+    played_here(folder, agent(folder, code), "--budget", "2", "--policy-package", "scipy", *shown)
     return folder
 
 

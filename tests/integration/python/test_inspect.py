@@ -101,17 +101,19 @@ def surroundings(folder: Path) -> dict[str, str]:
     return os.environ | {name: str(folder / value) for name, value in own.items()}
 
 
-def start(folder: Path, *command: str | Path) -> str:
+def start(folder: Path, *command: str | Path, code: int = 0, **more: str) -> str:
+    """What the command says, which ends with this status."""
     done = subprocess.run(
         [*map(str, command)],
         cwd=folder,
-        env=surroundings(folder),
-        capture_output=True,
+        env=surroundings(folder) | more,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE if code == 0 else subprocess.STDOUT,
         text=True,
         check=False,
         timeout=500,
     )
-    assert done.returncode == 0, (done.stdout + done.stderr)[-6000:]
+    assert done.returncode == code, (done.stdout + (done.stderr or ""))[-6000:]
     return done.stdout
 
 
@@ -134,10 +136,8 @@ def test_a_model_of_inspect_plays_a_run_and_gets_its_score(inspect: Path, tmp_pa
     (usage,) = sample["model_usage"].values()
     use, tokens = record["agent"]["model_use"], record["agent"]["tokens"]
     assert (use["metering"], use["limits"], use["requests"]) == ("agent", None, None)
-    assert (record["agent"]["model_string"], record["agent"]["cli_version"][:11]) == (
-        "mockllm/model",
-        "inspect_ai ",
-    )
+    assert record["agent"]["model_string"] == "mockllm/model"
+    assert record["agent"]["cli_version"].startswith("inspect_ai ")
     counts = ("input_noncached", "input_tokens"), ("output", "output_tokens")
     assert all(tokens[ours] == usage[theirs] > 0 for ours, theirs in counts)
     (score,) = sample["scores"].values()
@@ -148,10 +148,8 @@ def test_a_model_of_inspect_plays_a_run_and_gets_its_score(inspect: Path, tmp_pa
 
     messages = sample["messages"]
     answers = [one for one in messages if one["role"] == "tool"]
-    assert ["error" in one for one in answers] == [
-        *(False, True, True, False, True),
-        *(True, False, False, False, False),
-    ]
+    assert [number for number, one in enumerate(answers) if "error" in one] == [1, 2, 4, 5]
+    assert len(answers) == 10
     assert "budget_invalid" in answers[5]["error"]["message"]
     assert "no rules" not in (folder / "workspace" / "AGENTS.md").read_text()
     asked = [one["content"] for one in messages if one["role"] == "user"]
@@ -162,9 +160,7 @@ def test_a_model_of_inspect_plays_a_run_and_gets_its_score(inspect: Path, tmp_pa
 
 
 def test_the_pages_commands_play(inspect: Path, tmp_path: Path) -> None:
-    (line,) = [
-        one for one in re.findall(r"^inspect eval .*", PAGE.read_text(), re.MULTILINE) if "mockllm" in one
-    ]
+    (line,) = re.findall(r"^inspect eval .*mockllm.*", PAGE.read_text(), re.MULTILINE)
     program = f"{OFFLINE}\nfrom inspect_ai._cli.main import main\nmain()"
     start(tmp_path, inspect.with_name("python"), "-c", program, *shlex.split(line)[1:], "--display", "plain")
     (log,) = logs_in(inspect, tmp_path / "logs")
@@ -179,7 +175,15 @@ def test_the_pages_commands_play(inspect: Path, tmp_path: Path) -> None:
 def test_what_forbids_every_sample_ends_inspect_with_one_line(inspect: Path, tmp_path: Path) -> None:
     state = tmp_path / "state"
     state.mkdir(mode=0o700)
-    command = [inspect, "eval", "evopolicy/environments", "-T", "envs=toy/line", "-T", f"state={state}"]
+    command: list[str | Path] = [
+        inspect,
+        "eval",
+        "evopolicy/environments",
+        "-T",
+        "envs=toy/line",
+        "-T",
+        f"state={state}",
+    ]
     command += ["--model", "mockllm/model", "--display", "plain"]
     away = {"HTTPS_PROXY": "http://127.0.0.1:1", "TIKTOKEN_CACHE_DIR": str(tmp_path / "none")}
     with (state / "lock").open("w") as held:
@@ -189,18 +193,9 @@ def test_what_forbids_every_sample_ends_inspect_with_one_line(inspect: Path, tmp
             (away, "set TIKTOKEN_CACHE_DIR to its path"),
             ({"PYTHONPATH": str(tmp_path)}, "choose another folder with -T state"),
         ):
-            done = subprocess.run(
-                [*map(str, command)],
-                cwd=tmp_path,
-                env=surroundings(tmp_path) | more,
-                capture_output=True,
-                text=True,
-                check=False,
-                timeout=200,
-            )
-            assert done.returncode == 1
-            assert expected in " ".join((done.stdout + done.stderr).split())
-            assert "Traceback" not in done.stdout + done.stderr
+            said = start(tmp_path, *command, code=1, **more)
+            assert expected in " ".join(said.split())
+            assert "Traceback" not in said
     assert not (tmp_path / "runs").exists()
 
 
@@ -257,6 +252,7 @@ def test_exported_logs_of_agents_are_listed_read_and_served_by_inspect(inspect: 
         view.wait(timeout=60)
 
 
+DEEP = b'{"a":' * 90 + b"1" + b"}" * 90
 ODD = b"\n".join(
     [
         b"\xff\xfe",
@@ -266,11 +262,8 @@ ODD = b"\n".join(
         b'{"type": "assistant", "message": {"content": [{"type": "thinking", "thinking": "Hm."}]}}',
         b'{"type": "user", "message": {"content": [{"type": "tool_result", "content": "no", "is_error": true}]}}',
         b'{"type": "paused", "why": ' + b"[" * 90 + b"]" * 90 + b"}",
-        b'{"type": "assistant", "message": {"content": [{"type": "tool_use", "name": "f", "input":'
-        + b'{"a":' * 90
-        + b"1"
-        + b"}" * 90
-        + b"}]}}",
+        b'{"type": "assistant", "message": {"content": [{"type": "tool_use", "name": "f", "input": %s}]}}'
+        % DEEP,
     ]
 )
 """Lines that an agent of its own may write."""

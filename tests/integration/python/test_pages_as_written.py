@@ -16,7 +16,7 @@ from commands import toy_cluster
 from invented.policies import Version
 from invented.run_dirs import write_run
 from stages.cli_stage import FAKES
-from stages.model_api import ModelApi, Step
+from stages.model_api import SUBMIT, ModelApi, Step
 
 from evopolicy_common.records.run_record import decode_run_record
 
@@ -93,10 +93,6 @@ def test_the_page_about_other_tools_does_what_it_says(tmp_path: Path) -> None:
 
 
 SMALL = "--budget 2 --validation 1 --heldout 1 --exp-id"
-SUBMIT = (
-    "echo '# better' >> system/policy.py; curl -s --noproxy '*' -X POST"
-    " -d '{\"env_instances\": [0, 1]}' $EVOPOLICYGYM_SUBMIT_URL"
-)
 
 
 def stand_ins(folder: Path) -> Path:
@@ -105,10 +101,8 @@ def stand_ins(folder: Path) -> Path:
     programs.mkdir(parents=True)
     (folder / "clis" / "lib").mkdir()  # as in an installation, whose files the jail shows
     for name, source in (("codex", "codex"), ("fake_stream.py", "fake_stream.py"), ("gemini", "acp-agent")):
-        text = (FAKES / source).read_text()
-        text = text.replace('os.environ["FAKE_STATE"]', '".fake"').replace(
-            'os.environ["FAKE_SCENARIO"]', '"work"'
-        )
+        text = (FAKES / source).read_text().replace('os.environ["FAKE_STATE"]', '".fake"')
+        text = text.replace('os.environ["FAKE_SCENARIO"]', '"work"')
         (programs / name).write_text(text)
         (programs / name).chmod(0o755)
     return programs
@@ -127,9 +121,7 @@ def test_the_page_about_coding_agents_runs_its_agents(tmp_path: Path) -> None:
         for line in block.replace("\\\n", " ").splitlines()
         if line.startswith(("evopolicy texts", "evopolicy run")) and "remote" not in line
     ]
-    (endpoint,) = [
-        block for block in blocks("how-to/agents-api-key.md", "toml") if "EXAMPLE_API_KEY" in block
-    ]
+    (endpoint,) = [one for one in blocks("how-to/agents-api-key.md", "toml") if "EXAMPLE_API_KEY" in one]
     (tmp_path / "c").mkdir()
     with toy_cluster(tmp_path / "c") as operator, ModelApi([Step(command=SUBMIT)]) as api:
         (tmp_path / "operator-me").symlink_to(operator.parent if operator.is_file() else operator)
@@ -153,17 +145,13 @@ def test_the_page_about_coding_agents_runs_its_agents(tmp_path: Path) -> None:
             played.append(agent)
     assert played == ["codex", "codex", "acp", "file"]
     records = [decode_run_record(path.read_bytes()) for path in (tmp_path / "runs").glob("*/*/*/run.json")]
-    assert [(one.jail, one.outcome.status, one.outcome.budget_used) for one in records] == [
-        ("bwrap", "completed", 2)
-    ] * len(played)
-    harnesses = sorted(one.agent.harness for one in records)
-    assert harnesses == ["acp", "codex", "codex", "llm"]
+    facts = {(one.jail, one.outcome.status, one.outcome.budget_used) for one in records}
+    assert facts == {("bwrap", "completed", 2)}
+    assert sorted(one.agent.harness for one in records) == ["acp", "codex", "codex", "llm"]
     assert sum(bool(one.agent.prompts) and bool(one.experiment_dimensions.agents_md) for one in records) == 1
 
 
-def test_the_documented_schema_accepts_the_documented_suite_file(
-    tmp_path: Path,
-) -> None:
+def test_the_documented_schema_accepts_the_documented_suite_file(tmp_path: Path) -> None:
     pages = ("how-to/sweeps.md", "reference/files.md")
     found = [re.findall(r"`(evopolicy schema [^`]*>[^`]*)`", (DOCS / page).read_text()) for page in pages]
     ((line,), (same,)) = found

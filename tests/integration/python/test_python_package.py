@@ -1,8 +1,10 @@
-"""The public package at work: a policy, a run with a function as agent, the page as it is written."""
+"""The public package at work: a policy, a run with a function as agent, a cluster over mutual TLS, the page as it is
+written."""
 
 from __future__ import annotations
 
 import asyncio
+import hashlib
 import json
 import os
 import re
@@ -14,6 +16,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import process
+from coordinator_harness import Coordinator
+from machines.own_certs import OwnCerts
 
 import evopolicy as evp
 
@@ -149,6 +154,71 @@ def test_a_function_that_fails_or_returns_no_json_says_so(cluster: evp.Cluster, 
     assert "is not JSON" in (run.folder / "logs" / "agent.jsonl").read_text()
 
 
+@pytest.fixture(scope="module")
+def connected(tmp_path_factory: pytest.TempPathFactory) -> Iterator[evp.Cluster]:
+    root = tmp_path_factory.mktemp("connect")
+    certs = OwnCerts(root)
+    coordinator = Coordinator(certs.state, "--listen", certs.endpoint)
+    options = ["--env", "toy", "--slots", "2", "--grace", "0", "--need-tier", "bwrap"]
+    options += ["--connect", certs.endpoint, "--credentials", str(certs.issue("worker", "one"))]
+    state = str(root / "xdg")
+    try:
+        with (
+            process(coordinator.log, "evopolicy_worker.cli", *options, XDG_STATE_HOME=state),
+            evp.Cluster.connect(certs.endpoint, credentials=certs.issue("operator", "me")) as cluster,
+        ):
+            yield cluster
+    finally:
+        coordinator.stop()
+
+
+def test_a_policy_is_played_on_a_cluster_over_tls(connected: evp.Cluster, policy: Path) -> None:
+    result = connected.evaluate(policy, env="toy/line", cases=[0, 1])
+    assert [one.failure for one in result] == [None, None]
+    assert result[0].observations.shape == (result[0].length, 3)
+
+
+def test_a_run_on_it_takes_prompts_rules_and_the_detail_of_feedback(
+    connected: evp.Cluster, tmp_path: Path
+) -> None:
+    def agent(workspace: evp.Workspace) -> list[str]:
+        workspace.write(POLICY.replace("{gain}", "0.3"))
+        workspace.submit([0])
+        rules = (workspace.folder / "AGENTS.md").read_text().splitlines()
+        return [rules[0], *(path.name for path in workspace.folder.rglob("trajectory.jsonl"))]
+
+    (tmp_path / "rules.md").write_text("Be brave.\n\n$standard")
+    (tmp_path / "prompts.toml").write_text('first = "$standard Be brave."')
+    run = connected.run(
+        env="toy/line",
+        agent=agent,
+        budget=2,
+        validation=1,
+        heldout=1,
+        runs=tmp_path / "runs",
+        exp_id="brave",
+        feedback="scores",
+        agents_md=tmp_path / "rules.md",
+        prompts=tmp_path / "prompts.toml",
+    )
+    assert run.value == ["Be brave."]
+    record = json.loads((run.folder / "run.json").read_text())
+    dimensions = record["experiment_dimensions"]
+    digest = hashlib.sha256((tmp_path / "rules.md").read_bytes()).hexdigest()
+    assert (dimensions["feedback"], dimensions["agents_md"]) == ("scores", f"sha256:{digest}")
+    assert record["agent"]["prompts"]
+
+
+def test_a_wrong_text_is_reported_before_anything_starts(connected: evp.Cluster, tmp_path: Path) -> None:
+    with pytest.raises(evp.ConfigError, match=r"none\.md"):
+        connected.run(env="toy/line", agent="random", runs=tmp_path / "runs", agents_md=tmp_path / "none.md")
+
+
+def test_a_cluster_that_is_not_there_is_named(tmp_path: Path) -> None:
+    with pytest.raises(evp.EvopolicyError, match=r"operator-me"):
+        evp.Cluster.connect("tls/127.0.0.1:1", credentials=tmp_path / "operator-me").open()
+
+
 def test_ctrl_c_cancels_the_run_and_leaves_nothing(tmp_path: Path) -> None:
     program = """
 import time
@@ -182,19 +252,10 @@ def test_the_page_does_what_it_says(tmp_path: Path) -> None:
     blocks = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)
     assert len(blocks) == 5
     (tmp_path / "page.py").write_text("\n".join(blocks))
-    output = run_here([sys.executable, "page.py"], tmp_path)
-    assert "my_function gym/continuouscar completed" in output
-
-
-def run_here(command: list[str], folder: Path) -> str:
+    environment = os.environ | {"XDG_STATE_HOME": str(tmp_path / "state")}
+    command = [sys.executable, "page.py"]
     done = subprocess.run(
-        command,
-        cwd=folder,
-        env=os.environ | {"XDG_STATE_HOME": str(folder / "state")},
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=580,
+        command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False, timeout=580
     )
     assert done.returncode == 0, done.stderr[-4000:]
-    return done.stdout
+    assert "my_function gym/continuouscar completed" in done.stdout

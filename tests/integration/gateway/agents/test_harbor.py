@@ -18,10 +18,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from test_remote_agent import RemoteRun
+from test_remote_agent import remote_run
 from waiting import wait_until
-
-from evopolicy_common.records.run_record import decode_run_record
 
 HARBOR = os.environ.get("EVOPOLICY_HARBOR", "")
 PARTS = Path(__file__).parents[3] / "support" / "harbor_parts"
@@ -51,22 +49,9 @@ def scores(tasks: Path, *runs: Path) -> Iterator[str]:
 
 def play(folder: Path, tasks: Path, agent: str) -> dict[str, Any]:
     """Harbor's result of its one trial."""
+    words = ["run", "--path", str(tasks), "--agent", agent, "--jobs-dir", str(folder / "jobs"), "--yes"]
     done = subprocess.run(
-        [
-            HARBOR,
-            "run",
-            "--path",
-            str(tasks),
-            "--agent",
-            agent,
-            "--jobs-dir",
-            str(folder / "jobs"),
-            "--env",
-            "harbor_parts:Container",
-            "--n-concurrent",
-            "1",
-            "--yes",
-        ],
+        [HARBOR, *words, "--env", "harbor_parts:Container", "--n-concurrent", "1"],
         cwd=folder,
         env=os.environ | {"PYTHONPATH": str(PARTS)},
         capture_output=True,
@@ -81,34 +66,21 @@ def play(folder: Path, tasks: Path, agent: str) -> dict[str, Any]:
 
 
 def test_harbors_result_has_our_score(operator_file: Path, tmp_path: Path) -> None:
-    run = RemoteRun(operator_file, tmp_path)
     tasks = tmp_path / "tasks"
-    try:
-        run.wait_until_served()
-        with scores(tasks, run.folder.root):
-            result = play(tmp_path, tasks, "harbor_parts:Scripted")
-        assert run.end() == 0, run.said.read_text()
-    finally:
-        run.end()
-    record = decode_run_record(run.folder.run_json.read_bytes())
-    assert record.outcome.budget_used == 4
-    assert record.outcome.score is not None
+    with remote_run(operator_file, tmp_path) as run, scores(tasks, run.folder.root):
+        result = play(tmp_path, tasks, "harbor_parts:Scripted")
+    assert run.record.outcome.budget_used == 4
+    assert run.record.outcome.score is not None
     assert result["exception_info"] is None
-    assert result["verifier_result"]["rewards"] == {"reward": record.outcome.score}
+    assert result["verifier_result"]["rewards"] == {"reward": run.record.outcome.score}
     policy = run.folder.root / "checkpoints" / "submit_000" / "policy.py"
     assert "# better" in policy.read_text()
 
 
 def test_an_agent_that_submits_nothing_gets_no_reward(operator_file: Path, tmp_path: Path) -> None:
-    run = RemoteRun(operator_file, tmp_path)
     tasks = tmp_path / "tasks"
-    try:
-        run.wait_until_served()
-        with scores(tasks, run.folder.root):
-            result = play(tmp_path, tasks, "nop")
-    finally:
-        code = run.end()
-    assert code == 3, run.said.read_text()
-    assert decode_run_record(run.folder.run_json.read_bytes()).outcome.status == "no_ok_submit"
+    with remote_run(operator_file, tmp_path, code=3) as run, scores(tasks, run.folder.root):
+        result = play(tmp_path, tasks, "nop")
+    assert run.record.outcome.status == "no_ok_submit"
     assert result["verifier_result"] is None
     assert "Reward" in result["exception_info"]["exception_type"]

@@ -12,11 +12,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from commands import Command, command, record_in, run_arguments, run_dir, toy_cluster
-from stages.model_api import CACHED, OUTPUT, ModelApi, Step
+from commands import command, record_in, run_arguments, run_dir, toy_cluster
+from stages.model_api import CACHED, OUTPUT, ModelApi, Step, llm_agent
 from waiting import wait_until
-
-from evopolicy_common.processes import proc
 
 pytestmark = [pytest.mark.system, pytest.mark.slow, pytest.mark.timeout(600)]
 
@@ -47,7 +45,7 @@ def test_kills_at_random_lose_at_most_the_requests_in_flight(
     script = [*[Step(command=f"sleep 0.0{n % 4}") for n in range(40)], *[SUBMIT] * 20]
     lost = 0
     with ModelApi(script) as api, contextlib.ExitStack() as stack:
-        arguments = run_arguments(operator, _agent(tmp_path, api))
+        arguments = run_arguments(operator, llm_agent(tmp_path, api.base_url, retries=50))
         running = stack.enter_context(command(tmp_path, *arguments))
         for _ in range(N_KILLS):
             wanted = api.n_asked + chance.randint(1, 3)
@@ -55,7 +53,7 @@ def test_kills_at_random_lose_at_most_the_requests_in_flight(
             time.sleep(chance.random() * 0.1)
             victim = chance.choice([*VICTIMS, *VICTIMS, "command", "everything"])
             if victim in VICTIMS:
-                lost += _kill(running, VICTIMS[victim]) and victim == "relay"
+                lost += running.kill_below(VICTIMS[victim]) and victim == "relay"
                 continue
             running.kill_all() if victim == "everything" else running.kill()
             lost += 1
@@ -89,7 +87,11 @@ def test_kills_during_a_replay_leave_the_recorded_run_as_it_was(
     chance = random.Random(f"replay {seed}")
     monkeypatch.setenv("MODEL_ACCESS", "key-of-the-test-0123456789")
     with ModelApi([Step(command="sleep 0.1; ls"), SUBMIT] * 3) as api:
-        arguments = [*run_arguments(operator, _agent(tmp_path, api)), "--record-model", "full"]
+        arguments = [
+            *run_arguments(operator, llm_agent(tmp_path, api.base_url, retries=50)),
+            "--record-model",
+            "full",
+        ]
         with command(tmp_path, *arguments) as running:
             assert running.wait() == 0, running.text
     recorded = _content(run_dir(tmp_path))
@@ -98,7 +100,7 @@ def test_kills_during_a_replay_leave_the_recorded_run_as_it_was(
         with command(tmp_path, *again) as running:
             time.sleep(chance.random() * 3)
             if victim in VICTIMS:
-                _kill(running, VICTIMS[victim])
+                running.kill_below(VICTIMS[victim])
                 code, text = running.wait(), running.text
                 assert code in (0, 1), text
             else:
@@ -111,22 +113,3 @@ def test_kills_during_a_replay_leave_the_recorded_run_as_it_was(
 
 def _content(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-
-
-def _agent(folder: Path, api: ModelApi) -> str:
-    (folder / "agent.toml").write_text(
-        'harness = "llm"\nmodel = "m-1"\nbackoff_s = 0.01\npause_s = 0.1\nmax_pause_s = 0.2\nretries = 50\n'
-        f'[api]\nprotocol = "openai"\nbase_url = "{api.base_url}/v1"\nkey = "MODEL_ACCESS"\n'
-    )
-    return f"file:{folder / 'agent.toml'}"
-
-
-def _kill(running: Command, words: bytes) -> bool:
-    """Whether there was such a process below the command just now."""
-    for pid in proc.descendants(running.process.pid):
-        with contextlib.suppress(OSError):
-            line = Path(f"/proc/{pid}/cmdline").read_bytes()
-            if words in line and b"python" in line.partition(b"\0")[0]:
-                os.kill(pid, signal.SIGKILL)
-                return True
-    return False

@@ -13,11 +13,11 @@ from typing import Any
 import pytest
 from commands import Command, command, record_in, run_arguments, run_dir, toy_cluster
 from stages import odd_answers
-from stages.model_api import CACHED, INPUT, OUTPUT, ModelApi, Step
+from stages.model_api import CACHED, INPUT, OUTPUT, ModelApi, Step, llm_agent
 from waiting import wait_until
 
 from evopolicy_common.records import model_record
-from evopolicy_common.records.run_record import RunRecord
+from evopolicy_common.records.run_record import ModelUse, RunRecord, Tokens
 from evopolicy_gateway.relay.ledger import read
 
 pytestmark = [pytest.mark.system, pytest.mark.slow]
@@ -60,13 +60,11 @@ def the_key_is_set(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MODEL_ACCESS", KEY)
 
 
-def agent(folder: Path, api: ModelApi, protocol: str = "openai", **more: Any) -> str:
-    base = f"{api.base_url}/v1" if protocol == "openai" else api.base_url
-    usual = {"harness": "llm", "model": "m-1", "backoff_s": 0.01, "pause_s": 0.1, "max_pause_s": 0.2}
-    lines = [f"{name} = {json.dumps(value)}" for name, value in {**usual, **more}.items()]
-    table = f'[api]\nprotocol = "{protocol}"\nbase_url = "{base}"\nkey = "MODEL_ACCESS"\n'
-    (folder / "agent.toml").write_text("\n".join([*lines, table]))
-    return f"file:{folder / 'agent.toml'}"
+def used_in(record: RunRecord) -> tuple[ModelUse, Tokens]:
+    """What a run used of its model."""
+    assert record.agent.model_use is not None
+    assert record.agent.tokens is not None
+    return record.agent.model_use, record.agent.tokens
 
 
 def played(
@@ -75,7 +73,9 @@ def played(
     """The record of a run, the API that it used, and what the command said."""
     with (
         ModelApi(script) as api,
-        command(folder, *run_arguments(operator, agent(folder, api, protocol, **more))) as running,
+        command(
+            folder, *run_arguments(operator, llm_agent(folder, api.base_url, protocol, **more))
+        ) as running,
     ):
         running.wait()
         return record_in(run_dir(folder)), api, running.text
@@ -94,10 +94,8 @@ def test_odd_answers_are_counted_as_they_were_given(tmp_path: Path, operator: Pa
     talks += [odd_answers.stream(odd_answers.says("z" * 40), {"choices": [], "usage": usage})]
     script = [SUBMIT, *(Step(odd=each) for each in odd + talks), *ENDS[1:]]
     record, api, text = played(tmp_path, operator, script)
-    used, tokens = record.agent.model_use, record.agent.tokens
+    used, tokens = used_in(record)
     assert record.outcome.status == "completed"
-    assert used is not None
-    assert tokens is not None
     assert (used.metering, used.requests, used.requests_failed) == ("relay", api.n_asked, len(odd))
     assert used.models == {"m-1": len(script) - 4}
     assert used.requests_estimated == 4
@@ -112,8 +110,7 @@ def test_the_key_is_nowhere_in_the_jail(tmp_path: Path, operator: Path, protocol
     base = json.dumps(os.path.realpath(os.sys.base_prefix))  # type: ignore[attr-defined]
     search = f"cat > /tmp/s.py <<'E'\nBASE = {base}\n{SEARCH}\nE\npython3 -P /tmp/s.py; env"
     record, api, _ = played(tmp_path, operator, [Step(command=search), *ENDS], protocol)
-    assert record.agent.model_use is not None
-    assert record.agent.model_use.requests == api.n_asked == 5
+    assert used_in(record)[0].requests == api.n_asked == 5
     assert api.keys == {KEY if protocol == "anthropic" else f"Bearer {KEY}"}
     found = json.dumps(api.requests[1])
     assert "searched 0 []" in found
@@ -143,18 +140,15 @@ def test_a_model_that_cannot_play_ends_the_run_with_the_reason(
     assert record.agent.model_use is not None
     assert record.agent.model_use.requests == api.n_asked == asked
     if script[0].unknown:
-        assert (
-            '"name": "edit_file", "input": {"path": "policy.py"}'
-            in (run_dir(tmp_path) / "logs/agent.jsonl").read_text()
-        )
+        log = (run_dir(tmp_path) / "logs/agent.jsonl").read_text()
+        assert '"name": "edit_file", "input": {"path": "policy.py"}' in log
 
 
 def test_a_spent_model_budget_ends_the_run_with_what_it_has(tmp_path: Path, operator: Path) -> None:
     record, api, text = played(tmp_path, operator, [SUBMIT, *[Step(command="true")] * 9], max_requests=3)
     assert (record.outcome.status, record.outcome.closed_reason) == ("completed", "model_budget_spent")
     assert record.outcome.budget_used == 2
-    use = record.agent.model_use
-    assert use is not None
+    use, _ = used_in(record)
     assert (use.requests, use.limits.max_requests, use.limits.max_tokens) == (3, 3, 100_000_000)
     assert api.n_asked == 3
     assert "model limits: 3 requests, 100,000,000 tokens; metering: relay" in text
@@ -164,9 +158,8 @@ def test_a_spent_model_budget_ends_the_run_with_what_it_has(tmp_path: Path, oper
 def test_a_program_that_hangs_is_counted_and_resumed(tmp_path: Path, operator: Path) -> None:
     script = [Step(odd=odd_answers.hang(14.0)), *ENDS]
     record, api, _ = played(tmp_path, operator, script, silence_s=10.0)
-    use = record.agent.model_use
+    use, _ = used_in(record)
     assert (record.outcome.status, record.agent.retries) == ("completed", 1)
-    assert use is not None
     assert (use.requests, use.requests_failed) == (api.n_asked, 1)
 
 
@@ -174,18 +167,16 @@ def test_a_cancelled_run_has_all_that_it_used(tmp_path: Path, operator: Path) ->
     script = [SUBMIT, Step(text="one"), *[Step(command="sleep 0.2")] * 99]
     with (
         ModelApi(script) as api,
-        command(tmp_path, *run_arguments(operator, agent(tmp_path, api))) as running,
+        command(tmp_path, *run_arguments(operator, llm_agent(tmp_path, api.base_url))) as running,
     ):
         wait_until(lambda: api.n_asked >= 6)
         running.process.send_signal(signal.SIGINT)
         running.wait()
         record = record_in(run_dir(tmp_path))
-    use, tokens = record.agent.model_use, record.agent.tokens
+    use, tokens = used_in(record)
     assert record.outcome.status == "cancelled"
     assert (record.agent.harness, record.agent.model_string, record.agent.turns) == ("llm", "m-1", 1)
     assert record.agent.cli_version is not None
-    assert use is not None
-    assert tokens is not None
     assert use.requests == api.n_asked
     assert tokens.output == (api.n_asked - use.requests_failed) * OUTPUT
     assert use.reported is not None
@@ -195,7 +186,7 @@ def test_a_cancelled_run_has_all_that_it_used(tmp_path: Path, operator: Path) ->
 def test_a_kill_loses_no_finished_request(tmp_path: Path, operator: Path, victim: str) -> None:
     script = [SUBMIT, *[Step(command="sleep 0.1")] * 12, *ENDS[1:]]
     with ModelApi(script) as api:
-        arguments = run_arguments(operator, agent(tmp_path, api))
+        arguments = run_arguments(operator, llm_agent(tmp_path, api.base_url))
         with command(tmp_path, *arguments) as running:
             wait_until(lambda: api.n_asked >= 5)
             kill(running, victim)
@@ -207,9 +198,7 @@ def test_a_kill_loses_no_finished_request(tmp_path: Path, operator: Path, victim
             with command(tmp_path, *arguments, "--resume") as running:
                 assert running.wait() == 0, running.text
         record = record_in(run_dir(tmp_path))
-    use, tokens = record.agent.model_use, record.agent.tokens
-    assert use is not None
-    assert tokens is not None
+    use, tokens = used_in(record)
     assert record.outcome.status == "completed"
     assert use.requests is not None
     # At most the request in flight is lost.
@@ -222,41 +211,21 @@ def kill(running: Command, victim: str) -> None:
         running.kill_all()
     elif victim == "command":
         running.kill()
-    elif victim == "supervisor":
-        os.kill(running.running("agent_supervisor.supervisor"), signal.SIGKILL)
     else:
-        for entry in Path("/proc").iterdir():
-            words = (entry / "cmdline").read_bytes().split(b"\0") if entry.name.isdecimal() else []
-            if (
-                words
-                and b"python" in words[0]
-                and b"evopolicy_gateway.relay" in words
-                and is_below(int(entry.name), running)
-            ):
-                os.kill(int(entry.name), signal.SIGKILL)
-                return
-        raise AssertionError("no relay runs")
-
-
-def is_below(pid: int, running: Command) -> bool:
-    while pid > 1:
-        if pid == running.process.pid:
-            return True
-        pid = int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1])
-    return False
+        words = b"agent_supervisor.supervisor" if victim == "supervisor" else b"evopolicy_gateway.relay\0"
+        assert running.kill_below(words), f"no {victim} runs"
 
 
 def test_a_run_is_recorded_whole_and_stamped(tmp_path: Path, operator: Path) -> None:
     arguments = ["--record-model", "full"]
     read = Step(command="cat AGENTS.md; env; echo sk-0123456789abcdefghij")
     with ModelApi([read, *ENDS]) as api:
-        given = [*run_arguments(operator, agent(tmp_path, api)), *arguments]
+        given = [*run_arguments(operator, llm_agent(tmp_path, api.base_url)), *arguments]
         with command(tmp_path, *given) as running:
             assert running.wait() == 0, running.text
     root = run_dir(tmp_path)
-    use = record_in(root).agent.model_use
+    use, _ = used_in(record_in(root))
     calls = model_record.read_calls(root / model_record.FOLDER)
-    assert use is not None
     assert (use.record, use.record_stopped, use.requests) == ("full", "", len(calls))
     with contextlib.closing(model_record.Pack(root / model_record.FOLDER)) as pack:
         held = b"\n".join(map(pack.get, pack.keys()))
@@ -280,7 +249,7 @@ def test_a_recorded_agent_replays_to_the_byte_without_its_model(
 ) -> None:
     script = [EDIT, SUBMIT, EDIT, Step(odd=odd_answers.busy(429, retry_after="0")), *ENDS[1:]]
     with ModelApi(script) as api:
-        arguments = run_arguments(operator, agent(tmp_path, api, protocol))
+        arguments = run_arguments(operator, llm_agent(tmp_path, api.base_url, protocol))
         with command(tmp_path, *arguments, "--record-model", "full") as running:
             assert running.wait() == 0, running.text
     monkeypatch.delenv("MODEL_ACCESS")

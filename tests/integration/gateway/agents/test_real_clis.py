@@ -13,16 +13,18 @@ from __future__ import annotations
 import json
 import os
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import pytest
-from commands import command, record_in, run_dir
+from commands import played_here, run_dir
 from stages import odd_answers
 from stages.cli_stage import play, settings
 from stages.declared_inputs import DESCRIPTION, as_toml, declare
-from stages.model_api import CACHED, CREATED, INPUT, OUTPUT, REASONING, ModelApi, Step
+from stages.model_api import CACHED, CREATED, INPUT, OUTPUT, REASONING, SUBMIT, ModelApi, Step
 
-from evopolicy_gateway.harnesses.interface.agent_config import AcpTable, AgentConfig, read_agent
+from evopolicy_common.records.run_record import RunRecord
+from evopolicy_gateway.harnesses.interface.agent_config import AcpTable, AgentConfig, ApiTable, read_agent
 
 AGENTS = Path(__file__).parents[4] / "examples" / "agents"
 CLIS = os.environ.get("EVOPOLICY_REAL_CLIS", "")
@@ -31,12 +33,8 @@ pytestmark = pytest.mark.skipif(
     not CLIS, reason="needs the real CLIs: set EVOPOLICY_REAL_CLIS as this file's docstring says"
 )
 
-SUBMIT = (
-    "echo '# better' >> system/policy.py; curl -s --noproxy '*' -X POST"
-    " -d '{\"env_instances\": [0, 1]}' $EVOPOLICYGYM_SUBMIT_URL"
-)
-SMALL_HIDDEN = ("--validation", "1", "--heldout", "1", "--slots", "1")
 SCRIPT = [Step(command=SUBMIT), Step(text="first"), Step(command=SUBMIT), Step(text="second")]
+FAILING = [*SCRIPT[:2], Step(status=503, text="overloaded"), *SCRIPT[2:]]
 
 
 def config_for(harness: str, api: ModelApi) -> AgentConfig:
@@ -59,12 +57,10 @@ def config_for(harness: str, api: ModelApi) -> AgentConfig:
 
 
 @pytest.mark.parametrize("harness", ["codex", "claude-code"])
-def test_the_real_cli_edits_submits_and_is_resumed(tmp_path: Path, harness: str) -> None:
-    with ModelApi(SCRIPT) as api:
+def test_the_real_cli_edits_submits_and_is_resumed_also_after_a_failure(tmp_path: Path, harness: str) -> None:
+    with ModelApi(FAILING) as api:
         played = play(tmp_path, config_for(harness, api), "", budget=4)
-    assert played.ending is not None
-    assert played.ending.reason == "agent_stopped", played.ending.detail
-    assert (played.ending.turns, played.ending.retries) == (2, 0)
+    assert played.outcome == ("agent_stopped", 2, 1), played.ending.detail
     assert [text for _, text in played.turns] == ["first", "second"]
     assert (tmp_path / "workspace/system/policy.py").read_text() == "# better\n# better\n"
     tokens = played.ending.facts["tokens"]
@@ -75,23 +71,6 @@ def test_the_real_cli_edits_submits_and_is_resumed(tmp_path: Path, harness: str)
     assert tokens.get("reasoning") == (4 * REASONING if harness == "codex" else None)
     assert "sk-stub" not in played.text
     # The second turn knows the first: one session.
-    assert "first" in str(api.requests[2])
-
-
-@pytest.mark.parametrize("harness", ["codex", "claude-code"])
-def test_the_real_cli_is_resumed_after_its_provider_failed(tmp_path: Path, harness: str) -> None:
-    script = [
-        SCRIPT[0],
-        Step(text="first"),
-        Step(status=503, text="overloaded"),
-        SCRIPT[2],
-        Step(text="second"),
-    ]
-    with ModelApi(script) as api:
-        played = play(tmp_path, config_for(harness, api), "", budget=4)
-    assert played.ending is not None
-    assert played.ending.reason == "agent_stopped", played.ending.detail
-    assert (played.ending.turns, played.ending.retries) == (2, 1)
     assert "first" in str(api.requests[-1])
 
 
@@ -99,7 +78,6 @@ def test_the_real_cli_is_resumed_after_its_provider_failed(tmp_path: Path, harne
 def test_the_real_cli_with_a_wrong_key_ends_the_run(tmp_path: Path, harness: str) -> None:
     with ModelApi([Step(status=401, text="invalid key")] * 9) as api:
         played = play(tmp_path, config_for(harness, api), "", budget=4)
-    assert played.ending is not None
     assert played.ending.reason == "agent_failed"
     assert "401" in played.ending.detail
 
@@ -116,7 +94,7 @@ def test_a_cli_of_the_example_files_edits_submits_and_is_resumed(
         '{"security": {"auth": {"selectedType": "gemini-api-key"}}}'
     )
     agent = read_agent(AGENTS / f"{name}.toml")
-    with ModelApi([*SCRIPT[:2], Step(status=503, text="overloaded"), *SCRIPT[2:]]) as api:
+    with ModelApi(FAILING) as api:
         variables = {
             "GOOGLE_GEMINI_BASE_URL": api.base_url,
             "OPENAI_BASE_URL": f"{api.base_url}/v1",
@@ -126,7 +104,6 @@ def test_a_cli_of_the_example_files_edits_submits_and_is_resumed(
         played = play(
             tmp_path, config, "", budget=4, GEMINI_API_KEY="stub-0123456789", OPENAI_API_KEY="stub-0123456789"
         )
-    assert played.ending is not None
     assert played.ending.reason == "agent_stopped", played.ending.detail
     assert [text for _, text in played.turns] == ["first", "second"]
     assert "first" in str(api.requests[-1])
@@ -136,22 +113,19 @@ def test_a_cli_of_the_example_files_edits_submits_and_is_resumed(
     assert tokens["output"] == 4 * OUTPUT
 
 
+def jailed(folder: Path, config: AgentConfig, *more: str, **waits: float) -> tuple[RunRecord, str]:
+    """As `played_here`, with the settings in a file."""
+    document = msgspec.to_builtins(msgspec.structs.replace(config, backoff_s=0.01))
+    known = {name: value for name, value in document.items() if value not in (None, (), {})}
+    (folder / "agent.toml").write_text("".join(f"{name} = {as_toml(known[name])}\n" for name in known))
+    return played_here(folder, "file:agent.toml", *more, **waits)
+
+
 @pytest.mark.parametrize("harness", ["codex", "claude-code"])
 def test_the_real_cli_plays_and_resumes_a_jailed_run(tmp_path: Path, harness: str) -> None:
-    program = Path(CLIS) / {"codex": "codex", "claude-code": "claude"}[harness]
-    with ModelApi([*SCRIPT[:2], Step(status=503, text="overloaded"), *SCRIPT[2:]]) as api:
-        config = config_for(harness, api)
-        variables = {name: value for name, value in config.environment.items() if name != "PATH"}
-        line = ", ".join(f"{name} = {json.dumps(value)}" for name, value in variables.items())
-        (tmp_path / "agent.toml").write_text(
-            f'harness = "{harness}"\nmodel = "{config.model}"\nprogram = ["{program}"]\nbackoff_s = 0.01\n'
-            f"extra_args = {json.dumps(config.extra_args)}\nenvironment = {{ {line} }}\n"
-        )
-        arguments = ("--env", "toy/line", "--agent", "file:agent.toml", "--exp-id", "t", "--budget", "4")
+    with ModelApi(FAILING) as api:
         reaches = api.base_url.removeprefix("http://")
-        with command(tmp_path, "local", *arguments, *SMALL_HIDDEN, "--allow-host", reaches) as running:
-            assert running.wait() == 0, running.text
-    record = record_in(run_dir(tmp_path))
+        record, _ = jailed(tmp_path, inputs_config(harness, api, tmp_path), "--allow-host", reaches)
     assert (record.jail, record.outcome.budget_used, record.agent.retries) == ("bwrap", 4, 1)
     assert "first" in str(api.requests[-1])
     policy = run_dir(tmp_path) / "checkpoints" / "submit_001" / "policy.py"
@@ -164,45 +138,37 @@ def test_the_relay_counts_for_a_real_cli_which_never_has_the_key(
 ) -> None:
     """Whatever else it asks its model for, and whatever the model answers, the relay counts as the API does."""
     needle = "$(printf %s fedcba9876543210-dliw-ks | rev)"
-    look = (
+    search = (
         f"env | grep -c {needle}; cat /proc/[0-9]*/environ | grep -c {needle}; grep -rlaF {needle} ~ /tmp ."
     )
     odd = (odd_answers.busy(429, retry_after="1"), odd_answers.busy(500))
-    steps = [Step(command=look), *(Step(odd=each) for each in odd), Step(unknown="no_such_tool"), *SCRIPT]
+    steps = [Step(command=search), *(Step(odd=each) for each in odd), Step(unknown="no_such_tool"), *SCRIPT]
     anthropic = harness == "claude-code"
     with ModelApi(steps) as api:
         vendor = "ANTHROPIC" if anthropic else "OPENAI"
         monkeypatch.setenv(f"{vendor}_API_KEY", "sk-wild-0123456789abcdef")
         monkeypatch.setenv(f"{vendor}_BASE_URL", api.base_url if anthropic else f"{api.base_url}/v1")
-        name = harness.removesuffix("-acp")
-        program = [f"{CLIS}/{ {'claude-code': 'claude'}.get(name, name) }"]
+        name = {"claude-code": "claude"}.get(harness, harness.removesuffix("-acp"))
+        more: dict[str, Any] = {"program": (f"{CLIS}/{name}",)}
         if name == "qwen":
-            rest = (AGENTS / "qwen.toml").read_text()
-            table = rest[rest.index("[cli]") :]
+            more |= {"api": ApiTable(protocol="openai", base_url=f"{api.base_url}/v1")}
+            more |= {"cli": read_agent(AGENTS / "qwen.toml").cli}
         if harness == "qwen-acp":
-            program += ["--acp", "--model", "gpt-5.5", "--auth-type", "openai"]
-            table = "[acp]\n"
-        lines = [
-            f'harness = "{harness}"\nmodel = "gpt-5.5"\nprogram = {json.dumps(program)}\nbackoff_s = 0.01\n'
-        ]
-        if name == "qwen":
-            lines += [f'[api]\nprotocol = "openai"\nbase_url = "{api.base_url}/v1"\n', table]
-        (tmp_path / "agent.toml").write_text("".join(lines))
-        arguments = ("--env", "toy/line", "--agent", "file:agent.toml", "--exp-id", "t", "--budget", "4")
-        with command(tmp_path, "local", *arguments, *SMALL_HIDDEN) as running:
-            assert running.wait(400) == 0, running.text
-    record = record_in(run_dir(tmp_path))
+            program = (*more["program"], "--acp", "--model", "gpt-5.5", "--auth-type", "openai")
+            more |= {"program": program, "cli": None, "acp": AcpTable()}
+        config = AgentConfig(harness=harness, model="gpt-5.5", **more)
+        record, said = jailed(tmp_path, config, timeout_s=400)
     use, tokens = record.agent.model_use, record.agent.tokens
     assert record.outcome.budget_used == 4
     assert use is not None
     assert tokens is not None
-    assert (use.metering, use.requests, use.requests_failed) == ("relay", api.n_asked, 2), running.text
+    assert (use.metering, use.requests, use.requests_failed) == ("relay", api.n_asked, 2), said
     assert (tokens.output, tokens.cache_read) == (api.n_answered * OUTPUT, api.n_answered * CACHED)
     assert record.agent.cli_version is not None
     assert (record.agent.model_string, use.other_models) == ("gpt-5.5", {})
     assert all("sk-wild" in key for key in api.keys)
     assert "sk-wild" not in json.dumps(api.requests)
-    assert "next try in 1 s" in running.text
+    assert "next try in 1 s" in said
 
 
 KEY = "sk-ant-stub-0123456789abcdef"
@@ -245,47 +211,16 @@ def test_a_real_agent_behind_the_protocol_edits_submits_and_goes_on(tmp_path: Pa
         variables = acp_settings(name, api, tmp_path) | {"PATH": f"{CLIS}:{os.environ['PATH']}"}
         config = settings("acp", program=program, acp=AcpTable(), environment=variables, silence_s=60.0)
         played = play(tmp_path, config, "", budget=4)
-    assert played.ending is not None
-    assert played.ending.reason == "agent_stopped", played.ending.detail
-    assert (played.ending.turns, played.ending.retries) == (2, 0)
+    assert played.outcome == ("agent_stopped", 2, 0), played.ending.detail
     assert [text for _, text in played.turns] == ["first", "second"]
     assert (tmp_path / "workspace/system/policy.py").read_text() == "# better\n# better\n"
     assert "first" in str(api.requests[-1])
     # OpenCode tells those of a turn's last request.
     usage = {"gemini": 4 * INPUT, "opencode": 2 * INPUT, "claude": 4 * (INPUT + CREATED), "qwen": 4 * INPUT}
     tokens = played.ending.facts.get("tokens", {})
-    assert (
-        sum(tokens.get(kind, 0) for kind in ("input_noncached", "cache_read", "cache_creation"))
-        == usage[name]
-    )
+    given = sum(tokens.get(kind, 0) for kind in ("input_noncached", "cache_read", "cache_creation"))
+    assert given == usage[name]
     assert KEY not in played.text
-
-
-@pytest.mark.parametrize("name", ACP)
-def test_a_real_agent_behind_the_protocol_plays_a_jailed_run(
-    tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    home = tmp_path / "home"
-    home.mkdir()
-    with ModelApi(SCRIPT) as api:
-        monkeypatch.setenv("HOME", str(home))
-        variables = acp_settings(name, api, home)
-        line = ", ".join(f"{key} = {json.dumps(value)}" for key, value in variables.items())
-        program = json.dumps([f"{CLIS}/{ACP[name][0]}", *ACP[name][1:]])
-        (tmp_path / "agent.toml").write_text(
-            f'harness = "{name}"\nprogram = {program}\nenvironment = {{ {line} }}\nbackoff_s = 0.01\n[acp]\n'
-        )
-        arguments = ("--env", "toy/line", "--agent", "file:agent.toml", "--exp-id", "t", "--budget", "4")
-        reaches = api.base_url.removeprefix("http://")
-        more = ["--allow-host", reaches]
-        for path in home.iterdir():
-            more += ["--jail-bind-rw", str(path)]
-        with command(tmp_path, "local", *arguments, *SMALL_HIDDEN, *more) as running:
-            assert running.wait() == 0, running.text
-    record = record_in(run_dir(tmp_path))
-    assert (record.jail, record.agent.harness, record.outcome.budget_used) == ("bwrap", name, 4)
-    policy = run_dir(tmp_path) / "checkpoints" / "submit_001" / "policy.py"
-    assert policy.read_text().count("# better") == 2
 
 
 LOOK = (
@@ -307,33 +242,18 @@ def test_a_jailed_real_agent_has_the_runs_skills_and_servers(
     for variable in ("GEMINI_API_KEY", "OPENAI_API_KEY"):
         monkeypatch.setenv(variable, "stub-0123456789abcdef")
     skills, servers = declare(tmp_path)
-    script = [
-        Step(tool="measure"),
-        Step(command=LOOK),
-        Step(command=SUBMIT),
-        Step(command=SUBMIT),
-        Step(text="done"),
-    ]
+    script = [Step(tool="measure"), *map(Step, (LOOK, SUBMIT, SUBMIT)), Step(text="done")]
     with ModelApi(script) as api:
         more = ["--allow-host", api.base_url.removeprefix("http://")]
-        config = inputs_config(name, api, home)
-        config = msgspec.structs.replace(config, skills=skills, mcp=servers, backoff_s=0.01)
-        document = {
-            name: each for name, each in msgspec.to_builtins(config).items() if each not in (None, (), {})
-        }
-        lines = [f"{name} = {as_toml(each)}\n" for name, each in document.items()]
-        (tmp_path / "agent.toml").write_text("".join(lines))
+        config = msgspec.structs.replace(inputs_config(name, api, home), skills=skills, mcp=servers)
         for path in home.iterdir():
             more += ["--jail-bind-rw", str(path)]
-        arguments = ("--env", "toy/line", "--agent", "file:agent.toml", "--exp-id", "t", "--budget", "4")
-        with command(tmp_path, "local", *arguments, *SMALL_HIDDEN, *more) as running:
-            assert running.wait() == 0, running.text
-    record = record_in(run_dir(tmp_path))
+        record, _ = jailed(tmp_path, config, *more)
     assert [(each.kind, each.name, each.hosts) for each in record.agent.inputs] == [
         ("skill", "lamps", ()),
         ("mcp", "lamp", ("lamps.example.org",)),
     ]
-    assert record.outcome.budget_used == 4
+    assert (record.jail, record.outcome.budget_used) == ("bwrap", 4)
     assert DESCRIPTION in json.dumps(api.requests[0])
     assert "the lamp reads 42, lux; could not change it" in json.dumps(api.requests[1])
     assert "shut" in json.dumps(api.requests[2])

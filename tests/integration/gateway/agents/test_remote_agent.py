@@ -9,10 +9,9 @@ import os
 import stat
 import subprocess
 import sys
-import time
 import urllib.error
 import urllib.request
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -23,7 +22,7 @@ from typer.testing import CliRunner
 from waiting import wait_until
 
 from evopolicy_common.errors import ConfigError
-from evopolicy_common.records.run_record import decode_run_record
+from evopolicy_common.records.run_record import RunRecord, decode_run_record
 from evopolicy_gateway.cli.main import app as evopolicy
 from evopolicy_gateway.run_folder.layout import RunFolder, save
 from evopolicy_gateway.run_folder.listener import Listener, finish, listener_of
@@ -177,27 +176,20 @@ def test_a_listener_has_the_address_that_the_operator_named() -> None:
 @pytest.mark.parametrize(
     ("options", "problem"),
     [
-        (["--agent", "remote"], "needs --http"),
-        (
-            ["--agent", "evolve", "--http", "10.0.0.5:8080", "--jail", "none"],
-            "applies only with --agent remote",
-        ),
-        (
-            ["--agent", "remote", "--http", "127.0.0.1:0", "--jail", "open-network"],
-            "not started by this command",
-        ),
-        (["--agent", "remote", "--http-url", "https://gym.example"], "needs"),
-        (["--agent", "evolve", "--agent-host", "elsewhere"], "applies only with --agent remote"),
-        (["--agent", "remote", "--http", "127.0.0.1:0", "--agent-host", "my-laptop"], "boot_id"),
-        (["--agent", "evolve", "--hidden-isolation", "off"], "evopolicy-coordinator --hidden-isolation"),
-        (["--agent", "evolve", "--local", "--hidden-isolation", "none"], "'related', 'strict', 'off'"),
-        (["--agent", "evolve", "--hidden-cases", "mine"], "'shared', 'per-run'"),
+        ("remote", "needs --http"),
+        ("evolve --http 10.0.0.5:8080 --jail none", "applies only with --agent remote"),
+        ("remote --http 127.0.0.1:0 --jail open-network", "not started by this command"),
+        ("remote --http-url https://gym.example", "needs"),
+        ("evolve --agent-host elsewhere", "applies only with --agent remote"),
+        ("remote --http 127.0.0.1:0 --agent-host my-laptop", "boot_id"),
+        ("evolve --hidden-isolation off", "evopolicy-coordinator --hidden-isolation"),
+        ("evolve --local --hidden-isolation none", "'related', 'strict', 'off'"),
+        ("evolve --hidden-cases mine", "'shared', 'per-run'"),
     ],
 )
-def test_options_that_do_not_go_together_are_refused(
-    tmp_path: Path, options: list[str], problem: str
-) -> None:
-    done = CliRunner().invoke(evopolicy, ["run", "--env", "toy/line", "--runs", str(tmp_path), *options])
+def test_options_that_do_not_go_together_are_refused(tmp_path: Path, options: str, problem: str) -> None:
+    words = ["run", "--env", "toy/line", "--runs", str(tmp_path), "--agent", *options.split()]
+    done = CliRunner().invoke(evopolicy, words)
     assert done.exit_code == 2, done.stderr
     assert problem in done.stderr
     assert list(tmp_path.iterdir()) == []
@@ -205,6 +197,8 @@ def test_options_that_do_not_go_together_are_refused(
 
 class RemoteRun:
     """`evopolicy run --agent remote` on the module's cluster, and what it tells its operator."""
+
+    record: RunRecord
 
     def __init__(self, operator_file: Path, root: Path, *options: str) -> None:
         self.folder = RunFolder(root / "runs" / "theirs" / "toy_line" / "r")
@@ -221,95 +215,82 @@ class RemoteRun:
                 stderr=log,
             )
 
-    def wait_until_served(self) -> None:
-        deadline = time.monotonic() + TIMEOUT_S
-        while "when it is done before its budget" not in self.log.read_text():
-            assert self.process.poll() is None, self.log.read_text()
-            assert time.monotonic() < deadline, self.log.read_text()
-            time.sleep(0.1)
+    @property
+    def said(self) -> str:
+        return self.log.read_text()
 
-    def submit(self, episodes: list[int], token: str) -> tuple[int, str]:
+    def submit(self, episodes: list[int], token: str = "") -> tuple[int, str]:
         """Status of the answer, and of the submit."""
-        url = next(line.split()[-1] for line in self.log.read_text().splitlines() if "served at" in line)
-        request = urllib.request.Request(
-            url,
-            data=json.dumps({"env_instances": episodes}).encode(),
-            headers={"Authorization": f"Bearer {token}"},
-        )
+        url = next(line.split()[-1] for line in self.said.splitlines() if "served at" in line)
+        body = json.dumps({"env_instances": episodes}).encode()
+        headers = {"Authorization": f"Bearer {token or token_of(self.folder)}"}
         try:
-            with urllib.request.urlopen(request, timeout=TIMEOUT_S) as answer:
+            with urllib.request.urlopen(
+                urllib.request.Request(url, body, headers), timeout=TIMEOUT_S
+            ) as answer:
                 return answer.status, json.load(answer)["status"]
         except urllib.error.HTTPError as error:
             with error:
                 return error.code, ""
 
-    def end(self) -> int:
-        try:
-            return self.process.wait(timeout=TIMEOUT_S)
-        finally:
-            if self.process.poll() is None:
-                self.process.terminate()
-                self.process.wait(timeout=TIMEOUT_S)
+
+@contextlib.contextmanager
+def remote_run(operator_file: Path, root: Path, *options: str, code: int = 0) -> Iterator[RemoteRun]:
+    """A run that is served. It has to end with the `with`, with this status; its record is there then."""
+    run = RemoteRun(operator_file, root, *options)
+    try:
+        served = "when it is done before its budget"
+        wait_until(lambda: served in run.said or run.process.poll() is not None, lambda: run.said)
+        yield run
+        assert run.process.wait(timeout=TIMEOUT_S) == code, run.said
+        run.record = decode_run_record(run.folder.run_json.read_bytes())
+    finally:
+        run.process.terminate()
+        run.process.wait(timeout=TIMEOUT_S)
 
 
 def test_a_remote_run_ends_when_the_operator_says_so(operator_file: Path, tmp_path: Path) -> None:
-    run = RemoteRun(operator_file, tmp_path)
-    try:
-        run.wait_until_served()
+    with remote_run(operator_file, tmp_path) as run:
         token = token_of(run.folder)
-        assert str(run.folder.bearer) in run.log.read_text()
-        assert token not in run.log.read_text()
+        assert str(run.folder.bearer) in run.said
+        assert token not in run.said
         assert run.submit([0, 1], "guess") == (401, "")
-        assert run.submit([0, 1], token) == (200, "ok")
+        assert run.submit([0, 1]) == (200, "ok")
         assert (run.folder.feedback / "submit_000" / "summary.json").exists()
         with pytest.raises(SystemExit) as ended:
             evopolicy(["finish", str(run.folder.root)])
         assert ended.value.code == 0
-    finally:
-        code = run.end()
-    assert code == 0, run.log.read_text()
-    record = decode_run_record(run.folder.run_json.read_bytes())
+    record = run.record
     assert (record.agent.harness, record.jail, record.outcome.budget_used) == ("remote", "none", 2)
     assert record.outcome.closed_reason == "agent_stopped"
-    assert token not in run.log.read_text() + run.folder.harness_log.read_text()
+    assert token not in run.said + run.folder.harness_log.read_text()
     assert not run.folder.state.exists()
 
 
 def test_a_spent_remote_run_is_scored_once_its_agent_has_ended(operator_file: Path, tmp_path: Path) -> None:
-    run = RemoteRun(operator_file, tmp_path)
-    try:
-        run.wait_until_served()
-        assert "it may be any: no hidden case" in run.log.read_text()
-        assert run.submit([0, 1, 2, 3], token_of(run.folder)) == (200, "ok")
-        wait_until(lambda: "waiting for the agent's end" in run.log.read_text())
-        assert run.submit([0], token_of(run.folder))[0] == 409
+    with remote_run(operator_file, tmp_path) as run:
+        assert "it may be any: no hidden case" in run.said
+        assert run.submit([0, 1, 2, 3]) == (200, "ok")
+        wait_until(lambda: "waiting for the agent's end" in run.said)
+        assert run.submit([0])[0] == 409
         assert run.process.poll() is None
         finish(run.folder)
-    finally:
-        code = run.end()
-    assert code == 0, run.log.read_text()
-    record = decode_run_record(run.folder.run_json.read_bytes())
-    assert (record.outcome.closed_reason, record.hidden_isolation) == ("budget_spent", "exclusive")
+    assert (run.record.outcome.closed_reason, run.record.hidden_isolation) == ("budget_spent", "exclusive")
 
 
 def test_a_remote_run_whose_operator_vouches_for_its_agent_ends_by_itself(
     operator_file: Path, tmp_path: Path
 ) -> None:
-    run = RemoteRun(operator_file, tmp_path, "--agent-host", "elsewhere")
-    try:
-        run.wait_until_served()
-        assert run.submit([0, 1, 2, 3], token_of(run.folder)) == (200, "ok")
-    finally:
-        code = run.end()
-    assert code == 0, run.log.read_text()
-    record = decode_run_record(run.folder.run_json.read_bytes())
-    assert (record.outcome.closed_reason, record.hidden_isolation) == ("budget_spent", "waived")
+    with remote_run(operator_file, tmp_path, "--agent-host", "elsewhere") as run:
+        assert run.submit([0, 1, 2, 3]) == (200, "ok")
+    assert (run.record.outcome.closed_reason, run.record.hidden_isolation) == ("budget_spent", "waived")
 
 
 def test_a_remote_run_ends_when_its_agents_time_is_over(operator_file: Path, tmp_path: Path) -> None:
-    run = RemoteRun(operator_file, tmp_path, "--agent-wall-s", "1", "--agent-host", "elsewhere")
-    assert run.end() == 3, run.log.read_text()
-    assert decode_run_record(run.folder.run_json.read_bytes()).outcome.closed_reason == "wall_limit"
+    options = ("--agent-wall-s", "1", "--agent-host", "elsewhere")
+    with remote_run(operator_file, tmp_path, *options, code=3) as run:
+        pass
+    assert run.record.outcome.closed_reason == "wall_limit"
 
 
 def test_finish_is_refused_where_no_remote_agent_plays(tmp_path: Path) -> None:
