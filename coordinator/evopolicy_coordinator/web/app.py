@@ -205,7 +205,13 @@ class Site:
         feed = self.feeds.of(f"{may_act} {name} {words}", make, view)
         query = {k: v for k, v in (("q", words.q), ("page", words.page), ("before", words.before)) if v}
         live = f"/events/{name}" + (f"?{urlencode(query)}" if query else "")
-        shown = {"view": view, "live": live, "cursor": feed.cursor, "words": words, "title": title}
+        shown: dict[str, Any] = {
+            "view": view,
+            "live": live,
+            "cursor": feed.cursor,
+            "words": words,
+            "title": title,
+        }
         return self._page(request, template, here=name, **shown, **more)
 
     async def home(self, request: Request) -> Response:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 from markupsafe import Markup
@@ -172,7 +172,7 @@ def submit_values(run: RunFacts, reader: Reader, index: int) -> dict[str, Any]:
     failed = {int(each) for each in _numbers(summary.get("errors")) if each is not None}
     first, known = summary.get("first_global_episode"), detail.episodes(index)
     begin = first if isinstance(first, int) else known[0] if known else 0
-    rows = itertools.islice(itertools.zip_longest(range(n), *columns), MAX_EPISODES)
+    rows: Iterator[tuple[Any, ...]] = itertools.zip_longest(range(n), *columns)
     episodes = [
         {
             "number": begin + at,
@@ -182,7 +182,7 @@ def submit_values(run: RunFacts, reader: Reader, index: int) -> dict[str, Any]:
             "length": length,
             "failed": at in failed,
         }
-        for at, case, value, length in rows
+        for at, case, value, length in itertools.islice(rows, MAX_EPISODES)
     ]
     starts = [each.summary.submit_started_at for at in (index - 1, index) if (each := submits.get(at))]
     return {
