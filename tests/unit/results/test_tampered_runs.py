@@ -85,7 +85,7 @@ class _Nowhere:
     def n_known(self, curve: tracking.Curve) -> int:
         return 0
 
-    def add(self, curve: tracking.Curve, points: list[tracking.Point], n: int, *, finished: bool) -> None:
+    def add(self, curve: tracking.Curve, points: list[tracking.Point]) -> None:
         assert curve.settings()
 
     def close(self) -> None:
