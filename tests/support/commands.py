@@ -240,12 +240,6 @@ def toy_cluster(root: Path, *arguments: str) -> Iterator[Path]:
         yield Path(coordinator.ready["credentials"]["operator"])
 
 
-def run_on(operator_file: Path, cwd: Path, agent_name: str, *more: str) -> tuple[int, str, str]:
-    """A run named `t` on that cluster, to its end."""
-    with command(cwd, *run_arguments(operator_file, agent_name), *more) as running:
-        return running.finish()
-
-
 def run_arguments(operator_file: Path, agent_name: str) -> list[str]:
     arguments = ["run", "--env", "toy/line", "--agent", agent_name, "--exp-id", "t", *SMALL]
     return [*arguments, "--credentials", str(operator_file)]
