@@ -349,11 +349,10 @@ def test_a_changed_file_is_refused_and_a_scoreless_run_reported(tmp_path: Path, 
     file = tmp_path / "t.toml"
     file.write_text(text)
     arguments = ("--credentials", str(operator_file))
-    text = swept(tmp_path, *arguments, ends=3)
-    assert "feedback takes at most 25.8 KiB" in text
+    assert "feedback takes at most 25.8 KiB" in swept(tmp_path, *arguments, ends=3)
     file.write_text(text.replace("budget = 2", "budget = 3"))
-    text = swept(tmp_path, *arguments, ends=2)
-    assert "budget is 3, was 2" in " ".join(text.split())
+    refused = swept(tmp_path, *arguments, ends=2)
+    assert "budget is 3, was 2" in " ".join(refused.split())
     assert "1 runs: 1 kept" in swept(tmp_path, *arguments, "--changed", "keep", ends=3)
 
 
