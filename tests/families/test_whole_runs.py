@@ -12,7 +12,7 @@ from proofs import Proof
 
 from evopolicy_worker.environments import describe, missing
 
-pytestmark = [pytest.mark.families, pytest.mark.slow, pytest.mark.timeout(1200)]
+pytestmark = [pytest.mark.families, pytest.mark.slow, pytest.mark.timeout(2500)]
 
 BUDGET = 2
 
@@ -24,10 +24,11 @@ def played(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Command]:
     environments = [
         word for each in proofs.together() if not missing(each.env) for word in ("--env", each.env)
     ]
-    counts = ["--budget", str(BUDGET), "--validation", "2", "--heldout", "2", "--hidden-isolation", "off"]
+    counts = ["--budget", str(BUDGET), "--validation", "1", "--heldout", "1", "--hidden-isolation", "off"]
     more = ["--agent", "evolve", "--exp-id", "t", "--video", "all", "--parallel", "3"]
     with command(folder, "local", *environments, *counts, *more) as running:
-        running.wait(1100)
+        # Alone on two cores 200 s; beside other families several times as long.
+        running.wait(2400)
     return folder, running
 
 
@@ -41,7 +42,7 @@ def test_evolve_plays_a_whole_run(played: tuple[Path, Command], proof: Proof) ->
     outcome = record_in(folder).outcome
     assert outcome.status == "completed", done.text[-4000:]
     assert outcome.budget_used == BUDGET
-    assert len(outcome.heldout_returns) == 2
+    assert len(outcome.heldout_returns) == 1
     episodes = [each.parent for each in (folder / "workspace" / "feedback").rglob("trajectory.jsonl")]
     assert len(episodes) == BUDGET
     videos = [each for each in episodes if (each / "video.mp4").is_file()]

@@ -89,4 +89,5 @@ def test_each_test_is_reported_once_also_those_of_a_process_that_dies(tmp_path: 
 
 @pytest.mark.parametrize("option", ["-x", "--maxfail=1"])
 def test_the_first_failure_stops_all_if_that_is_asked(tmp_path: Path, option: str) -> None:
-    assert "stopping after 1 failures" in played(tmp_path, option)
+    # Another process may fail a second one meanwhile.
+    assert re.search("stopping after [12] failures", played(tmp_path, option))
