@@ -51,6 +51,14 @@ def test_a_zygote_that_stands_still_has_died(tmp_path: Path, monkeypatch: pytest
             found.spawn()
 
 
+def test_a_zygote_whose_worker_is_gone_ends_by_itself(tmp_path: Path) -> None:
+    with a_zygote(tmp_path) as found:
+        found.bury_later(found.spawn())
+        found.bury()
+        found._control.close()
+        assert found._process.wait(60) == 0
+
+
 def test_a_policys_process_that_survives_being_killed_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -21,6 +21,7 @@ import json
 import operator
 import os
 import resource
+import select
 import selectors
 import signal
 import socket
@@ -217,7 +218,8 @@ def zygote(control: int, namespaces: bool, then: Callable[[int], None]) -> NoRet
     with the same arguments. How a policy ended lies in a page that children do not inherit, from where it is sent.
 
     A request of one byte asks how a process ended (its pidfd, a socket for the answer), one of two asks for a process
-    (the socket that is returned) or, beginning with `q`, for the end.
+    (the socket that is returned) or, beginning with `q`, for the end. A closed socket asks for the end too: the kernel's
+    kill of a child whose parent dies can come before the child has asked for it.
     """
     page = unshared_page()
     how, usage = ctypes.c_void_p(page), ctypes.c_void_p(page + SIGINFO_BYTES)
@@ -225,6 +227,9 @@ def zygote(control: int, namespaces: bool, then: Callable[[int], None]) -> NoRet
     pieces = (ctypes.c_size_t * 2)(ctypes.addressof(asked), len(asked))
     # struct msghdr: no name, one piece, two descriptors, flags
     message = (ctypes.c_size_t * 7)(0, 0, ctypes.addressof(pieces), 1, ctypes.addressof(fds), len(fds), 0)
+    # struct pollfd, twice: two are ready only where the other side is closed.
+    watched = struct.pack("ihhihh", control, select.POLLIN, 0, control, select.POLLRDHUP, 0)
+    polled = ctypes.create_string_buffer(watched, len(watched))
     calls = ctypes.PyDLL(None)
     myself = os.pidfd_open(os.getpid())
     # The lowest numbers that are free, which descriptors that arrive get.
@@ -242,6 +247,9 @@ def zygote(control: int, namespaces: bool, then: Callable[[int], None]) -> NoRet
 
     ends = around(
         (
+            # The end, unless a request takes its place.
+            step("memset", None, asked, ord("q"), 2),
+            step("poll", ctypes.c_int, polled, 2, -1),
             # It begins again after a request for a process too. Then these descriptors are closed, and nothing happens.
             step("recvmsg", ctypes.c_ssize_t, control, message, 0),
             step("syscall", None, WAITID, P_PIDFD, first, how, WEXITED, usage),
@@ -262,7 +270,6 @@ def zygote(control: int, namespaces: bool, then: Callable[[int], None]) -> NoRet
         # Else the next child would be born into the namespace of this one.
         *([step("setns", None, myself, CLONE_NEWPID)] if namespaces else []),
         step("close", None, first),
-        step("memset", None, asked, 0, 2),
         # A number in place of the child's, which counts the policies.
         step("labs", ctypes.c_long, ctypes.c_long(1 << 40)),
     )
