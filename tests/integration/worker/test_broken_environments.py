@@ -32,6 +32,8 @@ how = "{how}"
 seeds_from = 100
 """
 """It keeps its word while it is tried out and measured, with small seeds, and breaks it in episodes that count."""
+QUICK = ("hang", "exit")
+"""Those of `make test`; the slot's process starts five times in each."""
 PROBLEMS = {
     "hang": "environment acme/bad, step 0: it has not returned for 4 s, the limit of one call",
     "hang in reset": "environment acme/bad, reset: it has not returned for 4 s",
@@ -61,7 +63,11 @@ def worker(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("worker", "how"), [(how, how) for how in PROBLEMS], indirect=["worker"])
+@pytest.mark.parametrize(
+    ("worker", "how"),
+    [pytest.param(how, how, marks=() if how in QUICK else pytest.mark.system) for how in PROBLEMS],
+    indirect=["worker"],
+)
 def test_a_broken_environment_is_reported_and_charges_nothing(
     tmp_path: Path, coordinator: Coordinator, worker: subprocess.Popen[bytes], how: str
 ) -> None:
