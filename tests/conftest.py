@@ -34,8 +34,9 @@ _LEFT_OUT: dict[str, Callable[[bytes], object]] = {
 """By `-m`: whether a file has no test of the layer. A file of another layer than `make test` says so in its first
 mark."""
 
-_ONE_BY_ONE = tuple(
-    f"tests/families/test_{name}.py::" for name in ("proof_of_life", "parity", "cited_policies")
+_ONE_BY_ONE = (
+    *(f"tests/families/test_{name}.py::" for name in ("proof_of_life", "parity", "cited_policies")),
+    "tests/unit/worker/runtime/test_foreign_slots.py::",
 )
 """Their tests share nothing and take minutes together: each is played where there is room."""
 

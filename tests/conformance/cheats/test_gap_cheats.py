@@ -24,12 +24,13 @@ def collected(slots: Slots, env: str, action: Any, seed: int, **options: Any) ->
 @pytest.mark.parametrize(
     ("env", "action", "per_policy", "video"),
     [
-        ("gym/acrobot", 1, 1, False),
-        ("gym/acrobot", 1, 4, True),
-        ("gymnasium/ALE/Pong-v5", 0, 1, False),
-        ("gymnasium/ALE/Pong-v5", 0, 4, False),
+        pytest.param("gym/acrobot", 1, 1, False, id="numbers", marks=pytest.mark.system),
+        pytest.param("gym/acrobot", 1, 4, True, id="numbers and pauses for videos"),
+        pytest.param("gymnasium/ALE/Pong-v5", 0, 1, False, id="pictures"),
+        pytest.param(
+            "gymnasium/ALE/Pong-v5", 0, 4, False, id="pictures and pauses", marks=pytest.mark.system
+        ),
     ],
-    ids=["numbers", "numbers and pauses for videos", "pictures", "pictures and pauses"],
 )
 def test_the_time_between_calls_does_not_tell_a_policy_its_split(
     slots: Slots, env: str, action: Any, per_policy: int, video: bool
