@@ -264,7 +264,7 @@ class Verifier:
         if not played.folders:
             return None
         try:
-            rows = compare.read_rows(played.folders[index])
+            rows = compare.Rows(played.folders[index])
         except (OSError, ValueError) as error:
             self.report.differs(played.name(index), f"trajectory.jsonl cannot be read: {error}")
             return None
@@ -315,7 +315,7 @@ def _of_files(played: EpisodeList, index: int, episode: Trajectory, *, actions: 
     """Describes the first difference of an episode's feedback files from `episode`."""
     folder = played.folders[index]
     try:
-        rows = compare.read_rows(folder)
+        rows = compare.Rows(folder)
         return compare.files_difference(folder, rows, episode, actions=actions, pictures=played.pictures)
     except Exception as error:
         # An agent without a jail could have written the files: damaged archives, arrays of any size.

@@ -104,7 +104,7 @@ def _verify(run: Path, whole: Path) -> None:
     for played in found.train:
         for folder in played.folders:
             try:
-                compare.actions_of(compare.read_rows(folder))
+                compare.actions_of(compare.Rows(folder))
             except (OSError, ValueError):
                 continue
 

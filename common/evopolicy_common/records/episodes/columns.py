@@ -7,9 +7,8 @@ surrogates) become an extension or readable text.
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
-from typing import Any
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, Literal
 
 import msgspec
 import numpy as np
@@ -48,9 +47,9 @@ def pack(values: list[Any]) -> list[Any]:
     elif kind is float:
         return ["scalar", "<f8", np.array(values, dtype="<f8").tobytes()]
     elif kind is str:
-        found: dict[str, int] = {}
-        where = [found.setdefault(value, len(found)) for value in values]
-        return ["text", list(found), np.array(where, dtype="<u4").tobytes()]
+        texts: dict[str, int] = {}
+        indices = [texts.setdefault(value, len(texts)) for value in values]
+        return ["text", list(texts), np.array(indices, dtype="<u4").tobytes()]
     elif kind is dict:
         keys = list(first)
         if all(type(key) is str for key in keys) and all(list(value) == keys for value in values):
@@ -75,9 +74,7 @@ class Pictures:
         """Adds a picture. Returns False, without a change, when its shape or dtype differs from the first."""
         if type(picture) is not np.ndarray or picture.dtype != self._dtype or picture.shape != self._shape:
             return False
-        piece = self._stream.compress(np.ascontiguousarray(picture).data)
-        if piece:
-            self._pieces.append(piece)
+        self._pieces.append(self._stream.compress(np.ascontiguousarray(picture).data))
         self._n += 1
         return True
 
@@ -87,81 +84,43 @@ class Pictures:
         return ["pictures", self._n, self._dtype.str, list(self._shape), data]
 
 
-class Column(ABC):
-    """Rows of one leaf, or of a dict or tuple of leaves."""
+class Column:
+    """Rows of one leaf, or of a dict or tuple of columns."""
 
-    @abstractmethod
-    def __len__(self) -> int:
-        """The number of rows."""
+    def __init__(
+        self, kind: Literal["array", "scalar", "values", "dict", "tuple"], data: Any, n: int
+    ) -> None:
+        """`data`, by kind: an array of arrays' or Python numbers' rows, a list of any values, or the columns of a dict
+        or tuple by key or position. Raises ValueError when these do not have `n` rows each."""
+        self.kind, self.data, self.n = kind, data, n
+        if kind in ("dict", "tuple") and (type(n) is not int or any(part.n != n for part in data.values())):
+            raise ValueError(f"columns of {n} rows have {[part.n for part in data.values()]}")
 
-    @abstractmethod
     def row(self, t: int) -> Any:
-        """The value of the leaf, dict or tuple in row t."""
-
-    @abstractmethod
-    def values(self) -> Any:
-        """The column in the form described at `Trajectory.obs`."""
+        """The value in row t."""
+        if self.kind == "array":
+            return np.asarray(self.data[t])
+        if self.kind == "scalar":
+            return self.data[t].item()
+        return self.data[t] if self.kind == "values" else self._each(lambda part: part.row(t))
 
     def rows(self) -> list[Any]:
         """All rows, one by one."""
-        return [self.row(t) for t in range(len(self))]
-
-
-class Arrays(Column):
-    """Arrays of one shape, or Python numbers of one type."""
-
-    def __init__(self, array: NDArray[Any], *, scalar: bool) -> None:
-        self.array = array
-        self.scalar = scalar
-
-    def __len__(self) -> int:
-        return len(self.array)
-
-    def row(self, t: int) -> Any:
-        return self.array[t].item() if self.scalar else np.asarray(self.array[t])
+        return [self.row(t) for t in range(self.n)]
 
     def values(self) -> Any:
-        return self.array
+        """The column in the form described at `Trajectory.obs`."""
+        return self._each(Column.values) if self.kind in ("dict", "tuple") else self.data
 
+    def form(self) -> object:
+        """Equal for columns that can be joined as they are."""
+        if isinstance(self.data, np.ndarray):
+            return self.kind, self.data.dtype, self.data.shape[1:]
+        return self.kind, tuple(self.data) if isinstance(self.data, dict) else ()
 
-class Values(Column):
-    """Arbitrary values, one per row."""
-
-    def __init__(self, items: list[Any]) -> None:
-        self._items = items
-
-    def __len__(self) -> int:
-        return len(self._items)
-
-    def row(self, t: int) -> Any:
-        return self._items[t]
-
-    def values(self) -> Any:
-        return self._items
-
-
-class Parts(Column):
-    """Rows that are dicts of the same keys, or tuples of one length, whose keys are positions: a column for each
-    key."""
-
-    def __init__(self, parts: dict[Any, Column], n: int, *, named: bool) -> None:
-        self.parts = parts
-        self.named = named
-        self._n = n
-        if any(len(part) != n for part in parts.values()):
-            raise ValueError(f"columns of {n} rows have {[len(part) for part in parts.values()]}")
-
-    def __len__(self) -> int:
-        return self._n
-
-    def row(self, t: int) -> Any:
-        return self._joined({key: part.row(t) for key, part in self.parts.items()})
-
-    def values(self) -> Any:
-        return self._joined({key: part.values() for key, part in self.parts.items()})
-
-    def _joined(self, found: dict[Any, Any]) -> Any:
-        return found if self.named else tuple(found.values())
+    def _each(self, made_of: Callable[[Column], Any]) -> Any:
+        parts = {key: made_of(part) for key, part in self.data.items()}
+        return parts if self.kind == "dict" else tuple(parts.values())
 
 
 def leaves(values: Any, path: str = "") -> Iterator[tuple[str, Any]]:
@@ -179,48 +138,42 @@ def leaves(values: Any, path: str = "") -> Iterator[tuple[str, Any]]:
 def unpack(packed: list[Any], *, pictures: bool = False) -> Column:
     """Unpacks the output of `pack` or, with `pictures`, of `Pictures.packed`. Raises ValueError for anything else."""
     kind = packed[0]
-    if kind == "array":
+    if kind == "array" or (kind == "pictures" and pictures):
         _, n, dtype, shape, data = packed
-        return Arrays(_shaped(_array(dtype, data), shape, n), scalar=False)
-    if kind == "pictures" and pictures:
-        _, n, dtype, shape, data = packed
-        _check_shape((n, *shape))
-        size = n * _dtype(dtype).itemsize * math.prod(shape)
-        if not 0 < size <= min(MAX_COLUMN_BYTES, most_of(data)):
-            raise ValueError(f"{len(data)} bytes that claim to be pictures of {size} bytes")
-        raw = zstandard.ZstdDecompressor().decompress(data, max_output_size=size)
-        return Arrays(_shaped(_array(dtype, raw), shape, n), scalar=False)
+        if kind == "pictures":
+            _check_shape((n, *shape))
+            size = n * _dtype(dtype).itemsize * math.prod(shape)
+            if not 0 < size <= min(MAX_COLUMN_BYTES, most_of(data)):
+                raise ValueError(f"{len(data)} bytes that claim to be pictures of {size} bytes")
+            data = zstandard.ZstdDecompressor().decompress(data, max_output_size=size)
+        return Column("array", _shaped(_array(dtype, data), shape, n), n)
     if kind == "scalar":
-        return Arrays(_array(packed[1], packed[2]), scalar=True)
+        numbers = _array(packed[1], packed[2])
+        return Column("scalar", numbers, len(numbers))
     if kind == "text":
-        return Values([packed[1][index] for index in _array("<u4", packed[2])])
+        texts = [packed[1][index] for index in _array("<u4", packed[2])]
+        return Column("values", texts, len(texts))
     if kind == "dict":
         _, n, keys, parts = packed
-        return Parts(dict(zip(keys, map(unpack, parts), strict=True)), n, named=True)
+        return Column("dict", dict(zip(keys, map(unpack, parts), strict=True)), n)
     if kind == "tuple":
-        return Parts(dict(enumerate(map(unpack, packed[2]))), packed[1], named=False)
+        return Column("tuple", dict(enumerate(map(unpack, packed[2]))), packed[1])
     if kind == "values":
-        return Values(packed[1])
+        return Column("values", packed[1], len(packed[1]))
     raise ValueError(f"unknown kind of column {kind!r}")
 
 
 def join(columns: list[Column]) -> Column:
     """Joins the columns of successive blocks."""
-    first = columns[0]
+    first, n = columns[0], sum(column.n for column in columns)
     if len(columns) == 1:
         return first
-    if isinstance(first, Arrays) and all(
-        isinstance(column, Arrays)
-        and (column.scalar, column.array.dtype, column.array.shape[1:])
-        == (first.scalar, first.array.dtype, first.array.shape[1:])
-        for column in columns
-    ):
-        return Arrays(np.concatenate([column.values() for column in columns]), scalar=first.scalar)
-    compound = [column for column in columns if isinstance(column, Parts)]
-    if len(compound) == len(columns) and len({(each.named, *each.parts) for each in compound}) == 1:
-        joined = {key: join([column.parts[key] for column in compound]) for key in compound[0].parts}
-        return Parts(joined, sum(map(len, columns)), named=compound[0].named)
-    return Values([item for column in columns for item in column.rows()])
+    if first.kind != "values" and len({column.form() for column in columns}) == 1:
+        parts = [column.data for column in columns]
+        if isinstance(first.data, dict):
+            return Column(first.kind, {key: join([part[key] for part in parts]) for key in first.data}, n)
+        return Column(first.kind, np.concatenate(parts), n)
+    return Column("values", [item for column in columns for item in column.rows()], n)
 
 
 # Values that msgpack cannot represent.

@@ -53,8 +53,7 @@ def action_log(actions: Iterable[Any]) -> bytes:
 def episode_difference(
     ours: EpisodeOutcome, recorded: Trajectory, theirs: EpisodeOutcome, replayed: Trajectory
 ) -> str | None:
-    """Describes the first difference of two outcomes of the same actions and their trajectories; None when they are
-    equal."""
+    """The first difference of two outcomes of the same actions, or their trajectories; None without."""
     return first_difference(recorded, replayed) or outcome_difference(ours, theirs)
 
 
@@ -92,15 +91,15 @@ def _rendered_difference(recorded: Trajectory, replayed: Trajectory) -> str | No
     lines = zip(ours[ROWS].splitlines(), theirs[ROWS].splitlines(), strict=True)
     for t, (one, other) in enumerate(lines):
         if one != other:
-            left, right = json.loads(one), json.loads(other)
-            if not same(left["obs"], right["obs"]):
+            first, second = json.loads(one), json.loads(other)
+            if not same(first["obs"], second["obs"]):
                 return f"step {t}: the observations differ"
-            if not same(*_comparable(left["info"], right["info"])):
+            if not same(*_comparable(first["info"], second["info"])):
                 return f"step {t}: the infos differ"
-    found, expected = (
+    arrays = [
         read_arrays(file, MAX_BYTES) if (file := files.get(OBSERVATIONS)) else {} for files in (ours, theirs)
-    )
-    return "the observations differ" if not same(found, expected) else None
+    ]
+    return None if same(*arrays) else "the observations differ"
 
 
 def outcome_difference(ours: EpisodeOutcome, theirs: EpisodeOutcome) -> str | None:
@@ -136,11 +135,12 @@ def same(left: Any, right: Any) -> bool:
 
 
 class Rows:
-    """The rows of a `trajectory.jsonl`. Each is parsed when it is needed: the objects of all may take gigabytes."""
+    """The rows of an episode's `trajectory.jsonl`. Each is parsed when it is needed: all may take gigabytes."""
 
-    def __init__(self, data: bytes) -> None:
-        """Raises ValueError when one is no row."""
-        self._lines = data.splitlines()
+    def __init__(self, folder: Path) -> None:
+        """Raises ValueError or OSError when the file cannot be read, or one is no row."""
+        self.text = read_regular(folder / ROWS, MAX_ROWS_BYTES)
+        self._lines = self.text.splitlines()
         try:
             if not all(isinstance(row, dict) and {"action", "reward"} <= row.keys() for row in self):
                 raise ValueError("a row is not one of a trajectory")
@@ -152,15 +152,6 @@ class Rows:
 
     def __iter__(self) -> Iterator[dict[str, Any]]:
         return map(json.loads, self._lines)
-
-    def __getitem__(self, t: int) -> dict[str, Any]:
-        row: dict[str, Any] = json.loads(self._lines[t])
-        return row
-
-
-def read_rows(folder: Path) -> Rows:
-    """The rows of an episode's `trajectory.jsonl`. Raises ValueError or OSError when it cannot be read."""
-    return Rows(read_regular(folder / ROWS, MAX_ROWS_BYTES))
 
 
 def actions_of(rows: Rows) -> list[Any]:
@@ -174,43 +165,36 @@ def files_difference(
     """Describes the first difference of an episode's feedback files from `episode`; None when they are equal.
 
     `rows` are those of its `trajectory.jsonl`. `actions`: whether `episode` has the exact actions that the policy
-    returned. `pictures`: whether the feedback has the observations that are stored outside the rows.
+    returned. `pictures`: whether the feedback has the observations that are stored outside the rows. The files of a
+    rendered episode are compared by their bytes first, then by their content.
     """
-    if episode.files:
-        return _written_difference(folder, rows, episode, actions=actions, pictures=pictures)
-    for t, (written, row) in enumerate(zip(rows, episode.rows(), strict=False)):
-        names = [*_NUMBERS, *(("action",) if actions else ())]
-        for name in [*names, "obs"] if written.get("obs") is not None else names:
-            value = getattr(row, name)
-            if not reads_as(written.get(name), value):
-                numbers = (
+    rendered = episode.files.get(ROWS, b"")
+    expected: Iterable[dict[str, Any]] = (row._asdict() for row in episode.rows())
+    if rendered:
+        expected = map(json.loads, () if rows.text == rendered else rendered.splitlines())
+    agree = same if rendered else reads_as
+    names = (*_NUMBERS, "action") if actions else _NUMBERS
+    for t, (written, row) in enumerate(zip(rows, expected, strict=False)):
+        for name in (*names, "obs") if rendered or written.get("obs") is not None else names:
+            value = row[name]
+            if not agree(written.get(name), value):
+                both = (
                     f" {written.get(name)!r} and {value!r}" if isinstance(value, float | bool | int) else ""
                 )
-                return f"step {t}: {name} differs{numbers}"
-        if not reads_as(*_comparable(written.get("info") or {}, row.info)):
+                return f"step {t}: {name} differs{both}"
+        if not agree(*_comparable(written.get("info") or {}, row["info"])):
             return f"step {t}: info differs"
     if len(rows) != episode.n:
         return f"{len(rows)} and {episode.n} steps"
-    return _pictures_difference(folder, rows, episode) if pictures else None
+    if not pictures:
+        return None
+    return (_file_difference if rendered else _pictures_difference)(folder, rows, episode)
 
 
-def _written_difference(
-    folder: Path, rows: Rows, episode: Trajectory, *, actions: bool, pictures: bool
-) -> str | None:
-    """`files_difference` for a rendered episode: compares its files' bytes first, then their content."""
-    lines = episode.files[ROWS].splitlines()
-    if read_regular(folder / ROWS, MAX_ROWS_BYTES) != episode.files[ROWS]:
-        for t, (written, line) in enumerate(zip(rows, lines, strict=False)):
-            ours = json.loads(line)
-            for name in (*_NUMBERS, *(("action",) if actions else ()), "obs"):
-                if not same(written.get(name), ours[name]):
-                    return f"step {t}: {name} differs"
-            if not same(*_comparable(written.get("info") or {}, ours["info"])):
-                return f"step {t}: info differs"
-    if len(rows) != len(lines):
-        return f"{len(rows)} and {len(lines)} steps"
+def _file_difference(folder: Path, _: Rows, episode: Trajectory) -> str | None:
+    """Describes a difference of a rendered episode's file of observations."""
     stored, expected = folder / OBSERVATIONS, episode.files.get(OBSERVATIONS)
-    if expected is None or not pictures:
+    if expected is None:
         return None
     if not stored.exists():
         return "there is no file of observations"
@@ -256,7 +240,7 @@ def reads_as(text: Any, value: Any) -> bool:
 
 def _pictures_difference(folder: Path, rows: Rows, episode: Trajectory) -> str | None:
     """Describes a difference of observations that are stored beside the rows."""
-    if episode.obs is None or not rows or rows[0].get("obs") is not None:
+    if episode.obs is None or not rows or next(iter(rows)).get("obs") is not None:
         return None
     columns = dict(leaves(episode.obs))
     path = next(
@@ -281,12 +265,12 @@ def _pictures_difference(folder: Path, rows: Rows, episode: Trajectory) -> str |
 
 def _comparable(recorded: dict[str, Any], replayed: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
     """Both infos without ignored keys, the replayed one in the form of the recorded one."""
-    left_out = _MARKS
+    ignored = _MARKS
     if "steps" in replayed and "steps" not in recorded:
-        left_out = _MARKS | {"steps", "rewards"}
+        ignored = _MARKS | {"steps", "rewards"}
         replayed = replayed | replayed.get("rewards", {})
     recorded, replayed = (
-        {key: value for key, value in info.items() if key not in left_out} for info in (recorded, replayed)
+        {key: value for key, value in info.items() if key not in ignored} for info in (recorded, replayed)
     )
     return recorded, replayed
 

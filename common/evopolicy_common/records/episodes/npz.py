@@ -46,10 +46,9 @@ class NpzWriter:
         if isinstance(rows, list):
             self._texts.setdefault(name, []).extend(rows)
             return
-        member = self._members.get(name)
-        if member is None:
-            member = self._members[name] = _Member(rows.dtype, rows.shape[1:])
-        member.add(rows)
+        if name not in self._members:
+            self._members[name] = _Member(rows.dtype, rows.shape[1:])
+        self._members[name].add(rows)
 
     def finish(self) -> bytes:
         """The file's bytes. The writer must not be used afterwards."""
@@ -78,11 +77,8 @@ class _Member:
             raise ProtocolError(
                 "observations that are neither numbers nor text cannot be stored beside the rows"
             )
-        self._dtype = dtype
-        self._shape = shape
-        self._n = 0
-        self._n_bytes = 0
-        self._crc = 0
+        self._dtype, self._shape = dtype, shape
+        self._n = self._n_bytes = self._crc = 0
         self._stream = zlib.compressobj(LEVEL, zlib.DEFLATED, -15)
         self._pieces: list[bytes] = []
 
@@ -138,11 +134,11 @@ def read_arrays(data: bytes, most: int) -> dict[str, NDArray[Any]]:
     try:
         if data[:2] == b"PK":
             check_archive(data, most)
-        found = np.load(io.BytesIO(data), allow_pickle=False)
-        if isinstance(found, np.ndarray):
-            return {"": found}
-        with found:
-            return {name: found[name] for name in found.files}
+        loaded = np.load(io.BytesIO(data), allow_pickle=False)
+        if isinstance(loaded, np.ndarray):
+            return {"": loaded}
+        with loaded:
+            return {name: loaded[name] for name in loaded.files}
     except ValueError:
         raise
     except Exception as error:  # damaged archives raise anything

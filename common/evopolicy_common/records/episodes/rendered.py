@@ -21,7 +21,7 @@ import threading
 import zipfile
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, Final, Literal, NamedTuple, cast
+from typing import Any, Final, Literal, cast
 
 import msgspec
 import numpy as np
@@ -31,7 +31,7 @@ from evopolicy_common.errors import DECODE_ERRORS, ProtocolError
 from evopolicy_common.messages.environment import ObservationForm, ObsStorage
 from evopolicy_common.records.episodes import columns, trajectory
 from evopolicy_common.records.episodes.npz import NpzWriter, check_archive
-from evopolicy_common.records.episodes.trajectory import Recorder, Trajectory
+from evopolicy_common.records.episodes.trajectory import Recorder, Row, Trajectory
 from evopolicy_common.records.json_text import as_lists, rows_text
 
 MAGIC = b"evofeed1"
@@ -137,11 +137,15 @@ class Renderer(Recorder):
                 )
             yield File(name=OBSERVATIONS, size=len(data), packed="as it is"), data
 
-    def _begin_block(self, obs: Any) -> None:
-        super()._begin_block(obs)
-        # Not in the block: a block of pictures would be large.
-        is_single = self._npz is not None and isinstance(obs, np.ndarray)
-        self._pictures = _Single(self._hold) if is_single else None
+    def _taker(self, obs: Any, is_picture: bool) -> Callable[[Any], bool]:
+        # Arrays are held outside the block: a block of pictures would be large.
+        return self._take_array if self._npz is not None and isinstance(obs, np.ndarray) else self._take_small
+
+    def _take_array(self, obs: Any) -> bool:
+        if isinstance(obs, np.ndarray):
+            self._hold(SINGLE, obs[np.newaxis])
+            return True
+        return False
 
     def _flush(self) -> None:
         first = self._n_packed
@@ -160,16 +164,13 @@ class Renderer(Recorder):
             obs = None
         elif self._form == "lists":
             obs = as_lists(self._obs)
-        rows = _Rows(
-            obs,
-            columns.unpack(block["actions"]).rows(),
-            self._rewards,
-            [bool(flag & trajectory.TERMINATED) for flag in self._flags],
-            [bool(flag & trajectory.TRUNCATED) for flag in self._flags],
-            self._infos,
-        )
+        ends = [
+            [bool(flag & bit) for flag in self._flags]
+            for bit in (trajectory.TERMINATED, trajectory.TRUNCATED)
+        ]
+        steps = (obs, columns.unpack(block["actions"]).rows(), self._rewards, *ends, self._infos)
         try:
-            for text in rows.texts(first, self._rows_size):
+            for text in _texts(steps, first, self._rows_size):
                 self._rows_size += len(text)
                 self._rows.append(self._compressor.compress(text))
         except ProtocolError as error:
@@ -194,45 +195,20 @@ class Renderer(Recorder):
                 self._left_out = str(error)
 
 
-class _Rows(NamedTuple):
-    """Steps, as one list per field."""
+def _texts(steps: Sequence[Sequence[Any] | None], first: int, size: int) -> Iterator[bytes]:
+    """The lines of steps from `first` on, in portions, since a short action may have a long text.
 
-    obs: list[Any] | None
-    actions: Sequence[Any]
-    rewards: list[float]
-    terminated: list[bool]
-    truncated: list[bool]
-    infos: list[dict[str, Any]]
-
-    def texts(self, first: int, size: int) -> Iterator[bytes]:
-        """Yields the lines from step `first` on in portions. Raises ProtocolError when `size` plus their bytes exceeds
-        the limit.
-
-        Portions are needed because a short action may have a long text.
-        """
-        for at in range(0, len(self.rewards), _STEPS_AT_ONCE):
-            part = [None if column is None else column[at : at + _STEPS_AT_ONCE] for column in self]
-            text = rows_text(first + at, *part)  # type: ignore[arg-type]
-            size += len(text)
-            if size > MAX_ROWS_BYTES:
-                raise ProtocolError(
-                    f"step {first + at} brings {ROWS} to {size:,} bytes; {MAX_ROWS_BYTES:,} are the limit"
-                )
-            yield text
-
-
-class _Single:
-    """Receives a block's observations when they are one array per step."""
-
-    def __init__(self, put: Callable[[str, Any], None]) -> None:
-        self._put = put
-
-    def add(self, obs: Any, /) -> bool:
-        """Stores one observation. Returns False, without a change, when it is not an array."""
-        if not isinstance(obs, np.ndarray):
-            return False
-        self._put(SINGLE, obs[np.newaxis])
-        return True
+    `steps`: the columns of `rows_text`. Raises ProtocolError when `size` plus their bytes exceeds the limit.
+    """
+    for at in range(0, len(steps[-1] or ()), _STEPS_AT_ONCE):
+        part = [None if column is None else column[at : at + _STEPS_AT_ONCE] for column in steps]
+        text = rows_text(first + at, *part)  # type: ignore[arg-type]
+        size += len(text)
+        if size > MAX_ROWS_BYTES:
+            raise ProtocolError(
+                f"step {first + at} brings {ROWS} to {size:,} bytes; {MAX_ROWS_BYTES:,} are the limit"
+            )
+        yield text
 
 
 class Container:
@@ -248,13 +224,9 @@ class Container:
             raise ProtocolError(
                 f"a rendered episode of {len(parts)} parts says that it has {len(self.header.files)} files"
             )
-        self._log = parts[1]
-        self._files = dict(zip(self.header.files, parts[2:], strict=True))
-
-    @property
-    def log(self) -> bytes:
+        self.log = parts[1]
         """The log of actions, as a trajectory."""
-        return bytes(self._log)
+        self._files = dict(zip(self.header.files, parts[2:], strict=True))
 
     @property
     def size(self) -> int:
@@ -281,7 +253,7 @@ def decode(data: bytes) -> Trajectory:
     if not is_rendered(data):
         return trajectory.decode(data)
     container = Container(data)
-    log = trajectory.decode(container.log)
+    log = trajectory.decode(bytes(container.log))
     if log.n != container.header.n:
         raise ProtocolError(f"a rendered episode of {container.header.n} steps has a log of {log.n}")
     # Without files only the log remains.
@@ -294,8 +266,7 @@ def decode(data: bytes) -> Trajectory:
 def checked_files(data: bytes, length: int, episode_return: float) -> dict[str, bytes]:
     """The feedback files of a rendered episode. Raises ProtocolError when they do not match that length and return."""
     files = Container(data).files()
-    rows = files.get(ROWS, b"")
-    rewards = _rewards(rows)
+    rewards = _rewards(files.get(ROWS, b""))
     # In the same order as on the worker, as floating-point sums depend on it; `sum` would compensate.
     total = functools.reduce(operator.add, rewards, 0.0)
     if (len(rewards), total) != (length, episode_return):
@@ -307,8 +278,7 @@ def checked_files(data: bytes, length: int, episode_return: float) -> dict[str, 
 
 
 def _rewards(rows: bytes) -> list[float]:
-    """The rewards of all rows, each of which is parsed. Raises ProtocolError for what is no row, or not the next
-    one."""
+    """The rewards of all rows. Raises ProtocolError for a line that is no row, or not the next one."""
     rewards: list[float] = []
     view, at = memoryview(rows), 0
     while at < len(rows):
@@ -317,11 +287,9 @@ def _rewards(rows: bytes) -> list[float]:
             some = _rows_decoder.decode_lines(view[at:end])
         except (msgspec.DecodeError, RecursionError) as error:
             raise ProtocolError(f"{ROWS} cannot be read after step {len(rewards)}: {error}") from error
-        if [row.t for row in some] != list(range(len(rewards), len(rewards) + len(some))):
-            wrong = next(n for n, row in enumerate(some, len(rewards)) if row.t != n)
-            raise ProtocolError(
-                f"row {wrong} of {ROWS} says that it is of step {some[wrong - len(rewards)].t}"
-            )
+        for n, row in enumerate(some, len(rewards)):
+            if row.t != n:
+                raise ProtocolError(f"row {n} of {ROWS} says that it is of step {row.t}")
         rewards += [row.reward for row in some]
         at = end
     return rewards
@@ -345,16 +313,8 @@ def files_of(episode: Trajectory, storage: ObsStorage | None) -> dict[str, bytes
     if episode.files:
         return episode.files
     outside = storage != "inline" if storage is not None else _holds_pictures(episode.obs)
-    steps = list(episode.rows())
-    rows = _Rows(
-        None if outside else [row.obs for row in steps],
-        [row.action for row in steps],
-        [row.reward for row in steps],
-        [row.terminated for row in steps],
-        [row.truncated for row in steps],
-        [row.info for row in steps],
-    )
-    files = {ROWS: b"".join(rows.texts(0, 0))}
+    _, obs, *others = zip(*episode.rows(), strict=True) if episode.n else ((),) * len(Row._fields)
+    files = {ROWS: b"".join(_texts([None if outside else obs, *others], 0, 0))}
     if outside and episode.obs is not None:
         npz = NpzWriter()
         for name, leaf in columns.leaves(episode.obs):
@@ -400,7 +360,7 @@ def _unpacked(file: File, data: memoryview) -> bytes:
         raise ValueError(f"{file.name} of {file.size:,} bytes; {most:,} are the limit")
     if file.packed == "as it is":
         # Arrays may have a gigabyte, which lies in a file at the gateway: a view of them does.
-        found = cast(bytes, data) if file.name == OBSERVATIONS else bytes(data)
+        content = cast(bytes, data) if file.name == OBSERVATIONS else bytes(data)
     elif not file.size:
         return b""
     elif file.size > columns.most_of(data) or zstandard.frame_content_size(data) not in (-1, file.size):
@@ -408,9 +368,9 @@ def _unpacked(file: File, data: memoryview) -> bytes:
     else:
         if not hasattr(_local, "zstd"):
             _local.zstd = zstandard.ZstdDecompressor()
-        found = _local.zstd.decompress(data, max_output_size=file.size)
-    if len(found) != file.size:
-        raise ValueError(f"{file.name} has {len(found):,} bytes, {file.size:,} were declared")
+        content = _local.zstd.decompress(data, max_output_size=file.size)
+    if len(content) != file.size:
+        raise ValueError(f"{file.name} has {len(content):,} bytes, {file.size:,} were declared")
     if file.name == OBSERVATIONS:
-        check_archive(found, trajectory.MAX_BYTES)
-    return found
+        check_archive(content, trajectory.MAX_BYTES)
+    return content

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -88,8 +88,7 @@ class Trajectory(msgspec.Struct, frozen=True, kw_only=True):
     obs_at: Callable[[int], Any]
     """The observation of one step, in the form of `Row.obs`."""
     files: dict[str, bytes] = {}
-    """Feedback files of an episode that was rendered where it was played (`records.episodes.rendered`); then only they
-    contain its observations and infos."""
+    """Files of a rendered episode (`rendered`), which alone have its observations and infos."""
 
     def rows(self) -> Iterator[Row]:
         """The steps in order."""
@@ -107,12 +106,6 @@ class Trajectory(msgspec.Struct, frozen=True, kw_only=True):
             )
 
 
-class PictureSink(Protocol):
-    """Takes large arrays one by one."""
-
-    def add(self, picture: Any, /) -> bool: ...
-
-
 class Recorder:
     """Records an episode's steps one by one. Not thread-safe."""
 
@@ -120,9 +113,9 @@ class Recorder:
         self._full = record == "full"
         header = columns.encoder.encode({"record": record, "observations": observations})
         self._parts: list[bytes] = [MAGIC, _LENGTH.pack(len(header)), header]
-        self._block_rows = 0
+        self._block_rows = BLOCK_ROWS
         self._n_packed = 0
-        self._pictures: PictureSink | None = None
+        self._pictures: columns.Pictures | None = None
         self._clear()
 
     def append(
@@ -132,17 +125,11 @@ class Recorder:
         if self._full:
             if not self._rewards:
                 self._begin_block(obs)
-            if self._pictures is None:
-                self._obs.append(obs)
-            elif not self._pictures.add(obs):
+            while not self._take(obs):
                 # Shape or dtype differs from the pictures before: start a new block of the kind that fits.
                 self._flush()
                 self._begin_block(obs)
-                if self._pictures is None or not self._pictures.add(obs):
-                    self._obs.append(obs)
             self._infos.append(info)
-        elif not self._rewards:
-            self._block_rows = BLOCK_ROWS
         self._actions.append(action)
         self._rewards.append(reward)
         self._flags.append((terminated and TERMINATED) | (truncated and TRUNCATED))
@@ -158,10 +145,21 @@ class Recorder:
     def _begin_block(self, obs: Any) -> None:
         """Starts a block. Its first row alone decides its kind, so that equal rows give equal bytes."""
         size = max(1, _size(obs))
-        is_picture = isinstance(obs, np.ndarray) and size >= PICTURE_BYTES
-        self._pictures = columns.Pictures(obs) if is_picture else None
+        is_picture = type(obs) is np.ndarray and size >= PICTURE_BYTES
         n_bytes = PICTURES_BLOCK_BYTES if is_picture else BLOCK_BYTES
         self._block_rows = max(1, min(BLOCK_ROWS, n_bytes // size))
+        self._take = self._taker(obs, is_picture)
+
+    def _taker(self, obs: Any, is_picture: bool) -> Callable[[Any], bool]:
+        """Takes the observations of a block that begins with `obs`; returns False for one of another form."""
+        if not is_picture:
+            return self._take_small
+        self._pictures = columns.Pictures(obs)
+        return self._pictures.add
+
+    def _take_small(self, obs: Any) -> bool:
+        self._obs.append(obs)
+        return True
 
     def _clear(self) -> None:
         self._pictures = None
@@ -172,8 +170,10 @@ class Recorder:
         self._infos: list[dict[str, Any]] = []
 
     def _flush(self) -> None:
-        infos = self._infos if any(self._infos) else len(self._infos)
-        self._add_block(self._pack_observations() if self._full else None, infos)
+        obs = None
+        if self._full:
+            obs = columns.pack(self._obs) if self._pictures is None else self._pictures.packed()
+        self._add_block(obs, self._infos if any(self._infos) else len(self._infos))
         self._clear()
 
     def _add_block(self, obs: list[Any] | None, infos: list[dict[str, Any]] | int) -> bytes:
@@ -197,10 +197,6 @@ class Recorder:
         self._parts += [_LENGTH.pack(len(compressed)), compressed]
         return packed
 
-    def _pack_observations(self) -> list[Any]:
-        pictures = self._pictures
-        return pictures.packed() if isinstance(pictures, columns.Pictures) else columns.pack(self._obs)
-
 
 def decode(data: bytes, max_bytes: int = MAX_BYTES) -> Trajectory:
     """The episode in `data`. Raises ProtocolError when it is not a trajectory, or larger than `max_bytes` unpacked."""
@@ -215,50 +211,15 @@ def _decode(data: bytes, max_bytes: int) -> Trajectory:
         raise ValueError("they do not begin with the format's mark")
     frames = _frames(data)
     header = columns.decoder.decode(next(frames, b"")[:_MAX_HEADER_BYTES])
-    full = header["record"] == "full"
-    blocks = _blocks(frames, full, max_bytes)
-    lists = header["observations"] == "lists"
-    seen = [block.obs for block in blocks if block.obs is not None]
-    observed = columns.join(seen) if seen else None
-    acted = columns.join([block.actions for block in blocks]) if blocks else columns.Values([])
-    flags = np.frombuffer(b"".join(block.flags for block in blocks), dtype=np.uint8)
-    rewards = np.frombuffer(b"".join(block.rewards for block in blocks), dtype="<f8").astype(np.float64)
-    infos = [info for block in blocks for info in block.infos]
-    n = len(rewards)
-
-    def obs_at(t: int) -> Any:
-        row = None if observed is None else observed.row(t)
-        return as_lists(row) if lists else row
-
-    return Trajectory(
-        n=n,
-        record="full" if full else "actions",
-        observations="lists" if lists else "arrays",
-        obs=None if observed is None else observed.values(),
-        actions=acted.array if isinstance(acted, columns.Arrays) and not acted.scalar else acted.rows(),
-        rewards=rewards,
-        terminated=(flags & TERMINATED) != 0,
-        truncated=(flags & TRUNCATED) != 0,
-        infos=infos,
-        obs_at=obs_at,
-    )
-
-
-class _Block(NamedTuple):
-    """The rows of one block."""
-
-    obs: columns.Column | None
-    actions: columns.Column
-    rewards: bytes
-    flags: bytes
-    infos: list[dict[str, Any]]
-
-
-def _blocks(frames: Iterator[bytes], full: bool, max_bytes: int) -> list[_Block]:
-    """Decodes the blocks in `frames`. Claimed sizes and counts are not trusted but checked against the limits first."""
+    full, lists = header["record"] == "full", header["observations"] == "lists"
     decompressor = zstandard.ZstdDecompressor()
-    blocks: list[_Block] = []
-    n_bytes = n_values = n_rows = 0
+    all_obs: list[columns.Column] = []
+    all_actions: list[columns.Column] = []
+    all_rewards: list[bytes] = []
+    all_flags: list[bytes] = []
+    infos: list[dict[str, Any]] = []
+    n_bytes = n_values = n = 0
+    # Claimed sizes and counts are not trusted but checked against the limits first.
     for frame in frames:
         size = zstandard.frame_content_size(frame)
         if not 0 < size <= min(MAX_BLOCK_BYTES, columns.most_of(frame)):
@@ -272,25 +233,44 @@ def _blocks(frames: Iterator[bytes], full: bool, max_bytes: int) -> list[_Block]
         if n_values > MAX_VALUES:
             raise ValueError(f"more than {MAX_VALUES:,} values")
         block = columns.decoder.decode(packed)
-        n = len(block["rewards"]) // 8
-        n_rows += n
-        if not 0 < n <= BLOCK_ROWS or n_rows > MAX_ROWS:
-            raise ValueError(f"a block of {n} rows, {n_rows} in all")
-        obs = columns.unpack(block["obs"], pictures=True) if full else None
-        if block["obs"] and block["obs"][0] == "pictures" and isinstance(obs, columns.Arrays):
-            n_bytes += obs.array.nbytes
-        if n_bytes > max_bytes:
-            raise ValueError(f"more than {max_bytes:,} bytes")
-        actions = columns.unpack(block["actions"])
-        infos = block["infos"]
-        if isinstance(infos, int):
-            infos = [{} for _ in range(n)] if infos == n else []
-        parts = (actions, block["flags"], *(() if obs is None else (obs, infos)))
-        lengths = {*map(len, parts)}
-        if lengths != {n}:
-            raise ValueError(f"columns of {n} rows have {sorted(lengths)}")
-        blocks.append(_Block(obs, actions, block["rewards"], block["flags"], infos))
-    return blocks
+        rows, odd = divmod(len(block["rewards"]), 8)
+        n += rows
+        if odd or not 0 < rows <= BLOCK_ROWS or n > MAX_ROWS:
+            raise ValueError(f"a block of {rows} rows, {n} in all")
+        all_actions.append(columns.unpack(block["actions"]))
+        lengths = {all_actions[-1].n, len(block["flags"])}
+        if full:
+            all_obs.append(columns.unpack(block["obs"], pictures=True))
+            n_bytes += all_obs[-1].data.nbytes if block["obs"][0] == "pictures" else 0
+            if n_bytes > max_bytes:
+                raise ValueError(f"more than {max_bytes:,} bytes")
+            some = block["infos"]
+            infos += ([{} for _ in range(rows)] if some == rows else []) if isinstance(some, int) else some
+            lengths |= {all_obs[-1].n, len(infos) - (n - rows)}
+        if lengths != {rows}:
+            raise ValueError(f"columns of {rows} rows have {sorted(lengths)}")
+        all_rewards.append(block["rewards"])
+        all_flags.append(block["flags"])
+    observed = columns.join(all_obs) if all_obs else None
+    actions = columns.join(all_actions) if all_actions else columns.Column("values", [], 0)
+    flags = np.frombuffer(b"".join(all_flags), dtype=np.uint8)
+
+    def obs_at(t: int) -> Any:
+        row = None if observed is None else observed.row(t)
+        return as_lists(row) if lists else row
+
+    return Trajectory(
+        n=n,
+        record="full" if full else "actions",
+        observations="lists" if lists else "arrays",
+        obs=None if observed is None else observed.values(),
+        actions=actions.data if actions.kind == "array" else actions.rows(),
+        rewards=np.frombuffer(b"".join(all_rewards), dtype="<f8").astype(np.float64),
+        terminated=(flags & TERMINATED) != 0,
+        truncated=(flags & TRUNCATED) != 0,
+        infos=infos,
+        obs_at=obs_at,
+    )
 
 
 def _frames(data: bytes) -> Iterator[bytes]:

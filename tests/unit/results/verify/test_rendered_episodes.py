@@ -10,10 +10,10 @@ import pytest
 
 from evopolicy_common.messages.environment import ObsStorage
 from evopolicy_common.records.episodes.compare import (
+    Rows,
     action_log,
     files_difference,
     first_difference,
-    read_rows,
 )
 from evopolicy_common.records.episodes.rendered import OBSERVATIONS, ROWS, Renderer, decode
 from evopolicy_common.records.episodes.trajectory import Recorder, Trajectory
@@ -77,14 +77,14 @@ def test_feedback_files_are_held_against_a_rendered_episode_and_a_replay(
     against = rendered if stored else episode(Recorder(), obs)
     for name, data in rendered.files.items():
         (tmp_path / name).write_bytes(data)
-    assert files_difference(tmp_path, read_rows(tmp_path), against, actions=True) is None
+    assert files_difference(tmp_path, Rows(tmp_path), against, actions=True) is None
     if storage == "npz":
         other = {**obs, "n": 4} if isinstance(obs, dict) else obs + obs.dtype.type(1)
         forged = episode(Renderer("arrays", storage), obs, obs=other)
         (tmp_path / OBSERVATIONS).write_bytes(forged.files[OBSERVATIONS])
-        assert OBSERVATIONS in (files_difference(tmp_path, read_rows(tmp_path), against, actions=True) or "")
+        assert OBSERVATIONS in (files_difference(tmp_path, Rows(tmp_path), against, actions=True) or "")
         (tmp_path / OBSERVATIONS).unlink()
-        assert files_difference(tmp_path, read_rows(tmp_path), against, actions=True) is not None
+        assert files_difference(tmp_path, Rows(tmp_path), against, actions=True) is not None
     text = rendered.files[ROWS].replace(b'"reward":0.5', b'"reward":0.25', 1)
     (tmp_path / ROWS).write_bytes(text)
-    assert "step 0: reward" in (files_difference(tmp_path, read_rows(tmp_path), against, actions=True) or "")
+    assert "step 0: reward" in (files_difference(tmp_path, Rows(tmp_path), against, actions=True) or "")

@@ -14,10 +14,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evopolicy_common.records.episodes.compare import (
+    Rows,
     actions_of,
     files_difference,
     first_difference,
-    read_rows,
     reads_as,
     same,
 )
@@ -123,7 +123,7 @@ def test_the_next_float_is_another_one(value: float) -> None:
 
 def test_files_that_tell_the_episode_have_no_difference(tmp_path: Path) -> None:
     write_files(tmp_path / "ep", rows_of(episode()))
-    rows = read_rows(tmp_path / "ep")
+    rows = Rows(tmp_path / "ep")
     assert files_difference(tmp_path / "ep", rows, episode(), actions=True) is None
     assert actions_of(rows)[1] == [0.1]
 
@@ -135,27 +135,27 @@ def test_a_tampered_field_of_a_file_is_found(tmp_path: Path, field: str) -> None
         field
     ]
     write_files(tmp_path / "ep", rows)
-    found = files_difference(tmp_path / "ep", read_rows(tmp_path / "ep"), episode(), actions=True)
+    found = files_difference(tmp_path / "ep", Rows(tmp_path / "ep"), episode(), actions=True)
     assert found.startswith(f"step 1: {field}")
 
 
 def test_a_row_that_was_taken_out_is_found(tmp_path: Path) -> None:
     write_files(tmp_path / "ep", rows_of(episode())[:2])
-    rows = read_rows(tmp_path / "ep")
+    rows = Rows(tmp_path / "ep")
     assert files_difference(tmp_path / "ep", rows, episode(), actions=True) == "2 and 3 steps"
 
 
 def test_a_file_that_holds_no_rows_of_a_trajectory_is_refused(tmp_path: Path) -> None:
     write_files(tmp_path / "ep", [{"reward": 1.0}])
     with pytest.raises(ValueError, match="not one of a trajectory"):
-        read_rows(tmp_path / "ep")
+        Rows(tmp_path / "ep")
 
 
 @pytest.mark.parametrize("row", ['{"action": ' + "[" * 100_000, '{"action": ' + "9" * 5000 + "}", "[]"])
 def test_a_row_of_any_wrong_shape_is_refused_as_unreadable(tmp_path: Path, row: str) -> None:
     (tmp_path / "trajectory.jsonl").write_text(row + "\n")
     with pytest.raises(ValueError):  # noqa: PT011
-        read_rows(tmp_path)
+        Rows(tmp_path)
 
 
 def test_a_number_without_measure_reads_as_no_float() -> None:
@@ -169,7 +169,7 @@ def test_rows_of_many_values_are_not_all_in_memory_at_once(tmp_path: Path) -> No
     size = 30 * len(line)
     tracemalloc.start()
     try:
-        assert actions_of(read_rows(tmp_path)) == [0] * 30
+        assert actions_of(Rows(tmp_path)) == [0] * 30
         assert tracemalloc.get_traced_memory()[1] < 6 * size
     finally:
         tracemalloc.stop()
